@@ -1,0 +1,3 @@
+"""The command `cgwm`."""
+def main() -> None:
+    """Run."""

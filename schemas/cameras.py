@@ -1,0 +1,78 @@
+"""Cameras on disk, `cameras.json`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from .base import FileModel
+
+CAMERAS_FORMAT = "cgwm-cameras/1"
+
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+
+class CameraIntrinsics(FileModel):
+    """A pinhole camera, with OpenCV distortion where there is any. Pixel centres: top-left is (0.5, 0.5)."""
+
+    model: Literal["PINHOLE", "OPENCV"] = "PINHOLE"
+    width: Annotated[int, Field(gt=0)]
+    height: Annotated[int, Field(gt=0)]
+    fx: Annotated[float, Field(gt=0)]
+    fy: Annotated[float, Field(gt=0)]
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """k1, k2, p1, p2 [, k3] for OPENCV; empty for PINHOLE."""
+
+    @model_validator(mode="after")
+    def _distortion(self) -> CameraIntrinsics:
+        if self.model == "PINHOLE" and any(self.distortion):
+            raise ValueError("a PINHOLE camera has no distortion; use the model OPENCV")
+        if self.model == "OPENCV" and len(self.distortion) not in (4, 5):
+            raise ValueError(f"OPENCV takes 4 or 5 distortion values; found {len(self.distortion)}")
+        return self
+
+
+class Scale(FileModel):
+    """Whether one unit of the camera poses is one metre."""
+
+    kind: Literal["metric", "unscaled"]
+    source: str = ""
+    relative_std: Annotated[float, Field(ge=0)] | None = None
+    """Standard error of the scale, as a fraction."""
+
+
+class PosedImage(FileModel):
+    """A photo: which camera took it, and from where."""
+
+    camera: str
+    T_world_cam: Matrix4
+    """Camera to world; camera axes OpenCV (x right, y down, z forward)."""
+
+
+class PosedVideo(FileModel):
+    """A video camera: one pose when it stands still, one for each frame when it moves."""
+
+    camera: str
+    T_world_cam: Matrix4 | tuple[Matrix4, ...]
+
+
+class CamerasFile(FileModel):
+    """`cameras.json`."""
+
+    format: Literal["cgwm-cameras/1"] = CAMERAS_FORMAT
+    scale: Scale
+    cameras: dict[str, CameraIntrinsics]
+    images: dict[str, PosedImage] = {}
+    videos: dict[str, PosedVideo] = {}
+
+    @model_validator(mode="after")
+    def _known_cameras(self) -> CamerasFile:
+        for kind, entries in (("image", self.images), ("video", self.videos)):
+            for name, entry in entries.items():
+                if entry.camera not in self.cameras:
+                    raise ValueError(f"{kind} '{name}' names the camera '{entry.camera}', which is not in 'cameras'")
+        return self

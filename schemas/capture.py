@@ -1,0 +1,238 @@
+"""The manifest of a capture, `capture.toml`."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from .base import FileModel
+
+CAPTURE_FORMAT = "cgwm-capture/1"
+QUATERNION_NORM_TOLERANCE = 1e-3
+"""A quaternion whose norm is off by no more than this is normalised; by more, it is refused."""
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Vector3 = tuple[float, float, float]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+
+
+def unit_quaternion(quat_wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Return the normalised quaternion; refuse one whose norm is off by more than the tolerance."""
+    norm = math.sqrt(sum(value * value for value in quat_wxyz))
+    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+        raise ValueError(
+            f"the quaternion has norm {norm:.4f}; it must be 1 within {QUATERNION_NORM_TOLERANCE:g} (order w, x, y, z)"
+        )
+    w, x, y, z = (value / norm for value in quat_wxyz)
+    return w, x, y, z
+
+
+class Pose(FileModel):
+    """A rigid pose: position [m] and unit quaternion (w, x, y, z)."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    quat_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    @field_validator("quat_wxyz")
+    @classmethod
+    def _unit(cls, value: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+        return unit_quaternion(value)
+
+
+class Ground(FileModel):
+    """A half space that nothing penetrates: points with normal . x < offset are inside it."""
+
+    normal: Vector3 = (0.0, 0.0, 1.0)
+    """Unit normal, world frame, pointing out of the ground."""
+    offset_m: float = 0.0
+    """Height of the plane along the normal [m]."""
+
+    @field_validator("normal")
+    @classmethod
+    def _unit(cls, value: Vector3) -> Vector3:
+        norm = math.hypot(*value)
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(f"the ground normal has length {norm:.4f}; it must be 1")
+        return value[0] / norm, value[1] / norm, value[2] / norm
+
+
+class World(FileModel):
+    """What surrounds the bodies."""
+
+    gravity_m_s2: Vector3 = (0.0, 0.0, -9.81)
+    """Gravitational acceleration [m/s2], world frame."""
+    ground: Ground | None = None
+    """The ground, or nothing where there is none."""
+
+
+class BoxShape(FileModel):
+    """A box, centred at the body frame's origin and aligned with its axes."""
+
+    half_extents_m: tuple[Positive, Positive, Positive]
+
+
+class SphereShape(FileModel):
+    """A ball, centred at the body frame's origin."""
+
+    radius_m: Positive
+
+
+class FileShape(FileModel):
+    """A shape in a file beside the manifest, in the body frame, in metres."""
+
+    path: str
+
+
+class Shape(FileModel):
+    """The shape of a body: exactly one of the four."""
+
+    box: BoxShape | None = None
+    sphere: SphereShape | None = None
+    mesh: FileShape | None = None
+    """A closed triangle mesh (.obj or .stl), metres."""
+    splats: FileShape | None = None
+    """Spherical Gaussians (.ply)."""
+
+    @model_validator(mode="after")
+    def _one(self) -> Shape:
+        given = [name for name in ("box", "sphere", "mesh", "splats") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"a shape is exactly one of box, sphere, mesh, splats; found {given or 'none'}")
+        return self
+
+
+class Body(FileModel):
+    """A rigid body."""
+
+    name: Name
+    motion: Literal["free", "driven", "fixed"] = "free"
+    """free: moves by physics; driven: its track is the command; fixed: does not move."""
+    mass_kg: Positive | None = None
+    """Mass [kg]; left out: free, and fitted only where a force makes it observable."""
+    inertia_kg_m2: tuple[float, float, float] | tuple[float, float, float, float, float, float] | None = None
+    """Inertia about the centre of mass, body axes: diagonal, or xx yy zz xy xz yz; left out: from the shape."""
+    com_m: Vector3 | None = None
+    """Centre of mass in the body frame [m]; left out: from the shape."""
+    shape: Shape | None = None
+    """Left out: from the photos (stage SG-GS)."""
+    photo_pose: Pose | None = None
+    """T_world_body while the photos were taken; default identity (see `Capture`)."""
+
+
+class Measurement(FileModel):
+    """How well the tracks are measured; estimated from the data where left out."""
+
+    position_std_m: Positive | None = None
+    rotation_std_rad: Positive | None = None
+
+
+class Episode(FileModel):
+    """Facts about one episode."""
+
+    group: str | None = None
+    """The session that the episode belongs to."""
+    start_s: float | None = None
+    """Ignore what was measured before this time [s]."""
+    end_s: float | None = None
+    """Ignore what was measured after this time [s]."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Episode:
+        if self.start_s is not None and self.end_s is not None and self.end_s <= self.start_s:
+            raise ValueError(f"end_s ({self.end_s:g}) must be later than start_s ({self.start_s:g})")
+        return self
+
+
+class Video(FileModel):
+    """Timing of the videos; frame k of a camera shows the world at k / frame_rate_hz + its offset."""
+
+    frame_rate_hz: Positive = 30.0
+    camera_time_offset_s: dict[str, float] = {}
+    """Added to the frame times of a camera [s]."""
+
+
+class Marker(FileModel):
+    """An ArUco marker of known size that is visible in the photos."""
+
+    id: Annotated[int, Field(ge=0)]
+    side_m: Positive
+    """Length of the black square's side [m]."""
+    pose: Pose | None = None
+    """T_world_marker (x right, y up as printed, z out of the paper); fixes the world frame where given."""
+
+
+class KnownDistance(FileModel):
+    """A known distance between two points that are marked in at least two photos each."""
+
+    distance_m: Positive
+    a_px: dict[str, tuple[float, float]]
+    """Photo (path relative to images/) to pixel (x, y) of the first point; top-left pixel centre is (0.5, 0.5)."""
+    b_px: dict[str, tuple[float, float]]
+    """The same for the second point."""
+
+    @model_validator(mode="after")
+    def _two_views(self) -> KnownDistance:
+        for name, marks in (("a_px", self.a_px), ("b_px", self.b_px)):
+            if len(marks) < 2:
+                raise ValueError(f"{name} marks the point in {len(marks)} photo(s); at least 2 are needed")
+        return self
+
+
+class KnownCameraDistance(FileModel):
+    """A known distance between the optical centres of two photos."""
+
+    distance_m: Positive
+    images: tuple[str, str]
+    """The two photos (paths relative to images/)."""
+
+
+class Calibration(FileModel):
+    """What `cgwm calibrate` knows about scale and world frame. Give at most one source of scale."""
+
+    aruco_dictionary: str = "4X4_50"
+    """OpenCV's name without the prefix DICT_."""
+    markers: tuple[Marker, ...] = ()
+    known_distance: KnownDistance | None = None
+    known_camera_distance: KnownCameraDistance | None = None
+    same_camera: bool = True
+    """Whether all photos (not the video frames) were taken with one camera at one focal length."""
+
+    @model_validator(mode="after")
+    def _one_scale(self) -> Calibration:
+        sources = [bool(self.markers), self.known_distance is not None, self.known_camera_distance is not None]
+        if sum(sources) > 1:
+            raise ValueError("give one source of scale: markers, known_distance or known_camera_distance")
+        ids = [marker.id for marker in self.markers]
+        if len(set(ids)) != len(ids):
+            raise ValueError(f"marker ids must differ; found {ids}")
+        return self
+
+
+class CaptureManifest(FileModel):
+    """`capture.toml`."""
+
+    format: Literal["cgwm-capture/1"]
+    world: World = World()
+    bodies: tuple[Body, ...] = ()
+    measurement: Measurement = Measurement()
+    splits: dict[Name, tuple[str, ...]] = {}
+    episodes: dict[str, Episode] = {}
+    video: Video = Video()
+    calibration: Calibration = Calibration()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> CaptureManifest:
+        names = [body.name for body in self.bodies]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"two bodies have the name '{twice[0]}'; names must differ")
+        for split, episodes in self.splits.items():
+            if len(set(episodes)) != len(episodes):
+                raise ValueError(f"split '{split}' names an episode twice")
+        train, test = set(self.splits.get("train", ())), set(self.splits.get("test", ()))
+        if train & test:
+            raise ValueError(f"episode '{min(train & test)}' is in both train and test")
+        return self

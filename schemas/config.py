@@ -1,0 +1,65 @@
+"""Settings of the stages. The resolved settings are written into what a stage makes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .base import FileModel
+
+Device = Literal["auto", "cpu", "cuda"]
+
+
+class CalibrateConfig(FileModel):
+    """Settings of `cgwm calibrate`."""
+
+    seed: int = 0
+    max_features: Annotated[int, Field(ge=256)] = 4096
+    max_image_size: Annotated[int, Field(ge=128)] = 1600
+    """Photos are reduced to this longer side [px] for feature extraction."""
+    retries: Annotated[int, Field(ge=0)] = 4
+    """Further attempts (other seeds, then more features) after a model that fails the self-check."""
+
+
+class SplatConfig(FileModel):
+    """Settings of the stage sg-gs."""
+
+    seed: int = 0
+    device: Device = "auto"
+    iterations: Annotated[int, Field(ge=1)] = 400
+    max_body_spheres: Annotated[int, Field(ge=16)] = 2500
+    max_scene_spheres: Annotated[int, Field(ge=16)] = 6000
+    max_collision_spheres: Annotated[int, Field(ge=8)] = 256
+    image_size: Annotated[int, Field(ge=32)] = 320
+    """Photos are reduced to this longer side [px] for fitting."""
+    test_every: Annotated[int, Field(ge=2)] = 8
+    """Every n-th photo is held out and its PSNR reported."""
+    radius_factor: Annotated[float, Field(gt=0)] = 2.0
+
+
+class PhysConfig(FileModel):
+    """Settings of the stage phys-geo."""
+
+    seed: int = 0
+    device: Device = "auto"
+    supervise: Literal["tracks", "images", "both"] = "tracks"
+    step_s: Annotated[float, Field(gt=0)] = 0.001
+    starts: Annotated[int, Field(ge=1)] = 6
+    iterations: Annotated[int, Field(ge=1)] = 25
+    warmup_s: Annotated[float, Field(gt=0)] = 0.1
+
+
+class SynthesizeConfig(FileModel):
+    """Settings of `cgwm synthesize`."""
+
+    seed: int = 0
+    device: Device = "auto"
+    rollouts: Annotated[int, Field(ge=1)] = 8
+    duration_s: Annotated[float, Field(gt=0)] = 1.0
+    frame_rate_hz: Annotated[float, Field(gt=0)] = 30.0
+    width: Annotated[int, Field(ge=16)] = 320
+    height: Annotated[int, Field(ge=16)] = 240
+    compression: Literal["zstd", "gzip", "none"] = "zstd"
+    shard: Annotated[int, Field(ge=0)] = 0
+    shards: Annotated[int, Field(ge=1)] = 1

@@ -1,0 +1,56 @@
+"""The errors that users meet, each with the exit code that the command line ends with.
+
+A message has three parts: what was found and where, what is allowed, what to do next.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class CgwmError(Exception):
+    """Base of every error that cgwm raises on purpose.
+
+    Args:
+        found: What was found, and where (file, line or field).
+        allowed: What is allowed instead.
+        todo: What to do next, with a command to type where there is one.
+    """
+
+    exit_code = 1
+
+    def __init__(self, found: str, allowed: str = "", todo: str = "") -> None:
+        self.found, self.allowed, self.todo = found, allowed, todo
+        lines = [found]
+        if allowed:
+            lines.append(f"Allowed: {allowed}")
+        if todo:
+            lines.append(f"Next: {todo}")
+        super().__init__("\n".join(lines))
+
+
+class UsageError(CgwmError):
+    """The command was called in a way that it cannot be (exit code 2)."""
+
+    exit_code = 2
+
+
+class InputDataError(CgwmError):
+    """A file or field that the user gave is wrong (exit code 2)."""
+
+    exit_code = 2
+
+
+class NotConvergedError(CgwmError):
+    """A fit, a calibration or a simulation failed to reach a usable result (exit code 1)."""
+
+
+class CheckFailedError(CgwmError):
+    """A check found faults (exit code 1)."""
+
+
+def did_you_mean(name: str, legal: Iterable[str]) -> str:
+    """Return `` Did you mean 'x'?`` with the nearest legal name, or an empty string."""
+    near = difflib.get_close_matches(name, list(legal), n=1, cutoff=0.5)
+    return f" Did you mean '{near[0]}'?" if near else ""

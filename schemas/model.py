@@ -1,0 +1,129 @@
+"""A fitted world model on disk: `model.json` and `fit.json`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from .base import FileModel
+from .capture import Ground, Name, Pose, Shape, Vector3
+
+MODEL_FORMAT = "cgwm-model/1"
+
+
+class Parameter(FileModel):
+    """A fitted (or given) physical number."""
+
+    name: str
+    """For example `friction` or `cube.mass_kg`."""
+    unit: str
+    estimate: float
+    std_error: float | None = None
+    """Standard error; none where the number was given or the data say nothing about it."""
+    interval_95: tuple[float, float] | None = None
+    bounds: tuple[float, float] | None = None
+    prior: str | None = None
+    state: Literal["fitted", "given", "on_bound", "not_observable", "derived"] = "fitted"
+    note: str = ""
+    """What it is confounded with, or the motion that would reveal it."""
+
+
+class BodyModel(FileModel):
+    """A body of the model. Files are names in the model's directory."""
+
+    name: Name
+    motion: Literal["free", "driven", "fixed"]
+    mass_kg: Annotated[float, Field(gt=0)]
+    inertia_kg_m2: tuple[float, float, float, float, float, float]
+    """xx yy zz xy xz yz about the centre of mass, body axes [kg m2]."""
+    com_m: Vector3
+    """Centre of mass in the body frame [m]."""
+    photo_pose: Pose = Pose()
+    """T_world_body while the photos were taken."""
+    shape: Shape | None = None
+    """The shape that the capture gave, where it did."""
+    splats: str | None = None
+    """Visual spheres (PLY, body frame)."""
+    collision: str | None = None
+    """Colliding spheres (PLY, body frame); none: the visual ones collide."""
+    collision_distance_m: float | None = None
+    """Largest distance between the colliding spheres' surface and the visual (or given) surface [m]."""
+    radius_factor: float = 2.0
+    """Collision radius of a sphere in units of its Gaussian scale s."""
+
+
+class ContactParameters(FileModel):
+    """The contact law's numbers (contact model `closed_form`)."""
+
+    friction: Annotated[float, Field(ge=0)] = 0.5
+    """Coulomb coefficient [1]."""
+    contact_time_s: Annotated[float, Field(gt=0)] = 0.005
+    """Natural contact time tau = sqrt(m_eff / K) [s]."""
+    damping_ratio: Annotated[float, Field(ge=0)] = 0.3
+    """zeta [1]; together with tau it fixes the restitution e(zeta)."""
+
+
+class Solver(FileModel):
+    """How the model is integrated."""
+
+    contact_model: Literal["closed_form"] = "closed_form"
+    step_s: Annotated[float, Field(gt=0)] = 0.001
+    sweeps: Annotated[int, Field(ge=1)] = 1
+    """Projected sweeps over the contacts; 1 is the published closed form."""
+
+
+class EffectModel(FileModel):
+    """An effect in the model, with its parameters."""
+
+    name: str
+    parameters: dict[str, float] = {}
+
+
+class Exposure(FileModel):
+    """Colour gain and offset of a camera against the model's colours: image = gain * model + offset."""
+
+    gain_rgb: Vector3 = (1.0, 1.0, 1.0)
+    offset_rgb: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Provenance(FileModel):
+    """Where the model comes from."""
+
+    capture: str
+    input_sha256: dict[str, str] = {}
+    versions: dict[str, str] = {}
+    seed: int = 0
+    parent: str | None = None
+    config: dict[str, Any] = {}
+
+
+class ModelFile(FileModel):
+    """`model.json`."""
+
+    format: Literal["cgwm-model/1"] = MODEL_FORMAT
+    gravity_m_s2: Vector3 = (0.0, 0.0, -9.81)
+    ground: Ground | None = None
+    bodies: tuple[BodyModel, ...]
+    contact: ContactParameters | None = None
+    """None until the stage phys-geo has run."""
+    parameters: tuple[Parameter, ...] = ()
+    effects: tuple[EffectModel, ...] = ()
+    solver: Solver = Solver()
+    measurement_std: dict[str, float] = {}
+    """position_m and rotation_rad: the measurement noise, given or estimated."""
+    scene: str | None = None
+    """Background spheres (PLY, world frame), where there are any."""
+    exposures: dict[str, Exposure] = {}
+    """By video camera."""
+    warnings: tuple[str, ...] = ()
+    provenance: Provenance
+
+
+class FitFile(FileModel):
+    """`fit.json`: how the fit went, stage by stage."""
+
+    format: Literal["cgwm-fit/1"] = "cgwm-fit/1"
+    stages: dict[str, dict[str, Any]] = {}
+    """Stage name to its record: loss by iteration, convergence, timings, held-out numbers."""
+    warnings: tuple[str, ...] = ()

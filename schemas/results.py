@@ -1,0 +1,49 @@
+"""What the commands print with `--json`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .base import FileModel
+
+
+class ErrorSummary(FileModel):
+    """Statistics over episodes of an error that was averaged within each episode."""
+
+    mean: float
+    median: float
+    final: float | None = None
+    """Median over episodes of the error at the last frame."""
+
+
+class EpisodeErrors(FileModel):
+    """The errors of one episode."""
+
+    episode: str
+    frames: int
+    """Number of frames after the warm-up."""
+    duration_s: float
+    translation_error_m: float
+    translation_final_m: float
+    rotation_error_deg: float | None = None
+    rotation_final_deg: float | None = None
+    psnr_db: float | None = None
+    psnr_object_db: float | None = None
+    state_fitted_residual_m: float | None = None
+    state_noise_floor_m: float | None = None
+
+
+class EvalResult(FileModel):
+    """`cgwm eval --json`."""
+
+    episodes: int
+    translation_error_m: ErrorSummary
+    rotation_error_deg: ErrorSummary | None = None
+    psnr_db: ErrorSummary | None = None
+    psnr_object_db: ErrorSummary | None = None
+    state_fitted_residual_m: ErrorSummary | None = None
+    state_noise_floor_m: ErrorSummary | None = None
+    baselines: dict[str, dict[str, Any]] = {}
+    """The same figures for a frozen object and a ballistic one."""
+    per_episode: tuple[EpisodeErrors, ...] = ()
+    warnings: tuple[str, ...] = ()
