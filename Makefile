@@ -1,0 +1,70 @@
+# Everything that this makes lies in .venv/, build/ and out/. 'make' alone lists the targets.
+PYTHON ?= python3
+OUT ?= out/demo
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip
+TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+FILES := $(sort $(shell find cgwm cgwm_cli datasets pipeline schemas -name '*.py' -o -name py.typed))
+
+.PHONY: help install demo test lint evidence clean force
+
+help:
+	@echo 'make demo      run the whole pipeline on a scene that it makes itself; the report: $(OUT)/report.html'
+	@echo 'make test      lint, type check and tests, as the continuous integration runs them'
+	@echo 'make install   only install cgwm into $(VENV)/ (the two above do it by themselves)'
+	@echo 'make lint      ruff and pyright alone'
+	@echo 'make evidence  the measurements that take longer than tests may'
+	@echo 'make clean     remove what make made: $(VENV)/, build/, out/'
+
+install: $(VENV)/linked
+
+# out/ is make's own product, so a second 'make demo' replaces the first; 'cgwm demo' itself would refuse.
+demo: install
+	$(BIN)/cgwm demo $(OUT) --overwrite
+
+test: lint
+	$(BIN)/pytest
+
+lint: install
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+
+evidence: install
+	$(BIN)/pytest -m evidence
+
+clean:
+	rm -rf $(VENV) build out *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/made:
+	@command -v '$(PYTHON)' >/dev/null || { \
+	  echo "'$(PYTHON)' was not found. Next: install Python 3.11 or newer, or name it: make PYTHON=/path/to/python3" >&2; exit 2; }
+	@'$(PYTHON)' -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "cgwm needs Python 3.11 or newer; '$(PYTHON)' is $$('$(PYTHON)' --version 2>&1)." >&2; \
+	  echo "Next: name a newer one, for example: make PYTHON=python3.12" >&2; exit 2; }
+	'$(PYTHON)' -m venv $(VENV)
+	$(PIP) install --quiet --upgrade pip
+	@touch $@
+
+# Without an NVIDIA GPU the CPU build of torch: from where pip looks anyway if it is there, else from PyTorch's own index.
+$(VENV)/dependencies: pyproject.toml constraints.txt | $(VENV)/made
+	@echo 'Installing the dependencies into $(VENV)/: some minutes the first time.'
+	@if [ "$$(uname -s)" = Linux ] && ! command -v nvidia-smi >/dev/null; then \
+	  $(PIP) install --quiet --no-deps 'torch==$(TORCH)+cpu' 2>/dev/null || \
+	  $(PIP) install --quiet --no-deps 'torch==$(TORCH)+cpu' --index-url https://download.pytorch.org/whl/cpu; \
+	else $(PIP) install --quiet --no-deps 'torch==$(TORCH)'; fi
+	@$(BIN)/python -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb')); \
+	  lists = project['build-system']['requires'], project['project']['dependencies'], project['project']['optional-dependencies']['dev']; \
+	  print(*sum(lists, []), sep='\n')" > $(VENV)/requirements.txt
+	$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements.txt
+	@touch $@
+
+# Strict editable mode links each file, so that type checkers follow it; new files need to be linked anew.
+$(VENV)/linked: $(VENV)/dependencies $(VENV)/files
+	$(PIP) install --quiet --no-deps --no-build-isolation --config-settings editable_mode=strict -e .
+	@touch $@
+
+$(VENV)/files: force | $(VENV)/made
+	@echo '$(FILES)' | cmp -s - $@ || echo '$(FILES)' > $@

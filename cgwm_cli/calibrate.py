@@ -1,0 +1,38 @@
+"""`cgwm calibrate`: photos to cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import ConfigFile, Debug, Json, Overwrite, Quiet, Seed, Settings
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import CalibrationReport
+
+
+def calibrate(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="The capture's directory.", show_default=False)],
+    seed: Seed = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Photos to cameras: poses, lens, metric scale, and a verdict for each image."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.calibrate import calibrate as work
+        from ..schemas import CalibrateConfig
+        from .settings import StageSettings
+
+        settings = StageSettings(["calibrate"], config, set_).configure("calibrate", CalibrateConfig, seed=seed)
+        emit(work(capture, settings, overwrite), _summary)
+
+
+def _summary(report: CalibrationReport) -> str:
+    return str(report)

@@ -1,0 +1,45 @@
+"""`cgwm doctor`: what this machine has."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from .options import Debug, Json, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import DoctorReport
+
+
+def doctor(json: Json = False, quiet: Quiet = False, debug: Debug = False) -> None:
+    """What this machine has, what is missing, and what would be used."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.doctor import doctor as work
+
+        report = work()
+        emit(report, _summary)
+    if not report.ready:
+        raise typer.Exit(1)
+
+
+def _summary(report: DoctorReport) -> str:
+    from .output import table
+
+    verdict = "ready" if report.ready else "not ready"
+    lines = [f"cgwm {report.cgwm}: {verdict}."]
+    lines += [f"  missing: {item.what} ({item.why}). Next: {item.todo}" for item in report.missing]
+    machine = [
+        ["python", f"{report.python} on {report.platform}"],
+        ["cores, memory", f"{report.cpu_cores}, {report.memory_gib:.1f} GiB"],
+        ["CUDA", ", ".join(report.cuda_devices) or "no device"],
+        ["Triton", report.triton or "not installed (optional)"],
+        ["EGL", "loads" if report.egl else "not found (optional)"],
+        ["COLMAP", f"{report.colmap or 'missing'}, {'CUDA' if report.colmap_cuda else 'CPU'} SIFT"],
+        ["HDF5 zstd", "works" if report.hdf5_zstd else "does not work"],
+    ]
+    packages = [[package.name, package.version or "missing", package.requirement] for package in report.packages]
+    uses = [[name.replace("_", " "), text] for name, text in report.uses.items()]
+    blocks = [("This machine", machine), ("Packages", packages), ("What cgwm would use", uses)]
+    return "\n".join([*lines, *(f"{title}\n{table(rows)}" for title, rows in blocks)])

@@ -1,0 +1,73 @@
+"""`cgwm eval`: a model against measurements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .options import Debug, DeviceName, Json, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import ErrorSummary, EvalResult
+
+
+def evaluate(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
+    target: Annotated[
+        Path, typer.Argument(metavar="TARGET", help="A capture with tracks, or a dataset.", show_default=False)
+    ],
+    split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to predict.")] = "test",
+    warmup_s: Annotated[
+        float, typer.Option("--warmup-s", help="Length of the start that the model may see [s].")
+    ] = 0.1,
+    device: Annotated[
+        DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")
+    ] = "auto",
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """A model against measurements: open-loop errors of position, rotation and image."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.eval import evaluate as work
+        from ..schemas import UsageError
+
+        if not warmup_s > 0:
+            raise UsageError(f"--warmup-s {warmup_s:g}: no length of time.", "more than 0 s.")
+        emit(work(model, target, split, warmup_s, device), _summary)
+
+
+def _summary(result: EvalResult) -> str:
+    from .output import millimetres, table, warnings
+
+    move, turn = result.translation_error_m, result.rotation_error_deg
+    head = f"{result.episodes} episodes, open loop: {millimetres(move.median)}"
+    head += f" and {turn.median:.1f} deg (medians)." if turn else " (median)."
+    rows = [_row("translation error [mm]", move, 1e3)]
+    rows += [
+        _row(name, summary, scale)
+        for name, summary, scale in (
+            ("rotation error [deg]", turn, 1.0),
+            ("PSNR, object [dB]", result.psnr_object_db, 1.0),
+            ("PSNR, frame [dB]", result.psnr_db, 1.0),
+            ("state-fitted residual [mm]", result.state_fitted_residual_m, 1e3),
+            ("noise of the start alone [mm]", result.state_noise_floor_m, 1e3),
+        )
+        if summary is not None
+    ]
+    rows += [_baseline(name, figures) for name, figures in result.baselines.items()]
+    return "\n".join([head, table(rows, ["", "mean", "median", "final"]), *warnings(result.warnings)])
+
+
+def _row(name: str, summary: ErrorSummary, scale: float) -> list[str]:
+    values = (summary.mean, summary.median, summary.final)
+    return [name, *("-" if value is None else f"{value * scale:.1f}" for value in values)]
+
+
+def _baseline(name: str, figures: dict[str, Any]) -> list[str]:
+    errors = figures.get("translation_error_m") or {}
+    values = (errors.get("mean"), errors.get("median"), errors.get("final"))
+    return [f"({name}: translation [mm])", *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]

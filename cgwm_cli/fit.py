@@ -1,0 +1,73 @@
+"""`cgwm fit`: a capture to a world model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import ModelFile, Parameter
+
+
+def fit(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="The capture's directory.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="MODEL", help="The directory to write.", show_default=False)
+    ],
+    stage: Annotated[
+        Literal["all", "sg-gs", "phys-geo"], typer.Option("--stage", help="all: what the capture has inputs for.")
+    ] = "all",
+    parent: Annotated[
+        Path | None, typer.Option("--from", metavar="MODEL", help="Start from a fitted model; it stays as it is.")
+    ] = None,
+    supervise: Annotated[
+        Literal["tracks", "images", "both"] | None,
+        typer.Option("--supervise", show_default="tracks", help="What the motion is compared with."),
+    ] = None,
+    split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to fit.")] = "train",
+    seed: Seed = None,
+    device: Device = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """A capture to a world model: its shape and looks (sg-gs), its physics (phys-geo)."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.fit import fit as work
+        from ..schemas import PhysConfig, SplatConfig
+        from .settings import StageSettings
+
+        settings = StageSettings(["sg-gs", "phys-geo"], config, set_)
+        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device)
+        physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
+        emit(work(capture, out, stage, parent, split, splats, physics, overwrite), lambda model: _summary(model, out))
+
+
+def _summary(model: ModelFile, out: Path) -> str:
+    from .output import table, warnings
+
+    bodies = ", ".join(f"{body.name} ({body.motion})" for body in model.bodies)
+    state = "with physics" if model.contact else "shape and looks only: no physics yet"
+    lines = [f"Fitted {out}: {bodies}; {state}."]
+    if model.parameters:
+        lines.append(
+            table([_row(p) for p in model.parameters], ["parameter", "estimate", "95 % interval", "unit", "state"])
+        )
+    return "\n".join([*lines, *warnings(model.warnings)])
+
+
+def _row(parameter: Parameter) -> list[str]:
+    from .output import quantity
+
+    interval = parameter.interval_95
+    span = f"{interval[0]:.4g} to {interval[1]:.4g}" if interval else "-"
+    state = parameter.state.replace("_", " ")
+    return [parameter.name, quantity(parameter.estimate, digits=4), span, parameter.unit, state]

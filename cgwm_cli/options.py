@@ -1,0 +1,34 @@
+"""The options that several verbs share, so that they are spelt and explained alike.
+
+An option that is also a setting of a stage defaults to None, so that a settings file can give it; what it is then is
+shown in the help, and a test compares that with the stage's configuration.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only (and the document of --json).")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Seed = Annotated[int | None, typer.Option("--seed", min=0, show_default="0", help="Seed of everything random.")]
+Device = Annotated[
+    DeviceName | None,
+    typer.Option("--device", show_default="auto", help="auto takes a CUDA device where there is one."),
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace an output that exists, once the new one is complete.")
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Settings: a TOML file with a table for each stage."),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="STAGE.KEY=VALUE", help="One setting; may be repeated. Wins over --config."),
+]

@@ -1,0 +1,167 @@
+"""How every verb runs: signals, errors and exit codes, and a stdout that belongs to the result alone."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from ..schemas import FileModel
+
+INTERRUPTED = 130
+_interrupted = False
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run `cgwm` with these arguments (default: those of the process), and end the process with its exit code."""
+    _catch_signals()
+    try:
+        code = _invoke(sys.argv[1:] if arguments is None else arguments)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        code = _say_interrupted()
+    except BrokenPipeError:
+        # Whoever read our output has gone ("cgwm ... | head"): nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    sys.exit(code)
+
+
+Emit = Callable[["FileModel", Callable[[Any], str]], None]
+
+
+@contextlib.contextmanager
+def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> Iterator[Emit]:
+    """Wrap the work of a verb: whatever it raises becomes one clear message on stderr and the right exit code.
+
+    Yields a function that takes the result and how to summarise it; it is printed when the work is over. What libraries
+    print on stdout meanwhile goes to stderr on a terminal, and nowhere otherwise.
+
+    Raises:
+        typer.Exit: With the exit code, when the work failed.
+    """
+    _hush(quiet, debug)
+    printed: list[str] = []
+
+    def emit(result: FileModel, summary: Callable[[Any], str]) -> None:
+        if json:
+            printed.append(result.model_dump_json(indent=2))
+        elif not quiet:
+            printed.append(summary(result))
+
+    try:
+        with _stdout_for_results_only():
+            yield emit
+        for text in printed:
+            print(text, flush=True)
+    except (typer.Exit, BrokenPipeError):
+        raise
+    except BaseException as error:
+        if debug:
+            traceback.print_exc()
+        raise typer.Exit(_report(error, debug)) from None
+
+
+def _invoke(arguments: list[str]) -> int:
+    from .app import app
+
+    try:
+        return int(app(arguments, prog_name="cgwm", standalone_mode=False) or 0)
+    except Exception as error:
+        # Typer's own errors are told by their shape: since 0.26 their classes are private.
+        if not hasattr(error, "format_message"):
+            raise
+        from .usage import explain
+
+        print(explain(error, arguments), file=sys.stderr)
+        return 2
+
+
+def _report(error: BaseException, debug: bool) -> int:
+    if _interrupted or isinstance(error, KeyboardInterrupt):
+        return _say_interrupted()
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else 1
+    from ..schemas import CgwmError
+
+    if isinstance(error, CgwmError):
+        print(error, file=sys.stderr)
+        return error.exit_code
+    print(_unforeseen(error, debug), file=sys.stderr)
+    return 1
+
+
+def _unforeseen(error: BaseException, debug: bool) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror}."
+    if isinstance(error, MemoryError):
+        return "The memory did not suffice.\nNext: close other programs, or work on less at a time."
+    if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("cgwm"):
+        return f"The package '{error.name}' is not installed.\nNext: run 'cgwm doctor', which prints the pip line."
+    hint = "" if debug else "\nNext: run the command again with --debug, and report the traceback."
+    return f"A fault inside cgwm: {type(error).__name__}: {error}{hint}"
+
+
+def _say_interrupted() -> int:
+    print("Interrupted; nothing was left under the output's name.", file=sys.stderr)
+    return INTERRUPTED
+
+
+def _catch_signals() -> None:
+    """Make SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, so that what is unfinished is cleaned up."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        # A signal that our parent had us ignore (nohup, a background job) stays ignored.
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            with contextlib.suppress(ValueError):  # not in the main thread
+                signal.signal(number, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    global _interrupted  # noqa: PLW0603  a library may turn the exception into another; this tells them apart
+    _interrupted = True
+    raise KeyboardInterrupt
+
+
+def _hush(quiet: bool, debug: bool) -> None:
+    if quiet:
+        os.environ["CGWM_QUIET"] = "1"  # read by cgwm.datasets.progress
+    if debug:
+        return
+    import warnings
+
+    if quiet or not sys.stderr.isatty():
+        warnings.simplefilter("ignore")
+
+
+@contextlib.contextmanager
+def _stdout_for_results_only() -> Iterator[None]:
+    """Send what is printed on stdout inside to stderr, for compiled libraries too."""
+    sys.stdout.flush()
+    original: Any = sys.stdout
+    with contextlib.ExitStack() as stack:
+        sink: Any = sys.stderr
+        if not sys.stderr.isatty():
+            sink = stack.enter_context(open(os.devnull, "w"))
+        stack.enter_context(contextlib.redirect_stdout(sink))
+        try:
+            descriptor = original.fileno()
+        except (OSError, ValueError, AttributeError):  # captured by a test: there is no file below
+            yield
+            return
+        saved = os.dup(descriptor)
+        try:
+            os.dup2(sink.fileno(), descriptor)
+            yield
+        finally:
+            os.dup2(saved, descriptor)
+            os.close(saved)

@@ -1,0 +1,50 @@
+"""`cgwm validate`: is this capture, model or dataset what it should be?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .options import Debug, Json, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import ValidationReport
+
+
+def validate(
+    thing: Annotated[Path, typer.Argument(metavar="THING", help="A capture, model or dataset.", show_default=False)],
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Check a capture, a model or a dataset: schema, units, finite numbers, hashes."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.validate import validate as work
+
+        report = work(thing)
+        emit(report, _summary)
+    if report.faults:
+        raise typer.Exit(1)
+
+
+def _summary(report: ValidationReport) -> str:
+    from .output import table
+
+    count = len(report.faults)
+    verdict = f"{count} fault{'s' if count > 1 else ''}" if count else "no faults"
+    faults = [f"  fault: {fault}" for fault in report.faults]
+    facts = table([[name.replace("_", " "), _text(value)] for name, value in report.facts.items()])
+    return "\n".join(part for part in [f"{report.kind} {report.path}: {verdict}.", *faults, facts] if part)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(entry)}" for name, entry in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_text, value)) or "none"
+    return str(value)
