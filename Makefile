@@ -44,8 +44,8 @@ $(VENV)/made:
 	@'$(PYTHON)' -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "cgwm needs Python 3.11 or newer; '$(PYTHON)' is $$('$(PYTHON)' --version 2>&1)." >&2; \
 	  echo "Next: name a newer one, for example: make PYTHON=python3.12" >&2; exit 2; }
-	'$(PYTHON)' -m venv $(VENV)
-	$(PIP) install --quiet --upgrade pip
+	@'$(PYTHON)' -m venv $(VENV)
+	@$(PIP) install --quiet --upgrade pip
 	@touch $@
 
 # Without an NVIDIA GPU the CPU build of torch: from where pip looks anyway if it is there, else from PyTorch's own index.
@@ -58,12 +58,12 @@ $(VENV)/dependencies: pyproject.toml constraints.txt | $(VENV)/made
 	@$(BIN)/python -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb')); \
 	  lists = project['build-system']['requires'], project['project']['dependencies'], project['project']['optional-dependencies']['dev']; \
 	  print(*sum(lists, []), sep='\n')" > $(VENV)/requirements.txt
-	$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements.txt
+	@$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements.txt
 	@touch $@
 
 # Strict editable mode links each file, so that type checkers follow it; new files need to be linked anew.
 $(VENV)/linked: $(VENV)/dependencies $(VENV)/files
-	$(PIP) install --quiet --no-deps --no-build-isolation --config-settings editable_mode=strict -e .
+	@$(PIP) install -qq --no-deps --no-build-isolation --config-settings editable_mode=strict -e .
 	@touch $@
 
 $(VENV)/files: force | $(VENV)/made

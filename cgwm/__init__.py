@@ -14,15 +14,74 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0.0.0"
 
 _PUBLIC = {
+    "CalibrateConfig": ".schemas",
+    "Capture": ".datasets.capture",
     "CgwmError": ".schemas",
-    "Capture": ".datasets",
+    "CheckFailedError": ".schemas",
+    "InputDataError": ".schemas",
+    "Model": ".datasets.models",
+    "NotConvergedError": ".schemas",
+    "PhysConfig": ".schemas",
+    "SplatConfig": ".schemas",
+    "SynthesizeConfig": ".schemas",
+    "UsageError": ".schemas",
+    "calibrate": ".pipeline.calibrate",
+    "doctor": ".pipeline.doctor",
+    "evaluate": ".pipeline.eval",
+    "fit": ".pipeline.fit",
+    "import_contactnets": ".datasets.contactnets",
+    "read_model": ".datasets.models",
+    "run_demo": ".pipeline.demo",
+    "synthesize": ".pipeline.synthesize",
+    "validate": ".pipeline.validate",
 }
 
-if TYPE_CHECKING:
-    from .datasets import Capture
-    from .schemas import CgwmError
+if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tree they lie beside it
+    from .datasets.capture import Capture  # pyright: ignore[reportMissingImports]
+    from .datasets.contactnets import import_contactnets  # pyright: ignore[reportMissingImports]
+    from .datasets.models import Model, read_model  # pyright: ignore[reportMissingImports]
+    from .pipeline.calibrate import calibrate  # pyright: ignore[reportMissingImports]
+    from .pipeline.demo import run_demo  # pyright: ignore[reportMissingImports]
+    from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
+    from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
+    from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
+    from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
+    from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
+    from .schemas import (  # pyright: ignore[reportMissingImports]
+        CalibrateConfig,
+        CgwmError,
+        CheckFailedError,
+        InputDataError,
+        NotConvergedError,
+        PhysConfig,
+        SplatConfig,
+        SynthesizeConfig,
+        UsageError,
+    )
 
-__all__ = ["Capture", "CgwmError", "__version__"]
+__all__ = [
+    "CalibrateConfig",
+    "Capture",
+    "CgwmError",
+    "CheckFailedError",
+    "InputDataError",
+    "Model",
+    "NotConvergedError",
+    "PhysConfig",
+    "SplatConfig",
+    "SynthesizeConfig",
+    "UsageError",
+    "__version__",
+    "calibrate",
+    "doctor",
+    "evaluate",
+    "fit",
+    "import_contactnets",
+    "read_model",
+    "run_demo",
+    "synthesize",
+    "validate",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -30,3 +89,7 @@ def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
         return getattr(import_module(_PUBLIC[name], __name__), name)
     raise AttributeError(f"module 'cgwm' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

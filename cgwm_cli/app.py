@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -16,16 +15,16 @@ from .import_ import import_capture
 from .synthesize import synthesize
 from .validate import validate
 
-VERBS: dict[str, Callable[..., Any]] = {
-    "demo": demo,
-    "calibrate": calibrate,
-    "fit": fit,
-    "synthesize": synthesize,
-    "eval": evaluate,
-    "import": import_capture,
-    "validate": validate,
-    "doctor": doctor,
-}
+VERBS = (
+    ("demo", demo, "The whole pipeline on a scene that it makes itself."),
+    ("calibrate", calibrate, "Photos to cameras, with a metric scale."),
+    ("fit", fit, "A capture to a world model."),
+    ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
+    ("eval", evaluate, "A model against measurements."),
+    ("import", import_capture, "Recordings in another format to a capture."),
+    ("validate", validate, "Check a capture, a model or a dataset."),
+    ("doctor", doctor, "What this machine has, and what would be used."),
+)
 
 app = typer.Typer(
     name="cgwm",
@@ -37,15 +36,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _name, _function in VERBS.items():
-    app.command(_name)(_function)
+for _name, _function, _short_help in VERBS:
+    app.command(_name, short_help=_short_help)(_function)
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from .. import __version__
+        from importlib.metadata import version as installed_version
 
-        typer.echo(f"cgwm {__version__}")
+        typer.echo(f"cgwm {installed_version('cgwm')}")
         raise typer.Exit
 
 

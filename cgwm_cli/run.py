@@ -135,12 +135,12 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 def _hush(quiet: bool, debug: bool) -> None:
     if quiet:
         os.environ["CGWM_QUIET"] = "1"  # read by cgwm.datasets.progress
-    if debug:
-        return
-    import warnings
+    if not debug and (quiet or not sys.stderr.isatty()):
+        import logging
+        import warnings
 
-    if quiet or not sys.stderr.isatty():
         warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
 
 
 @contextlib.contextmanager

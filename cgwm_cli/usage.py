@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 
@@ -20,12 +21,20 @@ def explain(error: Any, arguments: list[str]) -> str:
         found = f"{command}: there is no option '{option}'."
         return str(UsageError(found, f"{', '.join(legal)}.{did_you_mean(option, legal)}", todo))
     verbs = list(getattr(context.command, "commands", {})) if context else []
-    message = _sentence(error.format_message())
+    message = _sentence(error.format_message().replace("Value error, ", ""))
     if message.startswith("No such command"):
         verb = next((word for word in arguments if not word.startswith("-")), "")
         found = f"{command}: there is no command '{verb}'."
         return str(UsageError(found, f"{', '.join(verbs)}.{did_you_mean(verb, verbs)}", todo))
-    return str(UsageError(f"{command}: {message}", todo=todo))
+    return str(UsageError(f"{command}: {message}{_nearest_choice(message)}", todo=todo))
+
+
+def _nearest_choice(message: str) -> str:
+    """Suggest the legal value that is nearest to a wrong one, from a message that quotes both."""
+    from ..schemas import did_you_mean
+
+    found, is_choice, legal = message.partition(" is not one of ")
+    return did_you_mean(re.findall("'([^']*)'", found)[-1], re.findall("'([^']*)'", legal)) if is_choice else ""
 
 
 def _options(context: Any) -> list[str]:

@@ -1,0 +1,180 @@
+"""Laws of the source itself: one-way imports, nothing that executes a stranger's data, text that is run."""
+
+import ast
+import doctest
+import importlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import cgwm
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = {"schemas": "schemas", "datasets": "datasets", "pipeline": "pipeline", "cli": "cgwm_cli"}
+ORDER = list(ROOMS)
+HEAVY = ("torch", "numpy", "scipy", "mujoco", "h5py", "hdf5plugin", "pycolmap", "cv2", "matplotlib", "tqdm", "pydantic")
+FILES = sorted(path for folder in ROOMS.values() for path in (ROOT / folder).rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    """Return the import name of a source file, `cgwm.<room>...`."""
+    folder, *rest = path.relative_to(ROOT).with_suffix("").parts
+    room = next(room for room, name in ROOMS.items() if name == folder)
+    return ".".join(["cgwm", room, *(part for part in rest if part != "__init__")])
+
+
+def imports(path: Path, *, top_level: bool = False) -> Iterator[tuple[int, str]]:
+    """Yield line and absolute name of all that a file imports; `TYPE_CHECKING` blocks count as well."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    package = module_name(path) if path.name == "__init__.py" else module_name(path).rpartition(".")[0]
+    for node in tree.body if top_level else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
+            target = ".".join(part for part in (base, node.module) if part)
+            yield node.lineno, target
+            yield from ((node.lineno, f"{target}.{alias.name}") for alias in node.names)
+
+
+def calls(path: Path) -> Iterator[tuple[ast.Call, str]]:
+    """Yield every call in a file with the dotted name of what is called."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            yield node, ast.unparse(node.func)
+
+
+def place(path: Path, line: int) -> str:
+    return f"{path.relative_to(ROOT)}:{line}"
+
+
+def test_imports_run_one_way() -> None:
+    wrong = []
+    for path in FILES:
+        room = ORDER.index(module_name(path).split(".")[1])
+        for line, name in imports(path):
+            parts = name.split(".")
+            if parts[0] == "cgwm" and len(parts) > 1 and parts[1] in ORDER and ORDER.index(parts[1]) > room:
+                wrong.append(f"{place(path, line)} imports {name}")
+    assert wrong == []
+
+
+def test_the_rooms_import_each_other_relatively() -> None:
+    # "import datasets" would find another package of that name in many environments.
+    wrong = [
+        place(path, node.lineno)
+        for path in FILES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom) and not node.level
+            else []
+        )
+        if name.split(".")[0] in {"cgwm", *ROOMS.values()}
+    ]
+    assert wrong == []
+
+
+def test_the_command_line_imports_nothing_heavy_at_module_level() -> None:
+    wrong = [
+        f"{place(path, line)} imports {name}"
+        for path in sorted((ROOT / "cgwm_cli").rglob("*.py"))
+        for line, name in imports(path, top_level=True)
+        if name.split(".")[0] in HEAVY or (name.startswith("cgwm.") and not name.startswith("cgwm.cli"))
+    ]
+    assert wrong == []
+
+
+def test_only_one_module_speaks_to_colmap() -> None:
+    users = {path.relative_to(ROOT).as_posix() for path in FILES for _, name in imports(path) if name == "pycolmap"}
+    assert users <= {"pipeline/sfm/colmap.py"}
+
+
+def is_unsafe(call: ast.Call, name: str) -> bool:
+    """Tell whether a call executes, or may execute, what a file says."""
+    keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
+    return (
+        name in {"eval", "exec", "compile", "os.system", "torch.save"}
+        or name.endswith("yaml.load")
+        or (name == "torch.load" and keywords.get("weights_only") != "True")
+        or keywords.get("allow_pickle", "False") != "False"
+        or keywords.get("shell", "False") != "False"
+    )
+
+
+def test_nothing_is_unpickled_executed_or_fetched() -> None:
+    forbidden = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal", "requests", "httpx"}
+    forbidden |= {"urllib.request", "http.client", "ftplib"}
+    wrong = []
+    for path in FILES:
+        wrong += [place(path, line) for line, name in imports(path) if name in forbidden]
+        wrong += [f"{place(path, call.lineno)} calls {name}" for call, name in calls(path) if is_unsafe(call, name)]
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["eval(text)", "torch.load(path)", "torch.load(path, weights_only=False)", "np.load(p, allow_pickle=True)"],
+)
+def test_the_search_for_unsafe_calls_finds_them(source: str) -> None:
+    call = ast.parse(source, mode="eval").body
+    assert isinstance(call, ast.Call)
+    assert is_unsafe(call, ast.unparse(call.func))
+
+
+def test_only_the_command_line_prints_on_stdout() -> None:
+    wrong = [
+        place(path, call.lineno)
+        for path in FILES
+        if "cgwm_cli" not in path.parts
+        for call, name in calls(path)
+        if name == "print" and "file" not in {keyword.arg for keyword in call.keywords}
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("path", [path for path in FILES if path.name == "__init__.py"], ids=module_name)
+def test_all_is_complete(path: Path) -> None:
+    module = importlib.import_module(module_name(path))
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    exported = getattr(module, "__all__", [])
+    assert [name for name in exported if not hasattr(module, name)] == []
+    assert len(exported) == len(set(exported))
+    imported = {
+        alias.asname or alias.name
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.level
+        for alias in node.names
+    }
+    assert sorted(name for name in imported - set(exported) if not name.startswith("_")) == []
+
+
+def test_public_names_of_the_package() -> None:
+    assert set(cgwm.__all__) == {"__version__", *cgwm._PUBLIC}
+    assert [name for name in cgwm.__all__ if getattr(cgwm, name, None) is None] == []
+    with pytest.raises(AttributeError, match="module 'cgwm' has no attribute 'nothing'"):
+        _ = cgwm.nothing
+
+
+def test_reading_data_does_not_import_torch() -> None:
+    code = (
+        "import sys, cgwm.datasets, cgwm.datasets.capture, cgwm.datasets.models, cgwm.schemas; "
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in FILES if ">>> " in path.read_text(encoding="utf-8")], ids=module_name
+)
+def test_docstring_examples_run(path: Path) -> None:
+    outcome = doctest.testmod(importlib.import_module(module_name(path)))
+    assert outcome.attempted > 0
+    assert outcome.failed == 0

@@ -1,0 +1,75 @@
+"""What `cgwm doctor` finds, and what it says when something is missing."""
+
+from importlib import metadata
+
+import pytest
+from cgwm.pipeline import doctor as module
+from cgwm.pipeline.doctor import cpu_cores, doctor, memory_bytes, satisfies
+from cgwm.schemas import DoctorReport
+
+
+def set_version(monkeypatch: pytest.MonkeyPatch, package: str, version: str | None) -> None:
+    found = module._version
+    monkeypatch.setattr(module, "_version", lambda name: version if name == package else found(name))
+
+
+def test_the_machine_that_runs_the_tests_is_ready() -> None:
+    report = doctor()
+    assert report.ready
+    assert report.missing == ()
+    assert report.hdf5_zstd
+    assert report.aruco
+    assert report.colmap == metadata.version("pycolmap")
+    assert report.cgwm == metadata.version("cgwm")
+    assert {package.name for package in report.packages} >= {"torch", "mujoco", "pycolmap", "typer", "h5py"}
+    assert report.cpu_cores == cpu_cores() >= 1
+    assert 0.5 * 2**30 < memory_bytes() < 2**50
+    assert DoctorReport.model_validate_json(report.model_dump_json()) == report
+
+
+def test_a_missing_package_comes_with_its_pip_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_version(monkeypatch, "mujoco", None)
+    monkeypatch.setattr(module, "_load", lambda name: None)
+    monkeypatch.setattr(module, "_broken", lambda packages: [])
+    report = doctor()
+    assert not report.ready
+    (missing,) = report.missing
+    assert missing.what == "mujoco"
+    assert missing.why == "not installed"
+    assert missing.todo == "pip install 'mujoco<4,>=3.17'"
+    assert report.colmap is None
+    assert report.cuda_devices == ()
+
+
+def test_a_package_that_is_too_new_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_version(monkeypatch, "mujoco", "4.0.0")
+    (missing,) = doctor().missing
+    assert missing.why == "found 4.0.0, needed mujoco<4,>=3.17"
+
+
+def test_a_package_that_does_not_import_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: str) -> object:
+        if name == "cv2":
+            raise ImportError("libGL.so.1: cannot open shared object file")
+        return __import__(name)
+
+    monkeypatch.setattr(module, "import_module", load)
+    (missing,) = doctor().missing
+    assert missing.what == "opencv-python-headless"
+    assert missing.why == "does not import: libGL.so.1: cannot open shared object file"
+
+
+@pytest.mark.parametrize(
+    ("version", "requirement", "expected"),
+    [
+        ("2.13.0+cpu", "torch<3,>=2.11", True),
+        ("2.9.1", "torch<3,>=2.11", False),
+        ("3.17", "mujoco>=3.17.0", True),
+        ("4.0.0", "mujoco<4,>=3.17", False),
+        ("1.2.3", "thing", True),
+        ("1.2.3", "thing!=1.2.3", False),
+        ("10.0", "thing>9.9", True),
+    ],
+)
+def test_versions_against_bounds(version: str, requirement: str, expected: bool) -> None:
+    assert satisfies(version, requirement) is expected
