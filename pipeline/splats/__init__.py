@@ -1,1 +1,1 @@
-"""."""
+"""Spherical Gaussians: rendering, fitting to photos, and the spheres that collide."""

@@ -1,0 +1,304 @@
+"""The few spheres that collide, distilled from a solid so that planes touch them where they touch the solid.
+
+Contact with a plane sees nothing of a solid but its support function h(n) = max n . x; contact between bodies
+sees the surface. So spheres are chosen first where the support function lacks most, then where the surface is
+covered worst, each as large as fits inside the solid, and then to fill the inside, so that a deep query still
+finds a body there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ...datasets.ply import Splats, read_splats
+from ...schemas import InputDataError, Shape
+from .mesh import mesh_volume, read_mesh
+from .volume import Array, Volume, crossings, grid_points
+
+DIRECTIONS = 1500
+"""Number of directions in which the support function is held."""
+_SUPPORT_TOLERANCE = 1e-3  # of the solid's size
+_SURFACE_TOLERANCE = 2e-3
+_SMALLEST_RADIUS = 2e-3
+_SUPPORT_SHARE = 0.7
+_FILL_SHARE = 0.08
+_SAMPLES = 6000
+_CORNER_RADIUS_M = 1e-3
+
+
+class Solid(Protocol):
+    """What is distilled: `Volume` is one."""
+
+    @property
+    def surface(self) -> Array:
+        """Return points on the surface [m], shape (S, 3)."""
+        ...
+
+    @property
+    def normals(self) -> Array:
+        """Return outward unit normals at `surface`, shape (S, 3)."""
+        ...
+
+    @property
+    def tolerance(self) -> float:
+        """How accurate the signed distance is [m]."""
+        ...
+
+    def at(self, points: Array) -> Array:
+        """Return the signed distance [m] at points (n, 3), positive outside."""
+        ...
+
+    def size(self) -> float:
+        """Return the length of the bounding box's diagonal [m]."""
+        ...
+
+
+@dataclass(frozen=True)
+class CollisionSpheres:
+    """Spheres that stand for a solid in contact.
+
+    Attributes:
+        centers: Centres in the body frame [m], shape (n, 3).
+        radii: Collision radii [m], shape (n,).
+        distance_m: Largest distance between the union of the spheres and the solid's surface [m], both ways.
+        support_error_m: Largest difference of the support functions over `DIRECTIONS` directions [m].
+    """
+
+    centers: Array
+    radii: Array
+    distance_m: float
+    support_error_m: float
+
+    def splats(self, radius_factor: float) -> Splats:
+        """Return the spheres as Gaussians of scale radius / radius_factor, opaque and grey."""
+        count = self.radii.shape[0]
+        return Splats(
+            means=self.centers,
+            scales=self.radii / radius_factor,
+            opacities=np.full(count, 0.99),
+            colors=np.full((count, 3), 0.5),
+        )
+
+
+def shape_to_spheres(
+    shape: Shape, capture_root: Path, max_spheres: int, radius_factor: float = 2.0
+) -> tuple[Splats, float]:
+    """Return colliding spheres for a shape that the manifest gives.
+
+    A box has its corners first: 8 small spheres that touch three faces each, so that planes meet them where they meet
+    the box; with `max_spheres` = 8 it has no others. A ball is one sphere.
+
+    Args:
+        shape: The shape, in the body frame.
+        capture_root: Directory that the shape's path is relative to.
+        max_spheres: Largest number of spheres, at least 8.
+        radius_factor: Collision radius in units of the Gaussian scale.
+
+    Returns:
+        The spheres in the body frame, and the largest distance between their surface and the shape's [m].
+
+    Raises:
+        InputDataError: If the shape's file is missing or not readable.
+    """
+    if shape.sphere is not None:
+        one = CollisionSpheres(np.zeros((1, 3)), np.array([shape.sphere.radius_m]), 0.0, 0.0)
+        return one.splats(radius_factor), 0.0
+    if shape.splats is not None:
+        spheres = _from_splats(read_splats(capture_root / shape.splats.path), max_spheres, radius_factor)
+    elif shape.mesh is not None:
+        spheres = distil(mesh_volume(read_mesh(capture_root / shape.mesh.path)), max_spheres)
+    elif shape.box is not None:
+        spheres = _box_spheres(np.array(shape.box.half_extents_m), max_spheres)
+    else:
+        raise InputDataError("a shape without a kind.", "box, sphere, mesh, splats.")
+    return spheres.splats(radius_factor), spheres.distance_m
+
+
+def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = None, seed: int = 0) -> CollisionSpheres:
+    """Choose spheres inside a solid that support and cover it as it does itself.
+
+    Args:
+        solid: The solid.
+        max_spheres: Largest number of spheres.
+        first: Centres (k, 3) and radii (k,) of spheres that support the solid [m]; chosen here where left out.
+        seed: Seed of the choice of surface samples.
+    """
+    size = solid.size()
+    chosen = _Chosen(*(first if first is not None else (np.zeros((0, 3)), np.zeros(0))))
+    budget = max_spheres - chosen.count
+    fill = int(_FILL_SHARE * budget)
+    if first is None:
+        _add_support(chosen, solid, int(_SUPPORT_SHARE * (budget - fill)), _SUPPORT_TOLERANCE * size)
+    samples = np.random.default_rng(seed).permutation(solid.surface.shape[0])[:_SAMPLES]
+    points, normals = solid.surface[samples], solid.normals[samples]
+    _add_cover(chosen, solid, points, normals, max_spheres - fill, _SURFACE_TOLERANCE * size)
+    if isinstance(solid, Volume):
+        _add_fill(chosen, solid, max_spheres)
+    centers, radii = chosen.arrays()
+    gap = np.abs(union_distance(centers, radii, points)).max()
+    beyond = float((solid.at(centers) + radii).max())
+    support = np.abs(support_of_points(solid.surface) - support_of_spheres(centers, radii)).max()
+    return CollisionSpheres(centers, radii, float(max(gap, beyond)), float(support))
+
+
+def fibonacci_directions(count: int) -> Array:
+    """Return `count` nearly evenly spread unit vectors, shape (count, 3)."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    angle = math.pi * (1 + math.sqrt(5)) * index
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def support_of_points(points: Array, directions: Array | None = None) -> Array:
+    """Return max n . x over points (n, 3) [m], for each direction, shape (D,)."""
+    directions = fibonacci_directions(DIRECTIONS) if directions is None else directions
+    return np.array([(points @ direction).max() for direction in directions])
+
+
+def support_of_spheres(centers: Array, radii: Array, directions: Array | None = None) -> Array:
+    """Return max n . c + r over spheres [m], for each direction, shape (D,)."""
+    directions = fibonacci_directions(DIRECTIONS) if directions is None else directions
+    return (directions @ centers.T + radii).max(1)
+
+
+def union_distance(centers: Array, radii: Array, points: Array) -> Array:
+    """Return min |p - c| - r over spheres at points (n, 3) [m]: the exact distance outside of their union."""
+    result = np.full(points.shape[0], np.inf)
+    for center, radius in zip(centers, radii, strict=True):
+        np.minimum(result, np.linalg.norm(points - center, axis=1) - radius, out=result)
+    return result
+
+
+class _Chosen:
+    """The spheres chosen so far."""
+
+    def __init__(self, centers: Array, radii: Array) -> None:
+        self.centers, self.radii = [*centers], [*radii]
+
+    @property
+    def count(self) -> int:
+        return len(self.radii)
+
+    def add(self, center: Array, radius: float) -> None:
+        self.centers.append(center)
+        self.radii.append(radius)
+
+    def arrays(self) -> tuple[Array, Array]:
+        return np.array(self.centers).reshape(-1, 3), np.array(self.radii)
+
+
+def _add_support(chosen: _Chosen, solid: Solid, limit: int, tolerance: float) -> None:
+    """Add spheres where the support function lacks most, until it lacks less than `tolerance`."""
+    directions = fibonacci_directions(DIRECTIONS)
+    extreme = np.array([int(np.argmax(solid.surface @ direction)) for direction in directions])
+    points = solid.surface[extreme]
+    radii = _inscribed_radii(solid, points, directions)
+    lack = (points * directions).sum(1)
+    centers, sizes = chosen.arrays()
+    lack = lack - support_of_spheres(centers, sizes, directions) if chosen.count else np.full(lack.shape, np.inf)
+    while chosen.count < limit and lack.max() > tolerance:
+        worst = int(np.argmax(lack))
+        center = points[worst] - radii[worst] * directions[worst]
+        chosen.add(center, float(radii[worst]))
+        lack = np.minimum(lack, (points * directions).sum(1) - (directions @ center + radii[worst]))
+
+
+def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, limit: int, tolerance: float) -> None:
+    """Add spheres that touch the surface from inside at the point that is farthest from all spheres so far."""
+    radii = _inscribed_radii(solid, points, normals)
+    gap = union_distance(*chosen.arrays(), points)
+    while chosen.count < limit and gap.max() > tolerance:
+        worst = int(np.argmax(gap))
+        center = points[worst] - radii[worst] * normals[worst]
+        chosen.add(center, float(radii[worst]))
+        gap = np.minimum(gap, np.linalg.norm(points - center, axis=1) - radii[worst])
+
+
+def _add_fill(chosen: _Chosen, solid: Volume, limit: int) -> None:
+    """Add the largest inscribed spheres around points deep inside that no sphere holds yet."""
+    points = grid_points(solid.distance.shape, solid.origin, solid.pitch)
+    depth = -solid.distance.reshape(-1)
+    kept = depth > 3 * solid.pitch
+    points, depth = points[kept], depth[kept]
+    bare = union_distance(*chosen.arrays(), points) > 0
+    while chosen.count < limit and bare.any():
+        deepest = int(np.argmax(np.where(bare, depth, 0.0)))
+        chosen.add(points[deepest], float(depth[deepest]))
+        bare &= np.linalg.norm(points - points[deepest], axis=1) > depth[deepest]
+
+
+def _inscribed_radii(solid: Solid, points: Array, normals: Array) -> Array:
+    """Return the radius of the largest sphere that touches the surface at each point and lies inside, shape (n,).
+
+    It may stick out by the solid's own tolerance.
+    """
+    size = solid.size()
+    steps = size * np.geomspace(_SMALLEST_RADIUS, 0.5, 40)
+    radii = np.full(points.shape[0], steps[0])
+    for step in steps[1:]:
+        fits = -solid.at(points - step * normals) >= step - solid.tolerance
+        radii[fits] = step
+    return radii
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A box about the origin, with exact distances."""
+
+    half: Array
+    surface: Array
+    normals: Array
+    tolerance: float = 1e-9
+
+    @staticmethod
+    def make(half: Array, samples: int = 20) -> _Box:
+        points, normals = [], []
+        # At an edge no sphere touches one face without crossing the other.
+        inner = half - _SMALLEST_RADIUS * 2 * np.linalg.norm(half)
+        ticks = np.linspace(-1, 1, samples)
+        for axis in range(3):
+            others = [k for k in range(3) if k != axis]
+            grid = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), -1).reshape(-1, 2)
+            for sign in (-1.0, 1.0):
+                face = np.full((grid.shape[0], 3), sign * half[axis])
+                face[:, others] = grid * inner[others]
+                points.append(face)
+                normals.append(np.tile(sign * np.eye(3)[axis], (grid.shape[0], 1)))
+        return _Box(half, np.concatenate(points), np.concatenate(normals))
+
+    def at(self, points: Array) -> Array:
+        q = np.abs(points) - self.half
+        return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+
+    def size(self) -> float:
+        return float(2 * np.linalg.norm(self.half))
+
+
+def _box_spheres(half: Array, max_spheres: int) -> CollisionSpheres:
+    radius = min(_CORNER_RADIUS_M, 0.05 * float(half.min()))
+    signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), -1).reshape(-1, 3)
+    corners = signs * (half - radius)
+    return distil(_Box.make(half), max_spheres, first=(corners, np.full(8, radius)))
+
+
+def _from_splats(splats: Splats, max_spheres: int, radius_factor: float) -> CollisionSpheres:
+    centers, radii = np.asarray(splats.means, float), radius_factor * np.asarray(splats.scales, float)
+    if radii.shape[0] <= max_spheres:
+        return CollisionSpheres(centers, radii, 0.0, 0.0)
+    return distil(spheres_volume(centers, radii), max_spheres)
+
+
+def spheres_volume(centers: Array, radii: Array, resolution: int = 72) -> Volume:
+    """Put the union of spheres on a grid whose longest side has about `resolution` points."""
+    low, high = (centers - radii[:, None]).min(0), (centers + radii[:, None]).max(0)
+    pitch = float((high - low).max()) / (resolution - 6)
+    origin = low - 3 * pitch
+    shape = tuple(int(n) for n in np.ceil((high - origin) / pitch).astype(int) + 4)
+    field = union_distance(centers, radii, grid_points(shape, origin, pitch)).reshape(shape)
+    return Volume.from_inside(field < 0, origin, pitch, crossings(field, origin, pitch))

@@ -1,0 +1,158 @@
+"""Closed triangle meshes as solids: reading, volume, surface samples, mass properties."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import InputDataError
+from .volume import Array, MassProperties, Volume
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh.
+
+    Attributes:
+        vertices: Positions [m], shape (V, 3).
+        faces: Vertex indices, counter-clockwise seen from outside, shape (F, 3).
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+
+    def corners(self) -> Array:
+        """Return the triangles' corners [m], shape (F, 3 corners, 3)."""
+        return self.vertices[self.faces]
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a .obj or .stl file (binary or text), metres.
+
+    Raises:
+        InputDataError: If the file is missing, is of another kind, holds no triangles, or is not closed.
+    """
+    if not path.is_file():
+        raise InputDataError(f"{path}: no such file.", todo="correct the path of the mesh in capture.toml.")
+    suffix = path.suffix.lower()
+    if suffix not in (".obj", ".stl"):
+        raise InputDataError(f"{path}: a mesh of the kind '{suffix}' cannot be read.", ".obj, .stl.")
+    try:
+        mesh = _read_obj(path) if suffix == ".obj" else _read_stl(path)
+    except (ValueError, IndexError) as error:
+        raise InputDataError(f"{path}: not a readable {suffix} mesh: {error}.") from None
+    if mesh.faces.shape[0] < 4 or not np.isfinite(mesh.vertices).all():
+        raise InputDataError(f"{path}: no closed mesh; found {mesh.faces.shape[0]} triangles.")
+    _check_closed(mesh, path)
+    # A mesh turned inside out is as good as any other once its triangles are flipped.
+    return mesh if _signed_volume(mesh) > 0 else Mesh(mesh.vertices, mesh.faces[:, ::-1])
+
+
+def mesh_mass_properties(mesh: Mesh) -> MassProperties:
+    """Return the exact mass properties, by signed tetrahedra from the origin (divergence theorem)."""
+    triangles = mesh.corners()
+    volumes = np.linalg.det(triangles) / 6
+    volume = volumes.sum()
+    com = (volumes[:, None] * triangles.sum(1)).sum(0) / (4 * volume)
+    sums = triangles.sum(1)
+    outer = np.einsum("f,fci,fcj->ij", volumes, triangles, triangles) + np.einsum("f,fi,fj->ij", volumes, sums, sums)
+    second = outer / (20 * volume) - np.outer(com, com)
+    return MassProperties(float(volume), com, np.trace(second) * np.eye(3) - second)
+
+
+def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
+    """Put a closed mesh on a grid whose longest side has about `resolution` points."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    pitch = float((high - low).max()) / (resolution - 6)
+    # An irrational shift keeps rays off vertices and edges, where parity is ambiguous.
+    origin = low - pitch * (3 + np.array([0.3178, 0.2361, 0.1417]))
+    shape = tuple(int(n) for n in np.ceil((high - origin) / pitch).astype(int) + 4)
+    surface = sample_surface(mesh, 0.5 * pitch)
+    return Volume.from_inside(_inside(mesh, origin, pitch, shape), origin, pitch, surface)
+
+
+def sample_surface(mesh: Mesh, spacing: float) -> Array:
+    """Return points on all triangles no further apart than about `spacing` [m], the vertices among them, (S, 3)."""
+    triangles = mesh.corners()
+    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(1)
+    divisions = np.maximum(1, np.ceil(longest / spacing)).astype(int)
+    found = [mesh.vertices[np.unique(mesh.faces)]]
+    for count in np.unique(divisions):
+        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
+        kept = i + j <= count
+        barycentric = np.stack([i[kept], j[kept], count - i[kept] - j[kept]], 1) / count
+        found.append(np.einsum("bc,fcx->fbx", barycentric, triangles[divisions == count]).reshape(-1, 3))
+    return np.concatenate(found)
+
+
+def _inside(mesh: Mesh, origin: Array, pitch: float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which grid points lie inside, by the parity of crossings along z."""
+    flips = np.zeros(shape, dtype=np.int32)
+    for a, b, c in (mesh.corners() - origin) / pitch:
+        low = np.ceil(np.min([a, b, c], 0)[:2]).astype(int)
+        high = np.floor(np.max([a, b, c], 0)[:2]).astype(int)
+        if (high < low).any():
+            continue
+        x, y = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1), indexing="ij")
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if area == 0:
+            continue
+        u = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
+        v = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1)
+        z = np.ceil(a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2])).astype(int)
+        np.add.at(flips, (x[hit], y[hit], np.clip(z[hit], 0, shape[2] - 1)), 1)
+    return np.cumsum(flips, axis=2) % 2 == 1
+
+
+def _signed_volume(mesh: Mesh) -> float:
+    return float(np.linalg.det(mesh.corners()).sum() / 6)
+
+
+def _check_closed(mesh: Mesh, path: Path) -> None:
+    _, merged = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = merged.reshape(-1)[mesh.faces]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    open_edges = int((counts % 2 == 1).sum())
+    if open_edges:
+        raise InputDataError(
+            f"{path}: the mesh is not closed: {open_edges} of {counts.shape[0]} edges belong to an odd number of "
+            "triangles.",
+            "a closed (watertight) surface.",
+            "close its holes in a mesh editor.",
+        )
+
+
+def _read_obj(path: Path) -> Mesh:
+    vertices: list[list[float]] = []
+    faces: list[list[int]] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        words = line.split()
+        if words[:1] == ["v"]:
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == ["f"]:
+            ring = [int(word.split("/")[0]) for word in words[1:]]
+            ring = [index - 1 if index > 0 else len(vertices) + index for index in ring]
+            faces += [[ring[0], ring[k], ring[k + 1]] for k in range(1, len(ring) - 1)]
+    corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):
+        raise ValueError(f"a face names vertex {int(corners.max()) + 1} of {len(vertices)}")
+    return Mesh(np.array(vertices, dtype=float).reshape(-1, 3), corners)
+
+
+def _read_stl(path: Path) -> Mesh:
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
+    if len(data) == 84 + 50 * count:
+        record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        soup = np.frombuffer(data, record, count, 84)["corners"].astype(float).reshape(-1, 3)
+    else:
+        lines = (line.split() for line in data.decode("utf-8").splitlines())
+        soup = np.array([[float(w) for w in words[1:4]] for words in lines if words[:1] == ["vertex"]]).reshape(-1, 3)
+    vertices, index = np.unique(soup, axis=0, return_inverse=True)
+    return Mesh(vertices, index.reshape(-1, 3).astype(np.int64))

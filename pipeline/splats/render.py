@@ -1,0 +1,279 @@
+"""Rendering of spherical Gaussians: one pure, differentiable function, on any device.
+
+A sphere's response along a ray depends only on the distance from its centre to the ray, so it is used as it is
+(no projection to an ellipse on the image plane):
+
+    alpha_i(ray) = opacity_i exp(-dist(c_i, ray)^2 / (2 s_i^2))
+
+Spheres are composited front to back in the order of their distance from the camera's centre, which does not change
+when the camera turns.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .composite import TileLists, composite
+from .rays import pixel_rays
+
+MIN_ALPHA = 1 / 255
+MIN_TRANSMITTANCE = 1e-4
+_TILE = 8
+_BLOCK = 8  # tiles along the side of a block, the coarse level of culling
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """What the cameras see.
+
+    Attributes:
+        features: Composited features with the background behind them, shape (C, H, W, F).
+        alpha: Opacity of all spheres together in [0, 1), shape (C, H, W).
+        depth: Expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen.
+    """
+
+    features: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+def render(
+    means: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None = None,
+    distortion: Tensor | None = None,
+    *,
+    min_alpha: float = MIN_ALPHA,
+    min_transmittance: float = MIN_TRANSMITTANCE,
+    tile_size: int = _TILE,
+) -> RenderOutput:
+    """Render spheres into C cameras.
+
+    Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn where its centre
+    lies in front of the camera by more than its scale.
+
+    Args:
+        means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
+        scales: Standard deviations s > 0 [m], shape (N,).
+        opacities: Peak alphas in [0, 1], shape (N,).
+        features: Colours or any other channels, shape (N, F).
+        viewmats: T_cam_world, camera axes OpenCV, shape (C, 4, 4).
+        Ks: Camera matrices [px], shape (C, 3, 3); the centre of the top-left pixel is (0.5, 0.5).
+        width: Image width [px].
+        height: Image height [px].
+        background: Features behind everything, shape (F,) or (C, F); zero where left out.
+        distortion: OpenCV's k1, k2, p1, p2 [, k3], shape (k,) or (C, k); none where left out.
+        min_alpha: Smaller alphas are taken as 0 (0 keeps all, and every sphere meets every pixel).
+        min_transmittance: What lies behind pixels that let less through than this is skipped.
+        tile_size: Side of the tiles [px]; changes the speed only.
+
+    Returns:
+        Features, alpha and depth.
+    """
+    camera_count = viewmats.shape[0]
+    local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
+    tiles = _Tiles.make(Ks, distortion, width, height, tile_size)
+    with torch.no_grad():
+        tile_ids, cameras, spheres = _pairs(local, scales, opacities, tiles, min_alpha)
+        counts = torch.bincount(tile_ids, minlength=tiles.count * camera_count)
+    order = torch.argsort(tile_ids, stable=True)
+    tile_ids, cameras, spheres = tile_ids[order], cameras[order], spheres[order]
+    flat = cameras * scales.shape[0] + spheres
+    centres = local.reshape(-1, 3).index_select(0, flat)
+    frame = tiles.frame_of(tile_ids)
+    coefficients = _coefficients(
+        (tiles.rotations[frame] @ centres[:, :, None])[:, :, 0],
+        scales.index_select(0, spheres),
+        opacities.index_select(0, spheres),
+    )
+    channels = torch.cat([features.index_select(0, spheres), centres[:, 2:]], 1)
+    every_tile = torch.arange(counts.shape[0], device=means.device)
+    lists = TileLists(
+        tiles.basis, tiles.frame_of(every_tile), counts.cumsum(0) - counts, counts, min_alpha, min_transmittance
+    )
+    values, alpha = composite(coefficients, channels, lists)
+    return _assemble(values, alpha, background, tiles, camera_count)
+
+
+def _assemble(
+    values: Tensor, alpha: Tensor, background: Tensor | None, tiles: _Tiles, camera_count: int
+) -> RenderOutput:
+    image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
+    colours, depth, alpha = image[..., :-2], image[..., -2], image[..., -1]
+    if background is not None:
+        behind = background.expand(camera_count, -1)[:, None, None, :]
+        colours = colours + (1 - alpha)[..., None] * behind
+    seen = alpha > 0
+    depth = torch.where(seen, depth / torch.where(seen, alpha, 1.0), 0.0)
+    return RenderOutput(colours, alpha, depth)
+
+
+def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
+    """Return the exponent's coefficients of (1, x, y, x^2, xy, y^2) / (1 + x^2 + y^2), shape (M, 6).
+
+    The logarithm of the opacity stands with the monomials 1, x^2 and y^2, whose quotients sum to 1.
+    """
+    px, py, pz = centres.unbind(1)
+    k = -0.5 / (scales * scales)
+    log_opacity = opacities.clamp_min(1e-12).log()
+    kx, ky, kz = k * px, k * py, k * pz
+    xx, yy, zz = kx * px, ky * py, kz * pz
+    return torch.stack(
+        [
+            xx + yy + log_opacity,
+            -2 * kx * pz,
+            -2 * ky * pz,
+            zz + yy + log_opacity,
+            -2 * kx * py,
+            zz + xx + log_opacity,
+        ],
+        1,
+    )
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """The tiles of a picture. Cameras with equal K and distortion share their G rows.
+
+    Attributes:
+        basis: See `TileLists`, shape (G * tiles, P, 6).
+        rotations: Camera axes to tile axes (rows), shape (G * tiles, 3, 3); the last row is the tile's axis.
+        half_angle: Angle between the axis and the farthest pixel [rad], shape (G * tiles,).
+        group: Row group of each camera, shape (C,).
+    """
+
+    basis: Tensor
+    rotations: Tensor
+    half_angle: Tensor
+    group: Tensor
+    columns: int
+    rows: int
+    size: int
+    width: int
+    height: int
+
+    @property
+    def count(self) -> int:
+        return self.columns * self.rows
+
+    def frame_of(self, tile_ids: Tensor) -> Tensor:
+        """Return the rows of `basis` and `rotations` for tiles numbered camera * count + tile."""
+        return self.group[tile_ids // self.count] * self.count + tile_ids % self.count
+
+    @staticmethod
+    @torch.no_grad()
+    def make(Ks: Tensor, distortion: Tensor | None, width: int, height: int, size: int) -> _Tiles:
+        camera_count = Ks.shape[0]
+        keys = Ks.reshape(camera_count, 9)
+        if distortion is not None:
+            keys = torch.cat([keys, distortion.expand(camera_count, -1)], 1)
+        unique, group = torch.unique(keys, dim=0, return_inverse=True)
+        columns, rows = math.ceil(width / size), math.ceil(height / size)
+        # Pixels beyond the border repeat the last one inside, so that a tile's cone is never wider than the picture.
+        u = (torch.arange(columns * size, device=Ks.device, dtype=Ks.dtype) + 0.5).clamp_max(width - 0.5)
+        v = (torch.arange(rows * size, device=Ks.device, dtype=Ks.dtype) + 0.5).clamp_max(height - 0.5)
+        pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+        rays = pixel_rays(pixels, unique[:, :9].reshape(-1, 3, 3), unique[:, 9:] if distortion is not None else None)
+        rays = rays.reshape(-1, rows, size, columns, size, 3).transpose(2, 3).reshape(-1, size * size, 3)
+        axis = torch.nn.functional.normalize(rays.mean(1), dim=1)
+        rotations = _frames(axis)
+        local = rays @ rotations.transpose(1, 2)
+        sine = local[..., :2].norm(dim=-1)
+        half_angle = torch.atan2(sine, local[..., 2]).amax(1)
+        x, y = (local[..., :2] / local[..., 2:]).unbind(-1)
+        one = torch.ones_like(x)
+        basis = torch.stack([one, x, y, x * x, x * y, y * y], -1) / (1 + x * x + y * y)[..., None]
+        return _Tiles(basis, rotations, half_angle, group, columns, rows, size, width, height)
+
+    def to_image(self, values: Tensor, camera_count: int) -> Tensor:
+        """Lay tiles (C * tiles, P, F) out as pictures (C, H, W, F)."""
+        grid = values.reshape(camera_count, self.rows, self.columns, self.size, self.size, -1).transpose(2, 3)
+        grid = grid.reshape(camera_count, self.rows * self.size, self.columns * self.size, -1)
+        return grid[:, : self.height, : self.width]
+
+
+def _frames(axis: Tensor) -> Tensor:
+    """Return rotations whose third row is `axis` (n, 3), a unit vector; shape (n, 3, 3)."""
+    helper = torch.zeros_like(axis)
+    helper[:, 1] = 1.0
+    steep = axis[:, 1].abs() > 0.9
+    helper[steep] = helper.new_tensor([1.0, 0.0, 0.0])
+    first = torch.nn.functional.normalize(torch.linalg.cross(helper, axis), dim=1)
+    return torch.stack([first, torch.linalg.cross(axis, first), axis], 1)
+
+
+def _pairs(
+    local: Tensor, scales: Tensor, opacities: Tensor, tiles: _Tiles, min_alpha: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """List which spheres meet which tiles, nearest first within a tile.
+
+    A sphere reaches to where its alpha falls to `min_alpha`; it meets a tile when the cone around it meets the cone
+    around the tile. Blocks of tiles first, then their tiles.
+
+    Returns:
+        Tile number (camera * tiles + tile), camera and sphere of each pair, three arrays (M,).
+    """
+    distance = local.norm(dim=2)
+    drawn = (distance > scales) & torch.isfinite(distance)
+    if min_alpha > 0:
+        drawn &= opacities > min_alpha
+        reach = scales * (2 * (opacities / min_alpha).clamp_min(1.0).log()).sqrt()
+        cone = torch.asin((reach / distance).clamp_max(1.0))
+    else:
+        cone = torch.full_like(distance, math.pi)
+    order = torch.argsort(torch.where(drawn, distance, torch.inf), dim=1, stable=True)
+    axes = tiles.rotations[:, 2].reshape(-1, tiles.rows, tiles.columns, 3)
+    half = tiles.half_angle.reshape(-1, tiles.rows, tiles.columns)
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    for camera in range(local.shape[0]):
+        ranked = order[camera, : int(drawn[camera].sum())]
+        direction = local[camera, ranked] / distance[camera, ranked, None]
+        group = int(tiles.group[camera])
+        tile, position = _meet(axes[group], half[group], direction, cone[camera, ranked])
+        found.append((tile + camera * tiles.count, torch.full_like(tile, camera), ranked[position]))
+    tile_ids, cameras, spheres = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return tile_ids, cameras, spheres
+
+
+def _meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[Tensor, Tensor]:
+    """Return tile and sphere of every meeting of cones for one camera; spheres ascend within a tile.
+
+    Args:
+        axes: Tile axes, shape (rows, columns, 3).
+        half: Tile half angles [rad], shape (rows, columns).
+        direction: Unit vectors to the spheres, camera frame, shape (n, 3), nearest first.
+        cone: Half angles of the spheres [rad], shape (n,).
+    """
+    rows, columns = half.shape
+    tile_index = torch.arange(rows * columns, device=half.device).reshape(rows, columns)
+    pad = (0, -columns % _BLOCK, 0, -rows % _BLOCK)
+    blocks = torch.nn.functional.pad(tile_index, pad, value=-1)
+    block_rows, block_columns = blocks.shape[0] // _BLOCK, blocks.shape[1] // _BLOCK
+    blocks = blocks.reshape(block_rows, _BLOCK, block_columns, _BLOCK).transpose(1, 2).reshape(-1, _BLOCK**2)
+    valid = blocks >= 0
+    members = blocks.clamp_min(0)
+    flat_axes, flat_half = axes.reshape(-1, 3), half.reshape(-1)
+    block_axes = torch.nn.functional.normalize((flat_axes[members] * valid[..., None]).sum(1), dim=1)
+    apart = _angle((flat_axes[members] * block_axes[:, None]).sum(-1)) + flat_half[members]
+    block_half = torch.where(valid, apart, 0.0).amax(1)
+    block, sphere = (_angle(block_axes @ direction.T) <= block_half[:, None] + cone).nonzero(as_tuple=True)
+    angles = _angle((flat_axes[members[block]] @ direction[sphere, :, None])[..., 0])
+    meets = (angles <= flat_half[members[block]] + cone[sphere, None]) & valid[block]
+    pair, member = meets.nonzero(as_tuple=True)
+    return members[block[pair], member], sphere[pair]
+
+
+def _angle(cosine: Tensor) -> Tensor:
+    """Return the angle [rad], a little too small rather than too large: culling must not lose what is visible."""
+    slack = 4 * torch.finfo(cosine.dtype).eps
+    return torch.acos((cosine + slack).clamp(-1.0, 1.0))

@@ -1,0 +1,134 @@
+"""Solids on a grid: signed distance, surface points, and the mass properties of a uniform solid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.spatial import KDTree
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """Mass properties of a solid of uniform density.
+
+    Attributes:
+        volume_m3: Volume [m^3].
+        com_m: Centre of mass in the solid's frame [m], shape (3,).
+        inertia_m2: Inertia about the centre of mass for a mass of 1 kg, axes of the solid's frame [m^2], shape (3, 3).
+    """
+
+    volume_m3: float
+    com_m: Array
+    inertia_m2: Array
+
+    def shifted(self, offset: Array) -> MassProperties:
+        """Return the properties in a frame with the same axes in which the solid lies `offset` [m] further on."""
+        return MassProperties(self.volume_m3, self.com_m + offset, self.inertia_m2)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A solid, as its signed distance on a regular grid.
+
+    Attributes:
+        origin: Position of grid point (0, 0, 0) [m], shape (3,).
+        pitch: Grid spacing [m].
+        distance: Signed distance to the surface at the grid points [m], positive outside, shape (X, Y, Z).
+        surface: Points on the surface [m], about one or more per square pitch, shape (S, 3).
+        normals: Outward unit normals at `surface`, shape (S, 3).
+    """
+
+    origin: Array
+    pitch: float
+    distance: Array
+    surface: Array
+    normals: Array
+
+    @staticmethod
+    def from_inside(inside: NDArray[np.bool_], origin: Array, pitch: float, surface: Array) -> Volume:
+        """Make a volume from an occupancy grid and accurate points on its surface.
+
+        Args:
+            inside: Whether each grid point lies inside, shape (X, Y, Z).
+            origin: Position of grid point (0, 0, 0) [m].
+            pitch: Grid spacing [m].
+            surface: Points on the surface [m], at most about a pitch apart, shape (S, 3).
+        """
+        away = _distance_to(surface, inside.shape, np.asarray(origin, float), pitch)
+        distance = np.where(inside, -away, away)
+        gradient = np.stack([np.gradient(distance, pitch, axis=k) for k in range(3)], -1)
+        normals = np.stack([_interpolate(gradient[..., k], origin, pitch, surface) for k in range(3)], 1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return Volume(np.asarray(origin, float), pitch, distance, surface, normals)
+
+    def at(self, points: Array) -> Array:
+        """Return the signed distance [m] at points (n, 3) [m], by trilinear interpolation (clamped at the border)."""
+        return _interpolate(self.distance, self.origin, self.pitch, points)
+
+    @property
+    def tolerance(self) -> float:
+        """How accurate the signed distance is [m]."""
+        return 0.1 * self.pitch
+
+    def size(self) -> float:
+        """Return the diagonal of the surface's bounding box [m]."""
+        return float(np.linalg.norm(np.ptp(self.surface, axis=0)))
+
+    def mass_properties(self) -> MassProperties:
+        """Return the mass properties, with cells that the surface cuts counted in part."""
+        share = np.clip(0.5 - self.distance / self.pitch, 0.0, 1.0).reshape(-1)
+        kept = share > 0
+        points = grid_points(self.distance.shape, self.origin, self.pitch)[kept]
+        weights = share[kept] / share[kept].sum()
+        com = weights @ points
+        centred = points - com
+        second = (centred * weights[:, None]).T @ centred + np.eye(3) * self.pitch**2 / 12
+        inertia = np.trace(second) * np.eye(3) - second
+        return MassProperties(float(share.sum() * self.pitch**3), com, inertia)
+
+
+def grid_points(shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
+    """Return the positions of all grid points [m], shape (X * Y * Z, 3), the last axis running fastest."""
+    axes = [origin[k] + pitch * np.arange(shape[k]) for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def crossings(field: Array, origin: Array, pitch: float) -> Array:
+    """Return where a field on a grid changes sign along the grid's edges [m], shape (S, 3), by linear interpolation."""
+    found = []
+    for axis in range(3):
+        low = np.take(field, np.arange(field.shape[axis] - 1), axis)
+        high = np.take(field, np.arange(1, field.shape[axis]), axis)
+        index = np.argwhere((low > 0) != (high > 0))
+        if index.shape[0] == 0:
+            continue
+        a, b = low[tuple(index.T)], high[tuple(index.T)]
+        points = index.astype(float)
+        points[:, axis] += a / (a - b)
+        found.append(origin + pitch * points)
+    return np.concatenate(found) if found else np.zeros((0, 3))
+
+
+def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
+    """Return the distance [m] from each grid point to the nearest of dense surface points, shape (X, Y, Z)."""
+    cells = np.clip(np.rint((surface - origin) / pitch).astype(int), 0, np.array(shape) - 1)
+    representative = np.full(shape, -1)
+    representative[tuple(cells.T)] = np.arange(surface.shape[0])
+    nearest = np.asarray(distance_transform_edt(representative < 0, return_distances=False, return_indices=True))
+    points = grid_points(shape, origin, pitch)
+    away = np.linalg.norm(points - surface[representative[tuple(nearest)].reshape(-1)], axis=1)
+    # One point stands for a cell above; near the surface, where that matters, the nearest one is found instead. A tree
+    # search for all grid points would be slow: in the middle of a solid, many points are about equally near.
+    near = away < 3 * pitch
+    away[near], _ = KDTree(surface).query(points[near])
+    return away.reshape(shape)
+
+
+def _interpolate(values: Array, origin: Array, pitch: float, points: Array) -> Array:
+    coordinates = ((points - origin) / pitch).T
+    return map_coordinates(values, coordinates, order=1, mode="nearest")
