@@ -1,1 +1,85 @@
-"""."""
+"""Captures, models and rollouts on disk: readers, writers and importers. No torch at import.
+
+The names below are imported on first use, so that importing this package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .atomic import new_directory, new_file, sha256
+    from .cameras import Camera, camera_of, read_cameras, to_intrinsics
+    from .capture import Capture
+    from .check import CaptureFacts, check_capture
+    from .contactnets import import_contactnets
+    from .images import read_label, read_rgb, write_image
+    from .kinds import kind_of
+    from .manifest import manifest_toml, write_manifest
+    from .meshes import Mesh, SolidProperties, mass_properties, read_mesh
+    from .models import Model, read_model, write_model
+    from .ply import Splats, read_splats, write_splats
+    from .progress import progress
+    from .tracks import Track, read_tracks, write_tracks
+    from .video import read_video
+
+_HOMES = {
+    "atomic": ("new_directory", "new_file", "sha256"),
+    "cameras": ("Camera", "camera_of", "read_cameras", "to_intrinsics"),
+    "capture": ("Capture",),
+    "check": ("CaptureFacts", "check_capture"),
+    "contactnets": ("import_contactnets",),
+    "images": ("read_label", "read_rgb", "write_image"),
+    "kinds": ("kind_of",),
+    "manifest": ("manifest_toml", "write_manifest"),
+    "meshes": ("Mesh", "SolidProperties", "mass_properties", "read_mesh"),
+    "models": ("Model", "read_model", "write_model"),
+    "ply": ("Splats", "read_splats", "write_splats"),
+    "progress": ("progress",),
+    "tracks": ("Track", "read_tracks", "write_tracks"),
+    "video": ("read_video",),
+}
+_PUBLIC = {name: f".{module}" for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Camera",
+    "Capture",
+    "CaptureFacts",
+    "Mesh",
+    "Model",
+    "SolidProperties",
+    "Splats",
+    "Track",
+    "camera_of",
+    "check_capture",
+    "import_contactnets",
+    "kind_of",
+    "manifest_toml",
+    "mass_properties",
+    "new_directory",
+    "new_file",
+    "progress",
+    "read_cameras",
+    "read_label",
+    "read_mesh",
+    "read_model",
+    "read_rgb",
+    "read_splats",
+    "read_tracks",
+    "read_video",
+    "sha256",
+    "to_intrinsics",
+    "write_image",
+    "write_manifest",
+    "write_model",
+    "write_splats",
+    "write_tracks",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use."""
+    if name in _PUBLIC:
+        value = getattr(import_module(_PUBLIC[name], __name__), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

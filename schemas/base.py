@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import tomllib
 import types
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import InputDataError, did_you_mean
+from .lines import find_line
 
 ModelT = TypeVar("ModelT", bound="FileModel")
 
@@ -71,41 +71,113 @@ def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Pa
     # An unknown field explains the missing one beside it ("mass" for "mass_kg"), so it is told first.
     faults = error.errors()
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    location = tuple(part for part in fault["loc"] if part != "__root__")
-    where = _line(text, location)
+    location = _in_document(fault["loc"], data)
+    where = find_line(text, location, path.suffix)
     place = f"{path}, line {where}" if where else f"{path}"
     parent, name = location[:-1], str(location[-1]) if location else ""
     legal = _legal_fields(model, parent)
     section = _section(data, parent)
-    more = f" ({len(faults) - 1} more)" if len(faults) > 1 else ""
-    todo = f"correct the field{more}."
+    others = len({_in_document(f["loc"], data) for f in faults}) - 1
+    todo = f"correct the field ({others} more to correct)." if others else "correct the field."
     if fault["type"] == "extra_forbidden":
         found = f"{place}: {section} has an unknown field '{name}'."
         return InputDataError(found, ", ".join(legal) + "." + did_you_mean(name, legal), todo)
-    if fault["type"] == "missing":
+    if fault["type"] == "missing" and _has_fields(model, parent):
         return InputDataError(f"{place}: {section} lacks the field '{name}'.", ", ".join(legal) + ".", todo)
+    if fault["type"] == "missing" and isinstance(location[-1], int):
+        location = parent
+        fault = {**fault, "msg": _wrong_count(model, parent, data)}
+    field = _field(data, location)
+    message = _message(fault, location, data)
+    return InputDataError(f"{place}: {field}: {message}." if field else f"{place}: {message}.", todo=todo)
+
+
+def _message(fault: Any, location: tuple, data: Any) -> str:
+    """Say what is wrong with a value, and show it."""
     message = fault["msg"].removeprefix("Value error, ")
-    value = fault.get("input")
-    shown = f" (found {value!r:.80})" if not isinstance(value, dict) else ""
-    field = ".".join(str(part) for part in location) or "the file"
-    return InputDataError(f"{place}: {field}: {message}{shown}.", todo=todo)
+    if fault["type"] == "string_pattern_mismatch":
+        message = "a name begins with a letter or digit and holds only letters, digits, '_', '.' and '-'"
+    # "valid tuple" is Python's word for what is a list in the file.
+    message = (
+        (message[:1].lower() + message[1:]).replace("a valid tuple", "a list").replace("a valid dictionary", "a table")
+    )
+    try:
+        value = _at(data, location)
+    except (KeyError, IndexError, TypeError):
+        return message
+    if isinstance(value, dict) or (isinstance(value, list) and fault["type"] == "value_error"):
+        return message
+    return f"{message} (found {json.dumps(value, default=str):.80})"
+
+
+def _wrong_count(model: Any, location: tuple, data: Any) -> str:
+    """Say how many values a list of fixed length takes."""
+    for part in location:
+        model = _step_into(model, part)
+    return f"takes {len(get_args(model))} values; found {len(_at(data, location))}"
+
+
+def _in_document(location: tuple, data: Any) -> tuple:
+    """Keep of pydantic's location what stands in the document: it also names the branches of a union."""
+    kept: list[Any] = []
+    for k, part in enumerate(location):
+        try:
+            data = data[part]
+            kept.append(part)
+        except (KeyError, IndexError, TypeError):
+            # What is missing is no part of the document either, but it comes last and is an index or a plain name.
+            if k == len(location) - 1 and (isinstance(part, int) or str(part).isidentifier()):
+                kept.append(part)
+    return tuple(kept)
+
+
+def _at(data: Any, location: tuple) -> Any:
+    for part in location:
+        data = data[part]
+    return data
+
+
+def _field(data: Any, location: tuple) -> str:
+    """Name a field as its author wrote it: [[bodies]] 'cube' inertia_kg_m2, or splits.train."""
+    section, rest = _nearest_name(data, location)
+    dotted = ".".join(str(part) for part in rest)
+    return f"{section} {dotted}".strip() if section else dotted
+
+
+def _nearest_name(data: Any, location: tuple) -> tuple[str, tuple]:
+    """Return [[bodies]] 'cube' for the innermost table with a name on the way, and the rest of the way."""
+    for k in range(len(location), 0, -1):
+        table = _safely(data, location[:k])
+        if isinstance(table, dict) and isinstance(table.get("name"), str):
+            path = ".".join(str(part) for part in location[:k] if not isinstance(part, int))
+            return (
+                f"[[{path}]]" if isinstance(location[k - 1], int) else f"[{path}]"
+            ) + f" '{table['name']}'", location[k:]
+    return "", location
+
+
+def _safely(data: Any, location: tuple) -> Any:
+    try:
+        return _at(data, location)
+    except (KeyError, IndexError, TypeError):
+        return None
 
 
 def _section(data: Any, parent: tuple) -> str:
     """Name a place in the document as its author wrote it: [world], [[bodies]] 'cube', or the top level."""
     if not parent:
         return "the top level"
-    value, named, in_array = data, "", False
+    section, rest = _nearest_name(data, parent)
+    path = ".".join(str(part) for part in rest if not isinstance(part, int))
+    if section:
+        return f"{section} {path}".strip()
+    return f"[[{path}]]" if isinstance(rest[-1], int) else f"[{path}]"
+
+
+def _has_fields(model: Any, parent: tuple) -> bool:
     for part in parent:
-        try:
-            value = value[part]
-        except (KeyError, IndexError, TypeError):
-            break
-        in_array = in_array or isinstance(part, int)
-        if isinstance(value, dict) and isinstance(value.get("name"), str):
-            named = f" '{value['name']}'"
-    path = ".".join(str(part) for part in parent if not isinstance(part, int))
-    return (f"[[{path}]]" if in_array else f"[{path}]") + named
+        model = _step_into(model, part)
+    return hasattr(model, "model_fields")
 
 
 def _legal_fields(model: Any, parent: tuple) -> list[str]:
@@ -120,8 +192,8 @@ def _step_into(model: Any, part: Any) -> Any:
     fields = getattr(model, "model_fields", None)
     if fields is not None:
         return _concrete(fields[part].annotation) if part in fields else None
-    arguments = get_args(model)
-    return _concrete(arguments[-1]) if arguments and get_origin(model) in (dict, list, tuple) else model
+    arguments = [argument for argument in get_args(model) if argument is not Ellipsis]
+    return _concrete(arguments[-1]) if arguments and get_origin(model) in (dict, list, tuple) else None
 
 
 def _concrete(annotation: Any) -> Any:
@@ -129,13 +201,3 @@ def _concrete(annotation: Any) -> Any:
         options = [option for option in get_args(annotation) if option is not type(None)]
         return options[0]
     return annotation
-
-
-def _line(text: str, location: tuple) -> int | None:
-    """Find the line of a TOML or JSON text that holds the field at `location`, where that is certain."""
-    names = [str(part) for part in location if not isinstance(part, int)]
-    if not names or not text:
-        return None
-    pattern = re.compile(rf"""(^|[\s{{,."'\[])["']?{re.escape(names[-1])}["']?\s*[\]=:]""")
-    lines = [number for number, line in enumerate(text.splitlines(), 1) if pattern.search(line)]
-    return lines[0] if len(lines) == 1 else None

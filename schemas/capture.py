@@ -30,6 +30,21 @@ def unit_quaternion(quat_wxyz: tuple[float, float, float, float]) -> tuple[float
     return w, x, y, z
 
 
+def physical_inertia(value: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuse what is no inertia of a body [kg m2]: 3 or 6 numbers, positive, obeying the triangle inequality."""
+    if len(value) not in (3, 6):
+        raise ValueError(f"takes 3 numbers (xx, yy, zz) or 6 (xx, yy, zz, xy, xz, yz); found {len(value)}")
+    xx, yy, zz, xy, xz, yz = (*value, 0.0, 0.0, 0.0)[:6]
+    minor = xx * yy - xy * xy
+    determinant = zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz
+    if min(xx, yy, zz, minor, determinant) <= 0:
+        raise ValueError("the inertia must be positive definite")
+    # 2 % are left for rounded numbers: of a thin plate, one moment is the sum of the other two.
+    if 2 * max(xx, yy, zz) > 1.02 * (xx + yy + zz):
+        raise ValueError("no body has this inertia: one moment is larger than the other two together")
+    return value
+
+
 class Pose(FileModel):
     """A rigid pose: position [m] and unit quaternion (w, x, y, z)."""
 
@@ -112,7 +127,7 @@ class Body(FileModel):
     """free: moves by physics; driven: its track is the command; fixed: does not move."""
     mass_kg: Positive | None = None
     """Mass [kg]; left out: free, and fitted only where a force makes it observable."""
-    inertia_kg_m2: tuple[float, float, float] | tuple[float, float, float, float, float, float] | None = None
+    inertia_kg_m2: tuple[float, ...] | None = None
     """Inertia about the centre of mass, body axes: diagonal, or xx yy zz xy xz yz; left out: from the shape."""
     com_m: Vector3 | None = None
     """Centre of mass in the body frame [m]; left out: from the shape."""
@@ -120,6 +135,11 @@ class Body(FileModel):
     """Left out: from the photos (stage SG-GS)."""
     photo_pose: Pose | None = None
     """T_world_body while the photos were taken; default identity (see `Capture`)."""
+
+    @field_validator("inertia_kg_m2")
+    @classmethod
+    def _physical(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        return None if value is None else physical_inertia(value)
 
 
 class Measurement(FileModel):
@@ -197,12 +217,18 @@ class Calibration(FileModel):
     markers: tuple[Marker, ...] = ()
     known_distance: KnownDistance | None = None
     known_camera_distance: KnownCameraDistance | None = None
+    supplied_in_metres: bool = False
+    """Whether a supplied transforms.json or COLMAP model is in metres; cameras.json says it itself."""
     same_camera: bool = True
     """Whether all photos (not the video frames) were taken with one camera at one focal length."""
 
     @model_validator(mode="after")
     def _one_scale(self) -> Calibration:
-        sources = [bool(self.markers), self.known_distance is not None, self.known_camera_distance is not None]
+        sources = [
+            bool(self.markers),
+            self.known_distance is not None,
+            self.known_camera_distance is not None,
+        ]
         if sum(sources) > 1:
             raise ValueError("give one source of scale: markers, known_distance or known_camera_distance")
         ids = [marker.id for marker in self.markers]

@@ -1,0 +1,184 @@
+"""Directories and files that appear under their final name only when they are complete.
+
+What is being written stands beside its final place under `.<name>.partial-<pid>-<host>-<random>`. A process that
+is killed leaves that name behind and nothing else; the next one that writes the same output removes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..schemas import UsageError
+
+_PARTIAL = "partial"
+_REPLACED = "replaced"
+
+
+@contextmanager
+def new_directory(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """Yield an empty directory that takes the name `path` when the block ends without an exception.
+
+    Args:
+        path: Final place; parent directories are made.
+        overwrite: Replace what is there. The old one disappears only after the new one is complete.
+
+    Raises:
+        UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or if it is no
+            directory that one would want to lose (home, the working directory or one above it, a git work tree).
+    """
+    path = Path(path)
+    _refuse_existing(path, overwrite)
+    temporary = _temporary(path)
+    temporary.mkdir()
+    try:
+        yield temporary
+        _sync_tree(temporary)
+        _put_in_place(temporary, path, overwrite)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """Yield the path of a file to write, which takes the name `path` when the block ends without an exception.
+
+    The temporary name ends with the suffix of `path`, so that writers which look at it choose the same format.
+
+    Raises:
+        UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or is a directory.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise UsageError(f"{path} is a directory; a file is written here.", todo="choose another name.")
+    _refuse_existing(path, overwrite)
+    temporary = _temporary(path, path.suffix)
+    try:
+        yield temporary
+        _sync(temporary)
+        if not overwrite:
+            _refuse_existing(path, overwrite)
+        os.replace(temporary, path)
+        _sync(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def sha256(path: Path | str) -> str:
+    """Return the SHA-256 (hex) of a file; of a directory, that of its files' sorted relative names and hashes."""
+    path = Path(path)
+    digest = hashlib.sha256()
+    if path.is_dir():
+        for file in sorted(p for p in path.rglob("*") if p.is_file()):
+            digest.update(f"{file.relative_to(path).as_posix()}\0{sha256(file)}\n".encode())
+        return digest.hexdigest()
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _refuse_existing(path: Path, overwrite: bool) -> None:
+    if not os.path.lexists(path):
+        return
+    if not overwrite:
+        raise UsageError(f"{path} exists.", todo="choose another name or pass --overwrite.")
+    place = path.resolve()
+    here, home = Path.cwd().resolve(), Path.home().resolve()
+    if place in (here, home) or place in here.parents or place in home.parents or (place / ".git").exists():
+        reason = "holds a .git" if (place / ".git").exists() else "is, or contains, the home or working directory"
+        raise UsageError(f"{path} {reason}; --overwrite does not remove it.", todo="choose another name.")
+
+
+def _temporary(path: Path, suffix: str = "") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _clean_stale(path)
+    return _sibling(path, _PARTIAL, suffix)
+
+
+def _sibling(path: Path, kind: str, suffix: str = "") -> Path:
+    name = path.name or path.resolve().name
+    return path.parent / f".{name}.{kind}-{os.getpid()}-{_host()}-{secrets.token_hex(4)}{suffix}"
+
+
+def _host() -> str:
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+
+
+def _clean_stale(path: Path) -> None:
+    """Remove what dead processes of this machine left of `path`; put back an old one that lost its name."""
+    name = path.name or path.resolve().name
+    pattern = re.compile(rf"\.{re.escape(name)}\.({_PARTIAL}|{_REPLACED})-(\d+)-(?:([0-9a-f]{{8}})-)?[^-]*")
+    for entry in sorted(path.parent.glob(f".{_glob_escape(name)}.*-*")):
+        match = pattern.fullmatch(entry.name)
+        # On a shared file system the process may live on another machine, where its number says nothing here.
+        if match is None or _alive(int(match[2])) or match[3] not in (None, _host()):
+            continue
+        if match[1] == _REPLACED and not os.path.lexists(path):
+            os.rename(entry, path)
+        else:
+            _remove(entry)
+
+
+def _glob_escape(name: str) -> str:
+    return re.sub(r"([*?[])", r"[\1]", name)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _put_in_place(temporary: Path, path: Path, overwrite: bool) -> None:
+    if not os.path.lexists(path):
+        os.rename(temporary, path)
+        _sync(path.parent)
+        return
+    _refuse_existing(path, overwrite)
+    aside = _sibling(path, _REPLACED)
+    os.rename(path, aside)
+    try:
+        os.rename(temporary, path)
+    except BaseException:
+        os.rename(aside, path)
+        raise
+    _sync(path.parent)
+    _remove(aside)
+
+
+def _sync_tree(directory: Path) -> None:
+    for entry in directory.rglob("*"):
+        if entry.is_file() or entry.is_dir():
+            _sync(entry)
+    _sync(directory)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        pass  # some file systems cannot flush a directory; the rename is atomic all the same
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,242 @@
+"""Calibrated cameras: one object to project with, and the reader of the files that hold them.
+
+Pixel coordinates put the centre of the top-left pixel at (0.5, 0.5), as COLMAP and nerfstudio do. OpenCV's
+functions put it at (0, 0): take 0.5 off the principal point before `K` is given to them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedVideo, did_you_mean, read_json
+from .colmap_model import find_colmap_model, read_colmap_model
+from .transforms import read_transforms
+
+Array = NDArray[np.float64]
+
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with its pose; camera axes OpenCV (x right, y down, z forward).
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        K: Intrinsic matrix [px], shape (3, 3); the top-left pixel's centre is (0.5, 0.5).
+        distortion: OpenCV's k1, k2, p1, p2 [, k3] [1], shape (4,) or (5,); shape (0,) where there is none.
+        T_world_cam: Pose, camera to world [m where the scale is metric], shape (4, 4).
+    """
+
+    width: int
+    height: int
+    K: Array
+    distortion: Array
+    T_world_cam: Array
+
+    @property
+    def T_cam_world(self) -> Array:
+        """World to camera, shape (4, 4)."""
+        rotation, translation = self.T_world_cam[:3, :3], self.T_world_cam[:3, 3]
+        inverse = np.eye(4)
+        inverse[:3, :3] = rotation.T
+        inverse[:3, 3] = -rotation.T @ translation
+        return inverse
+
+    @property
+    def center(self) -> Array:
+        """Optical centre, world frame [m where the scale is metric], shape (3,)."""
+        return self.T_world_cam[:3, 3]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """Return the camera of the same view at another image size [px]."""
+        # With the corner of the image at (0, 0), a change of size is a pure scaling of pixel coordinates.
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return replace(self, width=width, height=height, K=scale @ self.K)
+
+    def project(self, points_world: Array) -> tuple[Array, Array]:
+        """Project points into the image.
+
+        Source of the distortion: OpenCV, calib3d, "Detailed description" (radial k1, k2, k3, tangential p1, p2).
+
+        Args:
+            points_world: Points, world frame, shape (N, 3).
+
+        Returns:
+            Pixel coordinates (x, y) [px], shape (N, 2), NaN for points at or behind the optical centre, and
+            depths along the optical axis, in the unit of the points, shape (N,).
+        """
+        T_cam_world = self.T_cam_world
+        points_cam = np.asarray(points_world, np.float64) @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+        depth = points_cam[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normalised = np.where(depth[:, None] > 0, points_cam[:, :2] / depth[:, None], np.nan)
+        distorted = distort(normalised, self.distortion)
+        return distorted @ self.K[:2, :2].T + self.K[:2, 2], depth
+
+    def undistorted(self, image: NDArray[np.uint8], labels: bool = False) -> tuple[NDArray[np.uint8], Camera]:
+        """Return the image that a camera without distortion and with the same K takes, and that camera.
+
+        Args:
+            image: Shape (height, width) or (height, width, 3).
+            labels: Take the nearest pixel instead of interpolating.
+        """
+        camera = replace(self, distortion=np.zeros(0))
+        if not np.any(self.distortion):
+            return image, camera
+        import cv2
+
+        K_opencv = self.K.copy()
+        K_opencv[:2, 2] -= 0.5
+        map_x, map_y = cv2.initUndistortRectifyMap(
+            K_opencv, self.distortion, np.eye(3), K_opencv, (self.width, self.height), cv2.CV_32FC1
+        )
+        method = cv2.INTER_NEAREST if labels else cv2.INTER_LINEAR
+        return np.asarray(cv2.remap(image, map_x, map_y, method), np.uint8), camera
+
+
+def distort(normalised: Array, distortion: Array) -> Array:
+    """Apply OpenCV's distortion to normalised image coordinates (x/z, y/z), shape (N, 2)."""
+    if not np.any(distortion):
+        return normalised
+    k1, k2, p1, p2, k3 = [*distortion, 0.0][:5]
+    x, y = normalised[:, 0], normalised[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=1,
+    )
+
+
+def read_cameras(root: Path | str, metric: bool = False) -> CamerasFile | None:
+    """Read the cameras of a capture directory, or None if there are none.
+
+    The first of these counts: `cameras.json`; nerfstudio's `transforms.json`; a COLMAP model, text or binary,
+    in `sparse/0`, `sparse` or `colmap`. Poses keep their scale; names of photos are relative to `images/`.
+
+    Args:
+        root: The capture directory.
+        metric: Whether `transforms.json` or the COLMAP model is in metres; `cameras.json` says it itself.
+
+    Raises:
+        InputDataError: If the file is wrong, uses a camera model that cannot be represented, or holds a pose
+            that is not a rotation and a translation.
+    """
+    root = Path(root)
+    if (root / "cameras.json").is_file():
+        path, cameras = root / "cameras.json", read_json(root / "cameras.json", CamerasFile)
+    elif (root / "transforms.json").is_file():
+        path, cameras = root / "transforms.json", read_transforms(root / "transforms.json", metric)
+    elif (model := find_colmap_model(root)) is not None:
+        path, cameras = model, read_colmap_model(model, metric)
+    else:
+        return None
+    for name, image in cameras.images.items():
+        _check_rigid(f"{path}: image '{name}'", np.array(image.T_world_cam))
+    for name, video in cameras.videos.items():
+        for pose in _poses(video):
+            _check_rigid(f"{path}: video '{name}'", pose)
+    return cameras
+
+
+def camera_of(
+    cameras: CamerasFile,
+    name: str,
+    frame: int | None = None,
+    kind: Literal["images", "videos"] = "images",
+    episode: str | None = None,
+) -> Camera:
+    """Return the camera of a photo or of a video frame.
+
+    Args:
+        cameras: What :func:`read_cameras` returned.
+        name: The photo, relative to `images/`, or the video camera.
+        frame: Frame number (from 0) for a video camera that moves.
+        kind: Whether `name` is a photo or a video camera.
+        episode: A video camera that stood elsewhere in this episode is filed under `<camera>/<episode>`.
+
+    Raises:
+        InputDataError: If the photo or video camera has no pose, or has one a frame and `frame` is no such one.
+    """
+    if kind == "images":
+        entry = cameras.images.get(name)
+        pose = None if entry is None else np.array(entry.T_world_cam)
+    else:
+        entry = cameras.videos.get(f"{name}/{episode}") or cameras.videos.get(name)
+        pose = None if entry is None else _pose_at(name, _poses(entry), frame)
+    if entry is None or pose is None:
+        legal = sorted(getattr(cameras, kind))
+        noun = "photo" if kind == "images" else "video camera"
+        raise InputDataError(
+            f"no pose for the {noun} '{name}' ({len(legal)} {kind} have one).{did_you_mean(name, legal)}",
+            todo="run 'cgwm calibrate', or add it to cameras.json.",
+        )
+    return from_intrinsics(cameras.cameras[entry.camera], pose)
+
+
+def from_intrinsics(intrinsics: CameraIntrinsics, T_world_cam: Array) -> Camera:
+    """Return the camera with these intrinsics at this pose, shape (4, 4)."""
+    K = np.array(
+        [[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]], np.float64
+    )
+    distortion = np.array(intrinsics.distortion if any(intrinsics.distortion) else (), np.float64)
+    return Camera(intrinsics.width, intrinsics.height, K, distortion, np.asarray(T_world_cam, np.float64))
+
+
+def to_intrinsics(camera: Camera) -> CameraIntrinsics:
+    """Return the intrinsics of a camera as they stand in `cameras.json`."""
+    distortion = tuple(float(value) for value in camera.distortion)
+    return CameraIntrinsics(
+        model="OPENCV" if any(distortion) else "PINHOLE",
+        width=camera.width,
+        height=camera.height,
+        fx=float(camera.K[0, 0]),
+        fy=float(camera.K[1, 1]),
+        cx=float(camera.K[0, 2]),
+        cy=float(camera.K[1, 2]),
+        distortion=distortion if any(distortion) else (),
+    )
+
+
+def pose_count(video: PosedVideo) -> int:
+    """Return the number of poses of a video camera; 1 where it stands still."""
+    return len(_poses(video))
+
+
+def _poses(video: PosedVideo) -> Array:
+    poses = np.array(video.T_world_cam, np.float64)
+    return poses[None] if poses.ndim == 2 else poses
+
+
+def _pose_at(name: str, poses: Array, frame: int | None) -> Array:
+    if len(poses) == 1:
+        return poses[0]
+    if frame is None or not 0 <= frame < len(poses):
+        raise InputDataError(
+            f"the video camera '{name}' has {len(poses)} poses, one a frame; frame {frame} was asked for.",
+            f"0 to {len(poses) - 1}.",
+        )
+    return poses[frame]
+
+
+def _check_rigid(where: str, pose: Array) -> None:
+    rotation = pose[:3, :3]
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    todo = "write the pose camera to world, 4x4, without scaling."
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        fault = f"R R^T differs from 1 by {off:.2g}" if off > _ROTATION_TOLERANCE else "it mirrors (determinant -1)"
+        raise InputDataError(
+            f"{where}: the pose is no rotation and translation: {fault}.", f"within {_ROTATION_TOLERANCE:g}.", todo
+        )
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputDataError(f"{where}: the pose's last row is {pose[3].tolist()}.", "0, 0, 0, 1.", todo)

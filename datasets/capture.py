@@ -1,0 +1,261 @@
+"""Captures: the directory that a user fills, opened and read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean, read_toml
+from .cameras import Camera, camera_of, read_cameras
+from .images import IMAGE_SUFFIXES, read_label, read_rgb
+from .kinds import refuse_other_kind
+from .tracks import Track, read_tracks
+from .video import VIDEO_SUFFIXES, VideoInfo, read_video, read_video_labels, video_info
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A capture directory. Make one with :meth:`open`; everything else is read from disk when asked for.
+
+    Attributes:
+        root: The directory.
+        manifest: `capture.toml`.
+        cameras: The calibrated cameras, or None if there are none yet.
+        only_splits: The splits that may be read; None for everything.
+    """
+
+    root: Path
+    manifest: CaptureManifest
+    cameras: CamerasFile | None = None
+    only_splits: tuple[str, ...] | None = None
+
+    @classmethod
+    def open(cls, path: Path | str, check: bool = True, splits: Sequence[str] | None = None) -> Capture:
+        """Open a capture.
+
+        Args:
+            path: The directory.
+            check: Check everything in it that can be checked without decoding photos or videos.
+            splits: Look at the episodes of these splits only; those of others may be absent or wrong.
+
+        Raises:
+            InputDataError: For the first fault, with file, line or field.
+        """
+        root = Path(path)
+        refuse_other_kind(root, "capture")
+        manifest = read_toml(root / "capture.toml", CaptureManifest)
+        cameras = read_cameras(root, manifest.calibration.supplied_in_metres)
+        capture = cls(root, manifest, cameras, None if splits is None else tuple(splits))
+        if check:
+            from .check import check_capture
+
+            check_capture(capture)
+        return capture
+
+    @property
+    def body_names(self) -> list[str]:
+        """Names of the bodies, in the order of the manifest; label k of a mask is number k - 1."""
+        return [body.name for body in self.manifest.bodies]
+
+    def body(self, name: str) -> Body:
+        """Return a body's entry in the manifest."""
+        for body in self.manifest.bodies:
+            if body.name == name:
+                return body
+        legal = ", ".join(self.body_names) or "none, [[bodies]] is empty"
+        raise UsageError(
+            f"{self.root / 'capture.toml'}: no body '{name}'.", legal + "." + did_you_mean(name, self.body_names)
+        )
+
+    def shape_file(self, body: Body) -> Path | None:
+        """Return the file of a body's mesh or splats, which must lie inside the capture; None without one."""
+        shape = body.shape and (body.shape.mesh or body.shape.splats)
+        if not shape:
+            return None
+        path = self.root / shape.path
+        where = f"{self.root / 'capture.toml'}: [[bodies]] '{body.name}': shape path '{shape.path}'"
+        if not path.resolve().is_relative_to(self.root.resolve()):
+            raise InputDataError(
+                f"{where} lies outside the capture.", "a file of the capture directory.", "copy the file into it."
+            )
+        if not path.is_file():
+            raise InputDataError(f"{where}: no such file.", "a path relative to the capture directory.")
+        legal = (".obj", ".stl") if body.shape and body.shape.mesh else (".ply",)
+        if path.suffix.lower() not in legal:
+            raise InputDataError(f"{where}: the suffix is '{path.suffix}'.", " or ".join(legal) + ".")
+        return path
+
+    # Photos
+
+    def photos(self) -> list[str]:
+        """Return the photos' names relative to `images/`, sorted."""
+        return _images_under(self.root / "images")
+
+    def masks(self) -> list[str]:
+        """Return the masks' names relative to `masks/`, sorted."""
+        return _images_under(self.root / "masks")
+
+    def photo(self, name: str) -> NDArray[np.uint8]:
+        """Return a photo, RGB, uint8, shape (height, width, 3)."""
+        return read_rgb(self.root / "images" / name)
+
+    def photo_mask(self, name: str) -> NDArray[np.uint8] | None:
+        """Return a photo's labels (k: the k-th body), uint8, shape (height, width), or None without a mask."""
+        path = self.root / "masks" / Path(name).with_suffix(".png")
+        return read_label(path) if path.is_file() else None
+
+    def photo_camera(self, name: str) -> Camera:
+        """Return the camera of a photo, at the photo's size."""
+        return camera_of(self._calibrated(), name)
+
+    # Episodes
+
+    def episodes(self, split: str | None = None) -> list[str]:
+        """Return the episodes of a split, in the manifest's order, or all that lie on disk, sorted.
+
+        Raises:
+            UsageError: If there is no such split.
+        """
+        if split is not None:
+            if split not in self.manifest.splits:
+                legal = sorted(self.manifest.splits)
+                allowed = ", ".join(legal) + "." + did_you_mean(split, legal) if legal else "none: [splits] is empty."
+                raise UsageError(f"{self.root / 'capture.toml'}: no split '{split}'.", allowed, "name it in [splits].")
+            return list(self.manifest.splits[split])
+        found = {path.stem for path in self.root.glob("tracks/*.csv") if not path.name.startswith(".")}
+        for camera in _folders(self.root / "videos"):
+            found |= set(_videos_in(camera))
+        if self.only_splits is not None:
+            found &= {name for split in self.only_splits for name in self.episodes(split)}
+        return sorted(found)
+
+    def tracks(self, episode: str) -> dict[str, Track]:
+        """Return the tracks of an episode by body, between its `start_s` and `end_s`; empty without any."""
+        return self.tracks_counted(episode)[0]
+
+    def tracks_counted(self, episode: str) -> tuple[dict[str, Track], int]:
+        """Return the tracks of an episode, and how many quaternions were normalised (see :func:`read_tracks`)."""
+        path = self.root / "tracks" / f"{episode}.csv"
+        if not path.is_file():
+            return {}, 0
+        tracks, normalised = read_tracks(path, self.body_names)
+        start_s, end_s = self._window(episode)
+        windowed = {name: track.window(start_s, end_s) for name, track in tracks.items()}
+        for name, track in windowed.items():
+            if len(track) < 2:
+                raise InputDataError(
+                    f"{path}: body '{name}' has {len(track)} of {len(tracks[name])} samples between the "
+                    f"episode's start_s and end_s.",
+                    "at least 2.",
+                    f"correct [episodes] '{episode}' in capture.toml; the track lasts from "
+                    f"{tracks[name].time_s[0]:g} s to {tracks[name].time_s[-1]:g} s.",
+                )
+        return windowed, normalised
+
+    # Videos
+
+    def video_cameras(self) -> list[str]:
+        """Return the names of the video cameras, sorted."""
+        return [folder.name for folder in _folders(self.root / "videos")]
+
+    def videos(self, episode: str) -> list[str]:
+        """Return the video cameras that saw an episode, sorted."""
+        return [folder.name for folder in _folders(self.root / "videos") if episode in _videos_in(folder)]
+
+    def video_path(self, camera: str, episode: str) -> Path:
+        """Return the directory of frames or the file of a video.
+
+        Raises:
+            InputDataError: If there is none.
+        """
+        folder = self.root / "videos" / camera
+        videos = _videos_in(folder) if camera in self.video_cameras() else {}
+        if episode not in videos:
+            raise InputDataError(f"{folder}: no video of episode '{episode}'.{did_you_mean(episode, videos)}")
+        return videos[episode]
+
+    def video_info(self, camera: str, episode: str) -> VideoInfo:
+        """Return what a video's headers say, before `start_s` and `end_s` cut it."""
+        return video_info(self.video_path(camera, episode))
+
+    def video_frames(self, camera: str, episode: str) -> NDArray[np.uint8]:
+        """Return the frames between the episode's start and end, RGB, uint8, shape (frames, height, width, 3)."""
+        frames = read_video(self.video_path(camera, episode))
+        return frames[self._in_window(camera, episode, len(frames))]
+
+    def video_masks(self, camera: str, episode: str) -> NDArray[np.uint8] | None:
+        """Return the labels that belong to :meth:`video_frames`, uint8, shape (frames, height, width), or None."""
+        folder = self.root / "video_masks" / camera / episode
+        if not folder.is_dir():
+            return None
+        labels = read_video_labels(folder)
+        return labels[self._in_window(camera, episode, len(labels))]
+
+    def frame_times(self, camera: str, episode: str) -> NDArray[np.float64]:
+        """Return the times [s] on the tracks' clock of what :meth:`video_frames` returns, shape (frames,)."""
+        count = video_info(self.video_path(camera, episode)).frames
+        return self._all_times(camera, count)[self._in_window(camera, episode, count)]
+
+    def frame_numbers(self, camera: str, episode: str) -> NDArray[np.int64]:
+        """Return the numbers, from 0 in the video, of the frames that :meth:`video_frames` returns."""
+        count = video_info(self.video_path(camera, episode)).frames
+        return np.flatnonzero(self._in_window(camera, episode, count))
+
+    def video_camera(self, camera: str, episode: str, frame: int | None = None) -> Camera:
+        """Return the camera of a video (`frame` from 0, needed where it moves)."""
+        return camera_of(self._calibrated(), camera, frame, "videos", episode)
+
+    def _all_times(self, camera: str, count: int) -> NDArray[np.float64]:
+        video = self.manifest.video
+        return np.arange(count) / video.frame_rate_hz + video.camera_time_offset_s.get(camera, 0.0)
+
+    def _in_window(self, camera: str, episode: str, count: int) -> NDArray[np.bool_]:
+        start_s, end_s = self._window(episode)
+        times = self._all_times(camera, count)
+        after = times >= (-np.inf if start_s is None else start_s)
+        return after & (times <= (np.inf if end_s is None else end_s))
+
+    def _window(self, episode: str) -> tuple[float | None, float | None]:
+        entry = self.manifest.episodes.get(episode)
+        return (None, None) if entry is None else (entry.start_s, entry.end_s)
+
+    def _calibrated(self) -> CamerasFile:
+        if self.cameras is None:
+            raise InputDataError(
+                f"{self.root}: no calibrated cameras.",
+                "cameras.json, transforms.json or a COLMAP model in sparse/0.",
+                f"run 'cgwm calibrate {self.root}'.",
+            )
+        return self.cameras
+
+
+def _images_under(folder: Path) -> list[str]:
+    files = (path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    names = (path.relative_to(folder) for path in files)
+    return sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
+
+
+def _folders(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
+def _videos_in(camera: Path) -> dict[str, Path]:
+    """Return the videos of a camera by episode; one that is there twice is refused."""
+    found: dict[str, Path] = {}
+    for path in sorted(camera.iterdir()):
+        if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
+            continue
+        episode = path.name if path.is_dir() else path.stem
+        if episode in found:
+            raise InputDataError(
+                f"{camera}: episode '{episode}' is there twice, as {found[episode].name} and {path.name}.",
+                todo="remove one.",
+            )
+        found[episode] = path
+    return found

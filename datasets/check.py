@@ -1,0 +1,292 @@
+"""Checks of a capture: every fault with its place, and the facts that were found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import InputDataError, did_you_mean
+from .cameras import pose_count
+from .images import image_size, read_label
+from .meshes import mass_properties, read_mesh
+from .ply import read_splats
+from .video import VideoInfo, frame_files, video_info
+
+if TYPE_CHECKING:
+    from .capture import Capture
+
+
+@dataclass
+class CaptureFacts:
+    """What a capture holds.
+
+    Attributes:
+        photos: Number of photos.
+        photos_with_camera: Number of those with a calibrated pose.
+        masks: Number of masks.
+        mask_coverage: Mean fraction of a mask's pixels that shows a body, by body.
+        scale: "metric", "unscaled" or "none" (no cameras).
+        bodies: Names of the bodies.
+        episodes: Number of episodes.
+        splits: Number of episodes by split.
+        track_samples: Number of poses in all tracks.
+        normalised_quaternions: Number of quaternions off the unit norm within the tolerance.
+        videos: Number of videos.
+        video_frames: Number of their frames.
+        warnings: What is no fault but should be known.
+    """
+
+    photos: int = 0
+    photos_with_camera: int = 0
+    masks: int = 0
+    mask_coverage: dict[str, float] = field(default_factory=dict)
+    scale: str = "none"
+    bodies: list[str] = field(default_factory=list)
+    episodes: int = 0
+    splits: dict[str, int] = field(default_factory=dict)
+    track_samples: int = 0
+    normalised_quaternions: int = 0
+    videos: int = 0
+    video_frames: int = 0
+    warnings: list[str] = field(default_factory=list)
+
+
+def check_capture(capture: Capture) -> CaptureFacts:
+    """Check a capture and return its facts.
+
+    Raises:
+        InputDataError: The first fault; its last line counts the others.
+    """
+    facts, faults = find_faults(capture)
+    if faults:
+        raise _first(faults, capture.root)
+    return facts
+
+
+def find_faults(capture: Capture) -> tuple[CaptureFacts, list[InputDataError]]:
+    """Check a capture; return the facts and all faults, in the order of the directory's parts."""
+    facts = CaptureFacts(
+        bodies=capture.body_names, splits={name: len(names) for name, names in capture.manifest.splits.items()}
+    )
+    faults: list[InputDataError] = []
+
+    def attempt(check: Callable[..., None], *arguments: object) -> None:
+        try:
+            check(*arguments)
+        except InputDataError as fault:
+            faults.append(fault)
+
+    attempt(_check_names, capture)
+    for body in capture.manifest.bodies:
+        attempt(_check_shape, capture, body.name)
+    sizes: dict[str, tuple[int, int]] = {}
+    for name in capture.photos():
+        attempt(_check_photo, capture, name, sizes)
+    facts.photos = len(sizes)
+    coverage: list[NDArray[np.float64]] = []
+    for name in capture.masks():
+        attempt(_check_mask, capture, name, sizes, coverage)
+    facts.masks = len(coverage)
+    if coverage:
+        facts.mask_coverage = dict(zip(facts.bodies, np.mean(coverage, axis=0)[1:].tolist(), strict=True))
+    attempt(_check_cameras, capture, sizes, facts)
+    episodes: list[str] = []
+    attempt(lambda: episodes.extend(capture.episodes()))
+    facts.episodes = len(episodes)
+    for episode in episodes:
+        attempt(_check_tracks, capture, episode, facts)
+        for camera in capture.videos(episode):
+            attempt(_check_video, capture, camera, episode, facts)
+    if facts.normalised_quaternions:
+        facts.warnings.append(f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3).")
+    return facts, faults
+
+
+def _first(faults: list[InputDataError], root: Path) -> InputDataError:
+    first = faults[0]
+    if len(faults) == 1:
+        return first
+    more = f"({len(faults) - 1} more fault(s); 'cgwm validate {root}' lists all.)"
+    return InputDataError(first.found, first.allowed, f"{first.todo} {more}".strip())
+
+
+def _check_names(capture: Capture) -> None:
+    """Check that the names in the manifest are those of things on disk."""
+    manifest, path = capture.manifest, capture.root / "capture.toml"
+    found = capture.episodes()
+    splits = manifest.splits if capture.only_splits is None else {s: capture.episodes(s) for s in capture.only_splits}
+    todo = f"correct the name, or add tracks/<episode>.csv or videos/<camera>/<episode> to {capture.root}."
+    for split, names in splits.items():
+        for name in names:
+            if name not in found:
+                raise InputDataError(
+                    f"{path}: [splits] {split} names the episode '{name}', which has neither track nor video.",
+                    _listed(found, "episodes") + did_you_mean(name, found),
+                    todo,
+                )
+    if capture.only_splits is None:
+        for name in manifest.episodes:
+            if name not in found:
+                raise InputDataError(
+                    f"{path}: [episodes] names '{name}', which has neither track nor video.",
+                    _listed(found, "episodes") + did_you_mean(name, found),
+                    todo,
+                )
+    cameras = capture.video_cameras()
+    for name in manifest.video.camera_time_offset_s:
+        if name not in cameras:
+            raise InputDataError(
+                f"{path}: [video] camera_time_offset_s names the camera '{name}', which has no directory in videos/.",
+                _listed(cameras, "cameras") + did_you_mean(name, cameras),
+            )
+
+
+def _listed(names: list[str], noun: str) -> str:
+    if not names:
+        return f"there are no {noun}."
+    shown = ", ".join(names[:8])
+    return f"{shown}, ... ({len(names)} {noun})." if len(names) > 8 else f"{shown}."
+
+
+def _check_shape(capture: Capture, name: str) -> None:
+    body = capture.body(name)
+    path = capture.shape_file(body)
+    if path is None or body.shape is None:
+        return
+    if body.shape.mesh:
+        mass_properties(read_mesh(path), path)
+    else:
+        read_splats(path)
+
+
+def _check_photo(capture: Capture, name: str, sizes: dict[str, tuple[int, int]]) -> None:
+    sizes[name] = image_size(capture.root / "images" / name)
+
+
+def _check_mask(
+    capture: Capture, name: str, sizes: dict[str, tuple[int, int]], coverage: list[NDArray[np.float64]]
+) -> None:
+    path = capture.root / "masks" / name
+    if path.suffix != ".png":
+        raise InputDataError(f"{path}: a mask that is no .png.", ".png; JPEG changes labels.")
+    stem = Path(name).with_suffix("")
+    photo = next((photo for photo in sizes if Path(photo).with_suffix("") == stem), None)
+    if photo is None:
+        on_disk = [p for p in capture.photos() if Path(p).with_suffix("") == stem]
+        if on_disk:
+            return  # the photo itself is at fault, which has been told
+        raise InputDataError(f"{path}: there is no photo of that name in images/.", "the photo's name, with .png.")
+    labels = read_label(path)
+    _check_labels(capture, path, labels, sizes[photo], f"images/{photo}")
+    count = len(capture.manifest.bodies) + 1
+    coverage.append(np.bincount(labels.ravel(), minlength=count)[:count] / labels.size)
+
+
+def _check_labels(capture: Capture, path: Path, labels: NDArray[np.uint8], size: tuple[int, int], shown: str) -> None:
+    height, width = labels.shape
+    if (width, height) != size:
+        raise InputDataError(
+            f"{path}: the mask has {width}x{height} px, {shown} has {size[0]}x{size[1]} px.",
+            "a mask of its image's size.",
+        )
+    bodies = len(capture.manifest.bodies)
+    if labels.max() > bodies:
+        hint = ""
+        if set(np.unique(labels)) <= {0, 255} and bodies:
+            hint = "for a mask of 0 and 255, divide it by 255 (and multiply by the body's number)."
+        raise InputDataError(
+            f"{path}: label {labels.max()}, but the manifest has {bodies} [[bodies]].",
+            f"0 (background) to {bodies}: label k is the k-th of [[bodies]].",
+            hint or "correct the mask, or add the bodies to capture.toml.",
+        )
+
+
+def _check_cameras(capture: Capture, sizes: dict[str, tuple[int, int]], facts: CaptureFacts) -> None:
+    cameras = capture.cameras
+    if cameras is None:
+        return
+    facts.scale = cameras.scale.kind
+    photos = capture.photos()
+    absent = [name for name in cameras.images if name not in photos]
+    if absent:
+        raise InputDataError(
+            f"{capture.root}: {len(absent)} of {len(cameras.images)} cameras are for photos that are not in images/, "
+            f"such as '{absent[0]}'.",
+            "names relative to images/." + did_you_mean(absent[0], photos),
+            "add the photos, or remove the cameras.",
+        )
+    for name, image in cameras.images.items():
+        camera = cameras.cameras[image.camera]
+        if name in sizes and sizes[name] != (camera.width, camera.height):
+            raise InputDataError(
+                f"{capture.root / 'images' / name}: {sizes[name][0]}x{sizes[name][1]} px, but its camera "
+                f"'{image.camera}' has {camera.width}x{camera.height} px.",
+                "the image size that the camera was calibrated for.",
+            )
+    facts.photos_with_camera = sum(name in cameras.images for name in sizes)
+    names = capture.video_cameras()
+    for name in cameras.videos:
+        if name.partition("/")[0] not in names:
+            raise InputDataError(
+                f"{capture.root / 'cameras.json'}: a camera for the videos '{name}', which are not in videos/.",
+                _listed(names, "cameras") + did_you_mean(name, names),
+            )
+
+
+def _check_tracks(capture: Capture, episode: str, facts: CaptureFacts) -> None:
+    tracks, normalised = capture.tracks_counted(episode)
+    facts.track_samples += sum(len(track) for track in tracks.values())
+    facts.normalised_quaternions += normalised
+
+
+def _check_video(capture: Capture, camera: str, episode: str, facts: CaptureFacts) -> None:
+    path = capture.video_path(camera, episode)
+    info = video_info(path)
+    kept = len(capture.frame_times(camera, episode))
+    if kept < 2:
+        window = "" if kept == info.frames else f" between start_s and end_s ({info.frames} in all)"
+        raise InputDataError(
+            f"{path}: episode '{episode}' has {kept} frame(s){window}.", "at least 2.", "add frames, or remove it."
+        )
+    facts.videos += 1
+    facts.video_frames += kept
+    rate = capture.manifest.video.frame_rate_hz
+    if info.frame_rate_hz is not None and abs(info.frame_rate_hz / rate - 1) > 0.01:
+        facts.warnings.append(
+            f"{path}: the file says {info.frame_rate_hz:g} frames/s; capture.toml's {rate:g} is used."
+        )
+    _check_video_camera(capture, camera, episode, path, info)
+    masks = capture.root / "video_masks" / camera / episode
+    if masks.is_dir():
+        files = frame_files(masks)
+        if len(files) != info.frames:
+            raise InputDataError(
+                f"{masks}: {len(files)} masks for {info.frames} frames.", "one mask a frame, or no directory."
+            )
+        for file in files:
+            _check_labels(capture, file, read_label(file), (info.width, info.height), f"videos/{camera}/{episode}")
+
+
+def _check_video_camera(capture: Capture, camera: str, episode: str, path: Path, info: VideoInfo) -> None:
+    if capture.cameras is None:
+        return
+    videos = capture.cameras.videos
+    entry = videos.get(f"{camera}/{episode}") or videos.get(camera)
+    if entry is None:
+        return
+    if pose_count(entry) not in (1, info.frames):
+        raise InputDataError(
+            f"{path}: {info.frames} frames, but its camera has {pose_count(entry)} poses.", "one pose, or one a frame."
+        )
+    intrinsics = capture.cameras.cameras[entry.camera]
+    if (intrinsics.width, intrinsics.height) != (info.width, info.height):
+        raise InputDataError(
+            f"{path}: {info.width}x{info.height} px, but its camera '{entry.camera}' has "
+            f"{intrinsics.width}x{intrinsics.height} px.",
+            "the image size that the camera was calibrated for.",
+        )

@@ -1,0 +1,177 @@
+"""Import of the cube tosses of ContactNets (DAIRLab/contact-nets): the published .pt files, or one .npz of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import (
+    Body,
+    BoxShape,
+    CaptureManifest,
+    Ground,
+    InputDataError,
+    Shape,
+    World,
+)
+from .atomic import new_directory
+from .manifest import write_manifest
+from .progress import progress
+from .tracks import Track, write_tracks
+
+Array = NDArray[np.float64]
+
+HALF_WIDTH_M = 0.0524
+"""Half the cube's edge [m]; positions and velocities in the .pt files are divided by it."""
+RATE_HZ = 148.0
+"""Rate of the tracking [Hz]."""
+MASS_KG = 0.37
+INERTIA_KG_M2 = 0.00081
+BODY = "cube"
+
+_COLUMNS = 19
+_POSITION, _QUATERNION, _VELOCITY, _OMEGA = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
+_NPZ_FIELDS = ("offsets", "pos", "quat_wxyz", "vel", "omega_body", "toss_index", "rate_hz", "half_width_m")
+
+
+@dataclass(frozen=True)
+class _Tosses:
+    """Tosses in SI units by number, and the cube that was tossed."""
+
+    tracks: dict[int, Track]
+    half_width_m: float
+
+
+def import_contactnets(
+    source: Path | str,
+    out: Path | str,
+    n_train: int = 50,
+    n_test: int = 100,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> CaptureManifest:
+    """Write the tosses as a capture with tracks, one episode a toss, named by its number.
+
+    The tosses, sorted by number, are permuted with `numpy.random.default_rng(seed)`; the first `n_train` are the
+    split "train", the next `n_test` are "test". Where there are fewer than both together, the first third is
+    "train" and the rest is "test".
+
+    Args:
+        source: A directory of <number>.pt files, or the .npz, or a directory that holds one of the two.
+        out: The capture directory to write.
+        n_train: Number of tosses to fit on.
+        n_test: Number of tosses to test on.
+        seed: Seed of the permutation.
+        overwrite: Replace `out`.
+
+    Returns:
+        The manifest that was written.
+
+    Raises:
+        InputDataError: If the source is not such data.
+        UsageError: If `out` exists, before anything is read.
+    """
+    with new_directory(out, overwrite) as directory:
+        tosses = _read(Path(source))
+        names = [f"{number:03d}" for number in sorted(tosses.tracks)]
+        manifest = _manifest(tosses.half_width_m, _splits(names, n_train, n_test, seed))
+        write_manifest(directory / "capture.toml", manifest)
+        (directory / "tracks").mkdir()
+        for number, track in progress(sorted(tosses.tracks.items()), "tosses", unit="toss"):
+            write_tracks(directory / "tracks" / f"{number:03d}.csv", {BODY: track})
+    return manifest
+
+
+def _manifest(half_width_m: float, splits: dict[str, tuple[str, ...]]) -> CaptureManifest:
+    cube = Body(
+        name=BODY,
+        mass_kg=MASS_KG,
+        inertia_kg_m2=(INERTIA_KG_M2, INERTIA_KG_M2, INERTIA_KG_M2),
+        com_m=(0.0, 0.0, 0.0),
+        shape=Shape(box=BoxShape(half_extents_m=(half_width_m, half_width_m, half_width_m))),
+    )
+    return CaptureManifest(format="cgwm-capture/1", world=World(ground=Ground()), bodies=(cube,), splits=splits)
+
+
+def _splits(names: list[str], n_train: int, n_test: int, seed: int) -> dict[str, tuple[str, ...]]:
+    order = [names[k] for k in np.random.default_rng(seed).permutation(len(names))]
+    if len(order) < n_train + n_test:
+        n_train, n_test = len(order) // 3, len(order) - len(order) // 3
+    return {"train": tuple(order[:n_train]), "test": tuple(order[n_train : n_train + n_test])}
+
+
+def _read(source: Path) -> _Tosses:
+    """Find the data: the .pt files in `source`, else an .npz, else the .pt files in `source/tosses`."""
+    if source.is_file() and source.suffix == ".npz":
+        return _read_npz(source)
+    if source.is_dir():
+        for folder in (source, source / "tosses"):
+            files = sorted(folder.glob("*.pt"))
+            archives = sorted(folder.glob("*.npz"))
+            if files:
+                return _read_pt(files)
+            if len(archives) == 1:
+                return _read_npz(archives[0])
+    what = "no such file or directory" if not source.exists() else "no ContactNets tosses"
+    raise InputDataError(
+        f"{source}: {what}.",
+        "a directory of <number>.pt files, or the .npz with " + ", ".join(_NPZ_FIELDS) + ".",
+        "get contact-nets' data/tosses_processed from github.com/DAIRLab/contact-nets.",
+    )
+
+
+def _read_pt(files: list[Path]) -> _Tosses:
+    import torch
+
+    tracks: dict[int, Track] = {}
+    for file in progress(files, "reading", unit="toss"):
+        if not file.stem.isdecimal():
+            raise InputDataError(f"{file}: the name is no toss number.", "<number>.pt.")
+        try:
+            # weights_only: tensors are read, nothing that the file may carry is executed.
+            tensor = torch.load(file, weights_only=True, map_location="cpu")
+        except Exception as error:  # torch raises whatever its readers raise
+            reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            raise InputDataError(f"{file}: not a tensor that can be read safely: {reason}") from None
+        if not isinstance(tensor, torch.Tensor) or tensor.shape[-1:] != (_COLUMNS,) or tensor.dim() not in (2, 3):
+            shape = tuple(tensor.shape) if isinstance(tensor, torch.Tensor) else type(tensor).__name__
+            raise InputDataError(f"{file}: {shape} where a toss was expected.", f"a tensor (1, T, {_COLUMNS}).")
+        rows = tensor.reshape(-1, _COLUMNS).numpy().astype(np.float64)
+        rows[:, _POSITION] *= HALF_WIDTH_M
+        rows[:, _VELOCITY] *= HALF_WIDTH_M
+        tracks[int(file.stem)] = _track(str(file), rows, RATE_HZ)
+    return _Tosses(tracks, HALF_WIDTH_M)
+
+
+def _read_npz(path: Path) -> _Tosses:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            data = {name: archive[name] for name in _NPZ_FIELDS}
+    except KeyError as error:
+        raise InputDataError(f"{path}: no array {error}.", ", ".join(_NPZ_FIELDS) + ".") from None
+    except (OSError, ValueError) as error:
+        raise InputDataError(f"{path}: not an .npz that can be read: {error}.") from None
+    offsets, numbers = data["offsets"].astype(np.int64), data["toss_index"].astype(np.int64)
+    if len(offsets) != len(numbers) + 1 or offsets[0] != 0 or offsets[-1] != len(data["pos"]):
+        raise InputDataError(
+            f"{path}: {len(numbers)} toss numbers, {len(offsets)} offsets, {len(data['pos'])} rows.",
+            "one offset more than tosses, from 0 to the number of rows.",
+        )
+    tracks: dict[int, Track] = {}
+    for number, start, stop in zip(numbers, offsets[:-1], offsets[1:], strict=True):
+        rows = np.concatenate([data[name][start:stop] for name in ("pos", "quat_wxyz", "vel", "omega_body")], axis=1)
+        tracks[int(number)] = _track(f"{path}: toss {number}", rows, float(data["rate_hz"]))
+    return _Tosses(tracks, float(data["half_width_m"]))
+
+
+def _track(where: str, rows: Array, rate_hz: float) -> Track:
+    """Make a track of rows in SI units: position, quaternion, velocity, angular velocity, ..., shape (T, >= 13)."""
+    rows = np.asarray(rows, np.float64)
+    if len(rows) < 2 or not np.isfinite(rows).all():
+        raise InputDataError(f"{where}: {len(rows)} samples, {np.count_nonzero(~np.isfinite(rows))} values not finite.")
+    return Track(
+        np.arange(len(rows)) / rate_hz, rows[:, _POSITION], rows[:, _QUATERNION], rows[:, _VELOCITY], rows[:, _OMEGA]
+    )

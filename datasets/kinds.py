@@ -1,0 +1,44 @@
+"""What a directory is: a capture, a model or a dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from ..schemas import CAPTURE_FORMAT, InputDataError
+
+Kind = Literal["capture", "model", "dataset"]
+
+_MARKS: dict[Kind, str] = {"capture": "capture.toml", "model": "model.json", "dataset": "rollouts-*.h5"}
+_USED_BY: dict[Kind, str] = {
+    "capture": "cgwm calibrate, fit, compare and diagnose take one",
+    "model": "cgwm synthesize, eval and compare take one",
+    "dataset": "cgwm eval takes one as its target",
+}
+
+
+def kind_of(path: Path | str) -> Kind | None:
+    """Return what a directory is by the files in it, or None if it is none of the three."""
+    path = Path(path)
+    return next((kind for kind, mark in _MARKS.items() if path.is_dir() and any(path.glob(mark))), None)
+
+
+def refuse_other_kind(path: Path, wanted: Kind) -> None:
+    """Raise InputDataError unless the directory is of the wanted kind; the message says what it is instead."""
+    found = kind_of(path)
+    if found == wanted:
+        return
+    if not path.exists():
+        raise InputDataError(f"{path}: no such {wanted}.", todo="check the path.")
+    if not path.is_dir():
+        raise InputDataError(f"{path} is a file; a {wanted} is a directory with {_MARKS[wanted]}.")
+    if found is not None:
+        raise InputDataError(
+            f"{path} is a {found} (it holds {_MARKS[found]}), not a {wanted}.",
+            f"a {wanted}, a directory with {_MARKS[wanted]}.",
+            f"{_USED_BY[found]}; pass a {wanted} here.",
+        )
+    todo = "check the path."
+    if wanted == "capture":
+        todo = f"write a manifest; the shortest one: echo 'format = \"{CAPTURE_FORMAT}\"' > {path / 'capture.toml'}"
+    raise InputDataError(f"{path} is no {wanted}: it has no {_MARKS[wanted]}.", todo=todo)

@@ -1,0 +1,100 @@
+"""Model directories: `model.json`, the spheres of each body, and `fit.json`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..schemas import BodyModel, FitFile, InputDataError, ModelFile, read_json
+from .atomic import new_directory
+from .kinds import refuse_other_kind
+from .ply import Splats, read_splats, write_splats
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A fitted world model in memory.
+
+    Attributes:
+        root: Its directory, or None if it was not read from one.
+        file: `model.json`.
+        body_splats: Visual spheres by body, body frame; a body without photos has none.
+        collision: Colliding spheres by body, body frame; only centres and scales count. The visual ones where
+            the model has no others.
+        scene: Background spheres, world frame, or None.
+        fit: `fit.json`.
+    """
+
+    root: Path | None
+    file: ModelFile
+    body_splats: dict[str, Splats] = field(default_factory=dict)
+    collision: dict[str, Splats] = field(default_factory=dict)
+    scene: Splats | None = None
+    fit: FitFile = field(default_factory=FitFile)
+
+    def body(self, name: str) -> BodyModel:
+        """Return the entry of a body in `model.json`."""
+        return next(body for body in self.file.bodies if body.name == name)
+
+
+def read_model(path: Path | str) -> Model:
+    """Read a model directory.
+
+    Raises:
+        InputDataError: If it is no model (a capture, a dataset, ...), or a file is missing or wrong.
+    """
+    root = Path(path)
+    refuse_other_kind(root, "model")
+    file = read_json(root / "model.json", ModelFile)
+    body_splats: dict[str, Splats] = {}
+    collision: dict[str, Splats] = {}
+    for body in file.bodies:
+        if body.splats is not None:
+            body_splats[body.name] = collision[body.name] = read_splats(_inside(root, body.splats))
+        if body.collision is not None:
+            collision[body.name] = read_splats(_inside(root, body.collision))
+    scene = None if file.scene is None else read_splats(_inside(root, file.scene))
+    fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
+    return Model(root, file, body_splats, collision, scene, fit)
+
+
+def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
+    """Write a model directory, complete or not at all; return the model as it now lies there.
+
+    The names of the .ply files in `model.json` are set here: `<body>.ply`, `<body>.collision.ply` where the
+    colliding spheres are not the visual ones, and `scene.ply`.
+    """
+    taken = {"scene.ply"}
+    bodies, files = [], []
+    for body in model.file.bodies:
+        visual, colliding = model.body_splats.get(body.name), model.collision.get(body.name)
+        colliding = None if colliding is visual else colliding
+        names = [_free_name(body.name, suffix, taken) for suffix in (".ply", ".collision.ply")]
+        files += [(name, splats) for name, splats in zip(names, (visual, colliding), strict=True) if splats is not None]
+        update = {"splats": names[0] if visual else None, "collision": names[1] if colliding else None}
+        bodies.append(body.model_copy(update=update))
+    scene = None if model.scene is None else "scene.ply"
+    file = model.file.model_copy(update={"bodies": tuple(bodies), "scene": scene})
+    with new_directory(path, overwrite) as directory:
+        for name, splats in files:
+            write_splats(directory / name, splats, "body")
+        if model.scene is not None:
+            write_splats(directory / "scene.ply", model.scene, "world")
+        (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        (directory / "model.json").write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return replace(model, root=Path(path), file=file)
+
+
+def _free_name(body: str, suffix: str, taken: set[str]) -> str:
+    name, number = f"{body}{suffix}", 2
+    while name in taken:
+        name, number = f"{body}-{number}{suffix}", number + 1
+    taken.add(name)
+    return name
+
+
+def _inside(root: Path, name: str) -> Path:
+    path = root / name
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise InputDataError(f"{root / 'model.json'}: '{name}' lies outside the model.", "files of its directory.")
+    return path

@@ -1,0 +1,180 @@
+"""Spherical Gaussians in the .ply layout of 3D Gaussian splatting (INRIA), so that the usual viewers open them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import InputDataError
+from .atomic import new_file
+
+Array = NDArray[np.floating]
+
+SH_C0 = 0.28209479177387814
+"""Constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc."""
+
+_OPACITY_MARGIN = 1e-6
+_ISOTROPY_TOLERANCE = 0.01
+_PLY_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "char": "i1", "int8": "i1"}
+_PLY_TYPES |= {"uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2"}
+_PLY_TYPES |= {"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"}
+_NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """Spherical Gaussians; isotropic and of one colour from all sides, so that turning a body turns them exactly.
+
+    Attributes:
+        means: Centres [m], shape (N, 3), in the frame of the body or of the world.
+        scales: Standard deviations s [m], shape (N,), not their logarithms.
+        opacities: Peak opacities in (0, 1), shape (N,).
+        colors: sRGB values as stored in images, in [0, 1], shape (N, 3).
+    """
+
+    means: Array
+    scales: Array
+    opacities: Array
+    colors: Array
+
+    def __post_init__(self) -> None:
+        count = len(self.means)
+        shapes = (self.means.shape, self.scales.shape, self.opacities.shape, self.colors.shape)
+        if shapes != ((count, 3), (count,), (count,), (count, 3)):
+            raise ValueError(f"means, scales, opacities, colors must be (N,3), (N,), (N,), (N,3); found {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def write_splats(
+    path: Path | str,
+    splats: Splats,
+    frame: Literal["body", "world"] = "body",
+    sh_degree: int = 0,
+    overwrite: bool = False,
+) -> None:
+    """Write spheres as a binary .ply: opacity as logit, log scale three times, unit quaternion, no normals.
+
+    Args:
+        path: The file.
+        splats: The spheres.
+        frame: The frame of the centres; it stands in a comment of the header.
+        sh_degree: Pad the colours with zeros up to this degree; INRIA's own loader wants 3.
+        overwrite: Replace an existing file.
+    """
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{k}" for k in range(3)), *(f"f_rest_{k}" for k in range(rest))]
+    names += ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    table = np.zeros((len(splats), len(names)), "<f4")
+    column = {name: k for k, name in enumerate(names)}
+    opacities = np.clip(np.asarray(splats.opacities, np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
+    table[:, :3] = splats.means
+    table[:, 6:9] = (np.asarray(splats.colors, np.float64) - 0.5) / SH_C0
+    table[:, column["opacity"]] = np.log(opacities / (1 - opacities))
+    table[:, column["scale_0"] : column["scale_2"] + 1] = np.log(np.asarray(splats.scales, np.float64))[:, None]
+    table[:, column["rot_0"]] = 1.0
+    if not np.isfinite(table).all():
+        raise ValueError("spheres with values that are not finite, or with a scale of 0, cannot be written")
+    header = ["ply", "format binary_little_endian 1.0", "comment unit metre", f"comment frame {frame}"]
+    header += [f"element vertex {len(splats)}", *(f"property float {name}" for name in names), "end_header"]
+    with new_file(path, overwrite) as temporary:
+        temporary.write_bytes(("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+
+
+def read_splats(path: Path | str) -> Splats:
+    """Read spheres from a .ply of 3D Gaussian splatting; the colour is that of degree 0.
+
+    Raises:
+        InputDataError: If it is no such file, is cut off, is not in metres by its own word, holds a value that
+            is not finite, or Gaussians that are no spheres (scales that differ by more than 1 %).
+    """
+    path = Path(path)
+    columns, comments = _read_vertices(path)
+    unit = next((comment.split()[1] for comment in comments if comment.startswith("unit ")), "metre")
+    if unit not in ("metre", "meter", "m"):
+        raise InputDataError(f"{path}: its header says 'comment unit {unit}'.", "metre.")
+    lacking = [name for name in _NEEDED if name not in columns]
+    if lacking:
+        raise InputDataError(
+            f"{path}: no property '{lacking[0]}'; it is no 3D Gaussian splatting file.",
+            "the properties " + ", ".join(_NEEDED) + ".",
+        )
+    table = {name: np.asarray(columns[name], np.float64) for name in _NEEDED}
+    for name, values in table.items():
+        bad = int(np.count_nonzero(~np.isfinite(values)))
+        if bad:
+            raise InputDataError(f"{path}: '{name}' is not finite in {bad} of {len(values)} splats.")
+    log_scales = np.stack([table[f"scale_{k}"] for k in range(3)], axis=1)
+    uneven = int(np.count_nonzero(np.ptp(log_scales, axis=1) > _ISOTROPY_TOLERANCE))
+    if uneven:
+        raise InputDataError(
+            f"{path}: {uneven} of {len(log_scales)} splats are no spheres.",
+            "three scales that are equal within 1 %.",
+            "leave the shape out, so that cgwm fit makes spheres from the photos.",
+        )
+    return Splats(
+        means=np.stack([table[axis] for axis in "xyz"], axis=1),
+        scales=np.exp(log_scales.mean(axis=1)),
+        opacities=1 / (1 + np.exp(-table["opacity"])),
+        colors=np.clip(0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1), 0.0, 1.0),
+    )
+
+
+def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputDataError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    end = data.find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise InputDataError(f"{path}: no .ply file.")
+    body = data.find(b"\n", end) + 1
+    kind, count, properties, comments = _parse_header(path, data[:end].decode("ascii", "replace"))
+    if kind == "ascii":
+        words = np.array(data[body:].split()[: count * len(properties)], np.float64)
+        if len(words) < count * len(properties):
+            raise _cut_off(path, count)
+        rows = words.reshape(count, len(properties))
+        return {name: rows[:, k] for k, (name, _) in enumerate(properties)}, comments
+    order = "<" if kind == "binary_little_endian" else ">"
+    dtype = np.dtype([(name, order + code) for name, code in properties])
+    if len(data) - body < count * dtype.itemsize:
+        raise _cut_off(path, count)
+    table = np.frombuffer(data, dtype, count, body)
+    return {name: table[name] for name, _ in properties}, comments
+
+
+def _cut_off(path: Path, count: int) -> InputDataError:
+    return InputDataError(f"{path}: cut off: it holds fewer than the {count} splats of its header.")
+
+
+def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]], list[str]]:
+    kind, count, comments = "", 0, []
+    properties: list[tuple[str, str]] = []
+    element = ""
+    try:
+        for line in text.splitlines()[1:]:
+            word, *rest = line.split() or [""]
+            if word == "comment":
+                comments.append(" ".join(rest))
+            elif word == "format":
+                kind = rest[0]
+            elif word == "element":
+                if not element and rest[0] != "vertex":
+                    raise ValueError(f"its first element is '{rest[0]}', not 'vertex'")
+                element = rest[0]
+                count = int(rest[1]) if element == "vertex" else count
+            elif word == "property" and element == "vertex":
+                properties.append((rest[1], _PLY_TYPES[rest[0]]))
+        if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
+            raise ValueError(f"its format is '{kind}'")
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputDataError(f"{path}: the .ply header cannot be read: {error}.") from None
+    return kind, count, properties, comments

@@ -1,0 +1,19 @@
+"""Progress bars on stderr, silent where nobody watches."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+
+from tqdm import tqdm
+
+
+def progress(iterable: Iterable | None = None, desc: str = "", total: int | None = None, unit: str = "it") -> tqdm:
+    """Iterate with a tqdm bar on stderr; no bar if stderr is no terminal or a dumb one, or CGWM_QUIET is set.
+
+    The bar's `set_postfix_str` takes a physical number to show beside the rate ("rms 1.8 mm"). Without an
+    iterable, call `update(n)` on what is returned.
+    """
+    watched = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not os.environ.get("CGWM_QUIET")
+    return tqdm(iterable, desc=desc, total=total, unit=unit, file=sys.stderr, disable=not watched, leave=False)

@@ -1,0 +1,239 @@
+"""Measured poses, `tracks/<episode>.csv`: one row a time and body."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import QUATERNION_NORM_TOLERANCE, InputDataError, did_you_mean
+from .atomic import new_file
+
+Array = NDArray[np.float64]
+
+_POSITION = ("px_m", "py_m", "pz_m")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
+_OMEGA = ("wx_rad_s", "wy_rad_s", "wz_rad_s")
+_REQUIRED = ("time_s", "body", *_POSITION)
+_OPTIONAL_GROUPS = {"quat_wxyz": _QUATERNION, "velocity_m_s": _VELOCITY, "omega_body_rad_s": _OMEGA}
+COLUMNS = (*_REQUIRED, *_QUATERNION, *_VELOCITY, *_OMEGA)
+"""The columns of a track file, in the order in which they are written."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The measured motion of one body in one episode, in the world frame, sorted by time.
+
+    Attributes:
+        time_s: Times [s], shape (T,), strictly increasing.
+        position_m: Position of the body frame's origin [m], world frame, shape (T, 3).
+        quat_wxyz: Orientation (body to world), unit quaternions, shape (T, 4); None for a centroid.
+        velocity_m_s: Velocity of the body frame's origin [m/s], world frame, shape (T, 3), or None.
+        omega_body_rad_s: Angular velocity [rad/s], BODY frame, shape (T, 3), or None.
+    """
+
+    time_s: Array
+    position_m: Array
+    quat_wxyz: Array | None = None
+    velocity_m_s: Array | None = None
+    omega_body_rad_s: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def window(self, start_s: float | None = None, end_s: float | None = None) -> Track:
+        """Return the samples with start_s <= time <= end_s [s]; None leaves that side open."""
+        keep = np.ones(len(self), bool)
+        if start_s is not None:
+            keep &= self.time_s >= start_s
+        if end_s is not None:
+            keep &= self.time_s <= end_s
+        optional = (self.quat_wxyz, self.velocity_m_s, self.omega_body_rad_s)
+        kept = (None if value is None else value[keep] for value in optional)
+        return Track(self.time_s[keep], self.position_m[keep], *kept)
+
+
+def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Track], int]:
+    """Read and check one episode's track file.
+
+    Args:
+        path: The CSV file.
+        bodies: Names of the capture's bodies.
+
+    Returns:
+        The tracks by body, in the order of first appearance, and the number of quaternions that were off the
+        unit norm by more than rounding (1e-6) but within the tolerance (1e-3), and were normalised.
+
+    Raises:
+        InputDataError: With line and column, for an unknown column or body, a value that is missing or not
+            finite, a quaternion that is not of unit norm, times that do not increase, or a single sample.
+    """
+    path, legal = Path(path), list(bodies)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = list(csv.reader(stream))
+    except FileNotFoundError:
+        raise InputDataError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    except (UnicodeDecodeError, csv.Error):
+        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    _check_header(path, header)
+    by_body: dict[str, list[tuple[int, list[str]]]] = {}
+    for line, row in enumerate(rows[1:], 2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            raise InputDataError(
+                f"{path}, line {line}: {len(row)} values under {len(header)} columns.", todo="correct the line."
+            )
+        name = row[header.index("body")].strip()
+        if name not in by_body and name not in legal:
+            allowed = ", ".join(legal) + "." + did_you_mean(name, legal) if legal else "no body: [[bodies]] is empty."
+            raise InputDataError(
+                f"{path}, line {line}: unknown body '{name}'.", allowed, "correct it, or add it to capture.toml."
+            )
+        by_body.setdefault(name, []).append((line, row))
+    if not by_body:
+        raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
+    tracks, normalised = {}, 0
+    for name, numbered in by_body.items():
+        tracks[name], count = _track(path, name, header, numbered)
+        normalised += count
+    return tracks, normalised
+
+
+def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = False) -> None:
+    """Write one episode's tracks, sorted by time; numbers survive the round trip exactly.
+
+    Columns that no track has are left out; a track that lacks columns another one has leaves them empty.
+    """
+    groups = {
+        name: columns
+        for name, columns in _OPTIONAL_GROUPS.items()
+        if any(getattr(track, name) is not None for track in tracks.values())
+    }
+    rows: list[tuple[float, int, list[str]]] = []
+    for order, (body, track) in enumerate(tracks.items()):
+        for k in range(len(track)):
+            row = [_text(track.time_s[k]), body, *map(_text, track.position_m[k])]
+            for name, columns in groups.items():
+                values = getattr(track, name)
+                row += [""] * len(columns) if values is None else map(_text, values[k])
+            rows.append((float(track.time_s[k]), order, row))
+    rows.sort(key=lambda entry: entry[:2])
+    with new_file(path, overwrite) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*_REQUIRED, *(column for columns in groups.values() for column in columns)])
+        writer.writerows(row for _, _, row in rows)
+
+
+def _text(value: float) -> str:
+    return repr(float(value))
+
+
+def _check_header(path: Path, header: list[str]) -> None:
+    allowed = ", ".join(COLUMNS)
+    todo = "correct the header; values are in SI units (m, s, rad)."
+    if not header:
+        raise InputDataError(f"{path}: the file is empty.", f"a header line of {allowed}.")
+    for column in header:
+        if column not in COLUMNS:
+            raise InputDataError(
+                f"{path}, line 1: unknown column '{column}'.", f"{allowed}." + did_you_mean(column, COLUMNS), todo
+            )
+        if header.count(column) > 1:
+            raise InputDataError(f"{path}, line 1: the column '{column}' stands twice.", todo="remove one.")
+    for group in (_REQUIRED, *_OPTIONAL_GROUPS.values()):
+        lacking = [column for column in group if column not in header]
+        if lacking and (group is _REQUIRED or len(lacking) < len(group)):
+            raise InputDataError(f"{path}, line 1: no column '{lacking[0]}'.", f"{allowed}.", todo)
+
+
+def _track(path: Path, body: str, header: list[str], rows: list[tuple[int, list[str]]]) -> tuple[Track, int]:
+    lines = [line for line, _ in rows]
+    time_s = _columns(path, body, header, rows, ("time_s",))[:, 0]
+    position_m = _columns(path, body, header, rows, _POSITION)
+    _check_times(path, body, time_s, lines)
+    found = {name: _optional(path, body, header, rows, group) for name, group in _OPTIONAL_GROUPS.items()}
+    quat_wxyz, normalised = found["quat_wxyz"], 0
+    if quat_wxyz is not None:
+        quat_wxyz, normalised = _unit(path, body, quat_wxyz, lines)
+    track = Track(time_s, position_m, quat_wxyz, found["velocity_m_s"], found["omega_body_rad_s"])
+    if len(track) < 2:
+        raise InputDataError(
+            f"{path}, line {lines[0]}: body '{body}' has 1 sample.", "at least 2.", "add samples, or remove it."
+        )
+    return track, normalised
+
+
+def _columns(
+    path: Path, body: str, header: list[str], rows: list[tuple[int, list[str]]], names: Sequence[str]
+) -> Array:
+    indices = [header.index(name) for name in names]
+    values = np.empty((len(rows), len(names)))
+    for k, (line, row) in enumerate(rows):
+        for j, index in enumerate(indices):
+            try:
+                values[k, j] = float(row[index])
+            except ValueError:
+                shown = f"'{row[index].strip()}' is no number" if row[index].strip() else "the value is missing"
+                raise InputDataError(
+                    f"{path}, line {line}: body '{body}', column '{names[j]}': {shown}.",
+                    "finite numbers; leave out the whole line where nothing was measured.",
+                ) from None
+            if not math.isfinite(values[k, j]):
+                raise InputDataError(
+                    f"{path}, line {line}: body '{body}', column '{names[j]}' is {row[index].strip()}.",
+                    "finite numbers; gaps are allowed.",
+                    "leave out the whole line where nothing was measured.",
+                )
+    return values
+
+
+def _optional(
+    path: Path, body: str, header: list[str], rows: list[tuple[int, list[str]]], names: Sequence[str]
+) -> Array | None:
+    if names[0] not in header:
+        return None
+    indices = [header.index(name) for name in names]
+    if not any(row[index].strip() for _, row in rows for index in indices):
+        return None
+    return _columns(path, body, header, rows, names)
+
+
+def _check_times(path: Path, body: str, time_s: Array, lines: list[int]) -> None:
+    bad = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(bad) == 0:
+        return
+    k = int(bad[0]) + 1
+    before, now = time_s[k - 1], time_s[k]
+    fault = "stands twice" if now == before else f"comes after {before:.6g} s (line {lines[k - 1]})"
+    raise InputDataError(
+        f"{path}, line {lines[k]}: body '{body}': time {now:.6g} s {fault}.",
+        "for each body, times that increase from line to line.",
+        "sort the lines and remove duplicates.",
+    )
+
+
+def _unit(path: Path, body: str, quat_wxyz: Array, lines: list[int]) -> tuple[Array, int]:
+    norm = np.linalg.norm(quat_wxyz, axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE)
+    if len(bad):
+        k = int(bad[0])
+        raise InputDataError(
+            f"{path}, line {lines[k]}: body '{body}': the quaternion has norm {norm[k]:.4f} "
+            f"({len(bad)} of {len(norm)} rows are off).",
+            f"norm 1 within {QUATERNION_NORM_TOLERANCE:g}, order qw, qx, qy, qz.",
+            "normalise the quaternions where they are made.",
+        )
+    # What is unit already stays as it is, so that writing and reading a track changes no bit of it.
+    norm[np.abs(norm - 1.0) < 1e-12] = 1.0
+    return quat_wxyz / norm[:, None], int(np.count_nonzero(np.abs(norm - 1.0) > 1e-6))

@@ -1,0 +1,149 @@
+"""Cameras from nerfstudio's (and instant-ngp's) `transforms.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
+from ..schemas.cameras import Matrix4
+from .images import IMAGE_SUFFIXES, image_size
+
+_INTRINSICS = (
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "k4",
+    "camera_angle_x",
+    "camera_angle_y",
+)
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+
+
+def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
+    """Read `transforms.json`: intrinsics common or by frame, poses camera to world with OpenGL axes.
+
+    The axes become OpenCV's (y and z turned round). Principal points need no shift: nerfstudio casts the ray of
+    pixel column i at i + 0.5, so it shares the corner origin used here. `applied_transform` is a record of what
+    was done to the world before, and is not undone.
+
+    Args:
+        path: The file.
+        metric: Whether its unit is the metre, which it does not say itself.
+
+    Raises:
+        InputDataError: For a field that is missing or wrong, or a camera model that is not a pinhole.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputDataError(f"{path}: not valid JSON: {error}.") from None
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+        raise InputDataError(f"{path}: no list 'frames' with at least one frame.")
+    cameras: dict[str, CameraIntrinsics] = {}
+    images: dict[str, PosedImage] = {}
+    for k, frame in enumerate(data["frames"]):
+        where = f"{path}: frames[{k}]"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputDataError(f"{where}: no 'file_path'.")
+        file = _image_file(path.parent, frame["file_path"])
+        intrinsics = _intrinsics(where, {**data, **frame}, path.parent / file)
+        camera = next((name for name, known in cameras.items() if known == intrinsics), None)
+        if camera is None:
+            camera = f"camera{len(cameras)}"
+            cameras[camera] = intrinsics
+        name = file.removeprefix("images/")
+        if name in images:
+            raise InputDataError(f"{where}: '{frame['file_path']}' stands twice.")
+        images[name] = PosedImage(camera=camera, T_world_cam=_pose(where, frame))
+    scale = Scale(kind="metric" if metric else "unscaled", source="transforms.json")
+    return CamerasFile(scale=scale, cameras=cameras, images=images)
+
+
+def opencv_from_opengl(T_world_cam: np.ndarray) -> np.ndarray:
+    """Turn a camera pose with OpenGL axes (y up, z backward) into one with OpenCV axes, shape (4, 4)."""
+    return np.asarray(T_world_cam, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def matrix4(pose: np.ndarray) -> Matrix4:
+    """Return a 4x4 matrix as it stands in `cameras.json`."""
+    if pose.shape != (4, 4):
+        raise ValueError(f"a pose has the shape (4, 4); found {pose.shape}")
+    a, b, c, d = ((float(x), float(y), float(z), float(w)) for x, y, z, w in pose)
+    return a, b, c, d
+
+
+def _image_file(folder: Path, file_path: str) -> str:
+    name = file_path.removeprefix("./")
+    if Path(name).suffix.lower() in IMAGE_SUFFIXES or (folder / name).is_file():
+        return name
+    # Blender's synthetic scenes leave the suffix out.
+    return next((name + suffix for suffix in (".png", ".jpg") if (folder / (name + suffix)).is_file()), name)
+
+
+def _pose(where: str, frame: dict[str, Any]) -> Matrix4:
+    try:
+        matrix = np.array(frame.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputDataError(f"{where}: 'transform_matrix' is no 4x4 matrix of finite numbers.")
+    return matrix4(opencv_from_opengl(matrix))
+
+
+def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrinsics:
+    model = str(fields.get("camera_model", "OPENCV"))
+    if model not in _MODELS or fields.get("is_fisheye"):
+        raise InputDataError(
+            f"{where}: the camera model is {model if model not in _MODELS else 'a fisheye'}.",
+            ", ".join(_MODELS) + ".",
+            "undistort the photos to a pinhole camera first.",
+        )
+    values = {name: _number(where, fields, name) for name in _INTRINSICS if name in fields}
+    if values.get("k4"):
+        raise InputDataError(f"{where}: k4 = {values['k4']:g}.", "distortion by k1, k2, p1, p2, k3.")
+    if "w" in values and "h" in values:
+        width, height = round(values["w"]), round(values["h"])
+    else:
+        width, height = image_size(image)
+    fx = values.get("fl_x") or _focal(where, values, "camera_angle_x", width)
+    fy = values.get("fl_y") or (_focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx)
+    distortion = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
+    distortion = distortion if distortion[4] else distortion[:4]
+    return CameraIntrinsics(
+        model="OPENCV" if any(distortion) else "PINHOLE",
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=values.get("cx", width / 2),
+        cy=values.get("cy", height / 2),
+        distortion=distortion if any(distortion) else (),
+    )
+
+
+def _focal(where: str, values: dict[str, float], name: str, size_px: int) -> float:
+    if not 0 < values.get(name, 0.0) < math.pi:
+        raise InputDataError(f"{where}: neither a focal length 'fl_x' nor an angle 'camera_angle_x'.")
+    return size_px / (2 * math.tan(values[name] / 2))
+
+
+def _number(where: str, fields: dict[str, Any], name: str) -> float:
+    value = fields[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputDataError(f"{where}: '{name}' is {value!r:.40}, no finite number.")
+    return float(value)

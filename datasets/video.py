@@ -1,0 +1,147 @@
+"""Videos: a directory of numbered frames, or an mp4 or webm file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import InputDataError
+from .images import IMAGE_SUFFIXES, image_size, read_label, read_rgb
+
+VIDEO_SUFFIXES = (".mp4", ".webm")
+"""Suffixes of the video files that are read."""
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What the headers of a video say.
+
+    Attributes:
+        frames: Number of frames.
+        width: Image width [px].
+        height: Image height [px].
+        frame_rate_hz: Frame rate of the file [Hz]; None for a directory of frames.
+    """
+
+    frames: int
+    width: int
+    height: int
+    frame_rate_hz: float | None = None
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Return the frames of a directory, frame 0 first.
+
+    Raises:
+        InputDataError: If a name is no number, or a number is missing: later frames would get wrong times.
+    """
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    numbered: dict[int, Path] = {}
+    for file in files:
+        if not file.stem.isdecimal():
+            raise InputDataError(f"{file}: the name is no frame number.", "000000.png, 000001.png, ...")
+        number = int(file.stem)
+        if number in numbered:
+            raise InputDataError(f"{file}: frame {number} is there twice, also as {numbered[number].name}.")
+        numbered[number] = file
+    missing = next((k for k in range(len(numbered)) if k not in numbered), None)
+    if missing is not None:
+        raise InputDataError(
+            f"{folder}: frame {missing} is missing ({len(numbered)} frames, the last is {max(numbered)}).",
+            "frames numbered 0, 1, 2, ... without gaps, since the number is the time.",
+            "number the frames from 0.",
+        )
+    return [numbered[k] for k in range(len(numbered))]
+
+
+def video_info(path: Path, decode: bool = False) -> VideoInfo:
+    """Return the number and size of the frames; of a directory, each frame's header is checked.
+
+    Args:
+        path: A directory of frames or a video file.
+        decode: Count the frames of a video file by decoding it; otherwise its header is believed.
+
+    Raises:
+        InputDataError: If it does not decode, has no frame, or its frames differ in size.
+    """
+    if path.is_dir():
+        return _folder_info(path)
+    capture = _open(path)
+    try:
+        frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        width, height = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        readable = capture.grab()
+    finally:
+        capture.release()
+    if not readable:
+        raise _undecodable(path)
+    # A webm that was streamed carries no frame count in its header.
+    if decode or frames <= 0:
+        frames = sum(1 for _ in _grab(path))
+    return VideoInfo(frames, width, height, rate if rate > 0 else None)
+
+
+def read_video(path: Path) -> NDArray[np.uint8]:
+    """Return all frames as RGB, uint8, shape (frames, height, width, 3)."""
+    if path.is_dir():
+        _folder_info(path)
+        return np.stack([read_rgb(file) for file in frame_files(path)])
+    frames = [np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8) for frame in _grab(path)]
+    if not frames:
+        raise _undecodable(path)
+    return np.stack(frames)
+
+
+def read_video_labels(folder: Path) -> NDArray[np.uint8]:
+    """Return the label images of a directory of frames, uint8, shape (frames, height, width)."""
+    return np.stack([read_label(file) for file in frame_files(folder)])
+
+
+def _folder_info(folder: Path) -> VideoInfo:
+    files = frame_files(folder)
+    if not files:
+        raise InputDataError(f"{folder}: no frames.", "000000.png, 000001.png, ... or .jpg.")
+    width, height = image_size(files[0])
+    for file in files[1:]:
+        size = image_size(file)
+        if size != (width, height):
+            raise InputDataError(
+                f"{file}: {size[0]}x{size[1]} px, but {files[0].name} has {width}x{height} px.",
+                "frames of one size.",
+            )
+    return VideoInfo(len(files), width, height)
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    if not path.is_file():
+        raise InputDataError(f"{path}: no such video.")
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise _undecodable(path)
+    return capture
+
+
+def _grab(path: Path) -> Iterator[NDArray[np.uint8]]:
+    capture = _open(path)
+    try:
+        while True:
+            done, frame = capture.read()
+            if not done:
+                return
+            yield np.asarray(frame, np.uint8)
+    finally:
+        capture.release()
+
+
+def _undecodable(path: Path) -> InputDataError:
+    return InputDataError(
+        f"{path}: the video does not decode.",
+        "mp4 or webm, or a directory of frames.",
+        "convert it, for example into frames: ffmpeg -i VIDEO -start_number 0 %06d.png",
+    )
