@@ -1,0 +1,179 @@
+"""Reading of datasets: random access to rollouts and to windows of frames, in plain numpy."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..schemas import InputDataError, UsageError, did_you_mean
+from .kinds import refuse_other_kind
+from .rollouts import demo_names, open_shard
+
+
+@dataclass(frozen=True)
+class RolloutInfo:
+    """Where a rollout lies."""
+
+    file: Path
+    demo: str
+    index: int
+    frames: int
+
+
+def shard_files(path: Path) -> list[Path]:
+    """Return the shards of a dataset directory, by name; or `path` itself where it is one shard."""
+    if path.is_file():
+        return [path]
+    refuse_other_kind(path, "dataset")
+    files = sorted(path.glob("rollouts-*-of-*.h5"))
+    if not files:
+        raise InputDataError(f"{path}: no shard (rollouts-<i>-of-<n>.h5) in it.")
+    return files
+
+
+class RolloutReader:
+    """Random access to the rollouts of a dataset or of one shard.
+
+    Files are opened when they are first read and the handles stay out of pickles, so that an instance can be sent
+    to worker processes (fork or spawn).
+
+    Args:
+        path: DATASET, or one of its shards.
+        split: Only the rollouts of `mask/<split>`, for example ``train``; all where left out.
+    """
+
+    def __init__(self, path: Path | str, split: str | None = None):
+        self.path = Path(path)
+        self._files: dict[tuple[int, Path], h5py.File] = {}
+        self.rollouts: list[RolloutInfo] = []
+        for file in shard_files(self.path):
+            with open_shard(file) as handle:
+                self.rollouts.extend(_list(handle, file, split))
+        self.rollouts.sort(key=lambda info: info.index)
+
+    def __len__(self) -> int:
+        return len(self.rollouts)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_files": {}}
+
+    def close(self) -> None:
+        """Close the files; they open again when they are read."""
+        for (process, _), file in self._files.items():
+            if process == os.getpid():
+                file.close()
+        self._files.clear()
+
+    def group(self, number: int) -> h5py.Group:
+        """Return the HDF5 group of the rollout at place `number` of this reader."""
+        info = self.rollouts[number]
+        key = (os.getpid(), info.file)  # a handle that a fork inherits is not safe to use
+        if key not in self._files:
+            self._files[key] = open_shard(info.file)
+        return self._files[key]["data"][info.demo]  # pyright: ignore
+
+    def keys(self, number: int = 0) -> list[str]:
+        """Return the names of all arrays of a rollout, for example ``obs/view0_image`` or ``bodies/pos``."""
+        names: list[str] = []
+        self.group(number).visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        return [name for name in names if not name.startswith("next_obs/")]
+
+    def cameras(self, number: int = 0) -> list[str]:
+        """Return the names of the cameras of a rollout."""
+        group = self.group(number)
+        return sorted(group["cameras"]) if "cameras" in group else []  # pyright: ignore
+
+    def parameters(self, number: int) -> dict[str, float]:
+        """Return the physical parameters of a rollout, in the unit that their attribute states."""
+        return {name: float(item[()]) for name, item in self.group(number)["parameters"].items()}  # pyright: ignore
+
+    def read(self, number: int, key: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Return an array of a rollout, its first axis cut to `start:stop` (frames, for what has a time axis)."""
+        group = self.group(number)
+        if key not in group:
+            names = self.keys(number)
+            raise UsageError(f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names))
+        data = group[key]
+        return data[start:stop] if data.ndim else data[()]  # pyright: ignore
+
+    def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
+        """Return the contacts of one frame: body_a, body_b, pos_world, normal_world, distance, impulse_world, mode."""
+        group = self.group(number)["contacts"]
+        first, last = group["offsets"][frame : frame + 2]  # pyright: ignore
+        return {name: item[first:last] for name, item in group.items() if name != "offsets"}  # pyright: ignore
+
+    def window(self, number: int, start: int, length: int, keys: Iterable[str]) -> dict[str, np.ndarray]:
+        """Return `length` successive frames of some arrays with a time axis."""
+        frames = self.rollouts[number].frames
+        if start < 0 or length < 1 or start + length > frames:
+            raise UsageError(f"frames {start} to {start + length} of rollout {number}, which has {frames}.")
+        return {key: self.read(number, key, start, start + length) for key in keys}
+
+
+class RolloutDataset:
+    """Windows of frames, as a map-style dataset: `torch.utils.data.DataLoader` takes it as it is.
+
+    An item is a dictionary of numpy arrays: the windows of `keys`, and for each camera named in them `<camera>_K`
+    (3, 3) and `<camera>_T_world_cam` (4, 4); `rollout` (global index) and `start` (first frame).
+
+    Args:
+        path: DATASET or a shard.
+        length: Frames in a window.
+        stride: Frames from one window's start to the next.
+        keys: Arrays with a time axis; default: the bodies' poses and every camera's image.
+        split: ``train``, ``valid`` or all.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        length: int = 8,
+        stride: int | None = None,
+        keys: Iterable[str] | None = None,
+        split: str | None = None,
+    ):
+        self.reader = RolloutReader(path, split)
+        self.length = length
+        step = stride or length
+        self.windows = [
+            (number, start)
+            for number, info in enumerate(self.reader.rollouts)
+            for start in range(0, info.frames - length + 1, step)
+        ]
+        self.cameras = self.reader.cameras() if len(self.reader) else []
+        default = ["bodies/pos", "bodies/quat_wxyz", *(f"obs/{name}_image" for name in self.cameras)]
+        self.keys = list(keys) if keys is not None else default
+        self.reader.close()
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
+        number, start = self.windows[index]
+        item = self.reader.window(number, start, self.length, self.keys)
+        for name in self.cameras:
+            if any(key.startswith(f"obs/{name}_") for key in self.keys):
+                for field in ("K", "T_world_cam"):
+                    item[f"{name}_{field}"] = self.reader.read(number, f"cameras/{name}/{field}")
+        item["rollout"] = np.int64(self.reader.rollouts[number].index)  # pyright: ignore
+        item["start"] = np.int64(start)  # pyright: ignore
+        return item
+
+
+def _list(handle: h5py.File, file: Path, split: str | None) -> Iterable[RolloutInfo]:
+    names = demo_names(handle)
+    if split is not None:
+        splits = list(handle["mask"])  # pyright: ignore
+        if split not in splits:
+            raise UsageError(f"{file} has no split '{split}'.", ", ".join(splits))
+        members = {name.decode() for name in handle["mask"][split][()]}  # pyright: ignore
+        names = [name for name in names if name in members]
+    for name in names:
+        demo = handle["data"][name]  # pyright: ignore
+        yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), int(demo.attrs["num_samples"]))

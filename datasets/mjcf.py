@@ -1,0 +1,134 @@
+"""A fitted model as MJCF, so that MuJoCo (and robomimic's attribute `model_file`) can simulate it.
+
+The mapping is approximate by nature: MuJoCo's contacts are soft in another way than ours. `solref = (tau / zeta, zeta)`
+gives the same restitution and contact time; the rest depth is MuJoCo's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from ..schemas import BodyModel, ContactParameters, ModelFile
+from .cameras import Camera
+from .models import Model
+
+MIN_DAMPING_RATIO = 1e-3
+"""MuJoCo's solref has the damping ratio in a quotient; smaller ones are written as this."""
+IMPEDANCE = 0.99
+"""solimp's d: rest depth in MuJoCo is (1 - d) g tau^2 / number of contacts."""
+
+
+def write_mjcf(model: Model, cameras: Mapping[str, Camera] | None = None) -> str:
+    """Return the model as MJCF text.
+
+    Free bodies get a free joint, driven ones are mocap bodies, fixed ones stand at their photo pose. Collision spheres
+    are `sphere` geoms; where the model has none, the shape that the capture gave (box or ball) is the geom. Masses,
+    inertia, friction and the contact time and damping are the model's.
+
+    Args:
+        model: A model with fitted physics.
+        cameras: Cameras to add, by name; without distortion, which MJCF cannot say.
+    """
+    file = model.file
+    root = ET.Element("mujoco", model="cgwm")
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
+    # RK4: the other integrators damp the tumbling of a free body.
+    option = {"timestep": _text(_timestep(file)), "gravity": _text(file.gravity_m_s2), "integrator": "RK4"}
+    ET.SubElement(root, "option", **option, cone="elliptic")
+    defaults = ET.SubElement(ET.SubElement(root, "default"), "geom", contype="1", conaffinity="1", condim="3")
+    defaults.attrib.update(_contact(file.contact))
+    world = ET.SubElement(root, "worldbody")
+    if file.ground is not None:
+        normal = np.asarray(file.ground.normal)
+        place = {"pos": _text(normal * file.ground.offset_m), "zaxis": _text(normal)}
+        ET.SubElement(world, "geom", name="ground", type="plane", size="0 0 1", **place)
+    for body in file.bodies:
+        _add_body(world, body, model)
+    for name, camera in (cameras or {}).items():
+        _add_camera(world, name, camera)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def mujoco_states(file: ModelFile, time_s: np.ndarray, pose: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Return MuJoCo's states of the free bodies: time, qpos, qvel.
+
+    Args:
+        file: The model.
+        time_s: Shape (T,).
+        pose: position_m (T, B, 3), quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) of the body origin in world axes, and
+            omega_body_rad_s (T, B, 3): a free joint's own convention.
+
+    Returns:
+        Shape (T, 1 + 13 F) for F free bodies.
+    """
+    free = [index for index, body in enumerate(file.bodies) if body.motion == "free"]
+    position, quat, velocity, omega = (values[:, free] for values in pose)
+    qpos = np.concatenate([position, quat], -1).reshape(len(time_s), -1)
+    qvel = np.concatenate([velocity, omega], -1).reshape(len(time_s), -1)
+    return np.concatenate([time_s[:, None], qpos, qvel], 1)
+
+
+def _timestep(file: ModelFile) -> float:
+    step = file.solver.step_s
+    if file.contact is None:
+        return step
+    # MuJoCo clips a time constant below two steps; a twentieth of tau keeps the restitution within 0.003.
+    return min(step, file.contact.contact_time_s / 20)
+
+
+def _contact(contact: ContactParameters | None) -> dict[str, str]:
+    if contact is None:
+        return {}
+    zeta = max(contact.damping_ratio, MIN_DAMPING_RATIO)
+    return {
+        "friction": _text((contact.friction, 0.0, 0.0)),
+        "solref": _text((contact.contact_time_s / zeta, zeta)),
+        "solimp": _text((IMPEDANCE, IMPEDANCE, 0.001)),
+    }
+
+
+def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:
+    pose = body.photo_pose
+    element = ET.SubElement(world, "body", name=body.name, pos=_text(pose.position_m), quat=_text(pose.quat_wxyz))
+    if body.motion == "driven":
+        element.set("mocap", "true")
+    elif body.motion == "free":
+        ET.SubElement(element, "freejoint", name=f"{body.name}_free")
+    if body.motion != "fixed":
+        inertia = _text(body.inertia_kg_m2)
+        ET.SubElement(element, "inertial", pos=_text(body.com_m), mass=_text(body.mass_kg), fullinertia=inertia)
+    spheres = model.collision.get(body.name)
+    if spheres is not None:
+        radii = np.asarray(spheres.scales, float) * body.radius_factor
+        for center, radius in zip(np.asarray(spheres.means, float), radii, strict=True):
+            ET.SubElement(element, "geom", type="sphere", pos=_text(center), size=_text(radius))
+    elif body.shape is not None and body.shape.box is not None:
+        ET.SubElement(element, "geom", type="box", size=_text(body.shape.box.half_extents_m))
+    elif body.shape is not None and body.shape.sphere is not None:
+        ET.SubElement(element, "geom", type="sphere", size=_text(body.shape.sphere.radius_m))
+
+
+def _add_camera(world: ET.Element, name: str, camera: Camera) -> None:
+    pose, K = np.asarray(camera.T_world_cam, float), np.asarray(camera.K, float)
+    # MuJoCo looks along -z with y up, OpenCV along z with y down.
+    axes = np.concatenate([pose[:3, 0], -pose[:3, 1]])
+    offset = (camera.width / 2 - K[0, 2], camera.height / 2 - K[1, 2])
+    ET.SubElement(
+        world,
+        "camera",
+        name=name,
+        pos=_text(pose[:3, 3]),
+        xyaxes=_text(axes),
+        resolution=f"{camera.width} {camera.height}",
+        sensorsize=_text((camera.width * 1e-5, camera.height * 1e-5)),
+        focalpixel=_text((K[0, 0], K[1, 1])),
+        principalpixel=_text(offset),
+    )
+
+
+def _text(values: object) -> str:
+    return " ".join(f"{value:.10g}" for value in np.atleast_1d(np.asarray(values, float)))

@@ -1,0 +1,217 @@
+"""Labelled images of a moving model: colour, depth and instance masks, from one pass of the renderer.
+
+What never moves (the background and fixed bodies) is rendered once a camera. In each frame only the tiles that the
+moving bodies can reach are rendered again, with everything in them: outside, nothing of a body contributes, so the
+result is that of rendering the whole picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datasets.cameras import Camera
+from ..datasets.models import Model
+from ..datasets.ply import Splats
+from ..datasets.rollouts import CHUNK_FRAMES, FrameBlock
+from .physics.rotation import quat_to_matrix
+from .splats.render import MIN_ALPHA, render
+
+TILE = 8
+"""Crops begin and end on multiples of the renderer's tile [px], so that its tiles are those of the whole picture."""
+SOLID_ALPHA = 0.5
+"""A pixel shows a surface (and gets a depth and a label) where the spheres let less than half of the light through."""
+
+
+@dataclass(frozen=True)
+class _Spheres:
+    """Spheres to render, float32; `features` are colour and a one-hot label (background, body 1, ...)."""
+
+    means: Tensor
+    scales: Tensor
+    opacities: Tensor
+    features: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+@dataclass(frozen=True)
+class _Moving:
+    body: int
+    spheres: _Spheres
+
+
+@dataclass
+class _View:
+    """A camera, and its picture of what never moves: features (H, W, F), alpha (H, W), depth (H, W)."""
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+    features: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+class LabelRenderer:
+    """Renders the labels of a model for a set of cameras without distortion.
+
+    Args:
+        model: A model with visual spheres.
+        cameras: The cameras by name.
+        device: Where to render.
+    """
+
+    def __init__(self, model: Model, cameras: Mapping[str, Camera], device: str = "cpu"):
+        self._device = device
+        self._labels = 1 + len(model.file.bodies)
+        static, self._moving = [], []
+        if model.scene is not None:
+            static.append(self._spheres(model.scene, 0))
+        for index, body in enumerate(model.file.bodies):
+            if body.name not in model.body_splats:
+                continue
+            spheres = self._spheres(model.body_splats[body.name], index + 1)
+            if body.motion == "fixed":
+                pose = body.photo_pose
+                static.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
+            else:
+                self._moving.append(_Moving(index, spheres))
+        nothing = torch.zeros(0, 3, device=device)
+        empty = _Spheres(nothing, nothing[:, 0], nothing[:, 0], torch.zeros(0, 3 + self._labels, device=device))
+        self._static = _joined([*static, empty])
+        self._views = {name: self._view(camera) for name, camera in cameras.items()}
+
+    @torch.no_grad()
+    def blocks(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> Iterator[FrameBlock]:
+        """Render a rollout, a chunk of frames of one camera at a time.
+
+        Args:
+            position_m: Body frame origins [m], world, shape (T, B, 3).
+            quat_wxyz: T_world_body, shape (T, B, 4).
+        """
+        count = len(position_m)
+        for start in range(0, count, CHUNK_FRAMES):
+            frames = range(start, min(start + CHUNK_FRAMES, count))
+            placed = [self._place(position_m[frame], quat_wxyz[frame]) for frame in frames]
+            for name, view in self._views.items():
+                pictures = [self._frame(view, spheres) for spheres in placed]
+                image, depth, mask = (np.stack(parts) for parts in zip(*pictures, strict=True))
+                yield FrameBlock(name, start, image, depth, mask)
+
+    def _spheres(self, splats: Splats, label: int) -> _Spheres:
+        one_hot = torch.zeros(len(splats), self._labels, device=self._device)
+        one_hot[:, label] = 1.0
+        features = torch.cat([self._float(splats.colors), one_hot], 1)
+        return _Spheres(self._float(splats.means), self._float(splats.scales), self._float(splats.opacities), features)
+
+    def _float(self, values: object) -> Tensor:
+        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self._device)
+
+    def _view(self, camera: Camera) -> _View:
+        viewmat, K = self._float(camera.T_cam_world), self._float(camera.K)
+        size = (camera.width, camera.height)
+        with torch.no_grad():
+            picture = _render(self._static, viewmat, K, *size)
+        return _View(viewmat, K, *size, *picture)
+
+    def _place(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> _Spheres:
+        moved = [
+            _placed(part.spheres, self._float(position_m[part.body]), self._float(quat_wxyz[part.body]))
+            for part in self._moving
+        ]
+        return _joined([*moved, _cut(self._static, slice(0, 0))])
+
+    def _frame(self, view: _View, moving: _Spheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        features, alpha, depth = view.features, view.alpha, view.depth
+        box = _reach(moving, view)
+        if box is not None:
+            left, top, right, bottom = box
+            K = view.K.clone()
+            K[0, 2] -= left
+            K[1, 2] -= top
+            everything = _joined([moving, self._static])
+            crop = _render(everything, view.viewmat, K, right - left, bottom - top)
+            features, alpha, depth = features.clone(), alpha.clone(), depth.clone()
+            for whole, part in zip((features, alpha, depth), crop, strict=True):
+                whole[top:bottom, left:right] = part
+        solid = alpha > SOLID_ALPHA
+        label = torch.where(solid, features[..., 3:].argmax(-1), 0)
+        image = (features[..., :3].clamp(0, 1) * 255).round()
+        depth = torch.where(solid, depth, 0.0)
+        return (
+            image.to(torch.uint8).cpu().numpy(),
+            depth.to(torch.float32).cpu().numpy(),
+            label.to(torch.uint8).cpu().numpy(),
+        )
+
+
+def _render(spheres: _Spheres, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    if len(spheres) == 0:
+        shape = (height, width)
+        empty = spheres.features.new_zeros(shape)
+        return spheres.features.new_zeros(*shape, spheres.features.shape[1]), empty, empty.clone()
+    picture = render(
+        spheres.means,
+        spheres.scales,
+        spheres.opacities,
+        spheres.features,
+        viewmat[None],
+        K[None],
+        width,
+        height,
+        tile_size=TILE,
+    )
+    return picture.features[0], picture.alpha[0], picture.depth[0]
+
+
+def _placed(spheres: _Spheres, position_m: Tensor, quat_wxyz: Tensor) -> _Spheres:
+    means = spheres.means @ quat_to_matrix(quat_wxyz).T + position_m
+    return _Spheres(means, spheres.scales, spheres.opacities, spheres.features)
+
+
+def _joined(parts: list[_Spheres]) -> _Spheres:
+    fields = ("means", "scales", "opacities", "features")
+    return _Spheres(*(torch.cat([getattr(part, field) for part in parts]) for field in fields))
+
+
+def _cut(spheres: _Spheres, rows: slice) -> _Spheres:
+    return _Spheres(spheres.means[rows], spheres.scales[rows], spheres.opacities[rows], spheres.features[rows])
+
+
+def _reach(spheres: _Spheres, view: _View) -> tuple[int, int, int, int] | None:
+    """Return the box (left, top, right, bottom) [px], on tile borders, outside which no sphere reaches MIN_ALPHA.
+
+    Derived: the rays that pass a centre (x, z) within r lie, in the plane of x and z, within asin(r / |(x, z)|) of
+    its direction; so for y. A sphere around the camera reaches everywhere.
+    """
+    if len(spheres) == 0:
+        return None
+    local = spheres.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    reach = spheres.scales * (2 * (spheres.opacities / MIN_ALPHA).clamp_min(1.0).log()).sqrt()
+    depth = local[:, 2]
+    drawn = (spheres.opacities > MIN_ALPHA) & (depth > -reach)
+    if not bool(drawn.any()):
+        return None
+    local, reach, depth = local[drawn], reach[drawn], depth[drawn]
+    if bool((depth <= reach).any()):
+        return 0, 0, view.width, view.height
+    limits = []
+    for axis, size in ((0, view.width), (1, view.height)):
+        middle = torch.atan2(local[:, axis], depth)
+        half = torch.asin((reach / torch.hypot(local[:, axis], depth)).clamp_max(1.0))
+        ends = torch.tan(torch.stack([middle - half, middle + half])) * view.K[axis, axis] + view.K[axis, 2]
+        low, high = float(ends[0].min()) - 1, float(ends[1].max()) + 1  # a pixel against rounding
+        if high <= 0 or low >= size:
+            return None
+        low = max(0, math.floor(low / TILE) * TILE)
+        limits.append((low, min(size, math.ceil(high / TILE) * TILE)))
+    (left, right), (top, bottom) = limits
+    return left, top, right, bottom
