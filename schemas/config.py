@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .base import FileModel
+from .dataset import SamplingPlan
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -63,3 +64,12 @@ class SynthesizeConfig(FileModel):
     compression: Literal["zstd", "gzip", "none"] = "zstd"
     shard: Annotated[int, Field(ge=0)] = 0
     shards: Annotated[int, Field(ge=1)] = 1
+    plan: SamplingPlan = SamplingPlan()
+
+    @model_validator(mode="after")
+    def _shard(self) -> SynthesizeConfig:
+        if self.shard >= self.shards:
+            raise ValueError(
+                f"shard {self.shard} of {self.shards}: they are numbered 0 to {self.shards - 1}"
+            )
+        return self
