@@ -30,7 +30,9 @@ def calibrate(
         from ..schemas import CalibrateConfig
         from .settings import StageSettings
 
-        settings = StageSettings(["calibrate"], config, set_).configure("calibrate", CalibrateConfig, seed=seed)
+        settings = StageSettings({"calibrate": CalibrateConfig}, config, set_).configure(
+            "calibrate", CalibrateConfig, seed=seed
+        )
         emit(work(capture, settings, overwrite), _summary)
 
 

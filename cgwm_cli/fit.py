@@ -45,7 +45,7 @@ def fit(
         from ..schemas import PhysConfig, SplatConfig
         from .settings import StageSettings
 
-        settings = StageSettings(["sg-gs", "phys-geo"], config, set_)
+        settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
         splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
         emit(work(capture, out, stage, parent, split, splats, physics, overwrite), lambda model: _summary(model, out))

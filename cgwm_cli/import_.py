@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -11,7 +11,7 @@ from .options import Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
-    from ..schemas import FileModel
+    from ..schemas import ImportResult
 
 
 def import_capture(
@@ -35,11 +35,9 @@ def import_capture(
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..datasets.contactnets import import_contactnets
 
-        emit(import_contactnets(source, out, train, test, seed, overwrite), lambda summary: _summary(summary, out))
+        emit(import_contactnets(source, out, train, test, seed, overwrite), _summary)
 
 
-def _summary(summary: FileModel, out: Path) -> str:
-    from .output import table
-
-    facts: dict[str, Any] = summary.model_dump()
-    return "\n".join([f"Wrote {out}.", table([[name.replace("_", " "), str(value)] for name, value in facts.items()])])
+def _summary(result: ImportResult) -> str:
+    splits = ", ".join(f"{name} {count}" for name, count in result.splits.items())
+    return f"Wrote {result.capture}: {result.episodes} episodes ({splits}) with {result.samples} poses."

@@ -42,13 +42,15 @@ Emit = Callable[["FileModel", Callable[[Any], str]], None]
 def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> Iterator[Emit]:
     """Wrap the work of a verb: whatever it raises becomes one clear message on stderr and the right exit code.
 
-    Yields a function that takes the result and how to summarise it; it is printed when the work is over. What libraries
-    print on stdout meanwhile goes to stderr on a terminal, and nowhere otherwise.
+    Yields a function that takes the result and how to summarise it; it is printed when the work is over. Progress, logs
+    and what libraries print meanwhile go to stderr if that is a terminal, and nowhere otherwise.
 
     Raises:
         typer.Exit: With the exit code, when the work failed.
     """
-    _hush(quiet, debug)
+    watched = _is_watched(quiet, debug)
+    if not watched:
+        _hush()
     printed: list[str] = []
 
     def emit(result: FileModel, summary: Callable[[Any], str]) -> None:
@@ -58,7 +60,7 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
             printed.append(summary(result))
 
     try:
-        with _stdout_for_results_only():
+        with _stdout_for_results_only(watched):
             yield emit
         for text in printed:
             print(text, flush=True)
@@ -132,36 +134,43 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _hush(quiet: bool, debug: bool) -> None:
-    if quiet:
-        os.environ["CGWM_QUIET"] = "1"  # read by cgwm.datasets.progress
-    if not debug and (quiet or not sys.stderr.isatty()):
-        import logging
-        import warnings
+def _is_watched(quiet: bool, debug: bool) -> bool:
+    """Tell whether somebody wants to see progress and logs."""
+    return debug or (sys.stderr.isatty() and not quiet)
 
-        warnings.simplefilter("ignore")
-        logging.disable(logging.CRITICAL)
+
+def _hush() -> None:
+    """Silence logs and warnings; the progress bars of cgwm.datasets.progress read the variable."""
+    import logging
+    import warnings
+
+    os.environ["CGWM_QUIET"] = "1"
+    warnings.simplefilter("ignore")
+    logging.disable(logging.CRITICAL)
 
 
 @contextlib.contextmanager
-def _stdout_for_results_only() -> Iterator[None]:
-    """Send what is printed on stdout inside to stderr, for compiled libraries too."""
+def _stdout_for_results_only(watched: bool) -> Iterator[None]:
+    """Send what is printed inside to stderr if somebody watches, and nowhere otherwise.
+
+    That is done to the file descriptors, because compiled libraries print past `sys.stdout`.
+    """
+    _flush()
+    saved = [os.dup(1), os.dup(2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(2 if watched else nowhere, 1)
+        if not watched:
+            os.dup2(nowhere, 2)
+        yield
+    finally:
+        _flush()
+        for descriptor, original in enumerate(saved, 1):
+            os.dup2(original, descriptor)
+            os.close(original)
+        os.close(nowhere)
+
+
+def _flush() -> None:
     sys.stdout.flush()
-    original: Any = sys.stdout
-    with contextlib.ExitStack() as stack:
-        sink: Any = sys.stderr
-        if not sys.stderr.isatty():
-            sink = stack.enter_context(open(os.devnull, "w"))
-        stack.enter_context(contextlib.redirect_stdout(sink))
-        try:
-            descriptor = original.fileno()
-        except (OSError, ValueError, AttributeError):  # captured by a test: there is no file below
-            yield
-            return
-        saved = os.dup(descriptor)
-        try:
-            os.dup2(sink.fileno(), descriptor)
-            yield
-        finally:
-            os.dup2(saved, descriptor)
-            os.close(saved)
+    sys.stderr.flush()

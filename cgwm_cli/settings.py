@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,7 +16,8 @@ class StageSettings:
     """What the user set for the stages of one command.
 
     Args:
-        stages: The stages that the command runs; settings of others are refused, not passed over.
+        stages: The stages that the command runs, with their configurations; settings of other stages are refused,
+            not passed over.
         file: A TOML file with a table for each stage, or None.
         assignments: `stage.key=value` (or `stage.table.key=value`), as typed after `--set`.
 
@@ -25,13 +26,16 @@ class StageSettings:
         UsageError: If an assignment is.
     """
 
-    def __init__(self, stages: Sequence[str], file: Path | None, assignments: Sequence[str] | None) -> None:
+    def __init__(
+        self, stages: Mapping[str, type[FileModel]], file: Path | None, assignments: Sequence[str] | None
+    ) -> None:
         self._stages = list(stages)
-        self._values: dict[str, dict[str, Any]] = {stage: {} for stage in stages}
-        self._file, self._text = file, ""
+        self._model = _document_model(stages)
+        self._values: dict[str, Any] = {}
         if file is not None:
-            self._read(file)
-        self._from_file = {stage: dict(values) for stage, values in self._values.items()}
+            from ..schemas import read_toml
+
+            self._values = read_toml(file, self._model).model_dump(exclude_unset=True, by_alias=True)
         for assignment in assignments or ():
             self._assign(assignment)
 
@@ -48,52 +52,42 @@ class StageSettings:
         """
         from ..schemas import parse
 
-        if self._file is not None:  # first alone, so that a fault is reported with its file and line
-            parse(self._from_file[stage], config, self._file, self._text)
         given = {name: value for name, value in options.items() if value is not None}
-        return parse(self._values[stage] | given, config, Path(f"settings of {stage}"))
-
-    def _read(self, file: Path) -> None:
-        import tomllib
-
-        from ..schemas import InputDataError
-
-        try:
-            self._text = file.read_text(encoding="utf-8")
-            document = tomllib.loads(self._text)
-        except FileNotFoundError:
-            raise InputDataError(f"{file}: no such file.") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputDataError(f"{file}: not valid TOML: {error}.") from None
-        for stage, table in document.items():
-            self._check_stage(stage, f"{file}: [{stage}]")
-            if not isinstance(table, dict):
-                raise InputDataError(f"{file}: '{stage}' is no table.", f"[{stage}], and its settings below it.")
-            self._values[stage] = table
+        document = {stage: self._values.get(stage, {}) | given}
+        return getattr(parse(document, self._model, Path("settings")), _attribute(stage))
 
     def _assign(self, text: str) -> None:
-        from ..schemas import UsageError
+        from ..schemas import UsageError, did_you_mean
 
         key, equals, value = text.partition("=")
         stage, *path = (part.strip() for part in key.split("."))
         if not (equals and stage and path and all(path)):
             example = f"{self._stages[0]}.seed=1"
             raise UsageError(f"--set {text}: not understood.", f"STAGE.KEY=VALUE, for example {example}.")
-        self._check_stage(stage, f"--set {text}")
-        table = self._values[stage]
-        for part in path[:-1]:
+        if stage not in self._stages:
+            legal = f"{', '.join(self._stages)}.{did_you_mean(stage, self._stages)}"
+            raise UsageError(f"--set {text}: this command runs no stage '{stage}'.", legal)
+        table = self._values
+        for part in [stage, *path[:-1]]:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
                 raise UsageError(f"--set {text}: '{part}' is no table.")
         table[path[-1]] = _value(value.strip())
 
-    def _check_stage(self, stage: str, place: str) -> None:
-        from ..schemas import UsageError, did_you_mean
 
-        if stage not in self._stages:
-            legal = ", ".join(self._stages)
-            found = f"{place}: this command runs no stage '{stage}'."
-            raise UsageError(found, f"{legal}.{did_you_mean(stage, self._stages)}")
+def _document_model(stages: Mapping[str, type[FileModel]]) -> type[FileModel]:
+    from pydantic import Field, create_model
+
+    from ..schemas import FileModel
+
+    fields: dict[str, Any] = {
+        _attribute(stage): (config, Field(default=config(), alias=stage)) for stage, config in stages.items()
+    }
+    return create_model("Settings", __base__=FileModel, **fields)
+
+
+def _attribute(stage: str) -> str:
+    return stage.replace("-", "_")
 
 
 def _value(text: str) -> Any:

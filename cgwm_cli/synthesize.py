@@ -42,7 +42,7 @@ def synthesize(
         from .settings import StageSettings
 
         index, count = _shard(shard) if shard is not None else (None, None)
-        settings = StageSettings(["synthesize"], config, set_).configure(
+        settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
         )
         emit(work(model, out, settings, overwrite), _summary)
