@@ -35,10 +35,11 @@ def new_directory(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
             directory that one would want to lose (home, the working directory or one above it, a git work tree).
     """
     path = Path(path)
+    _clean_stale(path)
     _refuse_existing(path, overwrite)
     temporary = _temporary(path)
-    temporary.mkdir()
     try:
+        temporary.mkdir()  # inside, so that a signal that arrives right after it still removes it
         yield temporary
         _sync_tree(temporary)
         _put_in_place(temporary, path, overwrite)
@@ -59,6 +60,7 @@ def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     path = Path(path)
     if path.is_dir():
         raise UsageError(f"{path} is a directory; a file is written here.", todo="choose another name.")
+    _clean_stale(path)
     _refuse_existing(path, overwrite)
     temporary = _temporary(path, path.suffix)
     try:
@@ -101,7 +103,6 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
 
 def _temporary(path: Path, suffix: str = "") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    _clean_stale(path)
     return _sibling(path, _PARTIAL, suffix)
 
 

@@ -17,10 +17,11 @@ from ..schemas import (
     Shape,
     World,
 )
+from ..schemas.imports import ImportResult
 from .atomic import new_directory
 from .manifest import write_manifest
 from .progress import progress
-from .tracks import Track, write_tracks
+from .tracks import Track, tracks_csv
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,7 @@ def import_contactnets(
     n_test: int = 100,
     seed: int = 0,
     overwrite: bool = False,
-) -> CaptureManifest:
+) -> ImportResult:
     """Write the tosses as a capture with tracks, one episode a toss, named by its number.
 
     The tosses, sorted by number, are permuted with `numpy.random.default_rng(seed)`; the first `n_train` are the
@@ -67,9 +68,6 @@ def import_contactnets(
         seed: Seed of the permutation.
         overwrite: Replace `out`.
 
-    Returns:
-        The manifest that was written.
-
     Raises:
         InputDataError: If the source is not such data.
         UsageError: If `out` exists, before anything is read.
@@ -81,8 +79,13 @@ def import_contactnets(
         write_manifest(directory / "capture.toml", manifest)
         (directory / "tracks").mkdir()
         for number, track in progress(sorted(tosses.tracks.items()), "tosses", unit="toss"):
-            write_tracks(directory / "tracks" / f"{number:03d}.csv", {BODY: track})
-    return manifest
+            (directory / "tracks" / f"{number:03d}.csv").write_text(tracks_csv({BODY: track}), encoding="utf-8")
+    return ImportResult(
+        capture=str(out),
+        episodes=len(tosses.tracks),
+        samples=sum(len(track) for track in tosses.tracks.values()),
+        splits={name: len(episodes) for name, episodes in manifest.splits.items()},
+    )
 
 
 def _manifest(half_width_m: float, splits: dict[str, tuple[str, ...]]) -> CaptureManifest:

@@ -64,7 +64,9 @@ def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -
     if array.ndim == 2 and path.suffix != ".png":
         raise ValueError(f"labels are written as .png; found {path.name}")
     pixels = array if array.ndim == 2 else cv2.cvtColor(array, cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(path.suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    # OpenCV warns on stderr about a JPEG setting that is given to a PNG.
+    settings = [] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, quality]
+    done, data = cv2.imencode(path.suffix, pixels, settings)
     if not done:
         raise ValueError(f"OpenCV cannot write {path.name}")
     path.write_bytes(data.tobytes())

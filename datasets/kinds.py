@@ -39,6 +39,6 @@ def refuse_other_kind(path: Path, wanted: Kind) -> None:
             f"{_USED_BY[found]}; pass a {wanted} here.",
         )
     todo = "check the path."
-    if wanted == "capture":
+    if wanted == "capture" and any((path / folder).is_dir() for folder in ("images", "videos", "tracks")):
         todo = f"write a manifest; the shortest one: echo 'format = \"{CAPTURE_FORMAT}\"' > {path / 'capture.toml'}"
     raise InputDataError(f"{path} is no {wanted}: it has no {_MARKS[wanted]}.", todo=todo)

@@ -111,7 +111,13 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
 
 
 def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = False) -> None:
-    """Write one episode's tracks, sorted by time; numbers survive the round trip exactly.
+    """Write one episode's tracks, complete or not at all; numbers survive the round trip exactly."""
+    with new_file(path, overwrite) as temporary:
+        temporary.write_text(tracks_csv(tracks), encoding="utf-8")
+
+
+def tracks_csv(tracks: dict[str, Track]) -> str:
+    """Return the text of a track file, sorted by time.
 
     Columns that no track has are left out; a track that lacks columns another one has leaves them empty.
     """
@@ -129,10 +135,8 @@ def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = F
                 row += [""] * len(columns) if values is None else map(_text, values[k])
             rows.append((float(track.time_s[k]), order, row))
     rows.sort(key=lambda entry: entry[:2])
-    with new_file(path, overwrite) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*_REQUIRED, *(column for columns in groups.values() for column in columns)])
-        writer.writerows(row for _, _, row in rows)
+    header = [*_REQUIRED, *(column for columns in groups.values() for column in columns)]
+    return "".join(",".join(row) + "\n" for row in [header, *(row for _, _, row in rows)])
 
 
 def _text(value: float) -> str:

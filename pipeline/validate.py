@@ -1,0 +1,87 @@
+"""`cgwm validate`: is this capture, model or dataset what it should be?"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from ..datasets.capture import Capture
+from ..datasets.check import find_faults
+from ..datasets.kinds import kind_of
+from ..datasets.models import Model, read_model
+from ..schemas import InputDataError
+from ..schemas.validation import ValidationReport
+
+
+def validate(thing: Path | str) -> ValidationReport:
+    """Check a capture, a model or a dataset.
+
+    Returns:
+        The facts that were found and measured; its `faults` are those of what cgwm itself wrote (hashes,
+        reprojection, ...).
+
+    Raises:
+        InputDataError: If the directory is none of the three or a file in it cannot be read, and for everything
+            that is wrong with a capture, which is the user's to correct: all faults in one message.
+    """
+    path = Path(thing)
+    kind = kind_of(path)
+    if kind == "capture":
+        return validate_capture(path)
+    if kind == "model":
+        return validate_model(path)
+    if kind == "dataset":
+        from .validate_dataset import validate_dataset
+
+        return validate_dataset(path)
+    found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset"
+    raise InputDataError(
+        f"{path}: {found}.", "a directory with capture.toml, model.json, or dataset.json and rollouts-*.h5."
+    )
+
+
+def validate_capture(path: Path | str) -> ValidationReport:
+    """Check everything in a capture, and count what there is."""
+    capture = Capture.open(path, check=False)
+    facts, faults = find_faults(capture)
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        listed = "\n".join(f"{number}. {fault}" for number, fault in enumerate(faults, 1))
+        raise InputDataError(f"{path}: {len(faults)} faults.\n{listed}")
+    return ValidationReport(path=str(path), kind="capture", facts=dataclasses.asdict(facts))
+
+
+def validate_model(path: Path | str) -> ValidationReport:
+    """Check the files of a model and its numbers."""
+    model = read_model(path)
+    facts = {
+        "bodies": [body.name for body in model.file.bodies],
+        "visual_spheres": {name: len(splats) for name, splats in model.body_splats.items()},
+        "colliding_spheres": {name: len(splats) for name, splats in model.collision.items()},
+        "scene_spheres": 0 if model.scene is None else len(model.scene),
+        "stages": sorted(model.fit.stages),
+        "parameters": {entry.name: f"{entry.estimate:.6g} {entry.unit}".strip() for entry in model.file.parameters},
+        "warnings": [*model.file.warnings, *model.fit.warnings],
+    }
+    return ValidationReport(path=str(path), kind="model", facts=facts, faults=tuple(_model_faults(model)))
+
+
+def _model_faults(model: Model) -> list[str]:
+    faults = []
+    for body in model.file.bodies:
+        xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if moments[0] <= 0 or moments[2] > 1.02 * (moments[0] + moments[1]):
+            shown = ", ".join(f"{moment:.3g}" for moment in moments)
+            faults.append(f"model.json: body '{body.name}': no body has the principal moments {shown} kg m2.")
+    for entry in model.file.parameters:
+        low, high = entry.bounds or (-np.inf, np.inf)
+        if not low <= entry.estimate <= high:
+            faults.append(
+                f"model.json: parameter '{entry.name}' is {entry.estimate:g} {entry.unit}, outside its bounds "
+                f"{low:g} to {high:g}."
+            )
+    return faults
