@@ -31,9 +31,7 @@ class Spheres:
         return self.means.shape[0]
 
     @staticmethod
-    def from_numpy(
-        splats: Splats, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-    ) -> Spheres:
+    def from_numpy(splats: Splats, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Spheres:
         """Return the spheres as tensors."""
         arrays = (splats.means, splats.scales, splats.opacities, splats.colors)
         return Spheres(*(torch.as_tensor(np.ascontiguousarray(array), dtype=dtype, device=device) for array in arrays))

@@ -1,0 +1,170 @@
+"""Visual hulls: the largest solid that all silhouettes allow.
+
+A point lies in the hull when every view that sees it finds it inside the mask. Here it is a continuous field, the least
+over the views of the signed distance from the mask's border, so that the surface is not bound to the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label, map_coordinates
+
+from ...schemas import Ground, InputDataError
+from .volume import Array, Volume, crossings, grid_points
+
+_COARSE = 40
+_REFINED = (56, 128)
+_BORDER_SMOOTHING_PX = 0.7
+_MIN_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """A mask and its camera.
+
+    Attributes:
+        mask: Whether each pixel shows the body, shape (H, W).
+        K: Camera matrix [px], shape (3, 3); the centre of the top-left pixel is (0.5, 0.5); no distortion.
+        T_cam_world: World to camera, OpenCV axes, shape (4, 4).
+    """
+
+    mask: NDArray[np.bool_]
+    K: Array
+    T_cam_world: Array
+
+
+def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = "body") -> Volume:
+    """Return the visual hull of a body, in the world frame.
+
+    Views whose mask is empty are left out; what lies beyond a picture's border is unknown there and not carved.
+
+    Args:
+        silhouettes: The views.
+        ground: Half space that the body does not enter; it bounds the underside, which no view sees.
+        name: The body's name, for errors.
+
+    Raises:
+        InputDataError: If fewer than 3 views show the body, or no point is inside all masks.
+    """
+    views = [view for view in silhouettes if view.mask.any()]
+    if len(views) < _MIN_VIEWS:
+        raise InputDataError(
+            f"body '{name}': its mask is not empty in {len(views)} of {len(silhouettes)} photos.",
+            f"at least {_MIN_VIEWS}; 20 or more from all sides give a good shape.",
+            "add masks, or give the body a shape in capture.toml.",
+        )
+    fields = [_signed_distance_px(view.mask) for view in views]
+    center, radius = _bounds(views)
+    pitch = 2 * radius / (_COARSE - 1)
+    origin = center - radius
+    shape = (_COARSE,) * 3
+    coarse = _field(grid_points(shape, origin, pitch), views, fields, ground).reshape(shape)
+    inside = _largest_component(coarse > -pitch)
+    if inside is None or not (coarse > 0).any():
+        raise InputDataError(
+            f"body '{name}': no point lies inside the masks of all {len(views)} photos that show it.",
+            todo="check that masks and cameras belong together: 'cgwm validate' reprojects them.",
+        )
+    field, origin, pitch = _refined(coarse, inside, origin, pitch, views, fields, ground)
+    solid = _largest_component(field > 0)
+    if solid is None:
+        raise InputDataError(f"body '{name}': the masks leave nothing larger than {1e3 * pitch:.2g} mm.")
+    field = np.where(solid, field, np.minimum(field, -1e-3 * pitch))
+    return Volume.from_inside(solid, origin, pitch, crossings(field, origin, pitch))
+
+
+def _refined(
+    coarse: Array,
+    inside: NDArray[np.bool_],
+    origin: Array,
+    pitch: float,
+    views: Sequence[Silhouette],
+    fields: Sequence[Array],
+    ground: Ground | None,
+) -> tuple[Array, Array, float]:
+    """Cut the grid to the body and refine it, twice; only points near the surface are looked up again."""
+    for resolution in _REFINED:
+        kept = np.argwhere(inside)
+        low, high = np.maximum(kept.min(0) - 2, 0), np.minimum(kept.max(0) + 2, np.array(inside.shape) - 1)
+        fine_pitch = float((high - low).max()) * pitch / (resolution - 1)
+        fine_origin = origin + low * pitch
+        shape = tuple(int(n) for n in np.floor((high - low) * pitch / fine_pitch + 0.5).astype(int) + 1)
+        points = grid_points(shape, fine_origin, fine_pitch)
+        values = map_coordinates(coarse, ((points - origin) / pitch).T, order=1, mode="nearest")
+        near = np.abs(values) < 1.5 * pitch
+        values[near] = _field(points[near], views, fields, ground)
+        coarse, origin, pitch = values.reshape(shape), fine_origin, fine_pitch
+        found = _largest_component(coarse > -pitch)
+        inside = inside if found is None else found
+    return coarse, origin, pitch
+
+
+def _signed_distance_px(mask: NDArray[np.bool_]) -> Array:
+    """Return the distance from the mask's border at pixel centres [px], positive inside, shape (H, W)."""
+    image = mask.astype(np.uint8)
+    inner = cv2.distanceTransform(np.pad(image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outer = cv2.distanceTransform(np.pad(1 - image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    signed = np.where(mask, inner[1:-1, 1:-1] - 0.5, 0.5 - outer[1:-1, 1:-1])
+    # The border runs in steps between pixel centres; a little smoothing takes them out of slanted edges.
+    return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BORDER_SMOOTHING_PX), np.float64)
+
+
+def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], ground: Ground | None) -> Array:
+    """Return about the distance from the hull's surface at points (n, 3) [m], positive inside, shape (n,)."""
+    result = np.full(points.shape[0], np.inf)
+    seen = np.zeros(points.shape[0], dtype=np.int32)
+    for view, field in zip(views, fields, strict=True):
+        local = points @ view.T_cam_world[:3, :3].T + view.T_cam_world[:3, 3]
+        depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+        u = view.K[0, 0] * local[:, 0] / depth + view.K[0, 2]
+        v = view.K[1, 1] * local[:, 1] / depth + view.K[1, 2]
+        visible = (local[:, 2] > 0) & (u > 0) & (v > 0) & (u < field.shape[1]) & (v < field.shape[0])
+        signed = map_coordinates(field, [v[visible] - 0.5, u[visible] - 0.5], order=1, mode="nearest")
+        metres = signed * depth[visible] / np.sqrt(view.K[0, 0] * view.K[1, 1])
+        result[visible] = np.minimum(result[visible], metres)
+        seen[visible] += 1
+    far = np.abs(result[np.isfinite(result)]).max(initial=1.0)
+    result = np.where(seen >= min(_MIN_VIEWS, len(views)), result, -far)
+    if ground is not None:
+        result = np.minimum(result, points @ np.array(ground.normal) - ground.offset_m)
+    return result
+
+
+def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:
+    """Return a point near the body's middle [m] and a radius [m] around it that holds the body."""
+    system, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        rotation = view.T_cam_world[:3, :3]
+        camera = -rotation.T @ view.T_cam_world[:3, 3]
+        v, u = (index.mean() + 0.5 for index in np.nonzero(view.mask))
+        ray = rotation.T @ np.linalg.solve(view.K, [u, v, 1.0])
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        system += across
+        right += across @ camera
+    center = np.linalg.solve(system, right)
+    radii = []
+    for view in views:
+        local = view.T_cam_world[:3, :3] @ center + view.T_cam_world[:3, 3]
+        v, u = np.nonzero(view.mask)
+        offset = np.hypot(
+            (u + 0.5 - view.K[0, 2]) / view.K[0, 0] - local[0] / local[2],
+            (v + 0.5 - view.K[1, 2]) / view.K[1, 1] - local[1] / local[2],
+        )
+        radii.append(offset.max() * abs(local[2]))
+    return center, 1.25 * float(max(radii))
+
+
+def _largest_component(inside: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """Return the largest connected part, or None where nothing is inside."""
+    labels, count = label(inside)  # type: ignore[misc]
+    if count == 0:
+        return None
+    sizes = np.bincount(labels.reshape(-1))
+    sizes[0] = 0
+    return labels == int(np.argmax(sizes))

@@ -1,0 +1,50 @@
+"""Shapes that the manifest gives, as solids with a surface and mass properties, in the body frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...datasets.ply import read_splats
+from ...schemas import InputDataError, Shape
+from .collision import spheres_volume
+from .mesh import Mesh, mesh_mass_properties, mesh_volume, read_mesh
+from .volume import MassProperties, Volume
+
+
+def shape_volume(shape: Shape, capture_root: Path, radius_factor: float = 2.0) -> Volume:
+    """Return a shape as a solid on a grid, in the body frame.
+
+    Args:
+        shape: The shape.
+        capture_root: Directory that the shape's path is relative to.
+        radius_factor: Radius of a shape's Gaussians in units of their scale.
+    """
+    if shape.sphere is not None:
+        return spheres_volume(np.zeros((1, 3)), np.array([shape.sphere.radius_m]))
+    if shape.splats is not None:
+        splats = read_splats(capture_root / shape.splats.path)
+        return spheres_volume(np.asarray(splats.means, float), radius_factor * np.asarray(splats.scales, float))
+    return mesh_volume(_mesh(shape, capture_root))
+
+
+def shape_mass_properties(shape: Shape, capture_root: Path, radius_factor: float = 2.0) -> MassProperties:
+    """Return the mass properties of a shape of uniform density, in the body frame; exact but for splats."""
+    if shape.sphere is not None:
+        radius = shape.sphere.radius_m
+        return MassProperties(4 / 3 * np.pi * radius**3, np.zeros(3), 0.4 * radius**2 * np.eye(3))
+    if shape.splats is not None:
+        return shape_volume(shape, capture_root, radius_factor).mass_properties()
+    return mesh_mass_properties(_mesh(shape, capture_root))
+
+
+def _mesh(shape: Shape, capture_root: Path) -> Mesh:
+    if shape.mesh is not None:
+        return read_mesh(capture_root / shape.mesh.path)
+    if shape.box is None:
+        raise InputDataError("a shape without a kind.", "box, sphere, mesh, splats.")
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
+    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    return Mesh(signs * np.array(shape.box.half_extents_m), np.array(faces))
