@@ -1,1 +1,99 @@
-"""."""
+"""Scenes that cgwm makes itself, with MuJoCo and without OpenGL, as captures on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...schemas import UsageError, did_you_mean
+from ..atomic import new_directory
+from .truth import TRUTH_FILE, TRUTH_MESH, TruthFile, read_truth
+
+if TYPE_CHECKING:
+    from .plan import ScenePlan
+
+__all__ = [
+    "RENDERERS",
+    "SCENES",
+    "TRUTH_FILE",
+    "TRUTH_MESH",
+    "TruthFile",
+    "make_scene",
+    "plan_scene",
+    "read_truth",
+]
+
+SCENES = ("fall", "push")
+"""Names of the scenes."""
+RENDERERS = ("raycast",)
+"""Names of the renderers."""
+
+
+def make_scene(
+    name: str,
+    out: Path | str,
+    seed: int = 0,
+    renderer: str = "raycast",
+    overwrite: bool = False,
+    *,
+    photo_size: tuple[int, int] = (640, 480),
+    video_size: tuple[int, int] = (480, 360),
+    photos: int = 48,
+) -> Path:
+    """Make a capture; the same arguments give the same bytes.
+
+    Object, parameters and motion depend on the scene and the seed alone, not on sizes and counts.
+
+    Args:
+        name: One of `SCENES`.
+        out: Directory that takes the capture.
+        seed: Draws the object, its parameters, the motion, the cameras and the noise.
+        renderer: One of `RENDERERS`.
+        overwrite: Replace what is at `out`.
+        photo_size: Width and height of the photos [px].
+        video_size: Width and height of the video frames [px].
+        photos: Number of photos.
+
+    Returns:
+        `out` as a path.
+
+    Raises:
+        UsageError: If a name or a number is not allowed, or `out` exists.
+        NotConvergedError: If no motion could be drawn that stays in view.
+    """
+    from .record import build_set, record
+
+    if renderer not in RENDERERS:
+        near = did_you_mean(renderer, RENDERERS)
+        raise UsageError(f"unknown renderer '{renderer}'.", ", ".join(RENDERERS) + "." + near)
+    if photos < 3 or min(*photo_size, *video_size) < 16:
+        raise UsageError(
+            f"{photos} photos of {photo_size[0]}x{photo_size[1]} px, videos of {video_size[0]}x{video_size[1]} px.",
+            "at least 3 photos, and sides of at least 16 px.",
+        )
+    with new_directory(Path(out), overwrite) as directory:
+        record(build_set(plan_scene(name, seed), photo_size, video_size, photos), directory)
+    return Path(out)
+
+
+def plan_scene(name: str, seed: int = 0) -> ScenePlan:
+    """Draw a scene: the object, the true physics and every episode's true motion; nothing is rendered.
+
+    Args:
+        name: One of `SCENES`.
+        seed: Any integer >= 0.
+
+    Raises:
+        UsageError: If the name or the seed is not allowed.
+        NotConvergedError: If no motion could be drawn that stays in view.
+    """
+    from .fall import plan_fall
+    from .push import plan_push
+
+    planners: dict[str, Callable[[int], ScenePlan]] = {"fall": plan_fall, "push": plan_push}
+    if name not in planners:
+        raise UsageError(f"unknown scene '{name}'.", ", ".join(SCENES) + "." + did_you_mean(name, SCENES))
+    if seed < 0:
+        raise UsageError(f"the seed is {seed}.", "integers >= 0.")
+    return planners[name](seed)

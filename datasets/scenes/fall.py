@@ -1,0 +1,78 @@
+"""Scene `fall`: an object is dropped, tumbles, bounces, slides and comes to rest."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import NotConvergedError
+from .dynamics import MjModel, Motion, build_model, draw_contact, lowest, rest_pose, simulate
+from .objects import SolidObject, make_object, resting_down
+from .plan import EXPOSURE_LEAD_S, EpisodePlan, ScenePlan, stays_in_view, turned_deg
+from .rig import video_cameras
+
+Array = NDArray[np.float64]
+
+FRAME_RATE = 30.0
+TRAIN_FRAMES, TEST_FRAMES = 15, 36
+_TRIES = 400
+
+
+def plan_fall(seed: int) -> ScenePlan:
+    """Draw the object, its contact parameters and four tosses: one to train on, three longer ones to test on."""
+    solid = make_object(seed)
+    rng = np.random.default_rng([seed, 2])
+    contact = draw_contact(rng)
+    photo_qpos = rest_pose(solid, resting_down(solid), rng.uniform(-np.pi, np.pi), *rng.uniform(-0.01, 0.01, 2))
+    model = build_model(solid, contact, fingertip=False)
+    episodes: list[EpisodePlan] = []
+    for name in ("000", "001", "002", "003"):
+        split, frames = ("train", TRAIN_FRAMES) if name == "000" else ("test", TEST_FRAMES)
+        others = [episode.motion.qpos[0, 3:7] for episode in episodes]
+        episodes.append(EpisodePlan(name, split, frames, _toss(rng, seed, model, solid, split, others)))
+    return ScenePlan("fall", seed, solid, contact, photo_qpos, FRAME_RATE, tuple(episodes), fingertip=False)
+
+
+def _toss(
+    rng: np.random.Generator, seed: int, model: MjModel, solid: SolidObject, split: str, others: list[Array]
+) -> Motion:
+    """Toss until a toss stays in view, is unlike the others, and shows what its split needs."""
+    duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
+    cameras = video_cameras(seed).values()
+    for _ in range(_TRIES):
+        qpos, qvel = _release(rng, solid, (0.10, 0.16) if split == "train" else (0.12, 0.25))
+        if any(turned_deg(qpos[3:7], other) < 35 for other in others):
+            continue
+        motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
+        useful = _instructive(motion) if split == "train" else _settles(motion)
+        near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
+        if useful and near and stays_in_view(solid, motion, cameras):
+            return motion
+    raise NotConvergedError(f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.")
+
+
+def _release(rng: np.random.Generator, solid: SolidObject, height: tuple[float, float]) -> tuple[Array, Array]:
+    """Draw a release: pose and velocity of the body frame, lowest point within `height` above ground [m]."""
+    quat_wxyz = rng.standard_normal(4)
+    quat_wxyz /= np.linalg.norm(quat_wxyz)
+    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.15, 0.5)
+    direction = np.array([np.cos(heading), np.sin(heading), 0])
+    position = -direction * rng.uniform(0.06, 0.14)
+    position[2] = lowest(solid, quat_wxyz) + rng.uniform(*height)
+    spin = rng.standard_normal(3)
+    omega_body = spin / np.linalg.norm(spin) * rng.uniform(1.0, 4.0)
+    return np.concatenate([position, quat_wxyz]), np.concatenate([speed * direction, omega_body])
+
+
+def _instructive(motion: Motion) -> bool:
+    """Tell whether the first impact comes early and the object turns and travels after it."""
+    if motion.first_contact is None or not 0.12 < motion.first_contact < 0.2:
+        return False
+    hit, end = motion.qpos[motion.row(motion.first_contact)], motion.qpos[-1]
+    return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.03
+
+
+def _settles(motion: Motion) -> bool:
+    """Tell whether the object is near rest at the end, after an impact no sooner than the warm-up's end."""
+    speed, rate = np.linalg.norm(motion.qvel[-1, :3]), np.linalg.norm(motion.qvel[-1, 3:6])
+    return bool(motion.first_contact is not None and motion.first_contact > 0.14 and speed < 0.02 and rate < 0.3)

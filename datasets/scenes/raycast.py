@@ -1,0 +1,293 @@
+"""A renderer that needs no OpenGL: MuJoCo's rays, procedural textures, one lamp with shadows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras import Camera
+from .dynamics import BODY_GROUP, MjModel, mujoco
+from .textures import Sheet
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Window = tuple[int, int, int, int]
+"""First row, first column, end row, end column [px] of a part of an image."""
+_SIDES = np.array([1.0, 0.731, 0.417])  # a direction along which no two sides of an object agree but by chance
+
+
+class Material(Protocol):
+    """The colour of a surface, in the frame of its body."""
+
+    def albedo(self, points: Floats, normals: Floats, footprint: Floats) -> Floats:
+        """Return colours in [0, 1], shape (point, 3).
+
+        Args:
+            points: On the surface, body frame [m], shape (point, 3).
+            normals: Outward unit normals, body frame, shape (point, 3).
+            footprint: Width of what one ray stands for [m], shape (point,).
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One colour all over."""
+
+    color: tuple[float, float, float]
+
+    def albedo(self, points: Floats, normals: Floats, footprint: Floats) -> Floats:
+        """See `Material`."""
+        return np.tile(np.asarray(self.color, np.float32), (len(points), 1))
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A sheet in the xy plane of the body frame."""
+
+    sheet: Sheet
+
+    def albedo(self, points: Floats, normals: Floats, footprint: Floats) -> Floats:
+        """See `Material`."""
+        return self.sheet.sample(points[:, :2], footprint)
+
+
+@dataclass(frozen=True)
+class Faceted:
+    """A printed sheet for each facet direction of a polyhedron, projected along that direction.
+
+    Args:
+        normals: Outward unit normals of the facets, body frame, shape (facet, 3).
+        sheets: One for each.
+    """
+
+    normals: Array
+    sheets: tuple[Sheet, ...]
+
+    def albedo(self, points: Floats, normals: Floats, footprint: Floats) -> Floats:
+        """See `Material`."""
+        facet = (normals @ self.normals.T.astype(np.float32)).argmax(axis=1)
+        colours = np.empty((len(points), 3), np.float32)
+        for index in np.unique(facet):
+            chosen = facet == index
+            first = np.cross(self.normals[index], np.eye(3)[np.abs(self.normals[index]).argmin()])
+            first /= np.linalg.norm(first)
+            basis = np.stack([first, np.cross(self.normals[index], first)], axis=1).astype(np.float32)
+            colours[chosen] = self.sheets[index].sample(points[chosen] @ basis, footprint[chosen])
+        return colours
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp far away, and the light of the room.
+
+    Args:
+        position: World [m], shape (3,); so far away that its light is all but parallel.
+        diffuse: Brightness of a white surface that faces it [1].
+        ambient: Brightness of a white surface in the shadow that looks up [1].
+        underneath: The same for one that looks down [1].
+    """
+
+    position: Array
+    diffuse: float = 0.42
+    ambient: float = 0.60
+    underneath: float = 0.42
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What rays meet first, in the order of the rays.
+
+    Args:
+        geom: MuJoCo's geometry id, -1 for none, shape (ray,).
+        distance: Along the unit ray [m], -1 for none, shape (ray,).
+        normal: Outward unit normals, world frame, shape (ray, 3).
+    """
+
+    geom: NDArray[np.int32]
+    distance: Array
+    normal: Array
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """An image, or a window of one.
+
+    Args:
+        color: Ideal colours, [0, 1] where well exposed, shape (height, width, 3).
+        label: What is seen through each pixel's centre, by the caster's labels, uint8 (height, width).
+        depth: Along the optical axis, through each pixel's centre [m], 0 where nothing is hit, (height, width).
+    """
+
+    color: Floats
+    label: NDArray[np.uint8]
+    depth: Floats
+
+
+class Raycaster:
+    """Draws the bodies of a MuJoCo model at the poses of its data.
+
+    Args:
+        model: Geometries in group 0 (the ground) and BODY_GROUP (what moves).
+        materials: By geometry id.
+        labels: Value in the masks by geometry id; absent: background.
+        lamp: The light.
+        backdrop: Colour where rays hit nothing, in [0, 1].
+    """
+
+    def __init__(
+        self,
+        model: MjModel,
+        materials: Mapping[int, Material],
+        labels: Mapping[int, int],
+        lamp: Lamp,
+        backdrop: tuple[float, float, float],
+    ) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        self.materials, self.lamp = dict(materials), lamp
+        self.backdrop = np.asarray(backdrop, np.float32)
+        # The last entry serves geometry -1.
+        self.label_of = np.array([labels.get(geom, 0) for geom in range(model.ngeom)] + [0], np.uint8)
+
+    def place(self, qpos: Array) -> None:
+        """Put the bodies at MuJoCo positions `qpos`, shape (nq,)."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+
+    def cast(self, origin: Array, directions: Array, bodies_only: bool = False) -> Hits:
+        """Cast rays from one point.
+
+        Args:
+            origin: World [m], shape (3,).
+            directions: Unit vectors, world, shape (ray, 3).
+            bodies_only: Leave out the ground.
+        """
+        count = len(directions)
+        geom, distance, normal = np.empty(count, np.int32), np.empty(count), np.empty((count, 3))
+        groups = np.zeros(6, np.uint8)
+        groups[BODY_GROUP], groups[0] = 1, not bodies_only
+        mujoco.mj_multiRay(
+            self.model, self.data, np.ascontiguousarray(origin, float), directions.ravel(), groups, 1, -1,
+            geom, distance, normal.reshape(-1), count, mujoco.mjMAXVAL,
+        )  # fmt: skip
+        return Hits(geom, distance, normal)
+
+    def render(self, camera: Camera, window: Window | None = None, samples: int = 3) -> Rendering:
+        """Draw an image, or the window of it.
+
+        One ray goes through each pixel's centre; where surface, side or shadow change between neighbours, samples x
+        samples rays are averaged instead (inside a surface the textures are band-limited already).
+        """
+        top, left, bottom, right = window or whole(camera)
+        shape = (bottom - top, right - left)
+        x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
+        centres = np.asarray(np.stack([x, y], axis=-1), np.float64).reshape(-1, 2)
+        directions, axial = rays_through(camera, centres)
+        hits = self.cast(camera.T_world_cam[:3, 3], directions)
+        colours, code = self._shade(camera, directions, hits)
+        edge = np.flatnonzero(_changes(code.reshape(shape)))
+        if len(edge):
+            steps = (np.arange(samples) + 0.5) / samples - 0.5
+            offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+            spread: Array = np.asarray(centres[edge, None] + offsets, np.float64).reshape(-1, 2)
+            fine, _ = rays_through(camera, spread)
+            drawn, _ = self._shade(camera, fine, self.cast(camera.T_world_cam[:3, 3], fine))
+            colours[edge] = drawn.reshape(len(edge), -1, 3).mean(axis=1)
+        depth = np.where(hits.geom >= 0, hits.distance * axial, 0).astype(np.float32)
+        return Rendering(colours.reshape(*shape, 3), self.label_of[hits.geom].reshape(shape), depth.reshape(shape))
+
+    def _shade(self, camera: Camera, directions: Array, hits: Hits) -> tuple[Floats, Floats]:
+        """Return colours (ray, 3), and a number for each ray that tells surfaces, sides and shadow apart (ray,)."""
+        origin, angle = camera.T_world_cam[:3, 3], 1 / camera.K[0, 0]
+        colours = np.tile(self.backdrop, (len(directions), 1))
+        code = np.full(len(directions), -1, np.float32)
+        for geom in np.flatnonzero(np.bincount(hits.geom + 1)) - 1:
+            if geom < 0:
+                continue
+            chosen = np.flatnonzero(hits.geom == geom)
+            distance, ray, normals = hits.distance[chosen], directions[chosen], hits.normal[chosen]
+            points = origin + distance[:, None] * ray
+            # A slanted surface stretches the footprint one way only; the root is the middle of its two widths.
+            slant = np.abs(np.einsum("ij,ij->i", ray, normals)).clip(0.06)
+            footprint = (distance * angle / np.sqrt(slant)).astype(np.float32)
+            body = self.model.geom_bodyid[geom]
+            turn = self.data.xmat[body].reshape(3, 3)
+            local = ((points - self.data.xpos[body]) @ turn).astype(np.float32)
+            facing = (normals @ turn).astype(np.float32)
+            albedo = self.materials[int(geom)].albedo(local, facing, footprint)
+            light, lit = self._light(points, normals)
+            colours[chosen] = albedo * light[:, None]
+            code[chosen] = 10 * geom + normals @ _SIDES + 5 * lit
+        return colours, code
+
+    def _light(self, points: Array, normals: Array) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return a white surface's brightness by Lambert's law, and whether the lamp reaches it, each (point,)."""
+        lamp = self.lamp
+        ray = points - lamp.position
+        distance = np.linalg.norm(ray, axis=1)
+        ray /= distance[:, None]
+        first = self.cast(lamp.position, ray, bodies_only=True).distance
+        lit = (first < 0) | (first > distance - 2e-4)
+        cosine = -np.einsum("ij,ij->i", ray, normals).clip(-1, 0)
+        room = lamp.underneath + (lamp.ambient - lamp.underneath) * (normals[:, 2] + 1) / 2
+        return (room + lamp.diffuse * cosine * lit).astype(np.float32), lit
+
+
+def _changes(code: Floats) -> NDArray[np.bool_]:
+    """Tell which pixels (height, width) differ from one of their four neighbours."""
+    edge = np.zeros(code.shape, bool)
+    down, right = np.abs(np.diff(code, axis=0)) > 1e-4, np.abs(np.diff(code, axis=1)) > 1e-4
+    edge[1:] |= down
+    edge[:-1] |= down
+    edge[:, 1:] |= right
+    edge[:, :-1] |= right
+    return edge
+
+
+def whole(camera: Camera) -> Window:
+    """Return the window that is the whole image."""
+    return 0, 0, camera.height, camera.width
+
+
+def rays_through(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """Return the rays through image points.
+
+    Args:
+        camera: With or without distortion.
+        pixels: Image points (x, y) [px], shape (ray, 2); the top-left pixel's centre is (0.5, 0.5).
+
+    Returns:
+        Unit directions, world frame, shape (ray, 3), and their cosines with the optical axis, shape (ray,).
+    """
+    K = camera.K
+    if np.any(camera.distortion):
+        plane = cv2.undistortPoints(pixels[:, None], K, np.asarray(camera.distortion, float)).reshape(-1, 2)
+    else:
+        plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
+    axial = 1 / np.sqrt((plane * plane).sum(axis=1) + 1)
+    local = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) * axial[:, None]
+    return local @ camera.T_world_cam[:3, :3].T, axial
+
+
+def window_around(camera: Camera, points: Array, margin: int = 2) -> Window | None:
+    """Return the smallest window that holds the convex hull of world points (point, 3), or None if out of view.
+
+    Where a point lies behind the camera, or the lens distorts, the window is the whole image.
+    """
+    local = (points - camera.T_world_cam[:3, 3]) @ camera.T_world_cam[:3, :3]
+    if local[:, 2].min() < 1e-3 or np.any(camera.distortion):
+        return whole(camera)
+    pixel = (local @ camera.K.T)[:, :2] / local[:, 2:]
+    low = np.floor(pixel.min(axis=0)).astype(int) - margin
+    high = np.ceil(pixel.max(axis=0)).astype(int) + margin
+    column, end_column = max(low[0], 0), min(high[0], camera.width)
+    row, end_row = max(low[1], 0), min(high[1], camera.height)
+    if column >= end_column or row >= end_row:
+        return None
+    return int(row), int(column), int(end_row), int(end_column)
