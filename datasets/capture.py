@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean, read_toml
 from .cameras import Camera, camera_of, read_cameras
+from .files import files_under
 from .images import IMAGE_SUFFIXES, read_label, read_rgb
 from .kinds import refuse_other_kind
 from .tracks import Track, read_tracks
@@ -197,13 +198,17 @@ class Capture:
 
     def frame_times(self, camera: str, episode: str) -> NDArray[np.float64]:
         """Return the times [s] on the tracks' clock of what :meth:`video_frames` returns, shape (frames,)."""
-        count = video_info(self.video_path(camera, episode)).frames
+        count = video_info(self.video_path(camera, episode), decode=True).frames
         return self._all_times(camera, count)[self._in_window(camera, episode, count)]
 
     def frame_numbers(self, camera: str, episode: str) -> NDArray[np.int64]:
         """Return the numbers, from 0 in the video, of the frames that :meth:`video_frames` returns."""
-        count = video_info(self.video_path(camera, episode)).frames
+        count = video_info(self.video_path(camera, episode), decode=True).frames
         return np.flatnonzero(self._in_window(camera, episode, count))
+
+    def frames_kept(self, camera: str, episode: str, count: int) -> int:
+        """Return how many of the first `count` frames of a video lie between the episode's start and end."""
+        return int(self._in_window(camera, episode, count).sum())
 
     def video_camera(self, camera: str, episode: str, frame: int | None = None) -> Camera:
         """Return the camera of a video (`frame` from 0, needed where it moves)."""
@@ -234,9 +239,7 @@ class Capture:
 
 
 def _images_under(folder: Path) -> list[str]:
-    files = (path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
-    names = (path.relative_to(folder) for path in files)
-    return sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
+    return [name for name in files_under(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
 
 
 def _folders(folder: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..schemas import InputDataError, did_you_mean
 from .cameras import pose_count
+from .files import files_under
 from .images import image_size, read_label
 from .meshes import mass_properties, read_mesh
 from .ply import read_splats
@@ -19,6 +20,14 @@ from .video import VideoInfo, frame_files, video_info
 
 if TYPE_CHECKING:
     from .capture import Capture
+
+
+_UNREAD_IMAGES = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng", ".raw", ".npy")
+_UNREAD = (
+    ("images", _UNREAD_IMAGES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
+    ("masks", _UNREAD_IMAGES, ".png.", "convert it without loss."),
+    ("videos", (".mov", ".avi", ".mkv", ".m4v"), ".mp4, .webm, or a directory of frames.", "convert it with ffmpeg."),
+)
 
 
 @dataclass
@@ -84,13 +93,16 @@ def find_faults(capture: Capture) -> tuple[CaptureFacts, list[InputDataError]]:
     attempt(_check_names, capture)
     for body in capture.manifest.bodies:
         attempt(_check_shape, capture, body.name)
+    attempt(_check_formats, capture)
     sizes: dict[str, tuple[int, int]] = {}
-    for name in capture.photos():
+    photos = capture.photos()
+    for name in photos:
         attempt(_check_photo, capture, name, sizes)
     facts.photos = len(sizes)
     coverage: list[NDArray[np.float64]] = []
+    by_stem = {Path(name).with_suffix(""): name for name in photos}
     for name in capture.masks():
-        attempt(_check_mask, capture, name, sizes, coverage)
+        attempt(_check_mask, capture, name, by_stem, sizes, coverage)
     facts.masks = len(coverage)
     if coverage:
         facts.mask_coverage = dict(zip(facts.bodies, np.mean(coverage, axis=0)[1:].tolist(), strict=True))
@@ -153,6 +165,16 @@ def _listed(names: list[str], noun: str) -> str:
     return f"{shown}, ... ({len(names)} {noun})." if len(names) > 8 else f"{shown}."
 
 
+def _check_formats(capture: Capture) -> None:
+    """Refuse photos and videos in formats that would be passed over in silence."""
+    for folder, unread, allowed, convert in _UNREAD:
+        for name in files_under(capture.root / folder):
+            if Path(name).suffix.lower() in unread:
+                raise InputDataError(
+                    f"{capture.root / folder / name}: {Path(name).suffix} is not read.", allowed, convert
+                )
+
+
 def _check_shape(capture: Capture, name: str) -> None:
     body = capture.body(name)
     path = capture.shape_file(body)
@@ -169,18 +191,20 @@ def _check_photo(capture: Capture, name: str, sizes: dict[str, tuple[int, int]])
 
 
 def _check_mask(
-    capture: Capture, name: str, sizes: dict[str, tuple[int, int]], coverage: list[NDArray[np.float64]]
+    capture: Capture,
+    name: str,
+    by_stem: dict[Path, str],
+    sizes: dict[str, tuple[int, int]],
+    coverage: list[NDArray[np.float64]],
 ) -> None:
     path = capture.root / "masks" / name
     if path.suffix != ".png":
         raise InputDataError(f"{path}: a mask that is no .png.", ".png; JPEG changes labels.")
-    stem = Path(name).with_suffix("")
-    photo = next((photo for photo in sizes if Path(photo).with_suffix("") == stem), None)
+    photo = by_stem.get(Path(name).with_suffix(""))
     if photo is None:
-        on_disk = [p for p in capture.photos() if Path(p).with_suffix("") == stem]
-        if on_disk:
-            return  # the photo itself is at fault, which has been told
         raise InputDataError(f"{path}: there is no photo of that name in images/.", "the photo's name, with .png.")
+    if photo not in sizes:
+        return  # the photo itself is at fault, which has been told
     labels = read_label(path)
     _check_labels(capture, path, labels, sizes[photo], f"images/{photo}")
     count = len(capture.manifest.bodies) + 1
@@ -211,13 +235,13 @@ def _check_cameras(capture: Capture, sizes: dict[str, tuple[int, int]], facts: C
     if cameras is None:
         return
     facts.scale = cameras.scale.kind
-    photos = capture.photos()
+    photos = set(capture.photos())
     absent = [name for name in cameras.images if name not in photos]
     if absent:
         raise InputDataError(
             f"{capture.root}: {len(absent)} of {len(cameras.images)} cameras are for photos that are not in images/, "
             f"such as '{absent[0]}'.",
-            "names relative to images/." + did_you_mean(absent[0], photos),
+            "names relative to images/." + did_you_mean(absent[0], sorted(photos)),
             "add the photos, or remove the cameras.",
         )
     for name, image in cameras.images.items():
@@ -247,7 +271,7 @@ def _check_tracks(capture: Capture, episode: str, facts: CaptureFacts) -> None:
 def _check_video(capture: Capture, camera: str, episode: str, facts: CaptureFacts) -> None:
     path = capture.video_path(camera, episode)
     info = video_info(path)
-    kept = len(capture.frame_times(camera, episode))
+    kept = capture.frames_kept(camera, episode, info.frames)
     if kept < 2:
         window = "" if kept == info.frames else f" between start_s and end_s ({info.frames} in all)"
         raise InputDataError(

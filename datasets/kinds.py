@@ -9,7 +9,7 @@ from ..schemas import CAPTURE_FORMAT, InputDataError
 
 Kind = Literal["capture", "model", "dataset"]
 
-_MARKS: dict[Kind, str] = {"capture": "capture.toml", "model": "model.json", "dataset": "rollouts-*.h5"}
+_MARKS: dict[Kind, str] = {"capture": "capture.toml", "model": "model.json", "dataset": "dataset.json"}
 _USED_BY: dict[Kind, str] = {
     "capture": "cgwm calibrate, fit, compare and diagnose take one",
     "model": "cgwm synthesize, eval and compare take one",
@@ -25,9 +25,9 @@ def kind_of(path: Path | str) -> Kind | None:
 
 def refuse_other_kind(path: Path, wanted: Kind) -> None:
     """Raise InputDataError unless the directory is of the wanted kind; the message says what it is instead."""
-    found = kind_of(path)
-    if found == wanted:
+    if path.is_dir() and any(path.glob(_MARKS[wanted])):
         return
+    found = kind_of(path)
     if not path.exists():
         raise InputDataError(f"{path}: no such {wanted}.", todo="check the path.")
     if not path.is_dir():

@@ -83,7 +83,7 @@ def video_info(path: Path, decode: bool = False) -> VideoInfo:
         raise _undecodable(path)
     # A webm that was streamed carries no frame count in its header.
     if decode or frames <= 0:
-        frames = sum(1 for _ in _grab(path))
+        frames = _count(path)
     return VideoInfo(frames, width, height, rate if rate > 0 else None)
 
 
@@ -135,6 +135,17 @@ def _grab(path: Path) -> Iterator[NDArray[np.uint8]]:
             if not done:
                 return
             yield np.asarray(frame, np.uint8)
+    finally:
+        capture.release()
+
+
+def _count(path: Path) -> int:
+    capture = _open(path)
+    try:
+        count = 0
+        while capture.grab():
+            count += 1
+        return count
     finally:
         capture.release()
 

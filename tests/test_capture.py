@@ -433,6 +433,27 @@ def test_misspelt_field_in_cameras_json(root: Path) -> None:
     assert fault(root).splitlines()[0] == "C/cameras.json, line 1: [cameras.c] has an unknown field 'focal_x'."
 
 
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("images/IMG_1.HEIC", "C/images/IMG_1.HEIC: .HEIC is not read.\nAllowed: .jpg and .png."),
+        ("masks/a.tif", "C/masks/a.tif: .tif is not read.\nAllowed: .png."),
+        ("videos/left/002.MOV", "C/videos/left/002.MOV: .MOV is not read.\nAllowed: .mp4, .webm, or a directory"),
+    ],
+)
+def test_no_photo_or_video_is_passed_over_in_silence(root: Path, name: str, expected: str) -> None:
+    (root / name).touch()
+    assert fault(root).startswith(expected)
+
+
+def test_links_are_followed_but_not_in_circles(root: Path, tmp_path: Path) -> None:
+    put(tmp_path / "elsewhere" / "b.png", picture(4))
+    (root / "images" / "linked").symlink_to(tmp_path / "elsewhere")
+    (root / "images" / "circle").symlink_to(root / "images")
+    (root / "images" / ".hidden.png").touch()
+    assert Capture.open(root).photos() == ["linked/b.png", "walk/0.jpg", "walk/1.jpg", "walk/2.jpg"]
+
+
 # Episodes
 
 
