@@ -27,7 +27,8 @@ def shard_name(index: int, count: int) -> str:
 
 def read_manifest(path: Path) -> DatasetManifest:
     """Read the manifest of a dataset directory."""
-    refuse_other_kind(path, "dataset")
+    if not (path / MANIFEST).is_file():
+        refuse_other_kind(path, "dataset")
     return read_json(path / MANIFEST, DatasetManifest)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..schemas import InputDataError, UsageError, did_you_mean
 from .kinds import refuse_other_kind
-from .rollouts import demo_names, open_shard
+from .rollouts import Node, demo_names, open_shard
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class RolloutReader:
 
     def __init__(self, path: Path | str, split: str | None = None):
         self.path = Path(path)
-        self._files: dict[tuple[int, Path], h5py.File] = {}
+        self._files: dict[tuple[int, Path], Node] = {}
         self.rollouts: list[RolloutInfo] = []
         for file in shard_files(self.path):
             with open_shard(file) as handle:
@@ -70,13 +70,13 @@ class RolloutReader:
                 file.close()
         self._files.clear()
 
-    def group(self, number: int) -> h5py.Group:
+    def group(self, number: int) -> Node:
         """Return the HDF5 group of the rollout at place `number` of this reader."""
         info = self.rollouts[number]
         key = (os.getpid(), info.file)  # a handle that a fork inherits is not safe to use
         if key not in self._files:
             self._files[key] = open_shard(info.file)
-        return self._files[key]["data"][info.demo]  # pyright: ignore
+        return self._files[key]["data"][info.demo]
 
     def keys(self, number: int = 0) -> list[str]:
         """Return the names of all arrays of a rollout, for example ``obs/view0_image`` or ``bodies/pos``."""
@@ -87,11 +87,11 @@ class RolloutReader:
     def cameras(self, number: int = 0) -> list[str]:
         """Return the names of the cameras of a rollout."""
         group = self.group(number)
-        return sorted(group["cameras"]) if "cameras" in group else []  # pyright: ignore
+        return sorted(group["cameras"]) if "cameras" in group else []
 
     def parameters(self, number: int) -> dict[str, float]:
         """Return the physical parameters of a rollout, in the unit that their attribute states."""
-        return {name: float(item[()]) for name, item in self.group(number)["parameters"].items()}  # pyright: ignore
+        return {name: float(item[()]) for name, item in self.group(number)["parameters"].items()}
 
     def read(self, number: int, key: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return an array of a rollout, its first axis cut to `start:stop` (frames, for what has a time axis)."""
@@ -100,13 +100,13 @@ class RolloutReader:
             names = self.keys(number)
             raise UsageError(f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names))
         data = group[key]
-        return data[start:stop] if data.ndim else data[()]  # pyright: ignore
+        return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
         """Return the contacts of one frame: body_a, body_b, pos_world, normal_world, distance, impulse_world, mode."""
         group = self.group(number)["contacts"]
-        first, last = group["offsets"][frame : frame + 2]  # pyright: ignore
-        return {name: item[first:last] for name, item in group.items() if name != "offsets"}  # pyright: ignore
+        first, last = group["offsets"][frame : frame + 2]
+        return {name: item[first:last] for name, item in group.items() if name != "offsets"}
 
     def window(self, number: int, start: int, length: int, keys: Iterable[str]) -> dict[str, np.ndarray]:
         """Return `length` successive frames of some arrays with a time axis."""
@@ -154,26 +154,26 @@ class RolloutDataset:
     def __len__(self) -> int:
         return len(self.windows)
 
-    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
+    def __getitem__(self, index: int) -> dict[str, Any]:
         number, start = self.windows[index]
-        item = self.reader.window(number, start, self.length, self.keys)
+        item: dict[str, Any] = self.reader.window(number, start, self.length, self.keys)
         for name in self.cameras:
             if any(key.startswith(f"obs/{name}_") for key in self.keys):
                 for field in ("K", "T_world_cam"):
                     item[f"{name}_{field}"] = self.reader.read(number, f"cameras/{name}/{field}")
-        item["rollout"] = np.int64(self.reader.rollouts[number].index)  # pyright: ignore
-        item["start"] = np.int64(start)  # pyright: ignore
+        item["rollout"] = np.int64(self.reader.rollouts[number].index)
+        item["start"] = np.int64(start)
         return item
 
 
-def _list(handle: h5py.File, file: Path, split: str | None) -> Iterable[RolloutInfo]:
+def _list(handle: Node, file: Path, split: str | None) -> Iterable[RolloutInfo]:
     names = demo_names(handle)
     if split is not None:
-        splits = list(handle["mask"])  # pyright: ignore
+        splits = list(handle["mask"])
         if split not in splits:
             raise UsageError(f"{file} has no split '{split}'.", ", ".join(splits))
-        members = {name.decode() for name in handle["mask"][split][()]}  # pyright: ignore
+        members = {name.decode() for name in handle["mask"][split][()]}
         names = [name for name in names if name in members]
     for name in names:
-        demo = handle["data"][name]  # pyright: ignore
+        demo = handle["data"][name]
         yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), int(demo.attrs["num_samples"]))

@@ -37,14 +37,14 @@ def write_mjcf(model: Model, cameras: Mapping[str, Camera] | None = None) -> str
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     # RK4: the other integrators damp the tumbling of a free body.
     option = {"timestep": _text(_timestep(file)), "gravity": _text(file.gravity_m_s2), "integrator": "RK4"}
-    ET.SubElement(root, "option", **option, cone="elliptic")
+    ET.SubElement(root, "option", option, cone="elliptic")
     defaults = ET.SubElement(ET.SubElement(root, "default"), "geom", contype="1", conaffinity="1", condim="3")
     defaults.attrib.update(_contact(file.contact))
     world = ET.SubElement(root, "worldbody")
     if file.ground is not None:
         normal = np.asarray(file.ground.normal)
         place = {"pos": _text(normal * file.ground.offset_m), "zaxis": _text(normal)}
-        ET.SubElement(world, "geom", name="ground", type="plane", size="0 0 1", **place)
+        ET.SubElement(world, "geom", name="ground", type="plane", size="0 0 1").attrib.update(place)
     for body in file.bodies:
         _add_body(world, body, model)
     for name, camera in (cameras or {}).items():

@@ -21,6 +21,9 @@ from .cameras import Camera
 
 Compression = Literal["zstd", "gzip", "none"]
 
+Node = Any
+"""A group of an HDF5 file; h5py's own types do not tell what a path in it leads to."""
+
 CHUNK_FRAMES = 8
 """Frames in a chunk of images: with zstd-1 the best of size, writing and random reading that was measured."""
 
@@ -180,7 +183,8 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
 
 def demo_names(file: h5py.File) -> list[str]:
     """Return the names of the demos of a shard, by rollout index."""
-    return sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))  # pyright: ignore[reportArgumentType]
+    data: Node = file["data"]
+    return sorted(data, key=lambda name: int(name.removeprefix("demo_")))
 
 
 class RolloutWriter:
@@ -208,7 +212,7 @@ class RolloutWriter:
             convention=CONVENTION,
             filters=compression,
         )
-        self._data = self._file.create_group("data")
+        self._data: Node = self._file.create_group("data")
         env = {"env_name": "cgwm", "env_type": 2, "type": 2, "env_kwargs": {}}
         self._data.attrs["env_args"] = json.dumps(env)
         self._indices: list[int] = []
@@ -242,20 +246,25 @@ class RolloutWriter:
             axes, text = "(T, camera, body)", "Pixels of the body in the mask; cameras in the order of their names."
             cameras = sorted(labels.cameras)
             pixels = np.stack([visible[name] for name in cameras], axis=1)
-            _put(demo["bodies"], "visible_px", pixels, "px", "image", "-", axes, text)  # pyright: ignore
+            _put(demo["bodies"], "visible_px", pixels, "px", "image", "-", axes, text)
         _link_next_observations(demo)
         self._indices.append(labels.episode_index)
         self.total += count
 
-    def _image_sets(self, group: h5py.Group, name: str, camera: Camera, count: int) -> dict[str, h5py.Dataset]:
+    def _image_sets(self, group: Node, name: str, camera: Camera, count: int) -> dict[str, h5py.Dataset]:
         size = (camera.height, camera.width)
         texts = {
             "image": ("1", "row, column, RGB", "(T, H, W, 3)", "Rendered colour, 0 to 255."),
-            "depth": ("m", "row, column", "(T, H, W)", "Expected depth along the optical axis; 0 = no surface."),
+            "depth": (
+                "m",
+                "row, column",
+                "(T, H, W)",
+                "Depth along the optical axis of what the mask names; 0 = no surface.",
+            ),
             "mask": ("1", "row, column", "(T, H, W)", "Visible instance: 0 = background, k = the k-th body."),
         }
         kinds = {"image": (np.uint8, (*size, 3)), "depth": (np.float32, size), "mask": (np.uint8, size)}
-        made = {}
+        made: dict[str, h5py.Dataset] = {}
         for key, (dtype, shape) in kinds.items():
             chunk = (min(CHUNK_FRAMES, count), *shape)
             sets = group.create_dataset(
@@ -277,9 +286,7 @@ class RolloutWriter:
             group.create_dataset(split, data=np.array(names, dtype=f"S{width}"))
 
 
-def _put(
-    group: h5py.Group, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str
-) -> h5py.Dataset:
+def _put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str) -> h5py.Dataset:
     values = np.asarray(data)
     checked = {"fletcher32": True, "chunks": values.shape} if values.ndim and values.size else {}
     made = group.create_dataset(name, data=values, **checked)
@@ -291,7 +298,7 @@ def _describe(made: h5py.Dataset, unit: str, frame: str, order: str, shape: str,
     made.attrs.update(unit=unit, frame=frame, order=order, shape_meaning=shape, description=text)
 
 
-def _write_attributes(demo: h5py.Group, labels: RolloutLabels, count: int) -> None:
+def _write_attributes(demo: Node, labels: RolloutLabels, count: int) -> None:
     parameters = {p.name: {"value": p.value, "unit": p.unit} for p in labels.parameters}
     demo.attrs.update(
         num_samples=count,
@@ -303,7 +310,7 @@ def _write_attributes(demo: h5py.Group, labels: RolloutLabels, count: int) -> No
     )
 
 
-def _write_timeline(demo: h5py.Group, labels: RolloutLabels) -> None:
+def _write_timeline(demo: Node, labels: RolloutLabels) -> None:
     count = len(labels.time_s)
     done = np.zeros(count, np.uint8)
     done[-1] = 1
@@ -315,7 +322,7 @@ def _write_timeline(demo: h5py.Group, labels: RolloutLabels) -> None:
     _put(demo, "dones", done, "1", "-", "-", "(T,)", "1 at the last frame.")
 
 
-def _write_bodies(demo: h5py.Group, labels: RolloutLabels) -> None:
+def _write_bodies(demo: Node, labels: RolloutLabels) -> None:
     group = demo.create_group("bodies")
     names = np.array([name.encode() for name in labels.bodies])
     motions = np.array([motion.encode() for motion in labels.motions])
@@ -332,7 +339,7 @@ def _write_bodies(demo: h5py.Group, labels: RolloutLabels) -> None:
     _put(group, "gravity", labels.gravity_m_s2, "m/s2", "world", "x y z", "(3,)", "Gravitational acceleration.")
 
 
-def _write_contacts(demo: h5py.Group, table: ContactTable) -> None:
+def _write_contacts(demo: Node, table: ContactTable) -> None:
     group = demo.create_group("contacts")
     impulse = "Impulse on body a since the frame before (frame 0: zero); body b gets its opposite."
     force = "Mean force on body a since the frame before: impulse / frame interval = impulse * rate."
@@ -349,7 +356,7 @@ def _write_contacts(demo: h5py.Group, table: ContactTable) -> None:
     group.attrs["force"] = force
 
 
-def _write_parameters(demo: h5py.Group, parameters: tuple[RolloutParameter, ...]) -> None:
+def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> None:
     group = demo.create_group("parameters")
     for p in parameters:
         made = _put(group, p.name, np.float64(p.value), p.unit, "-", "-", "scalar", "Value used in this rollout.")
@@ -358,14 +365,14 @@ def _write_parameters(demo: h5py.Group, parameters: tuple[RolloutParameter, ...]
             made.attrs["std_error"] = p.std_error
 
 
-def _write_object_observation(group: h5py.Group, labels: RolloutLabels) -> None:
+def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
     parts = (labels.position_m, labels.quat_wxyz, labels.velocity_m_s, labels.omega_body_rad_s)
     values = np.concatenate(parts, axis=-1).reshape(len(labels.time_s), -1)
     order = "for each body: position, quaternion w x y z, velocity (world), angular velocity (body)"
     _put(group, "object", values, "SI", "world", order, "(T, 13 B)", "State of all bodies, robomimic's low-dim key.")
 
 
-def _write_cameras(demo: h5py.Group, cameras: Mapping[str, Camera]) -> None:
+def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
     group = demo.create_group("cameras")
     for name, camera in cameras.items():
         entry = group.create_group(name)
@@ -397,10 +404,10 @@ def _write_frames(
     return visible
 
 
-def _link_next_observations(demo: h5py.Group) -> None:
+def _link_next_observations(demo: Node) -> None:
     """Add `next_obs` as virtual datasets on `obs`, shifted by one frame: what robomimic reads, at no size."""
     group = demo.create_group("next_obs")
-    for name, source in demo["obs"].items():  # pyright: ignore[reportAttributeAccessIssue]
+    for name, source in demo["obs"].items():
         count = source.shape[0]
         # By h5py's low level: its high level stamps virtual datasets with the time of their creation.
         properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)

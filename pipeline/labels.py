@@ -1,5 +1,8 @@
 """Labelled images of a moving model: colour, depth and instance masks, from one pass of the renderer.
 
+The depth of a pixel is the expected depth of the one surface that its mask names, so that no depths float between an
+object and what is behind it.
+
 What never moves (the background and fixed bodies) is rendered once a camera. In each frame only the tiles that the
 moving bodies can reach are rendered again, with everything in them: outside, nothing of a body contributes, so the
 result is that of rendering the whole picture.
@@ -49,7 +52,7 @@ class _Moving:
 
 @dataclass
 class _View:
-    """A camera, and its picture of what never moves: features (H, W, F), alpha (H, W), depth (H, W)."""
+    """A camera, and its picture of what never moves: features (H, W, F) as :func:`_render` makes them, alpha (H, W)."""
 
     viewmat: Tensor
     K: Tensor
@@ -57,7 +60,6 @@ class _View:
     height: int
     features: Tensor
     alpha: Tensor
-    depth: Tensor
 
 
 class LabelRenderer:
@@ -130,7 +132,7 @@ class LabelRenderer:
         return _joined([*moved, _cut(self._static, slice(0, 0))])
 
     def _frame(self, view: _View, moving: _Spheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        features, alpha, depth = view.features, view.alpha, view.depth
+        features, alpha = view.features, view.alpha
         box = _reach(moving, view)
         if box is not None:
             left, top, right, bottom = box
@@ -139,13 +141,17 @@ class LabelRenderer:
             K[1, 2] -= top
             everything = _joined([moving, self._static])
             crop = _render(everything, view.viewmat, K, right - left, bottom - top)
-            features, alpha, depth = features.clone(), alpha.clone(), depth.clone()
-            for whole, part in zip((features, alpha, depth), crop, strict=True):
+            features, alpha = features.clone(), alpha.clone()
+            for whole, part in zip((features, alpha), crop, strict=True):
                 whole[top:bottom, left:right] = part
         solid = alpha > SOLID_ALPHA
-        label = torch.where(solid, features[..., 3:].argmax(-1), 0)
-        image = (features[..., :3].clamp(0, 1) * 255).round()
-        depth = torch.where(solid, depth, 0.0)
+        color, weight, weighted_depth = features.split([3, self._labels, self._labels], dim=-1)
+        # Of equal weights the first counts, and a solid pixel has a weight above 0.
+        most, surface = weight.max(-1)
+        label = torch.where(solid, surface, 0)
+        image = (color.clamp(0, 1) * 255).round()
+        nearest = weighted_depth.gather(-1, surface[..., None])[..., 0]
+        depth = torch.where(solid, nearest / most.clamp_min(1e-6), 0.0)
         return (
             image.to(torch.uint8).cpu().numpy(),
             depth.to(torch.float32).cpu().numpy(),
@@ -153,23 +159,24 @@ class LabelRenderer:
         )
 
 
-def _render(spheres: _Spheres, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+def _render(spheres: _Spheres, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Return colour, weight of each label, weight times depth of each label (H, W, 3 + 2 labels), and alpha (H, W)."""
+    depth = spheres.means @ viewmat[2, :3] + viewmat[2, 3]
+    features = torch.cat([spheres.features, spheres.features[:, 3:] * depth[:, None]], 1)
     if len(spheres) == 0:
-        shape = (height, width)
-        empty = spheres.features.new_zeros(shape)
-        return spheres.features.new_zeros(*shape, spheres.features.shape[1]), empty, empty.clone()
+        return features.new_zeros(height, width, features.shape[1]), features.new_zeros(height, width)
     picture = render(
         spheres.means,
         spheres.scales,
         spheres.opacities,
-        spheres.features,
+        features,
         viewmat[None],
         K[None],
         width,
         height,
         tile_size=TILE,
     )
-    return picture.features[0], picture.alpha[0], picture.depth[0]
+    return picture.features[0], picture.alpha[0]
 
 
 def _placed(spheres: _Spheres, position_m: Tensor, quat_wxyz: Tensor) -> _Spheres:

@@ -38,7 +38,7 @@ def validate(thing: Path | str) -> ValidationReport:
         return validate_dataset(path)
     found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset"
     raise InputDataError(
-        f"{path}: {found}.", "a directory with capture.toml, model.json, or dataset.json and rollouts-*.h5."
+        f"{path}: {found}.", "a directory with capture.toml, model.json or dataset.json."
     )
 
 
@@ -77,6 +77,8 @@ def _model_faults(model: Model) -> list[str]:
         if moments[0] <= 0 or moments[2] > 1.02 * (moments[0] + moments[1]):
             shown = ", ".join(f"{moment:.3g}" for moment in moments)
             faults.append(f"model.json: body '{body.name}': no body has the principal moments {shown} kg m2.")
+        if model.file.contact is not None and body.name not in model.collision:
+            faults.append(f"model.json: body '{body.name}' has no colliding spheres, but the model has contacts.")
     for entry in model.file.parameters:
         low, high = entry.bounds or (-np.inf, np.inf)
         if not low <= entry.estimate <= high:

@@ -90,11 +90,11 @@ def test_a_capture_is_no_model(tmp_path: Path) -> None:
 
 def test_a_dataset_a_file_and_nothing_are_no_models(tmp_path: Path) -> None:
     (tmp_path / "d").mkdir()
-    (tmp_path / "d" / "rollouts-0000-of-0001.h5").touch()
+    (tmp_path / "d" / "dataset.json").touch()
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
     for name, expected in (
-        ("d", "is a dataset (it holds rollouts-*.h5), not a model."),
+        ("d", "is a dataset (it holds dataset.json), not a model."),
         ("file", "is a file; a model is a directory with model.json."),
         ("empty", "is no model: it has no model.json."),
     ):
