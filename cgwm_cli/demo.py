@@ -21,8 +21,8 @@ def demo(
         typer.Option("--scene", help="fall: an object dropped and bouncing; push: one pushed by a fingertip."),
     ] = "fall",
     renderer: Annotated[
-        str, typer.Option("--renderer", help="How the scene's photos are made; rays needs no OpenGL.")
-    ] = "rays",
+        Literal["raycast"], typer.Option("--renderer", help="How the photos are made; raycast needs no OpenGL.")
+    ] = "raycast",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Object, parameters and noise vary with it.")] = 0,
     device: Annotated[
         DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")

@@ -3,12 +3,15 @@
 import ast
 import doctest
 import importlib
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from cgwm.pipeline.doctor import satisfies
 
 import cgwm
 
@@ -155,6 +158,22 @@ def test_public_names_of_the_package() -> None:
     assert [name for name in cgwm.__all__ if getattr(cgwm, name, None) is None] == []
     with pytest.raises(AttributeError, match="module 'cgwm' has no attribute 'nothing'"):
         _ = cgwm.nothing
+
+
+def test_every_package_is_installed() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    packages = {"cgwm", *(module_name(path) for path in FILES if path.name == "__init__.py")}
+    assert set(project["tool"]["setuptools"]["packages"]) == packages
+    assert {path.parent for path in FILES} == {path.parent for path in FILES if path.name == "__init__.py"}
+
+
+def test_every_requirement_is_pinned_to_a_version_that_it_admits() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pins = dict(line.split("==") for line in lines)
+    for requirement in project["dependencies"] + project["optional-dependencies"]["dev"]:
+        name = re.split(r"[<>=\[]", requirement)[0]
+        assert satisfies(pins[name], requirement), requirement
 
 
 def test_reading_data_does_not_import_torch() -> None:
