@@ -44,7 +44,8 @@ def _summary(result: EvalResult) -> str:
     from .output import millimetres, table, warnings
 
     move, turn = result.translation_error_m, result.rotation_error_deg
-    head = f"{result.episodes} episodes, open loop: {millimetres(move.median)}"
+    count = f"{result.episodes} episode{'' if result.episodes == 1 else 's'}"
+    head = f"{count}, open loop: {millimetres(move.median)}"
     head += f" and {turn.median:.1f} deg (medians)." if turn else " (median)."
     rows = [_row("translation error [mm]", move, 1e3)]
     rows += [
