@@ -12,10 +12,13 @@ if TYPE_CHECKING:
     from .capture import Capture
     from .check import CaptureFacts, check_capture
     from .contactnets import import_contactnets
+    from .dataset import read_manifest
     from .images import read_label, read_rgb, write_image
     from .kinds import kind_of
+    from .loader import RolloutDataset, RolloutReader
     from .manifest import manifest_toml, write_manifest
     from .meshes import Mesh, SolidProperties, mass_properties, read_mesh
+    from .mjcf import write_mjcf
     from .models import Model, read_model, write_model
     from .ply import Splats, read_splats, write_splats
     from .progress import progress
@@ -28,10 +31,13 @@ _HOMES = {
     "capture": ("Capture",),
     "check": ("CaptureFacts", "check_capture"),
     "contactnets": ("import_contactnets",),
+    "dataset": ("read_manifest",),
     "images": ("read_label", "read_rgb", "write_image"),
     "kinds": ("kind_of",),
+    "loader": ("RolloutDataset", "RolloutReader"),
     "manifest": ("manifest_toml", "write_manifest"),
     "meshes": ("Mesh", "SolidProperties", "mass_properties", "read_mesh"),
+    "mjcf": ("write_mjcf",),
     "models": ("Model", "read_model", "write_model"),
     "ply": ("Splats", "read_splats", "write_splats"),
     "progress": ("progress",),
@@ -46,6 +52,8 @@ __all__ = [
     "CaptureFacts",
     "Mesh",
     "Model",
+    "RolloutDataset",
+    "RolloutReader",
     "SolidProperties",
     "Splats",
     "Track",
@@ -60,6 +68,7 @@ __all__ = [
     "progress",
     "read_cameras",
     "read_label",
+    "read_manifest",
     "read_mesh",
     "read_model",
     "read_rgb",
@@ -70,6 +79,7 @@ __all__ = [
     "to_intrinsics",
     "write_image",
     "write_manifest",
+    "write_mjcf",
     "write_model",
     "write_splats",
     "write_tracks",

@@ -70,7 +70,7 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
             images[name.removeprefix("images/")] = PosedImage(camera=f"camera{camera}", T_world_cam=pose)
         scale = Scale(kind="metric" if metric else "unscaled", source="COLMAP model")
         return CamerasFile(scale=scale, cameras=cameras, images=images)
-    except (struct.error, ValueError, IndexError) as error:
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise InputDataError(f"{folder}: not a COLMAP model that can be read: {error}.") from None
 
 

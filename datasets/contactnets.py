@@ -155,8 +155,13 @@ def _read_npz(path: Path) -> _Tosses:
             data = {name: archive[name] for name in _NPZ_FIELDS}
     except KeyError as error:
         raise InputDataError(f"{path}: no array {error}.", ", ".join(_NPZ_FIELDS) + ".") from None
-    except (OSError, ValueError) as error:
+    except Exception as error:  # numpy and zipfile raise many kinds
         raise InputDataError(f"{path}: not an .npz that can be read: {error}.") from None
+    for name, width in (("pos", 3), ("quat_wxyz", 4), ("vel", 3), ("omega_body", 3)):
+        if data[name].shape != (len(data["pos"]), width):
+            raise InputDataError(f"{path}: '{name}' has the shape {data[name].shape}.", f"(rows, {width}).")
+    if not (data["rate_hz"] > 0 and data["half_width_m"] > 0):
+        raise InputDataError(f"{path}: rate_hz {data['rate_hz']}, half_width_m {data['half_width_m']}.", "both > 0.")
     offsets, numbers = data["offsets"].astype(np.int64), data["toss_index"].astype(np.int64)
     if len(offsets) != len(numbers) + 1 or offsets[0] != 0 or offsets[-1] != len(data["pos"]):
         raise InputDataError(

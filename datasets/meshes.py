@@ -98,18 +98,21 @@ def mass_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
 
 
 def check_closed(mesh: Mesh, path: Path | str = "mesh") -> None:
-    """Raise InputDataError unless every edge belongs to two triangles that run along it in opposite directions."""
+    """Raise InputDataError unless along every edge as many triangles run one way as the other.
+
+    Then the surface has no boundary, which is what the divergence theorem needs; edges where more than two
+    triangles meet, as scans have them, are no fault.
+    """
     edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    base = len(mesh.vertices)
-    forward, counts = np.unique(edges[:, 0] * base + edges[:, 1], return_counts=True)
-    backward = np.unique(edges[:, 1] * base + edges[:, 0])
-    open_edges = len(np.setdiff1d(forward, backward, assume_unique=True))
-    doubled = int(np.count_nonzero(counts > 1))
-    if open_edges or doubled:
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    _, index = np.unique(low * len(mesh.vertices) + high, return_inverse=True)
+    balance = np.bincount(index.reshape(-1), np.where(edges[:, 0] == low, 1, -1))
+    unbalanced = int(np.count_nonzero(balance))
+    if unbalanced:
         raise InputDataError(
-            f"{path}: the mesh is not closed: of {len(forward)} directed edges, {open_edges} have no triangle on the "
-            f"other side and {doubled} are used twice.",
-            "a closed surface whose triangles are all oriented alike.",
+            f"{path}: the mesh is not closed, or its triangles are not oriented alike: at {unbalanced} of "
+            f"{len(balance)} edges the triangles do not match.",
+            "a closed surface whose triangles all face outwards.",
             "close it (for example in MeshLab or Blender), or give another shape.",
         )
 

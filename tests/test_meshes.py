@@ -116,14 +116,25 @@ def test_open_mesh_is_refused() -> None:
     with pytest.raises(InputDataError) as caught:
         mass_properties(Mesh(box().vertices, BOX_FACES[1:]), "box.obj")
     assert str(caught.value) == (
-        "box.obj: the mesh is not closed: of 33 directed edges, 3 have no triangle on the other side and 0 are used "
-        "twice.\nAllowed: a closed surface whose triangles are all oriented alike.\n"
+        "box.obj: the mesh is not closed, or its triangles are not oriented alike: at 3 of 18 edges the triangles do "
+        "not match.\nAllowed: a closed surface whose triangles all face outwards.\n"
         "Next: close it (for example in MeshLab or Blender), or give another shape."
     )
     flipped = BOX_FACES.copy()
     flipped[0] = flipped[0, ::-1]
-    with pytest.raises(InputDataError, match="3 are used twice"):
+    with pytest.raises(InputDataError, match="at 3 of 18 edges"):
         mass_properties(Mesh(box().vertices, flipped))
+
+
+def test_two_boxes_that_share_an_edge_are_closed() -> None:
+    """Four triangles meet at the shared edge; the solid is that of both boxes."""
+    corners = np.concatenate([box().vertices, box().vertices + [0.02, 0.04, 0.0]])
+    vertices, index = np.unique(corners.round(9), axis=0, return_inverse=True)
+    both = Mesh(vertices, index.reshape(-1)[np.concatenate([BOX_FACES, BOX_FACES + 8])])
+    assert len(vertices) == 14
+    found = mass_properties(both)
+    assert found.volume_m3 == pytest.approx(2 * 8 * 6e-6)
+    np.testing.assert_allclose(found.com_m, [0.01, 0.02, 0], atol=1e-15)
 
 
 @pytest.mark.parametrize(
