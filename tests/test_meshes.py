@@ -128,7 +128,7 @@ def test_open_mesh_is_refused() -> None:
 
 def test_two_boxes_that_share_an_edge_are_closed() -> None:
     """Four triangles meet at the shared edge; the solid is that of both boxes."""
-    corners = np.concatenate([box().vertices, box().vertices + [0.02, 0.04, 0.0]])
+    corners = np.concatenate([box().vertices, box().vertices + np.array([0.02, 0.04, 0.0])])
     vertices, index = np.unique(corners.round(9), axis=0, return_inverse=True)
     both = Mesh(vertices, index.reshape(-1)[np.concatenate([BOX_FACES, BOX_FACES + 8])])
     assert len(vertices) == 14
