@@ -1,5 +1,6 @@
 """A command that is interrupted, or killed outright, leaves nothing under its final name and can be run again."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -117,8 +118,13 @@ def at_work(process: subprocess.Popen[bytes], out: Path, seconds: float) -> bool
 @pytest.mark.parametrize("verb", CASES)
 def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals, tmp_path: Path) -> None:
     arguments, out = CASES[verb](tmp_path)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
     before = set(tmp_path.rglob("*"))
-    with subprocess.Popen([*CGWM_INTERRUPTIBLE, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    environment = os.environ | {"TMPDIR": str(scratch)}
+    with subprocess.Popen(
+        [*CGWM_INTERRUPTIBLE, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment
+    ) as process:
         assert at_work(process, out, 4.0), process.communicate()[1].decode()
         process.send_signal(number)
         printed, said = process.communicate(timeout=60)
