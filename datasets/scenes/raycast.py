@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import cv2
@@ -69,16 +70,21 @@ class Faceted:
     normals: Array
     sheets: tuple[Sheet, ...]
 
+    @cached_property
+    def _bases(self) -> Floats:
+        """Axes u and v of the sheets, body frame, shape (facet, 3, 2)."""
+        away = np.eye(3)[np.abs(self.normals).argmin(axis=1)]
+        first = np.cross(self.normals, away)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        return np.stack([first, np.cross(self.normals, first)], axis=2).astype(np.float32)
+
     def albedo(self, points: Floats, normals: Floats, footprint: Floats) -> Floats:
         """See `Material`."""
         facet = (normals @ self.normals.T.astype(np.float32)).argmax(axis=1)
         colours = np.empty((len(points), 3), np.float32)
         for index in np.unique(facet):
             chosen = facet == index
-            first = np.cross(self.normals[index], np.eye(3)[np.abs(self.normals[index]).argmin()])
-            first /= np.linalg.norm(first)
-            basis = np.stack([first, np.cross(self.normals[index], first)], axis=1).astype(np.float32)
-            colours[chosen] = self.sheets[index].sample(points[chosen] @ basis, footprint[chosen])
+            colours[chosen] = self.sheets[index].sample(points[chosen] @ self._bases[index], footprint[chosen])
         return colours
 
 

@@ -53,22 +53,22 @@ class PrintedMarker:
 
 
 def draw_markers(rng: np.random.Generator) -> tuple[PrintedMarker, ...]:
-    """Lay four markers of 60 to 75 mm around the object's place, each turned its own way."""
+    """Lay four markers of 60 to 68 mm around the object's place, each turned its own way."""
     markers = []
     for index in range(4):
         angle = np.pi / 4 + index * np.pi / 2 + rng.uniform(-0.15, 0.15)
-        yaw, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.185, 0.205)
+        yaw, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.170, 0.182)
         T_world_marker = np.eye(4)
         T_world_marker[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         T_world_marker[:2, 3] = np.round(distance * np.array([np.cos(angle), np.sin(angle)]), 4)
-        markers.append(PrintedMarker(index, float(np.round(rng.uniform(0.060, 0.075), 3)), T_world_marker))
+        markers.append(PrintedMarker(index, float(np.round(rng.uniform(0.060, 0.068), 3)), T_world_marker))
     return tuple(markers)
 
 
 def make_mat(rng: np.random.Generator, markers: tuple[PrintedMarker, ...]) -> Sheet:
     """Paint the mat and print the markers on it; its u, v are the world's x, y."""
     palette = _MATS[rng.integers(len(_MATS))]
-    image = paint(rng, _MAT_PIXELS, 2 * MAT_HALF, palette, 7000, (0.002, 0.016))
+    image = paint(rng, _MAT_PIXELS, 2 * MAT_HALF, palette, 13000, (0.0018, 0.016))
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{MARKER_DICTIONARY}"))
     for marker in markers:
         modules = dictionary.markerSize + 2
@@ -86,7 +86,7 @@ def make_paint(rng: np.random.Generator, solid: SolidObject) -> Faceted:
         base = palette[rng.integers(2)]
         tone = tuple(float(v) for v in np.array(base) * rng.uniform(0.88, 1.12))
         red, green, blue = tone
-        image = paint(rng, _FACET_PIXELS, _FACET_SIDE, ((red, green, blue), *palette), 9000, (0.0022, 0.012))
+        image = paint(rng, _FACET_PIXELS, _FACET_SIDE, ((red, green, blue), *palette), 12000, (0.002, 0.012))
         sheets.append(make_sheet(image, _FACET_SIDE))
     return Faceted(normals, tuple(sheets))
 
@@ -120,7 +120,7 @@ def photo_cameras(count: int, size: tuple[int, int], rng: np.random.Generator) -
             direction = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
             target = np.array([0, 0, 0.03]) + rng.uniform(-0.012, 0.012, 3)
             T_world_cam = look_at(target + reach * direction, target, rng.uniform(-0.07, 0.07))
-            cameras[f"{len(cameras):03d}.jpg"] = _camera(size, 1.06, T_world_cam)
+            cameras[f"{len(cameras):03d}.jpg"] = _camera(size, 1.0, T_world_cam)
     return cameras
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 Colour = tuple[float, float, float]
 Floats = NDArray[np.float32]
 _REMAP_WIDTH = 8192  # cv2.remap takes no side above 32767, so points are laid out in rows
+_SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,11 @@ class Sheet:
         size = self.texel * 2**level
         column = (uv[:, 0] + self.half) / size - 0.5
         row = (self.half - uv[:, 1]) / size - 0.5
-        rows = -(-len(uv) // _REMAP_WIDTH)
-        padded = np.zeros((2, rows * _REMAP_WIDTH), np.float32)
+        width = min(len(uv), _REMAP_WIDTH)
+        rows = -(-len(uv) // width)
+        padded = np.zeros((2, rows * width), np.float32)
         padded[0, : len(uv)], padded[1, : len(uv)] = column, row
-        maps = padded.reshape(2, rows, _REMAP_WIDTH)
+        maps = padded.reshape(2, rows, width)
         image = cv2.remap(self.levels[level], maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(image, np.float32).reshape(-1, 3)[: len(uv)] / np.float32(255)
 
@@ -91,9 +93,11 @@ def paint(
     canvas = np.full((pixels, pixels, 3), np.array(palette[0]) * 255, np.uint8)
     count = int(spots_per_m2 * side * side)
     low, high = spot_radius
-    radii = low * (high / low) ** (rng.random(count) ** 1.5)
-    for radius in np.sort(radii)[::-1]:
-        _stamp(canvas, rng, radius * per_m, palette)
+    radii = np.sort(low * (high / low) ** (rng.random(count) ** 1.5))[::-1] * per_m
+    tones = np.array(palette)[rng.integers(len(palette), size=count)] * rng.uniform(0.75, 1.25, (count, 1))
+    colours = (tones * 255).clip(8, 240).round()
+    for outline, colour in zip(_outlines(rng, radii, pixels), colours, strict=True):
+        cv2.fillPoly(canvas, [outline], colour.tolist(), cv2.LINE_AA, _SHIFT)
     noise = sum(
         (0.5**octave * _value_noise(rng, pixels, max(2, round(side / (0.06 / 2**octave)))) for octave in range(4)),
         np.zeros((pixels, pixels), np.float32),
@@ -106,16 +110,22 @@ def paint(
     return canvas
 
 
-def _stamp(canvas: NDArray[np.uint8], rng: np.random.Generator, radius_px: float, palette: Sequence[Colour]) -> None:
-    """Draw one ellipse or irregular polygon, antialiased, in a jittered colour of the palette."""
-    tone = np.array(palette[int(rng.integers(len(palette)))]) * rng.uniform(0.75, 1.25)
-    colour = tuple(float(value) for value in (tone * 255).clip(8, 240).round())
-    centre = rng.uniform(0, len(canvas), 2)
-    corners = int(rng.integers(3, 7)) if rng.random() < 0.6 else 16
-    angles = np.sort(rng.uniform(0, 2 * np.pi, corners)) if corners < 16 else np.linspace(0, 2 * np.pi, 16, False)
-    stretch = rng.uniform(0.6, 1.0, 2)
-    outline = centre + radius_px * stretch * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    cv2.fillPoly(canvas, [np.round(outline * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
+def _outlines(rng: np.random.Generator, radii_px: NDArray[np.float64], pixels: int) -> list[NDArray[np.int32]]:
+    """Draw ellipses and irregular polygons of given radii anywhere on the canvas, in OpenCV's fixed-point pixels."""
+    count = len(radii_px)
+    centres, stretch = rng.uniform(0, pixels, (count, 1, 2)), rng.uniform(0.6, 1.0, (count, 1, 2))
+    corners = np.where(rng.random(count) < 0.6, rng.integers(3, 7, count), 16)
+    outlines: list[NDArray[np.int32]] = [np.zeros((0, 2), np.int32)] * count
+    for number in (3, 4, 5, 6, 16):
+        chosen = np.flatnonzero(corners == number)
+        angles = np.tile(np.linspace(0, 2 * np.pi, 16, endpoint=False), (len(chosen), 1))
+        if number < 16:
+            angles = np.sort(rng.uniform(0, 2 * np.pi, (len(chosen), number)), axis=1)
+        rim = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * stretch[chosen] * radii_px[chosen, None, None]
+        fixed = np.round((centres[chosen] + rim) * 2**_SHIFT).astype(np.int32)
+        for index, outline in zip(chosen, fixed, strict=True):
+            outlines[index] = outline
+    return outlines
 
 
 def _value_noise(rng: np.random.Generator, pixels: int, cells: int) -> Floats:
