@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,9 @@ from .splats.hull import carve
 from .splats.seeds import body_seeds, scene_seeds, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
+from .splats.stereo import refine
 from .splats.views import View, load_views
-from .splats.volume import Array, MassProperties, Volume
+from .splats.volume import Array, MassProperties, Volume, grid_points
 
 _MIN_PHOTOS = 3
 
@@ -203,7 +204,12 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
 
 def _hull(stage: _Stage, index: int, body: Body) -> Volume:
     silhouettes = [view.silhouette(index) for view in stage.train]
-    return carve([one for one in silhouettes if one is not None], stage.ground, body.name)
+    hull = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
+    solid, refinement = refine(
+        hull, [view for view in stage.train if view.labels is not None], index, stage.config.seed
+    )
+    stage.record[body.name] = {"refinement": asdict(refinement)}
+    return solid
 
 
 def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Spheres:
@@ -224,7 +230,7 @@ def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Sphere
         appearance, windows, body_loss(index), stage.steps(0.5), config.seed, f"{body.name}: colours", 0.002
     )
     spheres = _detached(appearance.spheres())
-    stage.record[body.name] = {
+    stage.record[body.name] = stage.record.get(body.name, {}) | {
         "spheres": len(spheres),
         "surface_spheres": surface_count,
         "silhouette_loss": _thinned(losses),
@@ -317,15 +323,13 @@ def _moved(solid: Volume, T_to_from: Array) -> Volume:
     """Return a solid in another frame, on a grid of that frame."""
     rotation, offset = T_to_from[:3, :3], T_to_from[:3, 3]
     if np.allclose(rotation, np.eye(3)):
-        return Volume(solid.origin + offset, solid.pitch, solid.distance, solid.surface + offset, solid.normals)
+        return replace(solid, origin=solid.origin + offset, surface=solid.surface + offset)
     surface = solid.surface @ rotation.T + offset
     origin = surface.min(0) - 3 * solid.pitch
     shape = tuple(int(n) for n in np.ceil((surface.max(0) - origin) / solid.pitch).astype(int) + 4)
-    from .splats.volume import grid_points
-
     points = (grid_points(shape, origin, solid.pitch) - offset) @ rotation
     inside = (solid.at(points) < 0).reshape(shape)
-    return Volume.from_inside(inside, origin, solid.pitch, surface)
+    return Volume.from_inside(inside, origin, solid.pitch, surface, solid.corner_count)
 
 
 def _turned(properties: MassProperties, T_to_from: Array) -> MassProperties:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from cgwm.pipeline.splats.collision import (
     distil,
-    fibonacci_directions,
     shape_to_spheres,
     spheres_volume,
     support_of_spheres,
     union_distance,
 )
+from cgwm.pipeline.splats.directions import fibonacci_directions
 from cgwm.pipeline.splats.mesh import Mesh, mesh_mass_properties, mesh_volume, read_mesh
 from cgwm.schemas import InputDataError, Shape
 

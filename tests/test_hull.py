@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cgwm.pipeline.splats.collision import fibonacci_directions
+from cgwm.pipeline.splats.directions import fibonacci_directions
 from cgwm.pipeline.splats.hull import Silhouette, carve
 from cgwm.schemas import Ground, InputDataError
 
@@ -72,5 +72,5 @@ def test_masks_that_do_not_fit_are_refused():
     with pytest.raises(InputDataError, match="body 'cup': its mask is not empty in 2 of 6 photos"):
         carve([*silhouettes(6)[:2], *empty[2:]], None, "cup")
     moved = silhouettes(6, CENTER + np.array([0.0, 0.0, 0.11]))
-    with pytest.raises(InputDataError, match="no point lies inside the masks of all 1. photos"):
+    with pytest.raises(InputDataError, match=r"no point lies inside the masks of all 1. photos"):
         carve([*silhouettes(6), *moved], None)

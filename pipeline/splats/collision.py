@@ -8,7 +8,6 @@ finds a body there.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -17,6 +16,7 @@ import numpy as np
 
 from ...datasets.ply import Splats, read_splats
 from ...schemas import InputDataError, Shape
+from .directions import fibonacci_directions
 from .mesh import mesh_volume, read_mesh
 from .volume import Array, Volume, crossings, grid_points
 
@@ -146,15 +146,6 @@ def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = N
     return CollisionSpheres(centers, radii, float(max(gap, beyond)), float(support))
 
 
-def fibonacci_directions(count: int) -> Array:
-    """Return `count` nearly evenly spread unit vectors, shape (count, 3)."""
-    index = np.arange(count) + 0.5
-    z = 1 - 2 * index / count
-    angle = math.pi * (1 + math.sqrt(5)) * index
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
-
-
 def support_of_points(points: Array, directions: Array | None = None) -> Array:
     """Return max n . x over points (n, 3) [m], for each direction, shape (D,)."""
     directions = fibonacci_directions(DIRECTIONS) if directions is None else directions
@@ -222,8 +213,9 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
 
 def _add_fill(chosen: _Chosen, solid: Volume, limit: int) -> None:
     """Add the largest inscribed spheres around points deep inside that no sphere holds yet."""
-    points = grid_points(solid.distance.shape, solid.origin, solid.pitch)
-    depth = -solid.distance.reshape(-1)
+    every_other = solid.distance[::2, ::2, ::2]
+    points = grid_points(every_other.shape, solid.origin, 2 * solid.pitch)
+    depth = -every_other.reshape(-1)
     kept = depth > 3 * solid.pitch
     points, depth = points[kept], depth[kept]
     bare = union_distance(*chosen.arrays(), points) > 0

@@ -6,7 +6,7 @@ over the views of the signed distance from the mask's border, so that the surfac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import label, map_coordinates
 
 from ...schemas import Ground, InputDataError
+from .directions import fibonacci_directions
 from .volume import Array, Volume, crossings, grid_points
 
 _COARSE = 40
 _REFINED = (56, 128)
 _BORDER_SMOOTHING_PX = 0.7
+_BORDER_BIAS_PX = 0.3
+_TIP_DIRECTIONS = 500
 _MIN_VIEWS = 3
 
 
@@ -75,7 +78,26 @@ def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = 
     if solid is None:
         raise InputDataError(f"body '{name}': the masks leave nothing larger than {1e3 * pitch:.2g} mm.")
     field = np.where(solid, field, np.minimum(field, -1e-3 * pitch))
-    return Volume.from_inside(solid, origin, pitch, crossings(field, origin, pitch))
+    surface = crossings(field, origin, pitch)
+    tips = _tips(surface, pitch, lambda points: _field(points, views, fields, ground))
+    return Volume.from_inside(solid, origin, pitch, np.concatenate([surface, tips]), len(tips))
+
+
+def _tips(surface: Array, pitch: float, field: Callable[[Array], Array]) -> Array:
+    """Return points of the hull beyond the grid's surface in the directions in which it reaches farthest, (k, 3).
+
+    A corner lies between grid points and is cut off by their spacing; a plane that the body lands on meets it first.
+    """
+    directions = fibonacci_directions(_TIP_DIRECTIONS)
+    extreme = np.unique([int(np.argmax(surface @ direction)) for direction in directions])
+    ticks = np.linspace(-1.2, 1.2, 11) * pitch
+    offsets = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    points = (surface[extreme, None] + offsets).reshape(-1, 3)
+    points = points[field(points) > 0]
+    if len(points) == 0:
+        return np.zeros((0, 3))
+    tips = np.unique([int(np.argmax(points @ direction)) for direction in directions])
+    return points[tips]
 
 
 def _refined(
@@ -110,8 +132,9 @@ def _signed_distance_px(mask: NDArray[np.bool_]) -> Array:
     inner = cv2.distanceTransform(np.pad(image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outer = cv2.distanceTransform(np.pad(1 - image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     signed = np.where(mask, inner[1:-1, 1:-1] - 0.5, 0.5 - outer[1:-1, 1:-1])
-    # The border runs in steps between pixel centres; a little smoothing takes them out of slanted edges.
-    return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BORDER_SMOOTHING_PX), np.float64)
+    # The border runs in steps between pixel centres; a little smoothing takes them out of slanted edges. The least of
+    # many such distances, each uncertain by a part of a pixel, is too small: the bias was measured on known solids.
+    return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BORDER_SMOOTHING_PX), np.float64) + _BORDER_BIAS_PX
 
 
 def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], ground: Ground | None) -> Array:
@@ -147,7 +170,7 @@ def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:
         across = np.eye(3) - np.outer(ray, ray)
         system += across
         right += across @ camera
-    center = np.linalg.solve(system, right)
+    center: Array = np.linalg.solve(system, right)
     radii = []
     for view in views:
         local = view.T_cam_world[:3, :3] @ center + view.T_cam_world[:3, 3]

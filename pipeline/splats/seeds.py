@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial import KDTree
 
 from ...schemas import Ground
+from .directions import fibonacci_directions
 from .spheres import Spheres
 from .views import View
 from .volume import Array, Volume, grid_points
@@ -16,7 +19,12 @@ from .volume import Array, Volume, grid_points
 _SURFACE_SHARE = 0.9
 _COVER_FACTOR = 1.05  # collision radius in units of the spacing: neighbours overlap without a gap
 _FAR_FACTOR = 12.0
-_SHELL_SHARE = 0.12
+_SHELL_SHARE = 0.3
+_SHELL_SHARE_GROUND = 0.08
+_COARSE_SHELL = 80
+_PIXELS = 600_000
+_LEVELS = 12
+_CELL_SCALE = 0.55
 
 
 def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int) -> tuple[Array, Array, int]:
@@ -88,8 +96,8 @@ def scene_seeds(
 ) -> tuple[Array, Array]:
     """Return spheres for what is not a body: ground, SfM points, and a shell far away.
 
-    Ground that the photos show is covered by spheres as wide as a few pixels of the nearest photo; elsewhere SfM
-    points stand for the surfaces; rays that meet neither end on a shell.
+    Ground that the photos show is covered by cells, small where its picture has detail; elsewhere SfM points stand for
+    the surfaces; rays that meet neither end on a shell, which is closed, so that no view looks out of the world.
 
     Args:
         views: The photos; pixels of bodies are left out.
@@ -103,39 +111,44 @@ def scene_seeds(
     """
     rng = np.random.default_rng(seed)
     cameras = np.stack([view.camera.center for view in views])
-    rays, origins, footprints = _background_rays(views, rng)
-    parts: list[tuple[Array, Array]] = []
-    shell = rays, origins
-    shell_budget = int(_SHELL_SHARE * max_spheres)
+    spread = _spread(cameras)
+    sample = _background_pixels(views, rng)
+    shell_budget = int((_SHELL_SHARE_GROUND if ground is not None else _SHELL_SHARE) * max_spheres)
     rest = max_spheres - shell_budget
-    if points is not None and len(points):
-        near = points[np.linalg.norm(points - np.median(points, 0), axis=1) < 50 * _spread(points)]
-        share = rest if ground is None else rest // 4
-        if ground is not None:
-            near = near[near @ np.array(ground.normal) - ground.offset_m > 0.02 * _spread(cameras)]
-        if len(near) > 3:
-            parts.append(_with_neighbour_scales(near, share, rng))
+    parts: list[tuple[Array, Array]] = []
+    standing = points
+    if points is not None and ground is not None:
+        standing = points[points @ np.array(ground.normal) - ground.offset_m > 0.02 * spread]
+    if standing is not None and len(standing) > 3:
+        parts.append(_with_neighbour_scales(standing, rest if ground is None else rest // 4, rng))
     if ground is not None:
-        normal = np.array(ground.normal)
-        down = rays @ normal
-        height = ground.offset_m - origins @ normal
-        distance = np.where(down < -1e-3, height / np.minimum(down, -1e-3), np.inf)
-        hits = (distance > 0) & (distance < _FAR_FACTOR * _spread(cameras))
-        shell = rays[~hits], origins[~hits]
-        met = origins[hits] + distance[hits, None] * rays[hits]
+        hits, met = _on_ground(sample, ground, _FAR_FACTOR * spread)
         used = sum(len(part[0]) for part in parts)
-        parts.append(_even_cover(met, distance[hits] * footprints[hits], normal, rest - used))
-    parts.append(_shell(*shell, cameras, points, shell_budget))
+        parts.append(_ground_cover(met, sample.colors[hits], np.array(ground.normal), rest - used))
+        sample = sample.chosen(~hits)
+    parts.append(_shell(sample, cameras, points, shell_budget))
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
-def _background_rays(views: Sequence[View], rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Return unit rays, origins and angular pixel widths [rad] of pixels that show no body; about 2000 a view."""
-    rays, origins, footprints = [], [], []
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels that show no body: unit rays (n, 3), origins [m] (n, 3), colours (n, 3)."""
+
+    rays: Array
+    origins: Array
+    colors: Array
+
+    def chosen(self, mask: Array) -> _Pixels:
+        return _Pixels(self.rays[mask], self.origins[mask], self.colors[mask])
+
+
+def _background_pixels(views: Sequence[View], rng: np.random.Generator) -> _Pixels:
+    each = max(1000, _PIXELS // len(views))
+    rays, origins, colors = [], [], []
     for view in views:
         width, height = view.size
         K, T = view.K.double().cpu().numpy(), view.viewmat.double().cpu().numpy()
-        u, v = rng.integers(0, width, 2000), rng.integers(0, height, 2000)
+        u, v = rng.integers(0, width, each), rng.integers(0, height, each)
         if view.cover is not None:
             free = view.cover.sum(0).cpu().numpy()[v, u] < 0.05
             u, v = u[free], v[free]
@@ -143,50 +156,63 @@ def _background_rays(views: Sequence[View], rng: np.random.Generator) -> tuple[A
         local /= np.linalg.norm(local, axis=1, keepdims=True)
         rays.append(local @ T[:3, :3])
         origins.append(np.tile(view.camera.center, (len(u), 1)))
-        footprints.append(np.full(len(u), 1 / K[0, 0]))
-    return np.concatenate(rays), np.concatenate(origins), np.concatenate(footprints)
+        colors.append(view.image.cpu().numpy()[v, u])
+    return _Pixels(np.concatenate(rays), np.concatenate(origins), np.concatenate(colors).astype(float))
 
 
-def _even_cover(points: Array, footprints: Array, normal: Array, budget: int) -> tuple[Array, Array]:
-    """Cover points on a plane with cells that are as wide as `k` pixel footprints; k as small as the budget allows."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = np.cross(normal, helper)
+def _on_ground(sample: _Pixels, ground: Ground, farthest: float) -> tuple[Array, Array]:
+    """Return which rays meet the ground no farther than `farthest` [m], and where those do, (hits, 3)."""
+    normal = np.array(ground.normal)
+    down = np.minimum(sample.rays @ normal, -1e-6)
+    distance = (ground.offset_m - sample.origins @ normal) / down
+    hits = (sample.rays @ normal < -1e-3) & (distance > 0) & (distance < farthest)
+    return hits, sample.origins[hits] + distance[hits, None] * sample.rays[hits]
+
+
+def _ground_cover(points: Array, colors: Array, normal: Array, budget: int) -> tuple[Array, Array]:
+    """Cover a plane by the leaves of a quadtree that is split, again and again, where colours differ most.
+
+    Each sample is a pixel, so the sum of squared deviations in a cell is its error in the pictures: far ground, which
+    few pixels show, gets few cells without further ado.
+    """
+    if len(points) == 0 or budget < 1:
+        return np.zeros((0, 3)), np.zeros(0)
+    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     first /= np.linalg.norm(first)
-    plane = np.stack([points @ first, points @ np.cross(normal, first)], 1)
-    best: tuple[Array, Array] | None = None
-    low, high = 0.5, 200.0
-    for _ in range(14):
-        k = float(np.sqrt(low * high))
-        centers, sides = _cells(plane, k * footprints)
-        if len(centers) <= budget:
-            best, high = (centers, sides), k
-        else:
-            low = k
-    if best is None:
-        return points[:0], footprints[:0]
+    second = np.cross(normal, first)
+    plane = np.stack([points @ first, points @ second], 1)
+    corner = plane.min(0)
+    side = float(np.ptp(plane, axis=0).max()) * 1.001
+    leaves = _quadtree((plane - corner) / side, colors, budget)
+    width = side * 0.5 ** leaves[:, 0]
+    middle = corner + (leaves[:, 1:] + 0.5) * width[:, None]
     height = float(np.median(points @ normal))
-    centers = best[0][:, :1] * first + best[0][:, 1:] * np.cross(normal, first) + height * normal
-    return centers, 0.6 * best[1]
+    return middle[:, :1] * first + middle[:, 1:] * second + height * normal, _CELL_SCALE * width
 
 
-def _cells(plane: Array, widths: Array) -> tuple[Array, Array]:
-    """Return centres and sides of the quadtree cells that hold the points, each no wider than its finest point asks."""
-    level = np.floor(np.log2(np.maximum(widths, 1e-9))).astype(int)
-    centers, sides = [], []
-    taken = np.zeros(len(plane), dtype=bool)
-    for value in np.unique(level):
-        side = 2.0**value
-        mine = (level == value) & ~taken
-        if not mine.any():
+def _quadtree(unit: Array, colors: Array, budget: int) -> Array:
+    """Return the leaves (level, column, row) of a greedy quadtree over points in the unit square."""
+    errors: list[dict[tuple[int, int], float]] = []
+    for level in range(_LEVELS):
+        cell = np.minimum((unit * 2**level).astype(np.int64), 2**level - 1)
+        keys, index = np.unique(cell, axis=0, return_inverse=True)
+        index = index.reshape(-1)
+        count = np.bincount(index)
+        sums = np.stack([np.bincount(index, colors[:, k]) for k in range(3)], 1)
+        squares = np.bincount(index, (colors**2).sum(1))
+        error = squares - (sums**2).sum(1) / count
+        errors.append({(int(c), int(r)): float(e) for (c, r), e in zip(keys, error, strict=True)})
+    heap = [(-errors[0][(0, 0)], 0, 0, 0)]
+    done: list[tuple[int, int, int]] = []
+    while heap and len(heap) + len(done) < budget:
+        _, level, column, row = heapq.heappop(heap)
+        if level + 1 == _LEVELS:
+            done.append((level, column, row))
             continue
-        cells = np.unique(np.floor(plane[mine] / side).astype(np.int64), axis=0)
-        key = {tuple(cell) for cell in cells}
-        later = np.flatnonzero((level > value) & ~taken)
-        inside = np.array([tuple(cell) in key for cell in np.floor(plane[later] / side).astype(np.int64)], dtype=bool)
-        taken[later[inside]] = True
-        centers.append((cells + 0.5) * side)
-        sides.append(np.full(len(cells), side))
-    return np.concatenate(centers), np.concatenate(sides)
+        for child in ((2 * column + i, 2 * row + j) for i in (0, 1) for j in (0, 1)):
+            if child in errors[level + 1]:
+                heapq.heappush(heap, (-errors[level + 1][child], level + 1, *child))
+    return np.array([*done, *((level, column, row) for _, level, column, row in heap)][:budget], float)
 
 
 def _with_neighbour_scales(points: Array, budget: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -197,20 +223,24 @@ def _with_neighbour_scales(points: Array, budget: int, rng: np.random.Generator)
     return kept, np.clip(scale, 1e-3 * np.median(scale) + 1e-9, 5 * np.median(scale) + 1e-9)
 
 
-def _shell(rays: Array, origins: Array, cameras: Array, points: Array | None, budget: int) -> tuple[Array, Array]:
-    """Return spheres where rays meet a shell around everything, evenly spread and overlapping."""
-    if len(rays) == 0 or budget < 1:
-        return np.zeros((0, 3)), np.zeros(0)
+def _shell(sample: _Pixels, cameras: Array, points: Array | None, budget: int) -> tuple[Array, Array]:
+    """Return spheres on a shell around everything: a closed coarse one, and a finer one where rays meet it."""
     center = cameras.mean(0)
     radius = _FAR_FACTOR * _spread(cameras)
     if points is not None and len(points):
         radius = max(radius, 2 * float(np.percentile(np.linalg.norm(points - center, axis=1), 99)))
-    offset = origins - center
-    along = (rays * offset).sum(1)
+    coarse = min(_COARSE_SHELL, budget)
+    closed = center + 1.5 * radius * fibonacci_directions(coarse)
+    closed_scales = np.full(coarse, 1.5 * radius * np.sqrt(4 * np.pi / coarse) * _CELL_SCALE)
+    if len(sample.rays) == 0 or budget - coarse < 2:
+        return closed, closed_scales
+    offset = sample.origins - center
+    along = (sample.rays * offset).sum(1)
     distance = -along + np.sqrt(along**2 - (offset**2).sum(1) + radius**2)
-    met = origins + distance[:, None] * rays
-    index, spacing = farthest_points(met[:20000], budget)
-    return met[index], np.full(len(index), max(0.7 * spacing, 1e-3 * radius))
+    met = (sample.origins + distance[:, None] * sample.rays)[:20000]
+    index, spacing = farthest_points(met, budget - coarse)
+    scales = np.full(len(index), max(0.7 * spacing, 1e-3 * radius))
+    return np.concatenate([met[index], closed]), np.concatenate([scales, closed_scales])
 
 
 def _spread(points: Array) -> float:

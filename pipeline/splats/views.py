@@ -15,6 +15,9 @@ from ...datasets.cameras import Camera
 from ...datasets.capture import Capture
 from ...datasets.progress import progress
 from .hull import Silhouette
+from .volume import Array
+
+_FINE_SIZE = 800
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +32,7 @@ class View:
         viewmat: T_cam_world, shape (4, 4).
         camera: The camera at the photo's own size, without distortion.
         labels: Mask at the photo's own size, without distortion, or None.
+        grey: Grey values in [0, 1], longer side at most 800 px, on the CPU, shape (h, w).
     """
 
     name: str
@@ -38,6 +42,7 @@ class View:
     viewmat: Tensor
     camera: Camera
     labels: NDArray[np.uint8] | None
+    grey: Tensor
 
     @property
     def size(self) -> tuple[int, int]:
@@ -57,7 +62,7 @@ class View:
         K[1, 2] -= top
         rows, columns = slice(top, top + height), slice(left, left + width)
         cover = None if self.cover is None else self.cover[:, rows, columns]
-        return View(self.name, self.image[rows, columns], cover, K, self.viewmat, self.camera, self.labels)
+        return View(self.name, self.image[rows, columns], cover, K, self.viewmat, self.camera, self.labels, self.grey)
 
 
 def load_views(capture: Capture, names: Sequence[str], image_size: int, device: torch.device) -> list[View]:
@@ -81,9 +86,16 @@ def load_views(capture: Capture, names: Sequence[str], image_size: int, device: 
                 _tensor(small.T_cam_world, device),
                 camera,
                 labels,
+                _grey(image),
             )
         )
     return views
+
+
+def _grey(image: NDArray[np.uint8]) -> Tensor:
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    scale = min(1.0, _FINE_SIZE / max(grey.shape))
+    return torch.from_numpy(_reduced(grey, round(scale * grey.shape[1]), round(scale * grey.shape[0])))
 
 
 def _cover(labels: NDArray[np.uint8], bodies: int, width: int, height: int) -> NDArray[np.float32]:
@@ -91,7 +103,7 @@ def _cover(labels: NDArray[np.uint8], bodies: int, width: int, height: int) -> N
     return np.stack(shares) if shares else np.zeros((0, height, width), np.float32)
 
 
-def _reduced(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+def _reduced(image: Array, width: int, height: int) -> Array:
     if (image.shape[1], image.shape[0]) == (width, height):
         return image
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)

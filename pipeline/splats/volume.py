@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import KDTree
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Volume:
         distance: Signed distance to the surface at the grid points [m], positive outside, shape (X, Y, Z).
         surface: Points on the surface [m], about one or more per square pitch, shape (S, 3).
         normals: Outward unit normals at `surface`, shape (S, 3).
+        corner_count: The last so many of `surface` are tips that are finer than the grid.
     """
 
     origin: Array
@@ -48,9 +50,12 @@ class Volume:
     distance: Array
     surface: Array
     normals: Array
+    corner_count: int = 0
 
     @staticmethod
-    def from_inside(inside: NDArray[np.bool_], origin: Array, pitch: float, surface: Array) -> Volume:
+    def from_inside(
+        inside: NDArray[np.bool_], origin: Array, pitch: float, surface: Array, corner_count: int = 0
+    ) -> Volume:
         """Make a volume from an occupancy grid and accurate points on its surface.
 
         Args:
@@ -58,13 +63,14 @@ class Volume:
             origin: Position of grid point (0, 0, 0) [m].
             pitch: Grid spacing [m].
             surface: Points on the surface [m], at most about a pitch apart, shape (S, 3).
+            corner_count: How many of them, at the end, are tips that are finer than the grid.
         """
         away = _distance_to(surface, inside.shape, np.asarray(origin, float), pitch)
         distance = np.where(inside, -away, away)
         gradient = np.stack([np.gradient(distance, pitch, axis=k) for k in range(3)], -1)
         normals = np.stack([_interpolate(gradient[..., k], origin, pitch, surface) for k in range(3)], 1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        return Volume(np.asarray(origin, float), pitch, distance, surface, normals)
+        return Volume(np.asarray(origin, float), pitch, distance, surface, normals, corner_count)
 
     def at(self, points: Array) -> Array:
         """Return the signed distance [m] at points (n, 3) [m], by trilinear interpolation (clamped at the border)."""
@@ -74,6 +80,11 @@ class Volume:
     def tolerance(self) -> float:
         """How accurate the signed distance is [m]."""
         return 0.1 * self.pitch
+
+    @property
+    def corners(self) -> Array:
+        """Return the tips that are finer than the grid [m], shape (corner_count, 3)."""
+        return self.surface[len(self.surface) - self.corner_count :]
 
     def size(self) -> float:
         """Return the diagonal of the surface's bounding box [m]."""
