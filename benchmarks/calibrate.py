@@ -1,0 +1,106 @@
+"""Calibrate real photos, and print how right and how repeatable the cameras are.
+
+`fox`: camera centres against its transforms.json (itself a COLMAP result: agreement, not truth) after a similarity
+alignment, from three seeds, twice each. `kermit`: how many photos are registered. Run with
+
+    python benchmarks/calibrate.py [--seeds 0,1,2] [--max-features 4096]
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cgwm.pipeline.calibrate import calibrate
+from cgwm.pipeline.sfm.scale import umeyama
+from cgwm.schemas import CalibrateConfig, CamerasFile, read_json
+
+MANIFEST = 'format = "cgwm-capture/1"\n'
+
+
+def shared_data() -> Path | None:
+    """Return the folder of measured data, or None: `CGWM_SHARED_DATA`, or `shared/data` beside the repository."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("CGWM_SHARED_DATA", beside))
+    return folder if folder.is_dir() else None
+
+
+def make_capture(photos: Path, folder: Path) -> Path:
+    """Make a capture of a folder of photos, without copying them."""
+    (folder / "images").mkdir(parents=True)
+    for photo in sorted(photos.glob("*.jpg")):
+        (folder / "images" / photo.name).symlink_to(photo.resolve())
+    (folder / "capture.toml").write_text(MANIFEST, encoding="utf-8")
+    return folder
+
+
+def center_errors(cameras: CamerasFile, transforms: dict[str, Any]) -> np.ndarray:
+    """Return centre errors against a transforms.json, as fractions of the diagonal of its cameras' bounding box."""
+    reference = {
+        Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3, 3] for frame in transforms["frames"]
+    }
+    names = [name for name in cameras.images if name in reference]
+    found = np.array([cameras.images[name].T_world_cam for name in names])[:, :3, 3]
+    target = np.array([reference[name] for name in names])
+    diagonal = np.linalg.norm(np.ptp(np.array(list(reference.values())), axis=0))
+    return np.linalg.norm(umeyama(found, target).points(found) - target, axis=1) / diagonal
+
+
+def run_once(photos: Path, config: CalibrateConfig) -> dict[str, Any]:
+    """Calibrate a folder of photos from scratch and return the figures."""
+    with tempfile.TemporaryDirectory() as folder:
+        start, cpu = time.perf_counter(), time.process_time()
+        report = calibrate(make_capture(photos, Path(folder) / "capture"), config)
+        path = Path(folder) / "capture" / "cameras.json"
+        figures: dict[str, Any] = {
+            "photos": report.photos,
+            "registered": report.photos_registered,
+            "attempts": len(report.attempts),
+            "worst_strong_pair": report.self_check.worst.consistent if report.self_check.worst else None,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+            "wall_s": round(time.perf_counter() - start, 1),
+            "cpu_s": round(time.process_time() - cpu, 1),
+        }
+        transforms = photos.parent / "transforms.json"
+        if transforms.is_file():
+            errors = center_errors(read_json(path, CamerasFile), json.loads(transforms.read_text(encoding="utf-8")))
+            figures["center_error_percent_median"] = round(100.0 * float(np.median(errors)), 4)
+            figures["center_error_percent_max"] = round(100.0 * float(errors.max()), 4)
+    return figures
+
+
+def main() -> int:
+    """Print one JSON line a run; return 1 if a figure misses its bar."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--max-features", type=int, default=CalibrateConfig().max_features)
+    arguments = parser.parse_args()
+    data = shared_data()
+    if data is None:
+        print("no measured data: set CGWM_SHARED_DATA", file=sys.stderr)
+        return 2
+    good = True
+    for seed in (int(value) for value in arguments.seeds.split(",")):
+        config = CalibrateConfig(seed=seed, max_features=arguments.max_features)
+        runs = [run_once(data / "fox" / "images", config) for _ in range(2)]
+        for run in runs:
+            print(json.dumps({"set": "fox", "seed": seed, **run}), flush=True)
+            good &= run["registered"] == run["photos"] == 50 and run["center_error_percent_median"] < 0.2
+        good &= runs[0]["sha256"] == runs[1]["sha256"]
+    for name, folder in (("kermit", "images"), ("et", "et")):
+        run = run_once(data / "kermit" / folder, CalibrateConfig(max_features=arguments.max_features))
+        print(json.dumps({"set": name, "seed": 0, **run}), flush=True)
+        good &= run["registered"] == run["photos"]
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,331 @@
+"""The one module that talks to pycolmap: features, matches and mapping, repeatable bit for bit.
+
+Every seed is set and extraction, matching and mapping run on one thread each: with automatic thread counts two runs
+on the same photos differ. pycolmap is released often and renames things, so nothing else imports it.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pycolmap
+
+from ...datasets.progress import progress
+from .model import SfmCamera, SfmModel, VerifiedPair
+
+ResultT = TypeVar("ResultT")
+
+_EXTRACTION_CHUNK = 4
+_MATCHING_BLOCK = 25
+_MIN_MODEL_IMAGES = 3
+_POLL_S = 0.2
+
+pycolmap.logging.minloglevel = 3  # COLMAP's own log would drown ours; its outcomes are read from the database
+
+
+def _keep_sigterm() -> None:
+    """Give SIGTERM back to Python: on import, COLMAP's log library takes it, and would end us without a clean-up."""
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+
+
+_keep_sigterm()
+
+
+@dataclass(frozen=True)
+class SfmImage:
+    """An image to register."""
+
+    name: str
+    """Path relative to the image root, with forward slashes."""
+    camera: str
+    """Images of one camera share their intrinsics and their size."""
+    model: str = "OPENCV"
+    """COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
+    mask: Path | None = None
+    """Folder of masks, `<name>.png`, 0 where no features are wanted."""
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """Settings of one attempt."""
+
+    seed: int = 0
+    max_features: int = 4096
+    max_image_size: int = 1600
+    """Images are reduced to this longer side [px]; keypoints are given in original pixels."""
+    peak_threshold: float = 0.0067
+    """Smallest contrast of a SIFT feature; lower for weak texture."""
+    guided_matching: bool = False
+    """Match again along the epipolar lines of the first verification."""
+    max_ratio: float = 0.8
+    """Largest ratio of nearest to second-nearest descriptor distance; lower for repeated texture."""
+
+    verification_trials: int = 2000
+    """Most hypotheses per pair. Pairs without true matches use them all and take most of the time: on 20 photos of a
+    small scene 2000 kept 4848 inliers of the 4849 that COLMAP's 10000 find, in half the time."""
+
+    @property
+    def features(self) -> tuple[int, int, float]:
+        """What the features depend on."""
+        return self.max_features, self.max_image_size, self.peak_threshold
+
+    @property
+    def matches(self) -> tuple[object, ...]:
+        """What the verified matches depend on; the mapping depends on the seed as well."""
+        return (*self.features, self.guided_matching, self.max_ratio, self.verification_trials)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that the result depends on."""
+    return {"pycolmap": pycolmap.__version__}
+
+
+def build_database(database: Path, root: Path, images: Sequence[SfmImage], settings: SfmSettings) -> None:
+    """Extract and match the features of all images into a new COLMAP database.
+
+    Args:
+        database: The file to make.
+        root: Folder of the images.
+        images: The images.
+        settings: Settings of the attempt.
+    """
+    _extract(database, root, images, settings)
+    _match(database, [image.name for image in images], settings)
+
+
+def map_database(database: Path, root: Path, seed: int) -> list[SfmModel]:
+    """Estimate cameras and points; return all connected models, that with most images first."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    options.mapper.num_threads = 1
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.min_model_size = _MIN_MODEL_IMAGES
+    output = database.with_suffix(".models")
+    output.mkdir(exist_ok=True)
+    count = _count(database, lambda opened: opened.num_images())
+    with progress(range(count), "mapping", total=count, unit="image") as bar:
+        found = _run(
+            pycolmap.incremental_mapping,
+            seed,
+            database_path=database,
+            image_path=root,
+            output_path=output,
+            options=options,
+            next_image_callback=lambda: bar.update(1),
+        )
+    cameras = _camera_names(database)
+    models = [_plain_model(found[key], cameras) for key in sorted(found)]
+    return sorted(models, key=lambda model: -len(model.T_cam_world))
+
+
+def read_pairs(database: Path) -> list[VerifiedPair]:
+    """Return the verified pairs of a database, in the order of their identifiers."""
+    opened = pycolmap.Database.open(database)
+    try:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        keypoints = {image_id: opened.read_keypoints(image_id)[:, :2].astype(float) for image_id in names}
+        identifiers, geometries = opened.read_two_view_geometries()
+        pairs = []
+        for pair_id, geometry in sorted(zip(identifiers, geometries, strict=True), key=lambda item: item[0]):
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            matches = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
+            if len(matches):
+                pairs.append(VerifiedPair(names[a], names[b], keypoints[a][matches[:, 0]], keypoints[b][matches[:, 1]]))
+        return pairs
+    finally:
+        opened.close()
+
+
+def feature_counts(database: Path) -> dict[str, int]:
+    """Return the number of features of each image that COLMAP could read."""
+    return _count(
+        database,
+        lambda opened: {
+            image.name: int(opened.num_keypoints_for_image(image.image_id)) for image in opened.read_all_images()
+        },
+    )
+
+
+def _extract(database: Path, root: Path, images: Sequence[SfmImage], settings: SfmSettings) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.use_gpu = False
+    options.max_image_size = settings.max_image_size
+    options.sift.max_num_features = settings.max_features
+    options.sift.peak_threshold = settings.peak_threshold
+    pycolmap.Database.open(database).close()
+    with progress(range(len(images)), "features", total=len(images), unit="image") as bar:
+        for group in _groups(images):
+            for chunk in _chunks(group, _EXTRACTION_CHUNK):
+                reader = pycolmap.ImageReaderOptions()
+                reader.camera_model = chunk[0].model
+                reader.existing_camera_id = _existing_camera(database, group[0].name)
+                if chunk[0].mask is not None:
+                    reader.mask_path = chunk[0].mask
+                _run(
+                    pycolmap.extract_features,
+                    settings.seed,
+                    database_path=database,
+                    image_path=root,
+                    image_names=[image.name for image in chunk],
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
+                bar.update(len(chunk))
+    _name_cameras(database, images)
+
+
+def _match(database: Path, names: Sequence[str], settings: SfmSettings) -> None:
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = 1
+    matching.use_gpu = False
+    matching.guided_matching = settings.guided_matching
+    matching.sift.max_ratio = settings.max_ratio
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = settings.seed
+    verification.ransac.num_threads = 1
+    verification.ransac.max_num_trials = settings.verification_trials
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database.with_suffix(".pairs.txt")
+    read = feature_counts(database)
+    blocks = _pair_blocks([name for name in names if name in read])
+    total = sum(map(len, blocks))
+    with progress(range(total), "matches", total=total, unit="pair") as bar:
+        for chunk in blocks:
+            Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in chunk), encoding="utf-8")
+            _run(
+                pycolmap.match_image_pairs,
+                settings.seed,
+                database_path=database,
+                matching_options=matching,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+            bar.update(len(chunk))
+
+
+def _pair_blocks(names: Sequence[str]) -> list[list[tuple[str, str]]]:
+    """Return all pairs in square blocks: COLMAP indexes the features of an image anew in every call."""
+    groups = list(_chunks(names, _MATCHING_BLOCK))
+    blocks = [list(combinations(group, 2)) for group in groups]
+    blocks += [list(product(a, b)) for a, b in combinations(groups, 2)]
+    return [block for block in blocks if block]
+
+
+def _run(function: Callable[..., ResultT], seed: int, **arguments: Any) -> ResultT:
+    """Call pycolmap in a thread of its own, so that Ctrl-C cancels it instead of waiting for its end.
+
+    COLMAP's generator belongs to the thread, so it is seeded there.
+    """
+    token = pycolmap.CancellationToken()
+    outcome: dict[str, Any] = {}
+
+    def call() -> None:
+        try:
+            pycolmap.set_random_seed(seed)
+            outcome["value"] = function(**arguments, cancellation_token=token)
+        except BaseException as error:  # handed to the caller's thread
+            outcome["error"] = error
+
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(_POLL_S)
+    except BaseException:
+        token.cancel()
+        thread.join()
+        raise
+    if "error" in outcome:
+        raise outcome["error"]
+    return outcome["value"]
+
+
+def _groups(images: Sequence[SfmImage]) -> list[list[SfmImage]]:
+    groups: dict[str, list[SfmImage]] = {}
+    for image in images:
+        groups.setdefault(image.camera, []).append(image)
+    return list(groups.values())
+
+
+def _chunks(items: Sequence[Any], size: int) -> Iterable[Sequence[Any]]:
+    return (items[start : start + size] for start in range(0, len(items), size))
+
+
+def _count(database: Path, read: Callable[[Any], ResultT]) -> ResultT:
+    opened = pycolmap.Database.open(database)
+    try:
+        return read(opened)
+    finally:
+        opened.close()
+
+
+def _existing_camera(database: Path, image: str) -> int:
+    """Return the camera of an image that is already in the database, or -1."""
+
+    def read(opened: Any) -> int:
+        return opened.read_image_with_name(image).camera_id if opened.exists_image(image) else -1
+
+    return _count(database, read)
+
+
+def _name_cameras(database: Path, images: Sequence[SfmImage]) -> None:
+    names = {image.name: image.camera for image in images}
+    identifiers = {
+        image.camera_id: names[image.name] for image in _count(database, lambda opened: opened.read_all_images())
+    }
+    lines = [f"{identifier} {name}\n" for identifier, name in sorted(identifiers.items())]
+    database.with_suffix(".cameras.txt").write_text("".join(lines), encoding="utf-8")
+
+
+def _camera_names(database: Path) -> dict[int, str]:
+    lines = database.with_suffix(".cameras.txt").read_text(encoding="utf-8").splitlines()
+    return {int(line.split(" ", 1)[0]): line.split(" ", 1)[1] for line in lines}
+
+
+def _plain_model(model: pycolmap.Reconstruction, camera_names: dict[int, str]) -> SfmModel:
+    model.update_point_3d_errors()
+    point_ids = sorted(model.points3D)
+    index = {point_id: i for i, point_id in enumerate(point_ids)}
+    points = [model.points3D[point_id] for point_id in point_ids]
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    poses, observations = {}, {}
+    for image in images:
+        poses[image.name] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+        seen = [point for point in image.points2D if point.has_point3D()]
+        observations[image.name] = (
+            np.array([point.xy for point in seen], dtype=float).reshape(-1, 2),
+            np.array([index[point.point3D_id] for point in seen], dtype=np.int64),
+        )
+    used = {image.camera_id for image in images}
+    return SfmModel(
+        cameras={camera_names[key]: _plain_camera(model.cameras[key]) for key in sorted(used)},
+        image_camera={image.name: camera_names[image.camera_id] for image in images},
+        T_cam_world=poses,
+        points=np.array([point.xyz for point in points], dtype=float).reshape(-1, 3),
+        colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        observations=observations,
+        reprojection_error_px=float(model.compute_mean_reprojection_error()),
+    )
+
+
+def _plain_camera(camera: pycolmap.Camera) -> SfmCamera:
+    focal = [float(value) for value in camera.params[camera.focal_length_idxs()]]
+    cx, cy = (float(value) for value in camera.params[camera.principal_point_idxs()])
+    extra = [float(value) for value in camera.params[camera.extra_params_idxs()]]
+    k1, k2, p1, p2 = [*extra, 0.0, 0.0, 0.0, 0.0][:4]
+    return SfmCamera(camera.width, camera.height, focal[0], focal[-1], cx, cy, (k1, k2, p1, p2))

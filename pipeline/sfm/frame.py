@@ -1,0 +1,123 @@
+"""A world frame for cameras that nothing ties to the world: the dominant plane becomes the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .model import Array, SfmModel, Similarity
+
+_TRIALS = 500
+_THICKNESS = 0.005
+"""Half thickness of the plane, as a fraction of the median distance between camera and point."""
+_MIN_SHARE = 0.1
+"""The plane holds at least this share of the sparse points."""
+_MAX_BELOW = 0.05
+"""And at most this share lies below it: nothing is under the ground."""
+
+
+def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similarity | None:
+    """Return the rigid motion that puts the dominant plane at the ground's orientation, cameras above it.
+
+    The origin becomes the plane's point below what the cameras look at; x runs along the first camera's right.
+
+    Args:
+        model: The model, in any frame.
+        normal_world: The ground's unit normal in the world frame, shape (3,).
+        seed: Seed of the search.
+
+    Returns:
+        The transform, of scale 1, or None where no plane holds a tenth of the points with nothing below it.
+    """
+    plane = dominant_plane(model.points, model.centers(), _view_distance(model), seed)
+    if plane is None:
+        return None
+    normal, offset = plane
+    first = next(iter(model.T_cam_world.values()))
+    target = _basis(normal_world, np.array([1.0, 0.0, 0.0]))
+    rotation = target @ _basis(normal, first[0, :3]).T
+    focus = _focus(model)
+    origin = focus - (normal @ focus - offset) * normal
+    return Similarity(1.0, rotation, -rotation @ origin)
+
+
+def dominant_plane(points: Array, centers: Array, distance: float, seed: int = 0) -> tuple[Array, float] | None:
+    """Find the plane with most points that has all cameras, and nearly all other points, on its upper side.
+
+    Args:
+        points: Sparse points, shape (point, 3).
+        centers: Optical centres, shape (camera, 3).
+        distance: Typical distance between a camera and a point, which sets the plane's thickness.
+        seed: Seed of the search.
+
+    Returns:
+        Upward unit normal (3,) and offset, so that normal . p = offset on the plane; or None.
+    """
+    if len(points) < 3:
+        return None
+    rng = np.random.default_rng(seed)
+    best, best_count = None, _MIN_SHARE * len(points)
+    for _ in range(_TRIALS):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        plane = _oriented(np.cross(b - a, c - a), a, centers)
+        if plane is None:
+            continue
+        count = _support(points, plane, _THICKNESS * distance)
+        if count > best_count:
+            best, best_count = plane, count
+    return _refined(points, centers, best, _THICKNESS * distance) if best is not None else None
+
+
+def _support(points: Array, plane: tuple[Array, float], thickness: float) -> int:
+    height = points @ plane[0] - plane[1]
+    below = np.mean(height < -3.0 * thickness)
+    return int(np.sum(np.abs(height) < thickness)) if below <= _MAX_BELOW else 0
+
+
+def _refined(points: Array, centers: Array, plane: tuple[Array, float], thickness: float) -> tuple[Array, float] | None:
+    for _ in range(5):
+        near = points[np.abs(points @ plane[0] - plane[1]) < thickness]
+        middle = near.mean(axis=0)
+        normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+        plane = _oriented(normal, middle, centers) or plane
+    return plane
+
+
+def _oriented(normal: Array, point: Array, centers: Array) -> tuple[Array, float] | None:
+    """Return the plane with its normal towards the cameras, or None where they are on both sides."""
+    length = np.linalg.norm(normal)
+    if length == 0.0:
+        return None
+    normal = normal / length
+    side = (centers - point) @ normal
+    if not (np.all(side > 0) or np.all(side < 0)):
+        return None
+    normal = normal * np.sign(side[0])
+    return normal, float(normal @ point)
+
+
+def _basis(normal: Array, forward: Array) -> Array:
+    """Return a right-handed basis (columns x, y, z) with z along `normal` and x near `forward`."""
+    x = forward - (forward @ normal) * normal
+    if np.linalg.norm(x) < 1e-6:
+        x = np.eye(3)[np.argmin(np.abs(normal))]
+        x = x - (x @ normal) * normal
+    x = x / np.linalg.norm(x)
+    return np.column_stack([x, np.cross(normal, x), normal])
+
+
+def _focus(model: SfmModel) -> Array:
+    """Return the point nearest to all optical axes, shape (3,); the points' median for parallel axes."""
+    axes = np.array([pose[2, :3] for pose in model.T_cam_world.values()])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix = projectors.sum(axis=0)
+    if np.linalg.cond(matrix) > 1e4:
+        return np.median(model.points, axis=0)
+    return np.linalg.solve(matrix, np.einsum("vij,vj->i", projectors, model.centers()))
+
+
+def _view_distance(model: SfmModel) -> float:
+    distances = [
+        np.linalg.norm(model.points[index] - model.center(image), axis=1)
+        for image, (_, index) in model.observations.items()
+    ]
+    return float(np.median(np.concatenate(distances)))

@@ -1,0 +1,163 @@
+"""What goes into structure from motion: the photos, and the first frame of each video camera that stands still."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.capture import Capture
+from ...datasets.images import image_size, write_image
+from .colmap import SfmImage
+
+STILL_BELOW_PX = 2.0
+"""Median displacement of the background, per 1000 px of image width, below which a video camera stands still."""
+_EPISODES_LOOKED_AT = 4
+_FEW_PHOTOS = 6
+"""With fewer photos of one camera, four lens parameters are not determined; one (k1) is estimated then."""
+_MASK_MARGIN_PX = 5
+
+
+@dataclass(frozen=True)
+class Source:
+    """An image for structure from motion, and where it comes from."""
+
+    label: str
+    """The photo's name, or `video:<camera>`."""
+    image: SfmImage
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """All images of a capture, laid out for COLMAP."""
+
+    root: Path
+    sources: tuple[Source, ...]
+    notes: tuple[str, ...]
+    """What the user should know: moving video cameras, photos of several sizes."""
+    moving: dict[str, str]
+    """Video cameras that were left out, with the reason."""
+
+
+def video_label(camera: str) -> str:
+    """Return the label of a video camera's frame; no photo has a colon and no suffix in its name."""
+    return f"video:{camera}"
+
+
+def gather(capture: Capture, folder: Path) -> Inputs:
+    """Lay out a capture's images in a working folder, under names that COLMAP can read.
+
+    Args:
+        capture: The capture.
+        folder: An empty folder, for the time of the calibration.
+    """
+    root = folder / "images"
+    sources, notes = _photos(capture, root)
+    moving: dict[str, str] = {}
+    for camera in capture.video_cameras():
+        frames, masks = _probe_frames(capture, camera)
+        if not frames:
+            continue
+        flow = background_flow(frames, masks)
+        limit = STILL_BELOW_PX * frames[0].shape[1] / 1000.0
+        if flow > limit:
+            moving[camera] = f"the camera moves: its background shifts by {flow:.1f} px (still: below {limit:.1f} px)"
+            notes.append(f"video camera '{camera}' is left out: {moving[camera]}; give its poses in cameras.json")
+            continue
+        sources.append(_video_source(folder, root, camera, frames[0], masks[0]))
+    return Inputs(root, tuple(sources), tuple(notes), moving)
+
+
+def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray[np.uint8] | None]) -> float:
+    """Return the largest median displacement of corners between the first frame and any other [px].
+
+    The median is that of the background as long as moving bodies cover less than half of the trackable corners.
+
+    Args:
+        frames: RGB frames of one camera, each (height, width, 3).
+        masks: Their labels (height, width), 0 background, or None.
+    """
+    first = cv2.cvtColor(frames[0], cv2.COLOR_RGB2GRAY)
+    mask = None if masks[0] is None else (masks[0] == 0).astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(first, 300, 0.01, 8, mask=mask)
+    if corners is None:
+        return 0.0
+    worst = 0.0
+    for frame in frames[1:]:
+        moved, found, _ = cv2.calcOpticalFlowPyrLK(
+            first, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners, np.zeros_like(corners)
+        )
+        shift = np.linalg.norm((moved - corners).reshape(-1, 2), axis=1)[np.ravel(found) == 1]
+        if len(shift):
+            worst = max(worst, float(np.median(shift)))
+    return worst
+
+
+def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str]]:
+    (root / "photos").mkdir(parents=True)
+    names = capture.photos()
+    sizes = {name: image_size(capture.root / "images" / name) for name in names}
+    distinct = sorted(set(sizes.values()))
+    same = capture.manifest.calibration.same_camera
+    sources = []
+    for index, name in enumerate(names):
+        # Numbers instead of names: COLMAP's lists are separated by blanks.
+        inside = f"photos/{index:06d}{Path(name).suffix.lower()}"
+        _link(capture.root / "images" / name, root / inside)
+        width, height = sizes[name]
+        camera = name if not same else "photos" if len(distinct) == 1 else f"photos-{width}x{height}"
+        alike = sum(size == sizes[name] for size in sizes.values()) if same else 1
+        model = "OPENCV" if alike >= _FEW_PHOTOS else "SIMPLE_RADIAL"
+        sources.append(Source(name, SfmImage(inside, camera, model)))
+    notes = []
+    if same and len(distinct) > 1:
+        listed = ", ".join(f"{width}x{height}" for width, height in distinct)
+        notes.append(f"photos of {len(distinct)} sizes ({listed}): each size has intrinsics of its own")
+    return sources, notes
+
+
+def _video_source(
+    folder: Path, root: Path, camera: str, frame: NDArray[np.uint8], mask: NDArray[np.uint8] | None
+) -> Source:
+    inside = f"videos/{camera}.png"
+    (root / "videos").mkdir(exist_ok=True)
+    write_image(root / inside, frame)
+    masks = None
+    if mask is not None:
+        # The bodies are elsewhere in the photos: their features would be matches that contradict the scene.
+        masks = folder / "masks"
+        (masks / "videos").mkdir(parents=True, exist_ok=True)
+        kernel = np.ones((2 * _MASK_MARGIN_PX + 1, 2 * _MASK_MARGIN_PX + 1), np.uint8)
+        keep = np.where(cv2.dilate((mask > 0).astype(np.uint8), kernel) > 0, 0, 255).astype(np.uint8)
+        write_image(masks / f"{inside}.png", keep)
+    # A lens cannot be told from one frame: focal length only.
+    return Source(video_label(camera), SfmImage(inside, f"video-{camera}", "SIMPLE_PINHOLE", masks))
+
+
+def _probe_frames(capture: Capture, camera: str) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8] | None]]:
+    """Return the first frame of a camera, then the last ones and those of other episodes, with their masks."""
+    splits = capture.manifest.splits
+    wanted = capture.episodes("train") if "train" in splits else capture.episodes()
+    episodes = [episode for episode in wanted if camera in capture.videos(episode)][:_EPISODES_LOOKED_AT]
+    frames: list[NDArray[np.uint8]] = []
+    masks: list[NDArray[np.uint8] | None] = []
+    for episode in episodes:
+        video, labels = capture.video_frames(camera, episode), capture.video_masks(camera, episode)
+        for index in dict.fromkeys((0, len(video) - 1)):
+            frames.append(video[index])
+            masks.append(None if labels is None else labels[index])
+    sizes = {frame.shape for frame in frames}
+    return (frames, masks) if len(sizes) <= 1 else (frames[:2], masks[:2])
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.symlink(source.resolve(), target)
+    except OSError:  # file systems and systems without links
+        shutil.copyfile(source, target)

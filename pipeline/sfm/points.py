@@ -1,0 +1,63 @@
+"""The sparse points on disk: `sparse_points.ply`, which viewers open and the stage sg-gs starts from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import InputDataError
+from .model import Array
+
+POINTS_NAME = "sparse_points.ply"
+
+_VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
+_PROPERTIES = [f"property double {axis}" for axis in "xyz"] + [
+    f"property uchar {name}" for name in ("red", "green", "blue")
+]
+
+
+def write_points(path: Path, points: Array, colors: NDArray[np.uint8], unit: str) -> None:
+    """Write sparse points as binary PLY.
+
+    Args:
+        path: The file; not atomic, so give a temporary one.
+        points: Positions, world frame, shape (point, 3).
+        colors: sRGB, shape (point, 3).
+        unit: "metre" or "arbitrary", for the header.
+    """
+    header = ["ply", "format binary_little_endian 1.0", f"comment unit {unit}", "comment frame world"]
+    header += [f"element vertex {len(points)}", *_PROPERTIES, "end_header", ""]
+    table = np.empty(len(points), _VERTEX)
+    table["xyz"], table["rgb"] = points, colors
+    path.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
+
+
+def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
+    """Read what :func:`write_points` wrote.
+
+    Args:
+        path: `sparse_points.ply` of a capture.
+
+    Returns:
+        Positions, world frame, float64 (point, 3), in the unit of `cameras.json`, and sRGB colours, uint8 (point, 3).
+
+    Raises:
+        InputDataError: If it is another kind of file, or truncated.
+    """
+    data = path.read_bytes()
+    header, found, body = data.partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").splitlines()
+    counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
+    if not found or len(counts) != 1 or [line for line in lines if line.startswith("property")] != _PROPERTIES:
+        raise InputDataError(
+            f"{path}: not the sparse points of a calibration.", todo="run 'cgwm calibrate --overwrite'."
+        )
+    if len(body) != int(counts[0]) * _VERTEX.itemsize:
+        raise InputDataError(
+            f"{path}: truncated: {counts[0]} points announced, {len(body) // _VERTEX.itemsize} found.",
+            todo="run 'cgwm calibrate --overwrite'.",
+        )
+    table = np.frombuffer(body, _VERTEX)
+    return table["xyz"].astype(np.float64), table["rgb"].astype(np.uint8)

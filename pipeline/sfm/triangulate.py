@@ -1,0 +1,163 @@
+"""A point from its images in many registered photos, robust against false sightings, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .model import Array, SfmModel
+
+MAX_ERROR_PX = 4.0
+"""A sighting farther than this from the point's image is left out (the bound COLMAP filters by)."""
+_MAX_PAIRS = 300
+_GAUSS_NEWTON_STEPS = 10
+_PARALLEL = 1e-4
+"""Rays that differ by a smaller angle [rad] make no hypothesis."""
+
+
+@dataclass(frozen=True)
+class TriangulatedPoint:
+    """A triangulated point."""
+
+    position: Array
+    """Shape (3,), the model's frame."""
+    covariance: Array
+    """Shape (3, 3), model unit squared, from the measurement noise alone; the cameras are taken as exact."""
+    images: tuple[str, ...]
+    """The images that agree."""
+    rms_px: float
+    """Root mean square distance to the sightings in those images [px]."""
+
+
+def triangulate(
+    model: SfmModel, sightings: Mapping[str, tuple[float, float]], noise_px: float
+) -> TriangulatedPoint | None:
+    """Triangulate one point.
+
+    Every pair of views (evenly chosen, up to 300) makes a hypothesis by the midpoint of its rays;
+    the one with most agreeing views wins and is refined by Gauss-Newton on the reprojection error.
+
+    Args:
+        model: The registered cameras.
+        sightings: Image name to the point's pixel; images that are not registered are passed over.
+        noise_px: Standard deviation of a pixel coordinate [px], a lower bound for the covariance.
+
+    Returns:
+        The point, or None if no two views agree on one in front of them.
+    """
+    images = [name for name in sightings if name in model.T_cam_world]
+    if len(images) < 2:
+        return None
+    pixels = np.array([sightings[name] for name in images], dtype=float)
+    poses = np.array([model.T_cam_world[name] for name in images])
+    cameras = [model.camera(name) for name in images]
+    rays = np.array([camera.rays(xy[None])[0] for camera, xy in zip(cameras, pixels, strict=True)])
+    focal = np.array([camera.focal_px for camera in cameras])
+    point = _best_hypothesis(poses, rays, focal)
+    if point is None:
+        return None
+    good = _errors(point, poses, rays, focal) < MAX_ERROR_PX
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        residual, jacobian = _residual(point, poses[good], rays[good], focal[good])
+        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+        point = point - step
+        refined = _errors(point, poses, rays, focal) < MAX_ERROR_PX
+        if refined.sum() < 2:
+            return None
+        if np.array_equal(refined, good) and np.linalg.norm(step) < 1e-12 * np.linalg.norm(point):
+            break
+        good = refined
+    residual, jacobian = _residual(point, poses[good], rays[good], focal[good])
+    rms = float(np.sqrt(np.mean(residual**2) * 2.0))
+    freedom = max(len(residual) - 3, 1)
+    variance = max(float(residual @ residual) / freedom, noise_px**2)
+    covariance = np.asarray(variance * np.linalg.pinv(jacobian.T @ jacobian), np.float64)
+    return TriangulatedPoint(point, covariance, tuple(name for name, ok in zip(images, good, strict=True) if ok), rms)
+
+
+def center_std(model: SfmModel, image: str, direction: Array, noise_px: float) -> float:
+    """Return the standard deviation of an optical centre along a direction, by resection on the sparse points.
+
+    The points are taken as exact, so this is a lower bound; derived from the normal equations of the pose.
+
+    Args:
+        model: The model.
+        image: A registered image.
+        direction: Unit vector, the model's frame, shape (3,).
+        noise_px: Standard deviation of a pixel coordinate [px].
+
+    Returns:
+        Standard deviation [model unit].
+    """
+    pose = model.T_cam_world[image]
+    points = model.points[model.observations[image][1]]
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    projection = _projection_jacobian(local) * model.camera(image).focal_px
+    # x_cam = R (p - c): moving the centre shifts it by -R dc, turning the camera by w shifts it by w x x_cam.
+    turn = -_cross_matrices(local)
+    jacobian = np.concatenate([projection @ -pose[:3, :3], projection @ turn], axis=2).reshape(-1, 6)
+    covariance = noise_px**2 * np.linalg.pinv(jacobian.T @ jacobian)[:3, :3]
+    return float(np.sqrt(direction @ covariance @ direction))
+
+
+def _best_hypothesis(poses: Array, rays: Array, focal: Array) -> Array | None:
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    homogeneous = np.column_stack([rays, np.ones(len(rays))])
+    directions = np.einsum("vji,vj->vi", poses[:, :3, :3], homogeneous)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    pairs = np.array(list(combinations(range(len(rays)), 2)))
+    pairs = pairs[:: max(1, -(-len(pairs) // _MAX_PAIRS))]
+    points = _midpoints(centers[pairs], directions[pairs])
+    if len(points) == 0:
+        return None
+    errors = _errors(points, poses, rays, focal)
+    agreeing = (errors < MAX_ERROR_PX).sum(axis=1)
+    cost = np.minimum(errors, MAX_ERROR_PX).sum(axis=1)
+    best = np.lexsort((cost, -agreeing))[0]
+    return points[best] if agreeing[best] >= 2 else None
+
+
+def _midpoints(centers: Array, directions: Array) -> Array:
+    """Return the points nearest to two lines each, shape (pair, 3), without pairs of parallel lines.
+
+    Args:
+        centers: A point on each line, shape (pair, 2, 3).
+        directions: Unit directions, shape (pair, 2, 3).
+    """
+    crossing = np.linalg.norm(np.cross(directions[:, 0], directions[:, 1]), axis=1) > _PARALLEL
+    centers, directions = centers[crossing], directions[crossing]
+    projectors = np.eye(3) - directions[..., :, None] * directions[..., None, :]
+    right = np.einsum("pvij,pvj->pi", projectors, centers)
+    return np.linalg.solve(projectors.sum(axis=1), right[:, :, None])[:, :, 0]
+
+
+def _errors(points: Array, poses: Array, rays: Array, focal: Array) -> Array:
+    """Return reprojection errors [px], shape (..., view), of points (..., 3); infinite behind a camera."""
+    local = np.einsum("vij,...j->...vi", poses[:, :3, :3], points) + poses[:, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.linalg.norm(local[..., :2] / local[..., 2:] - rays, axis=-1) * focal
+    return np.where(local[..., 2] > 0, errors, np.inf)
+
+
+def _residual(point: Array, poses: Array, rays: Array, focal: Array) -> tuple[Array, Array]:
+    local = poses[:, :3, :3] @ point + poses[:, :3, 3]
+    residual = (local[:, :2] / local[:, 2:] - rays) * focal[:, None]
+    jacobian = _projection_jacobian(local) @ poses[:, :3, :3] * focal[:, None, None]
+    return residual.ravel(), jacobian.reshape(-1, 3)
+
+
+def _projection_jacobian(local: Array) -> Array:
+    """Return d(x/z, y/z)/d(x, y, z), shape (point, 2, 3)."""
+    x, y, z = local.T
+    zero = np.zeros_like(z)
+    return np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
+
+
+def _cross_matrices(vectors: Array) -> NDArray[np.float64]:
+    x, y, z = vectors.T
+    zero = np.zeros_like(z)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,129 @@
+"""What `cgwm calibrate` reports: `calibration.json`, beside `cameras.json`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from .base import FileModel
+from .cameras import Scale
+from .config import CalibrateConfig
+
+
+class ImageVerdict(FileModel):
+    """Whether an image was registered, and on what evidence."""
+
+    registered: bool
+    reason: str = ""
+    """Why not; empty for a registered image."""
+    features: int = 0
+    matched_images: int = 0
+    """Images that share verified matches with this one."""
+    matches: int = 0
+    """Verified matches with all of them together."""
+    inliers: int = 0
+    """Features that see a sparse point of the model."""
+
+
+class PairFigures(FileModel):
+    """A pair of images in the self-check."""
+
+    images: tuple[str, str]
+    inliers: int
+    """Matches that two-view verification kept."""
+    consistent: float
+    """Fraction of them that agrees with the model's relative pose (Sampson error below 4 px)."""
+
+
+class SelfCheckFigures(FileModel):
+    """The self-check: do the verified matches agree with the cameras?"""
+
+    passed: bool
+    pairs: int
+    """Pairs with at least 50 verified inliers."""
+    strong_pairs: int
+    """Pairs with at least 200: one of them that is less than half consistent rejects the model."""
+    worst: PairFigures | None = None
+    """The least consistent strong pair (of all pairs where none is strong)."""
+    images_without_strong_pair: tuple[str, ...] = ()
+    """Registered images for which the check has no strong evidence."""
+
+
+class CalibrationAttempt(FileModel):
+    """One attempt at a model."""
+
+    seed: int
+    max_features: int
+    max_image_size: int
+    peak_threshold: float
+    guided_matching: bool
+    max_ratio: float
+    models: int
+    """Connected models; the largest is taken."""
+    registered: int
+    points: int
+    reprojection_error_px: float | None = None
+    self_check: SelfCheckFigures | None = None
+    outcome: Literal["taken", "passed", "self_check_failed", "no_model"]
+
+
+class CalibrationReport(FileModel):
+    """`calibration.json`."""
+
+    format: Literal["cgwm-calibration/1"] = "cgwm-calibration/1"
+    photos: int
+    photos_registered: int
+    images: dict[str, ImageVerdict]
+    """By photo, relative to images/."""
+    videos: dict[str, ImageVerdict] = {}
+    """By video camera: its first frame."""
+    points: int
+    """Sparse points, in sparse_points.ply."""
+    reprojection_error_px: float
+    """Mean over the points. A wrong model can have a low one: the self-check decides."""
+    self_check: SelfCheckFigures
+    attempts: tuple[CalibrationAttempt, ...]
+    scale: Scale
+    world_frame: str
+    """Where the axes and the origin come from, in words."""
+    marker_residual_m: float | None = None
+    """Root mean square distance of the triangulated marker corners from their places [m]."""
+    ground_tilt_deg: float | None = None
+    """Angle between the manifest's ground and the dominant plane of the sparse points [deg], where both exist."""
+    ground_height_m: float | None = None
+    """Height of that plane over the manifest's ground at the origin [m]; metric scale only."""
+    warnings: tuple[str, ...] = ()
+    config: CalibrateConfig
+    versions: dict[str, str] = {}
+    wall_time_s: float
+
+    def __str__(self) -> str:
+        """Return the summary that the command prints."""
+        scale = self.scale
+        lines = [
+            f"{self.photos_registered} of {self.photos} photos registered, "
+            f"{self.points} points, reprojection {self.reprojection_error_px:.2f} px, {self.wall_time_s:.0f} s",
+            f"self-check: {_passed(self.self_check)}",
+        ]
+        if self.videos:
+            seen = sum(verdict.registered for verdict in self.videos.values())
+            lines.append(f"{seen} of {len(self.videos)} video cameras registered")
+        if scale.kind == "metric":
+            error = "" if scale.relative_std is None else f" +- {100 * scale.relative_std:.2f} %"
+            lines.append(f"scale: metric{error}, {scale.source}")
+        else:
+            lines.append("scale: unscaled; physics needs a metric scale (capture.toml, [calibration])")
+        lines.append(f"world frame: {self.world_frame}")
+        for name, verdict in {**self.images, **{f"video {k}": v for k, v in self.videos.items()}}.items():
+            if not verdict.registered:
+                lines.append(f"not registered: {name}: {verdict.reason}")
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+
+def _passed(check: SelfCheckFigures) -> str:
+    if check.worst is None:
+        return "passed, but no pair has the 50 matches that it needs"
+    a, b = check.worst.images
+    return (
+        f"passed, {check.strong_pairs} strong pairs; the worst, {a} and {b}, is {100 * check.worst.consistent:.0f} % "
+        f"consistent ({check.worst.inliers} matches)"
+    )
