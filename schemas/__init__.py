@@ -1,6 +1,7 @@
 """Pydantic models of everything that touches the disk, and the errors that users meet. No torch here."""
 
 from .base import FileModel, parse, read_json, read_toml
+from .calibration import CalibrationAttempt, CalibrationReport, ImageVerdict, PairFigures, SelfCheckFigures
 from .cameras import CAMERAS_FORMAT, CameraIntrinsics, CamerasFile, PosedImage, PosedVideo, Scale
 from .capture import (
     CAPTURE_FORMAT,
@@ -23,7 +24,17 @@ from .capture import (
     World,
 )
 from .config import CalibrateConfig, Device, PhysConfig, SplatConfig, SynthesizeConfig
+from .dataset import (
+    DATASET_FORMAT,
+    ROLLOUTS_FORMAT,
+    DatasetManifest,
+    DatasetSummary,
+    SamplingPlan,
+    ShardEntry,
+)
+from .doctor import DoctorReport, Missing, PackageState
 from .errors import CgwmError, CheckFailedError, InputDataError, NotConvergedError, UsageError, did_you_mean
+from .imports import ImportResult
 from .model import (
     MODEL_FORMAT,
     BodyModel,
@@ -37,24 +48,32 @@ from .model import (
     Solver,
 )
 from .results import EpisodeErrors, ErrorSummary, EvalResult
+from .validation import ValidationReport
 
 __all__ = [
     "CAMERAS_FORMAT",
     "CAPTURE_FORMAT",
+    "DATASET_FORMAT",
     "MODEL_FORMAT",
     "QUATERNION_NORM_TOLERANCE",
+    "ROLLOUTS_FORMAT",
     "Body",
     "BodyModel",
     "BoxShape",
     "CalibrateConfig",
     "Calibration",
+    "CalibrationAttempt",
+    "CalibrationReport",
     "CameraIntrinsics",
     "CamerasFile",
     "CaptureManifest",
     "CgwmError",
     "CheckFailedError",
     "ContactParameters",
+    "DatasetManifest",
+    "DatasetSummary",
     "Device",
+    "DoctorReport",
     "EffectModel",
     "Episode",
     "EpisodeErrors",
@@ -65,26 +84,35 @@ __all__ = [
     "FileShape",
     "FitFile",
     "Ground",
+    "ImageVerdict",
+    "ImportResult",
     "InputDataError",
     "KnownCameraDistance",
     "KnownDistance",
     "Marker",
     "Measurement",
+    "Missing",
     "ModelFile",
     "NotConvergedError",
+    "PackageState",
+    "PairFigures",
     "Parameter",
     "PhysConfig",
     "Pose",
     "PosedImage",
     "PosedVideo",
     "Provenance",
+    "SamplingPlan",
     "Scale",
+    "SelfCheckFigures",
     "Shape",
+    "ShardEntry",
     "Solver",
     "SphereShape",
     "SplatConfig",
     "SynthesizeConfig",
     "UsageError",
+    "ValidationReport",
     "Video",
     "World",
     "did_you_mean",

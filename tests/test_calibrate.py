@@ -254,8 +254,12 @@ def test_models_that_contradict_themselves_are_never_returned(scene, tmp_path, m
 
 def test_a_rejected_model_is_followed_by_another_seed_on_the_same_matches(scene, tmp_path, monkeypatch):
     root = _fresh(scene, tmp_path, photos=4)
-    checks = iter([_failed_check, stage.check_model])
-    monkeypatch.setattr(stage, "check_model", lambda *given: next(checks)(*given))
+    checks = [_failed_check, stage.check_model]
+
+    def check_model(model, pairs):
+        return checks.pop(0)(model, pairs)
+
+    monkeypatch.setattr(stage, "check_model", check_model)
     built = []
     build = colmap.build_database
     monkeypatch.setattr(colmap, "build_database", lambda *given: (built.append(given), build(*given)))
