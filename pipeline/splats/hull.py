@@ -19,7 +19,8 @@ from .directions import fibonacci_directions
 from .volume import Array, Volume, crossings, grid_points
 
 _COARSE = 40
-_REFINED = (56, 128)
+_FINEST = 128
+_PITCH_PX = 0.6
 _BORDER_SMOOTHING_PX = 0.7
 _BORDER_BIAS_PX = 0.3
 _TIP_DIRECTIONS = 500
@@ -39,6 +40,11 @@ class Silhouette:
     mask: NDArray[np.bool_]
     K: Array
     T_cam_world: Array
+
+    def pixel_at(self, point: Array) -> float:
+        """Return the width of a pixel [m] at the depth of a point, world frame, shape (3,)."""
+        depth = self.T_cam_world[2, :3] @ point + self.T_cam_world[2, 3]
+        return float(abs(depth) / self.K[0, 0])
 
 
 def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = "body") -> Volume:
@@ -110,10 +116,14 @@ def _refined(
     ground: Ground | None,
 ) -> tuple[Array, Array, float]:
     """Cut the grid to the body and refine it, twice; only points near the surface are looked up again."""
-    for resolution in _REFINED:
+    # A grid finer than the pixels would hold nothing more.
+    pixel = float(np.median([view.pixel_at(origin + 0.5 * pitch * np.array(coarse.shape)) for view in views]))
+    for level in range(2):
         kept = np.argwhere(inside)
         low, high = np.maximum(kept.min(0) - 2, 0), np.minimum(kept.max(0) + 2, np.array(inside.shape) - 1)
-        fine_pitch = float((high - low).max()) * pitch / (resolution - 1)
+        extent = float((high - low).max()) * pitch
+        finest = max(extent / (_FINEST - 1), min(_PITCH_PX * pixel, 0.9 * pitch))
+        fine_pitch = finest if level == 1 else float(np.sqrt(finest * pitch))
         fine_origin = origin + low * pitch
         shape = tuple(int(n) for n in np.floor((high - low) * pitch / fine_pitch + 0.5).astype(int) + 1)
         points = grid_points(shape, fine_origin, fine_pitch)

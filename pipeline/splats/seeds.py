@@ -195,13 +195,12 @@ def _quadtree(unit: Array, colors: Array, budget: int) -> Array:
     errors: list[dict[tuple[int, int], float]] = []
     for level in range(_LEVELS):
         cell = np.minimum((unit * 2**level).astype(np.int64), 2**level - 1)
-        keys, index = np.unique(cell, axis=0, return_inverse=True)
-        index = index.reshape(-1)
+        keys, index = np.unique(cell[:, 0] * 2**level + cell[:, 1], return_inverse=True)
         count = np.bincount(index)
         sums = np.stack([np.bincount(index, colors[:, k]) for k in range(3)], 1)
         squares = np.bincount(index, (colors**2).sum(1))
         error = squares - (sums**2).sum(1) / count
-        errors.append({(int(c), int(r)): float(e) for (c, r), e in zip(keys, error, strict=True)})
+        errors.append({divmod(key, 2**level): e for key, e in zip(keys.tolist(), error.tolist(), strict=True)})
     heap = [(-errors[0][(0, 0)], 0, 0, 0)]
     done: list[tuple[int, int, int]] = []
     while heap and len(heap) + len(done) < budget:

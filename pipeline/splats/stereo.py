@@ -147,7 +147,13 @@ def _visibility(solid: Volume, points: Array, normals: Array, views: Sequence[Vi
         free = solid.at(path.reshape(-1, 3)).reshape(len(front), -1).min(1) > -2 * solid.pitch
         pixel, depth = view.camera.project(points[front])
         column, row = (np.floor(np.nan_to_num(pixel[:, k], nan=-1)).astype(int) for k in range(2))
-        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
+        inside = (
+            np.asarray(depth > 0)
+            & (column >= 0)
+            & (row >= 0)
+            & (column < view.camera.width)
+            & (row < view.camera.height)
+        )
         labels = view.labels
         if labels is not None:
             inside[inside] = labels[row[inside], column[inside]] == body + 1
@@ -219,8 +225,8 @@ def _deformed(solid: Volume, points: Array, shift: Array) -> Volume:
     # A tip stands where silhouettes meet: it stays unless the photos say that the surface there is elsewhere.
     tips = solid.corners
     if len(tips):
-        kept = np.flatnonzero(_interpolated(points, shift, tips, solid.pitch) > -0.5 * solid.pitch)
-        tips = tips[kept]
+        moved = _interpolated(points, shift, tips, solid.pitch)
+        tips = tips[np.asarray(moved > -0.5 * solid.pitch)]
     return Volume.from_inside(field < 0, solid.origin, solid.pitch, np.concatenate([surface, tips]), len(tips))
 
 

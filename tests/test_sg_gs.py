@@ -1,0 +1,149 @@
+"""The stage sg-gs on a tiny capture that the renderer itself makes."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture import Capture
+from cgwm.pipeline.sg_gs import fit_scene
+from cgwm.pipeline.splats.directions import fibonacci_directions
+from cgwm.pipeline.splats.render import render
+from cgwm.schemas import InputDataError, SplatConfig
+
+WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
+RADIUS, PLACE = 0.05, np.array([0.01, -0.02, 0.05])
+CONFIG = SplatConfig(
+    iterations=40, max_body_spheres=200, max_scene_spheres=400, max_collision_spheres=60, image_size=96, device="cpu"
+)
+
+
+def looking_at(position, target):
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.stack([right, np.cross(forward, right), forward], 1), position
+    return T
+
+
+def world():
+    """A ball of spheres with a colour that changes over it, on a ground of squares."""
+    rng = np.random.default_rng(0)
+    directions = fibonacci_directions(600)
+    ball = PLACE + 0.92 * RADIUS * directions
+    ball_colors = 0.5 + 0.4 * np.sin(np.stack([7 * directions[:, 0], 5 * directions[:, 1], 6 * directions[:, 2]], 1))
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 41), np.linspace(-0.4, 0.4, 41))
+    ground = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+    ground_colors = (
+        0.3 + 0.4 * rng.random((8, 8, 3))[(ground[:, 0] * 9.9).astype(int) % 8, (ground[:, 1] * 9.9).astype(int) % 8]
+    )
+    means = torch.tensor(np.concatenate([ball, ground]), dtype=torch.float32)
+    scales = torch.cat([torch.full((600,), 0.004), torch.full((len(ground),), 0.012)])
+    label = torch.cat([torch.ones(600), torch.zeros(len(ground))])[:, None]
+    colors = torch.tensor(np.concatenate([ball_colors, ground_colors]), dtype=torch.float32)
+    return means, scales, torch.full_like(scales, 0.95), torch.cat([colors, label], 1)
+
+
+def make_capture(root, masks=True, shape=""):
+    views = fibonacci_directions(24)[:11]
+    poses = [looking_at(PLACE + 0.3 * view, PLACE) for view in views]
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    viewmats = torch.tensor(np.linalg.inv(np.stack(poses)), dtype=torch.float32)
+    Ks = torch.tensor(K, dtype=torch.float32).expand(len(poses), 3, 3)
+    background = torch.tensor([0.6, 0.7, 0.8, 0.0])
+    pictures = render(*world(), viewmats, Ks, WIDTH, HEIGHT, background).features.numpy()
+    (root / "images").mkdir(parents=True)
+    (root / "masks").mkdir()
+    cameras = {
+        "format": "cgwm-cameras/1",
+        "scale": {"kind": "metric"},
+        "cameras": {
+            "c": {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+        },
+        "images": {},
+    }
+    for number, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+        name = f"{number:03d}.png"
+        cv2.imwrite(str(root / "images" / name), (255 * picture[..., 2::-1]).round().astype(np.uint8))
+        if masks:
+            cv2.imwrite(str(root / "masks" / name), (picture[..., 3] > 0.5).astype(np.uint8))
+        cameras["images"][name] = {"camera": "c", "T_world_cam": pose.tolist()}
+    (root / "cameras.json").write_text(json.dumps(cameras))
+    write_manifest(root, shape)
+    return Capture.open(root, check=False)
+
+
+def write_manifest(root, shape):
+    root.mkdir(exist_ok=True)
+    ground = "ground = { normal = [0.0, 0.0, 1.0], offset_m = 0.0 }"
+    (root / "capture.toml").write_text(
+        f'format = "cgwm-capture/1"\n[world]\n{ground}\n[[bodies]]\nname = "ball"\n{shape}\n'
+    )
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return make_capture(tmp_path_factory.mktemp("capture") / "tiny")
+
+
+@pytest.fixture(scope="module")
+def result(capture):
+    return fit_scene(capture, CONFIG)
+
+
+def test_the_fit_shows_photos_that_it_did_not_see(capture, result):
+    held_out = result.record["held_out"]
+    assert held_out["photos"] == ["000.png", "008.png"]
+    assert held_out["psnr_db"] > 20
+    assert held_out["psnr_object_db"] > 20
+    assert held_out["mask_iou"] > 0.9
+    losses = result.record["ball"]["appearance_loss"]
+    assert np.mean(losses[-10:]) < np.mean(losses[:10])
+
+
+def test_psnr_rises_and_the_same_seed_gives_the_same_spheres(capture, result):
+    few, again = (fit_scene(capture, CONFIG.model_copy(update={"iterations": 2})) for _ in range(2))
+    assert result.record["held_out"]["psnr_db"] > few.record["held_out"]["psnr_db"] + 0.5
+    np.testing.assert_array_equal(again.bodies["ball"].visual.colors, few.bodies["ball"].visual.colors)
+    np.testing.assert_array_equal(again.bodies["ball"].collision.means, few.bodies["ball"].collision.means)
+    np.testing.assert_array_equal(again.scene.means, few.scene.means)
+
+
+def test_the_body_is_where_it_stood(result):
+    ball = result.bodies["ball"]
+    np.testing.assert_allclose(ball.photo_pose.position_m, PLACE, atol=2e-3)
+    np.testing.assert_allclose(np.asarray(ball.visual.means).mean(0), 0, atol=1e-6)
+    properties = ball.mass_properties
+    np.testing.assert_allclose(properties.com_m, 0, atol=2e-3)
+    assert properties.volume_m3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.15)
+    np.testing.assert_allclose(properties.inertia_m2, 0.4 * RADIUS**2 * np.eye(3), atol=0.15 * 0.4 * RADIUS**2)
+    reach = np.linalg.norm(ball.collision.means, axis=1) + result.radius_factor * ball.collision.scales
+    # The hull of 9 silhouettes, each pixel 2.6 mm wide, is a polyhedron around the ball.
+    assert RADIUS - 2e-3 < reach.max() < RADIUS + 12e-3
+    assert len(ball.collision) <= CONFIG.max_collision_spheres
+
+
+def test_a_body_without_photos_has_the_spheres_of_its_shape(tmp_path):
+    write_manifest(tmp_path / "tracks_only", "shape = { box = { half_extents_m = [0.05, 0.05, 0.05] } }")
+    result = fit_scene(Capture.open(tmp_path / "tracks_only", check=False), CONFIG)
+    ball = result.bodies["ball"]
+    assert ball.visual is None
+    assert result.scene is None
+    assert ball.mass_properties.volume_m3 == pytest.approx(1e-3)
+    np.testing.assert_allclose(ball.mass_properties.inertia_m2, 0.01 / 6 * np.eye(3), atol=1e-12)
+    assert len(ball.collision) <= CONFIG.max_collision_spheres
+
+
+def test_a_body_with_neither_masks_nor_shape_is_refused(tmp_path):
+    capture = make_capture(tmp_path / "bare", masks=False)
+    with pytest.raises(InputDataError, match="body 'ball' has neither a shape nor masks"):
+        fit_scene(capture, CONFIG)
+
+
+def test_photos_without_cameras_are_refused(tmp_path):
+    capture = make_capture(tmp_path / "raw")
+    (capture.root / "cameras.json").unlink()
+    with pytest.raises(InputDataError, match="11 photos and no cameras"):
+        fit_scene(Capture.open(capture.root, check=False), CONFIG)
