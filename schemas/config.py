@@ -46,8 +46,12 @@ class PhysConfig(FileModel):
     device: Device = "auto"
     supervise: Literal["tracks", "images", "both"] = "tracks"
     step_s: Annotated[float, Field(gt=0)] = 0.001
-    starts: Annotated[int, Field(ge=1)] = 6
-    iterations: Annotated[int, Field(ge=1)] = 25
+    population: Annotated[int, Field(ge=8)] = 24
+    """Samples in a generation of the global search."""
+    generations: Annotated[int, Field(ge=2)] = 8
+    """Generations of the global search; the first also draws from the whole admissible box (several starts)."""
+    iterations: Annotated[int, Field(ge=1)] = 10
+    """Most steps of the local refinement (Levenberg-Marquardt)."""
     warmup_s: Annotated[float, Field(gt=0)] = 0.1
 
 
@@ -69,7 +73,5 @@ class SynthesizeConfig(FileModel):
     @model_validator(mode="after")
     def _shard(self) -> SynthesizeConfig:
         if self.shard >= self.shards:
-            raise ValueError(
-                f"shard {self.shard} of {self.shards}: they are numbered 0 to {self.shards - 1}"
-            )
+            raise ValueError(f"shard {self.shard} of {self.shards}: they are numbered 0 to {self.shards - 1}")
         return self

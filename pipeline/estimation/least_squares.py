@@ -1,0 +1,181 @@
+"""Robust Levenberg-Marquardt for shared parameters and one hidden state for each observed item.
+
+The normal equations have the shape of an arrow: the state of an item meets only that item's residuals and the shared
+parameters. Eliminating the states (Schur complement) leaves a small system in the parameters (Triggs et al., "Bundle
+adjustment - a modern synthesis", 2000, section 6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...schemas import NotConvergedError
+
+Residuals = Callable[[Tensor, Tensor, bool], tuple[Tensor, Tensor | None]]
+"""(shared (P,), state change (B, S), with Jacobian) -> residuals (B, F, m) in sigmas, and (B, F, m, P + S) or None.
+
+Rows of F are what the robust loss weighs as one (a frame); an unobserved row is zero.
+"""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the fit ended.
+
+    shared (P,); states (B, S): changes from the initial states; cost; costs by accepted iteration; information (P, P):
+    of the shared parameters, states eliminated; scores (B, P): gradient of each item, states eliminated; state_cov
+    (B, S, S): covariance of the states at fixed parameters; chi2 (B, F); converged; free (P,): not on a bound.
+    """
+
+    shared: Tensor
+    states: Tensor
+    cost: float
+    costs: list[float]
+    information: Tensor
+    scores: Tensor
+    state_cov: Tensor
+    chi2: Tensor
+    converged: bool
+    free: Tensor
+
+
+def robust_loss(chi2: Tensor, scale: float | None) -> tuple[Tensor, Tensor]:
+    """Return the loss and the weight of rows with the given squared norms: Geman-McClure-like log loss, or squares.
+
+    rho = c^2 log(1 + chi2 / c^2), weight = 1 / (1 + chi2 / c^2) (Cauchy).
+    """
+    if scale is None:
+        return chi2, torch.ones_like(chi2)
+    ratio = chi2 / scale**2
+    return scale**2 * torch.log1p(ratio), 1 / (1 + ratio)
+
+
+def minimise(
+    residuals: Residuals,
+    shared: Tensor,
+    states: Tensor,
+    bounds: Tensor,
+    *,
+    robust_scale: float | None = None,
+    iterations: int = 25,
+    tolerance: float = 1e-4,
+    prior_information: Tensor | None = None,
+    on_iteration: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """Minimise the robust sum of squares over shared parameters and item states.
+
+    Args:
+        residuals: See `Residuals`.
+        shared: Start of the parameters, shape (P,), P may be 0.
+        states: Start of the state changes, shape (B, S), S may be 0.
+        bounds: Lower and upper bounds of the parameters, shape (P, 2).
+        robust_scale: Scale c of the Cauchy loss in sigmas for a row; None for plain squares.
+        iterations: Most accepted or refused steps.
+        tolerance: Stop when the cost falls by less than this fraction.
+        prior_information: Information (S,) of a zero-mean prior on each state change.
+        on_iteration: Called with the iteration and the cost.
+
+    Returns:
+        The solution.
+
+    Raises:
+        NotConvergedError: If the start gives no finite residual.
+    """
+    prior = torch.zeros(states.shape[1]).to(states) if prior_information is None else prior_information
+    damping, costs, converged = 1e-3, [], False
+    linear = _linearise(residuals, shared, states, robust_scale, prior)
+    if not torch.isfinite(linear.cost):
+        raise NotConvergedError("the model diverges already at the start of the fit (no finite residual).")
+    costs.append(float(linear.cost))
+    for iteration in range(iterations):
+        step_shared, step_states = _step(linear, shared, bounds, damping)
+        next_shared = (shared + step_shared).clamp(bounds[:, 0], bounds[:, 1])
+        next_states = states + step_states
+        cost = _cost(residuals, next_shared, next_states, robust_scale, prior)
+        if torch.isfinite(cost) and cost < linear.cost:
+            fall = float((linear.cost - cost) / linear.cost.clamp_min(1e-300))
+            shared, states = next_shared, next_states
+            linear = _linearise(residuals, shared, states, robust_scale, prior)
+            costs.append(float(linear.cost))
+            damping = max(damping / 5, 1e-8)
+            if fall < tolerance:
+                converged = True
+        else:
+            damping *= 6
+            converged = damping > 1e8
+        if on_iteration:
+            on_iteration(iteration, costs[-1])
+        if converged:
+            break
+    return _solution(linear, shared, states, bounds, costs, converged)
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Normal equations: a (B, S, S), b (B, S, P), c (B, P, P); gradients ga (B, S), gc (B, P); cost; chi2 (B, F)."""
+
+    a: Tensor
+    b: Tensor
+    c: Tensor
+    ga: Tensor
+    gc: Tensor
+    cost: Tensor
+    chi2: Tensor
+
+
+def _cost(residuals: Residuals, shared: Tensor, states: Tensor, scale: float | None, prior: Tensor) -> Tensor:
+    r, _ = residuals(shared, states, False)
+    return robust_loss(r.square().sum(-1), scale)[0].sum() + (prior * states.square()).sum()
+
+
+def _linearise(residuals: Residuals, shared: Tensor, states: Tensor, scale: float | None, prior: Tensor) -> _Linear:
+    r, jacobian = residuals(shared, states, True)
+    assert jacobian is not None
+    chi2 = r.square().sum(-1)
+    loss, weight = robust_loss(chi2, scale)
+    count = shared.shape[0]
+    # rows that are not finite carry no derivative worth using; the cost already refuses them
+    weighted = jacobian * weight[..., None, None]
+    flat, flat_weighted, flat_r = jacobian.flatten(1, 2), weighted.flatten(1, 2), r.flatten(1, 2)
+    normal = flat_weighted.transpose(1, 2) @ flat
+    gradient = -(flat_weighted.transpose(1, 2) @ flat_r[..., None]).squeeze(-1)
+    a = normal[:, count:, count:] + torch.diag(prior)
+    ga = gradient[:, count:] - prior * states
+    cost = loss.sum() + (prior * states.square()).sum()
+    return _Linear(a, normal[:, count:, :count], normal[:, :count, :count], ga, gradient[:, :count], cost, chi2)
+
+
+def _eliminate(linear: _Linear, damping: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the reduced information and gradient of the parameters by item, and what restores the states."""
+    diagonal = torch.diag_embed(linear.a.diagonal(dim1=1, dim2=2).clamp_min(1e-12))
+    a = linear.a + damping * diagonal
+    solved = torch.linalg.solve(a, torch.cat((linear.b, linear.ga[..., None]), -1))
+    by_shared, by_gradient = solved[..., :-1], solved[..., -1]
+    reduced = linear.c - linear.b.transpose(1, 2) @ by_shared
+    gradient = linear.gc - (linear.b.transpose(1, 2) @ by_gradient[..., None]).squeeze(-1)
+    return reduced, gradient, by_shared, by_gradient
+
+
+def _step(linear: _Linear, shared: Tensor, bounds: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    reduced, gradient, by_shared, by_gradient = _eliminate(linear, damping)
+    total, slope = reduced.sum(0), gradient.sum(0)
+    blocked = ((shared <= bounds[:, 0]) & (slope < 0)) | ((shared >= bounds[:, 1]) & (slope > 0))
+    free = (~blocked).to(shared.dtype)
+    scale = total.diagonal().clamp_min(1e-9)
+    system = total * free[:, None] * free + torch.diag(damping * scale + (1 - free) * scale + 1e-9)
+    step = torch.linalg.solve(system, slope * free) if shared.numel() else shared
+    return step, by_gradient - (by_shared @ step[:, None]).squeeze(-1)
+
+
+def _solution(
+    linear: _Linear, shared: Tensor, states: Tensor, bounds: Tensor, costs: list[float], converged: bool
+) -> Solution:
+    reduced, gradient, _, _ = _eliminate(linear, 1e-9)
+    free = (shared > bounds[:, 0]) & (shared < bounds[:, 1])
+    eye = torch.eye(linear.a.shape[-1]).to(linear.a)
+    state_cov = torch.linalg.pinv(linear.a, hermitian=True) if linear.a.shape[-1] else linear.a * eye
+    return Solution(shared, states, costs[-1], costs, reduced.sum(0), gradient, state_cov, linear.chi2, converged, free)

@@ -1,0 +1,164 @@
+"""Measured motions as a batch: windows of episodes on their own time grids, padded to one length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..physics.driven import Drive
+from ..physics.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
+from ..physics.world import State, World
+
+if TYPE_CHECKING:
+    from ...datasets.tracks import Track
+
+START_FRAMES = 4
+"""The first guess of an item's state is a straight line through this many frames."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """A batch of measured windows.
+
+    names (B): episode of each item; times_s (B, T): frame times, padded beyond an item's end; position_m
+    (B, T, nf, 3) and quat_wxyz (B, T, nf, 4) of the free bodies' frames; seen, turned (B, T, nf): 1 where the position,
+    the orientation was measured, 0 elsewhere; drives: commands by driven body; state (B, nb): first guess of the
+    states at times_s[:, 0]; free (nf): indices of the free bodies.
+    """
+
+    names: tuple[str, ...]
+    times_s: Tensor
+    position_m: Tensor
+    quat_wxyz: Tensor
+    seen: Tensor
+    turned: Tensor
+    drives: dict[str, Drive]
+    state: State
+    free: tuple[int, ...]
+
+    @property
+    def frames(self) -> Tensor:
+        """Number of measured frames of each item (B,)."""
+        return (self.seen.amax(-1) > 0).sum(-1)
+
+    @staticmethod
+    def of(
+        world: World, episodes: Sequence[tuple[str, dict[str, Track]]], windows: Sequence[tuple[float, float]]
+    ) -> Observations:
+        """Collect one window (start, end) [s] from each of the given episodes, which may repeat."""
+        rows = [_Row.of(world, name, tracks, window) for (name, tracks), window in zip(episodes, windows, strict=True)]
+        longest = max(len(row.times) for row in rows)
+        padded = [row.padded(longest) for row in rows]
+        like = world.gravity
+        times, position, quat, seen, turned = (
+            torch.as_tensor(np.stack([getattr(row, key) for row in padded])).to(like)
+            for key in ("times", "position", "quat", "seen", "turned")
+        )
+        drives = {
+            body.name: Drive.of([tracks[body.name] for _, tracks in episodes], like)
+            for body in world.bodies
+            if body.motion == "driven"
+        }
+        free = tuple(world.free)
+        partial = Observations(
+            tuple(row.name for row in rows),
+            times,
+            position,
+            quat,
+            seen,
+            turned,
+            drives,
+            _resting(world, len(rows)),
+            free,
+        )
+        return replace(partial, state=first_state(world, partial))
+
+    def select(self, items: Sequence[int]) -> Observations:
+        """Return some items of the batch."""
+        index = torch.as_tensor(list(items))
+        picked = {key: getattr(self, key)[index] for key in ("times_s", "position_m", "quat_wxyz", "seen", "turned")}
+        drives = {
+            name: Drive(*(getattr(d, key)[index] for key in d.__dataclass_fields__)) for name, d in self.drives.items()
+        }
+        state = State(*(getattr(self.state, key)[index] for key in self.state.__dataclass_fields__))
+        return replace(self, names=tuple(self.names[i] for i in items), drives=drives, state=state, **picked)
+
+
+@dataclass(frozen=True)
+class _Row:
+    name: str
+    times: np.ndarray
+    position: np.ndarray
+    quat: np.ndarray
+    seen: np.ndarray
+    turned: np.ndarray
+
+    @staticmethod
+    def of(world: World, name: str, tracks: dict[str, Track], window: tuple[float, float]) -> _Row:
+        bodies = [world.bodies[index].name for index in world.free]
+        cut = {body: tracks[body].window(*window) for body in bodies if body in tracks}
+        times = np.unique(np.concatenate([track.time_s for track in cut.values()]))
+        shape = (len(times), len(bodies))
+        position, quat = np.zeros((*shape, 3)), np.tile([1.0, 0, 0, 0], (*shape, 1))
+        seen, turned = np.zeros(shape), np.zeros(shape)
+        for column, body in enumerate(bodies):
+            if body in cut:
+                at = np.searchsorted(times, cut[body].time_s)
+                position[at, column], seen[at, column] = cut[body].position_m, 1.0
+                measured = cut[body].quat_wxyz
+                if measured is not None:
+                    quat[at, column], turned[at, column] = measured, 1.0
+        return _Row(name, times, position, quat, seen, turned)
+
+    def padded(self, length: int) -> _Row:
+        extra = length - len(self.times)
+        step = np.diff(self.times).mean() if len(self.times) > 1 else 1.0
+        times = np.concatenate((self.times, self.times[-1] + step * np.arange(1, extra + 1)))
+
+        def pad(values: np.ndarray) -> np.ndarray:
+            return np.concatenate((values, np.repeat(values[-1:], extra, 0)))
+
+        zero = np.zeros((extra, self.seen.shape[1]))
+        return _Row(
+            self.name,
+            times,
+            pad(self.position),
+            pad(self.quat),
+            np.concatenate((self.seen, zero)),
+            np.concatenate((self.turned, zero)),
+        )
+
+
+def first_state(world: World, observations: Observations) -> State:
+    """Return states at the first frames: a straight line through each item's first few measured frames."""
+    state = observations.state
+    position, quat = state.position_m.clone(), state.quat_wxyz.clone()
+    velocity, omega = state.velocity_m_s.clone(), state.omega_body_rad_s.clone()
+    for column, body in enumerate(observations.free):
+        for item in range(len(observations.names)):
+            at = torch.nonzero(observations.seen[item, :, column])[:START_FRAMES, 0]
+            if len(at) < 2:
+                continue
+            t = observations.times_s[item, at] - observations.times_s[item, 0]
+            line = torch.stack((torch.ones_like(t), t), -1)
+            fit = torch.linalg.lstsq(line, observations.position_m[item, at, column]).solution
+            position[item, body], velocity[item, body] = fit[0], fit[1]
+            if bool(observations.turned[item, at, column].all()):
+                measured = observations.quat_wxyz[item, at, column]
+                turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
+                rate = torch.linalg.lstsq(line, turn).solution
+                quat[item, body], omega[item, body] = measured[0], rate[1]
+    return State(position, quat, velocity, omega)
+
+
+def _resting(world: World, batch: int) -> State:
+    """All bodies at the origin of the world, unturned and at rest."""
+    like = world.gravity
+    zero = torch.zeros(batch, len(world.bodies), 3).to(like)
+    quat = matrix_to_quat(torch.eye(3).to(like)).expand(batch, len(world.bodies), 4).clone()
+    return State(zero, quat, zero, zero)

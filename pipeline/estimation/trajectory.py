@@ -1,0 +1,89 @@
+"""Residuals of rollouts against measured motions, in units of the measurement noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..physics.parameters import Parameter, apply_parameters
+from ..physics.rollout import Rollout, simulate
+from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..physics.world import State, World
+from .forward import batched_jacobian
+from .observations import Observations
+
+STATE_SIZE = 12
+"""Coordinates of a free body's state: position [m], rotation [rad] (body), velocity [m/s], omega_body [rad/s]."""
+STATE_PRIOR_STD = (0.1, 1.0, 5.0, 30.0)
+"""Spread of the weak prior on these coordinates about the first guess; it holds what was not measured."""
+
+
+def state_prior(bodies: int) -> Tensor:
+    """Return the information of the prior on a state change, shape (12 bodies,)."""
+    return torch.tensor([1 / std**2 for std in STATE_PRIOR_STD for _ in range(3)], dtype=torch.float64).repeat(bodies)
+
+
+def retract(state: State, change: Tensor, free: Sequence[int]) -> State:
+    """Return the states (B, nb) moved by changes (B, 12 nf) of the free bodies, rotations in the body frame."""
+    position, quat = list(state.position_m.unbind(1)), list(state.quat_wxyz.unbind(1))
+    velocity, omega = list(state.velocity_m_s.unbind(1)), list(state.omega_body_rad_s.unbind(1))
+    for column, body in enumerate(free):
+        dp, dr, dv, dw = change[:, STATE_SIZE * column : STATE_SIZE * (column + 1)].split(3, -1)
+        position[body] = position[body] + dp
+        quat[body] = quat_multiply(quat[body], quat_exp(dr))
+        velocity[body], omega[body] = velocity[body] + dv, omega[body] + dw
+    return State(*(torch.stack(values, 1) for values in (position, quat, velocity, omega)))
+
+
+@dataclass(frozen=True)
+class TrajectoryResiduals:
+    """The residuals of an open-loop rollout from every item's state: what `least_squares.minimise` wants.
+
+    Rows are (frame, free body); their six columns are position and rotation, in sigmas. The standard deviations are
+    numbers, or one for every row, shape (B, F, 1).
+    """
+
+    world: World
+    parameters: Sequence[Parameter]
+    observations: Observations
+    position_std_m: float | Tensor
+    rotation_std_rad: float | Tensor
+
+    def __call__(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
+        """Return residuals (B, F, 6) and, if wanted, their Jacobian (B, F, 6, P + S)."""
+        inputs = torch.cat((shared.expand(states.shape[0], -1), states), -1)
+        if not with_jacobian:
+            with torch.no_grad():
+                return self._residuals(inputs, 1).unflatten(1, (-1, 6)), None
+        value, jacobian = batched_jacobian(self._residuals, inputs)
+        return value.unflatten(1, (-1, 6)), jacobian.unflatten(1, (-1, 6))
+
+    def rollout(self, shared: Tensor, states: Tensor) -> Rollout:
+        """Return the rollout of given parameters (P,) and state changes (B, S)."""
+        with torch.no_grad():
+            return self._roll(torch.cat((shared.expand(states.shape[0], -1), states), -1), 1)
+
+    def _roll(self, inputs: Tensor, repeats: int) -> Rollout:
+        count = len(self.parameters)
+        values = [p.decode(inputs[:, k]) for k, p in enumerate(self.parameters)]
+        world = apply_parameters(self.world, self.parameters, torch.stack(values, -1)) if count else self.world
+        seen = self.observations
+        base = State(*(getattr(seen.state, key).repeat(repeats, 1, 1) for key in seen.state.__dataclass_fields__))
+        state = retract(base, inputs[:, count:], seen.free)
+        drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
+        return simulate(world, state, seen.times_s.repeat(repeats, 1), drives)
+
+    def _residuals(self, inputs: Tensor, repeats: int) -> Tensor:
+        rollout, seen, free = self._roll(inputs, repeats), self.observations, list(self.observations.free)
+        position = rollout.position_m[:, :, free] - seen.position_m.repeat(repeats, 1, 1, 1)
+        measured = quat_conjugate(seen.quat_wxyz.repeat(repeats, 1, 1, 1))
+        rotation = quat_log(quat_multiply(measured, rollout.quat_wxyz[:, :, free]))
+        weights = [
+            (mask.flatten(1)[..., None] / std).repeat(repeats, 1, 1)
+            for mask, std in ((seen.seen, self.position_std_m), (seen.turned, self.rotation_std_rad))
+        ]
+        rows = torch.cat((position.flatten(1, 2) * weights[0], rotation.flatten(1, 2) * weights[1]), -1)
+        return rows.flatten(1)

@@ -1,0 +1,97 @@
+"""Initial states: estimated by the model from the first frames of an episode, never past its first contact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..physics.distance import union_distance
+from ..physics.rotation import quat_to_matrix
+from ..physics.world import World
+from .least_squares import Solution, minimise
+from .observations import Observations
+from .trajectory import TrajectoryResiduals, retract, state_prior
+
+MIN_FRAMES = 4
+"""The warm-up has at least this many frames."""
+FLIGHT_MARGIN_M = 0.003
+"""A body this far from contact, plus three quarters of its last move, has not touched since the frame before."""
+
+
+def clearance(world: World, observations: Observations) -> Tensor:
+    """Return the smallest gap of any free body to the ground or to a driven or fixed body (B, T) [m], as measured."""
+    gaps = []
+    for column, index in enumerate(observations.free):
+        body = world.bodies[index]
+        rotation = quat_to_matrix(observations.quat_wxyz[:, :, column])
+        centers = observations.position_m[:, :, column, None] + body.centers[0] @ rotation.transpose(-1, -2)
+        if world.ground_normal is not None and world.ground_offset is not None:
+            gaps.append((centers @ world.ground_normal - world.ground_offset[0] - body.radii[0]).amin(-1))
+        for name, drive in observations.drives.items():
+            other = next(body for body in world.bodies if body.name == name)
+            columns = []
+            for frame in range(observations.times_s.shape[1]):
+                pose = drive.at(observations.times_s[:, frame])
+                points = pose.com[:, None] + other.centers[0] @ quat_to_matrix(pose.quat_wxyz).transpose(-1, -2)
+                distance, _ = union_distance(points, centers[:, frame], body.radii.expand(len(points), -1), width=1e-3)
+                columns.append((distance - other.radii).amin(-1))
+            gaps.append(torch.stack(columns, 1))
+    if not gaps:
+        return torch.full_like(observations.times_s, torch.inf)
+    return torch.stack(gaps).amin(0)
+
+
+def flight_frames(world: World, observations: Observations) -> Tensor:
+    """Return which frames (B, T) come before an item's first contact."""
+    gap = clearance(world, observations)
+    move = torch.zeros_like(gap)
+    move[:, 1:] = gap.diff(dim=1).abs()
+    free = gap > FLIGHT_MARGIN_M + 0.75 * torch.nan_to_num(move, posinf=0.0)
+    return free.to(gap.dtype).cumprod(1) > 0
+
+
+def warmup_frames(world: World, observations: Observations, warmup_s: float) -> Tensor:
+    """Return which frames (B, T) are the warm-up: its length or four frames, cut at the first contact from flight."""
+    time = observations.times_s - observations.times_s[:, :1]
+    measured = observations.seen.amax(-1) > 0
+    early = time <= warmup_s + 1e-9
+    first = measured.to(torch.int64).cumsum(1) <= MIN_FRAMES
+    wanted = (early | first) & measured
+    flight = flight_frames(world, observations)
+    two = measured.to(torch.int64).cumsum(1) <= 2  # a velocity needs two frames, whatever they hold
+    return torch.where(flight[:, :1], wanted & (flight | two), wanted)
+
+
+def estimate_states(
+    world: World, observations: Observations, frames: Tensor, noise: tuple[float, float], iterations: int = 12
+) -> tuple[Observations, Solution]:
+    """Fit the states at the first frames to the chosen frames (B, T), by the model itself.
+
+    Returns:
+        The observations with the states moved to the estimate, and the solution (its state_cov is the uncertainty).
+    """
+    last = int(frames.any(0).nonzero().max()) + 1
+    keep = frames[:, :last, None].to(observations.seen.dtype)
+    warm = replace(
+        observations,
+        times_s=observations.times_s[:, :last],
+        position_m=observations.position_m[:, :last],
+        quat_wxyz=observations.quat_wxyz[:, :last],
+        seen=observations.seen[:, :last] * keep,
+        turned=observations.turned[:, :last] * keep,
+    )
+    like = world.gravity
+    states = torch.zeros(len(observations.names), 12 * len(observations.free)).to(like)
+    nothing = torch.zeros(0).to(like)
+    solution = minimise(
+        TrajectoryResiduals(world, [], warm, *noise),
+        nothing,
+        states,
+        torch.zeros(0, 2).to(like),
+        robust_scale=5.0,
+        iterations=iterations,
+        prior_information=state_prior(len(observations.free)).to(like),
+    )
+    return replace(observations, state=retract(observations.state, solution.states, observations.free)), solution

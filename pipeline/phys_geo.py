@@ -1,0 +1,366 @@
+"""The stage phys-geo: the numbers of the contact model from measured motion.
+
+1. The noise of the tracks, given or estimated from them.
+2. Initial states from each episode's warm-up, by the model itself.
+3. A global search (cross-entropy) on the open-loop error, many rollouts at once: what the model is for is to predict
+   long unseen motion, and that error has several valleys.
+4. Levenberg-Marquardt from there with exact forward-mode derivatives, states and parameters together. It is kept
+   where the open-loop error agrees (it is the sharper estimate if the model is right, and misleads where it is not).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datasets.capture import Capture
+from ..datasets.progress import progress
+from ..datasets.tracks import Track
+from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
+from ..schemas import Parameter as FittedParameter
+from .estimation.least_squares import Solution, minimise
+from .estimation.noise import estimate_noise
+from .estimation.observations import Observations
+from .estimation.search import SearchResult, cross_entropy, episode_covariance
+from .estimation.trajectory import TrajectoryResiduals, state_prior
+from .estimation.warmup import estimate_states, flight_frames, warmup_frames
+from .physics.contact import restitution
+from .physics.parameters import CONTACT_PARAMETERS, GROUND_OFFSET, Parameter, apply_parameters
+from .physics.rollout import simulate
+from .physics.rotation import geodesic_angle
+from .physics.world import State, World
+
+START = {"friction": 0.3, "contact_time_s": 0.005, "damping_ratio": 0.4, "ground_offset_m": 0.0}
+SPREAD = {"friction": 0.5, "contact_time_s": 0.4, "damping_ratio": 0.6, "ground_offset_m": 0.0007}
+"""First spread of the search, in the fitted coordinate (natural logarithm where the parameter is logarithmic)."""
+MAX_SPAN_S = 1.2
+"""Longer episodes are fitted on this much after their start: what follows a dozen impacts is noise to the fit."""
+MAX_ROLLOUTS = 1200
+"""Rollouts in one batch of the search."""
+OPEN_LOOP_TOLERANCE = 1.1
+"""The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
+UNOBSERVABLE_LOG_STD = 1.0
+"""A logarithmic parameter known to no better than a factor e is called not observable."""
+
+
+@dataclass(frozen=True)
+class PhysicsFit:
+    """What the stage found.
+
+    contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there is no ground;
+    noise: position [m], rotation [rad]; record: for `fit.json`; warnings.
+    """
+
+    contact: ContactParameters
+    parameters: tuple[FittedParameter, ...]
+    ground_offset_m: float | None
+    noise: tuple[float, float]
+    record: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
+    """Return the episodes of a split that have tracks of a free body.
+
+    Raises:
+        InputDataError: If none has.
+    """
+    free = {body.name for body in capture.manifest.bodies if body.motion == "free"}
+    episodes = [(name, capture.tracks(name)) for name in capture.episodes(split)]
+    usable = [(name, tracks) for name, tracks in episodes if free & set(tracks)]
+    if not usable:
+        raise InputDataError(
+            f"{capture.root}: none of the {len(episodes)} episodes of split '{split}' has a track of a free body.",
+            "tracks/<episode>.csv with rows for a body whose motion is 'free'.",
+            "add tracks, or fit from the videos: --supervise images.",
+        )
+    return usable
+
+
+def fit_physics(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    config: PhysConfig,
+    noise: tuple[float | None, float | None] = (None, None),
+) -> PhysicsFit:
+    """Fit friction, contact time, damping ratio and ground height to measured tracks.
+
+    Args:
+        world: The world with its geometry and inertia; its contact law is the start of the search.
+        episodes: Name and tracks by body of each training episode.
+        config: The stage's settings.
+        noise: Known measurement noise (position [m], rotation [rad]); estimated where None.
+
+    Raises:
+        NotConvergedError: If the rollouts diverge everywhere.
+    """
+    free_tracks = [
+        tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
+    ]
+    estimated = estimate_noise(free_tracks)
+    sigma = (noise[0] or estimated[0], noise[1] or estimated[1])
+    names = [*CONTACT_PARAMETERS, *([GROUND_OFFSET] if world.ground_normal is not None else [])]
+    windows = [_span(tracks) for _, tracks in episodes]
+    observations = Observations.of(world, episodes, windows)
+    warm = warmup_frames(world, observations, config.warmup_s)
+    observations, _ = estimate_states(world, observations, warm, sigma)
+
+    search = _search(world, observations, warm, names, config)
+    if not math.isfinite(search.cost):
+        raise NotConvergedError(
+            "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
+        )
+    solution, misfit = _refine(world, observations, names, search.best, sigma, config)
+    refined_cost = float(_open_loop(world, observations, warm, names)(solution.shared.numpy()[None]).mean())
+    keep = solution.shared.isfinite().all() and refined_cost <= OPEN_LOOP_TOLERANCE * search.cost
+    best = solution.shared.numpy() if keep else search.best
+    covariance = episode_covariance(search, best)
+    if covariance is None:
+        covariance = _model_covariance(solution)
+    record = {
+        "episodes": len(episodes),
+        "noise_estimated": {"position_m": estimated[0], "rotation_rad": estimated[1]},
+        "search_open_loop_m": search.history,
+        "refinement_cost": solution.costs,
+        "refinement_converged": solution.converged,
+        "model_misfit": {"position_m": misfit[0], "rotation_rad": misfit[1]},
+        "open_loop_m": {"search": search.cost, "refined": refined_cost},
+        "kept": "refined" if keep else "search",
+        "correlation": _correlation(covariance).tolist(),
+    }
+    return _result(world, names, best, covariance, sigma, record)
+
+
+def _span(tracks: dict[str, Track]) -> tuple[float, float]:
+    start = min(float(track.time_s[0]) for track in tracks.values())
+    end = max(float(track.time_s[-1]) for track in tracks.values())
+    return start - 1e-9, min(end, start + MAX_SPAN_S) + 1e-9
+
+
+def _search(
+    world: World, observations: Observations, warm: Tensor, names: list[Parameter], config: PhysConfig
+) -> SearchResult:
+    bounds = np.array([parameter.limits for parameter in names])
+    start = np.array([p.encode(START[p.name]) for p in names])
+    spread = np.array([SPREAD[p.name] for p in names])
+    bar = progress(range(config.generations), "phys-geo: search", total=config.generations)
+    steps = iter(bar)
+
+    def advance(_: int, cost: float) -> None:
+        next(steps, None)
+        bar.set_postfix_str(f"open loop {1e3 * cost:.1f} mm")
+
+    result = cross_entropy(
+        _open_loop(world, observations, warm, names),
+        bounds,
+        start,
+        spread,
+        seed=config.seed,
+        population=config.population,
+        generations=config.generations,
+        on_generation=advance,
+    )
+    bar.close()
+    return result
+
+
+def _open_loop(world: World, observations: Observations, warm: Tensor, names: list[Parameter]):
+    """Return the open-loop error by episode: mean displacement [m] of a point on the surface after the warm-up."""
+    after = observations.seen * (~warm)[..., None].to(observations.seen.dtype)
+    frames = after.sum((1, 2)).clamp_min(1.0)
+    size = torch.stack([_surface_radius(world, index) for index in observations.free])
+
+    def costs(samples: np.ndarray) -> np.ndarray:
+        chunk = max(1, MAX_ROLLOUTS // len(observations.names))
+        parts = [one(samples[first : first + chunk]) for first in range(0, len(samples), chunk)]
+        return np.concatenate(parts)
+
+    def one(samples: np.ndarray) -> np.ndarray:
+        repeats = len(samples)
+        values = torch.as_tensor(samples).repeat_interleave(len(observations.names), 0)
+        decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(names)], -1)
+        base = State(
+            *(getattr(observations.state, key).repeat(repeats, 1, 1) for key in observations.state.__dataclass_fields__)
+        )
+        drives = {name: drive.repeat(repeats) for name, drive in observations.drives.items()}
+        with torch.no_grad():
+            rollout = simulate(
+                apply_parameters(world, names, decoded), base, observations.times_s.repeat(repeats, 1), drives
+            )
+        free = list(observations.free)
+        shift = rollout.position_m[:, :, free] - observations.position_m.repeat(repeats, 1, 1, 1)
+        angle = geodesic_angle(rollout.quat_wxyz[:, :, free], observations.quat_wxyz.repeat(repeats, 1, 1, 1))
+        turned = observations.turned.repeat(repeats, 1, 1)
+        error = (shift.square().sum(-1) + (turned * angle * size).square()).sqrt()
+        weight = after.repeat(repeats, 1, 1)
+        return ((error * weight).sum((1, 2)) / frames.repeat(repeats)).view(repeats, -1).numpy()
+
+    return costs
+
+
+def _surface_radius(world: World, index: int) -> Tensor:
+    """Return the mean distance of the colliding surface from the centre of mass [m]."""
+    body = world.bodies[index]
+    return ((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).mean()
+
+
+def _refine(
+    world: World,
+    observations: Observations,
+    names: list[Parameter],
+    start: np.ndarray,
+    sigma: tuple[float, float],
+    config: PhysConfig,
+) -> tuple[Solution, tuple[float, float]]:
+    """Refine states and parameters together; before an episode's first contact the noise is the tracks' own.
+
+    After it the model's own misfit adds to the noise; it is estimated from the residuals at the start, robustly, so
+    that a model that explains the data (a simulated capture) is fitted to the noise, and one that does not (a real
+    impact) is not forced through every frame.
+    """
+    shared = torch.as_tensor(start)
+    states = torch.zeros(len(observations.names), 12 * len(observations.free)).to(shared)
+    prior = state_prior(len(observations.free))
+    flight = flight_frames(world, observations)
+    raw = TrajectoryResiduals(world, names, observations, 1.0, 1.0)
+    bounds = torch.tensor([parameter.limits for parameter in names], dtype=shared.dtype)
+    misfit = (0.0, 0.0)
+    solution: Solution | None = None
+    for rounds in range(2):
+        residual, _ = raw(shared, states, False)
+        misfit = _misfit(residual, observations, flight, sigma)
+        std = [
+            torch.where(flight, torch.as_tensor(s), torch.as_tensor(math.hypot(s, m)))
+            .repeat_interleave(len(observations.free), 1)[..., None]
+            .to(shared)
+            for s, m in zip(sigma, misfit, strict=True)
+        ]
+        solution = minimise(
+            replace(raw, position_std_m=std[0], rotation_std_rad=std[1]),
+            shared,
+            states,
+            bounds,
+            robust_scale=4.0,
+            iterations=config.iterations if rounds else max(2, config.iterations // 2),
+            prior_information=prior,
+        )
+        shared, states = solution.shared, solution.states
+    assert solution is not None
+    return solution, misfit
+
+
+def _misfit(
+    residual: Tensor, observations: Observations, flight: Tensor, sigma: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the model's own error after contact (position [m], rotation [rad]) beyond the noise."""
+    seen = (observations.seen.flatten(1) > 0) & ~flight.repeat_interleave(len(observations.free), 1)
+    values = []
+    for columns, noise in ((slice(0, 3), sigma[0]), (slice(3, 6), sigma[1])):
+        rows = residual[..., columns][seen].abs()
+        spread = 1.4826 * float(rows.median()) if rows.numel() else 0.0
+        values.append(math.sqrt(max(spread**2 - noise**2, 0.0)))
+    return values[0], values[1]
+
+
+def _model_covariance(solution: Solution) -> np.ndarray:
+    """Return the covariance of the parameters from the curvature, scaled by the fit's reduced chi-square if above 1."""
+    information = solution.information.numpy()
+    eigenvalues, vectors = np.linalg.eigh(information)
+    floor = np.maximum(eigenvalues, 1e-6)
+    rows = solution.chi2[solution.chi2 > 0]
+    scale = max(1.0, float(rows.median()) / 5.35) if rows.numel() else 1.0  # 5.35: median of chi-square, 6 degrees
+    return scale * (vectors @ np.diag(1 / floor) @ vectors.T)
+
+
+def _correlation(covariance: np.ndarray) -> np.ndarray:
+    std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
+    return covariance / np.outer(std, std)
+
+
+def _result(
+    world: World,
+    names: list[Parameter],
+    best: np.ndarray,
+    covariance: np.ndarray,
+    sigma: tuple[float, float],
+    record: dict[str, Any],
+) -> PhysicsFit:
+    std = np.sqrt(np.diag(covariance))
+    fitted = [_parameter(p, z, s) for p, z, s in zip(names, best, std, strict=True)]
+    value = {p.name: p.estimate for p in fitted}
+    contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
+    warnings = [
+        f"{p.name} is on its bound ({p.estimate:g} {p.unit}): {p.note}" for p in fitted if p.state == "on_bound"
+    ] + [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
+    return PhysicsFit(
+        contact,
+        (*fitted, *_derived(world, names, best, covariance)),
+        value.get("ground_offset_m"),
+        sigma,
+        record,
+        tuple(warnings),
+    )
+
+
+def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
+    low, high = parameter.limits
+    estimate = float(parameter.decode(torch.tensor(coordinate, dtype=torch.float64)))
+    reach = [min(max(coordinate + k * 1.96 * std, low), high) for k in (-1, 1)]
+    interval = tuple(float(parameter.decode(torch.tensor(x, dtype=torch.float64))) for x in reach)
+    slope = estimate if parameter.logarithmic else 1.0
+    on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
+    state = "on_bound" if on_bound else "fitted"
+    if parameter.logarithmic and std > UNOBSERVABLE_LOG_STD:
+        state = "not_observable"
+    note = f"{parameter.reveals} would reveal it"
+    return FittedParameter(
+        name=parameter.name,
+        unit=parameter.unit,
+        estimate=estimate,
+        std_error=float(slope * std),
+        interval_95=(interval[0], interval[1]),
+        bounds=parameter.bounds,
+        prior="uniform in its logarithm" if parameter.logarithmic else "uniform",
+        state=state,
+        note=note,
+    )
+
+
+def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:
+    """Return restitution, and stiffness and damping of a single contact below the centre of mass, by first order."""
+    index = {parameter.name: k for k, parameter in enumerate(names)}
+    tau, zeta = index["contact_time_s"], index["damping_ratio"]
+    mass = float(world.bodies[world.free[0]].mass[0])
+    formulas = {
+        "restitution": ("1", lambda z: restitution(z[zeta].exp())),
+        "stiffness_n_m": ("N/m", lambda z: mass / z[tau].exp().square()),
+        "damping_n_s_m": ("N s/m", lambda z: 2 * z[zeta].exp() * mass / z[tau].exp()),
+    }
+    derived = []
+    for name, (unit, formula) in formulas.items():
+        z = torch.tensor(best, dtype=torch.float64, requires_grad=True)
+        value = formula(z)
+        (slope,) = torch.autograd.grad(value, z)
+        std = math.sqrt(float(slope.numpy() @ covariance @ slope.numpy()))
+        estimate = float(value.detach())
+        note = (
+            "speed ratio of a head-on impact" if name == "restitution" else f"of one contact that carries {mass:g} kg"
+        )
+        derived.append(
+            FittedParameter(
+                name=name,
+                unit=unit,
+                estimate=estimate,
+                std_error=std,
+                interval_95=(estimate - 1.96 * std, estimate + 1.96 * std),
+                state="derived",
+                note=note,
+            )
+        )
+    return derived

@@ -1,0 +1,90 @@
+"""Bodies whose motion is given: measured tracks as commands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from .motion import Motion
+from .rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+
+if TYPE_CHECKING:
+    from ...datasets.tracks import Track
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Commanded motions of a batch, linear in position and angle between their samples; held still outside them.
+
+    times_s (B, S); position_m (B, S, 3); quat_wxyz (B, S, 4); velocity_m_s, omega_world_rad_s (B, S, 3) from a sample
+    to the next; last (B,): index of the last interval (shorter tracks are padded by their end).
+    """
+
+    times_s: Tensor
+    position_m: Tensor
+    quat_wxyz: Tensor
+    velocity_m_s: Tensor
+    omega_world_rad_s: Tensor
+    last: Tensor
+
+    @staticmethod
+    def of(tracks: Sequence[Track], like: Tensor) -> Drive:
+        """Prepare one track for each rollout, or one for all; tensors take dtype and device of `like`."""
+        longest = max(len(track.time_s) for track in tracks)
+        rows = [_prepare(track, longest, like) for track in tracks]
+        return Drive(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+    def repeat(self, times: int) -> Drive:
+        """Return the batch repeated, as `Tensor.repeat` does."""
+        if self.times_s.shape[0] == 1:
+            return self
+        fields = (getattr(self, name) for name in self.__dataclass_fields__)
+        return Drive(*(field.repeat(times, *[1] * (field.ndim - 1)) for field in fields))
+
+    def at(self, time_s: Tensor) -> Motion:
+        """Return pose and velocity at times (B,) or (1,) [s]; the motion's spin is the angular velocity (world)."""
+        batch = max(time_s.shape[0], self.times_s.shape[0])
+        time = time_s.expand(batch)
+        grid = self.times_s.expand(batch, -1)
+        index = torch.searchsorted(grid, time.detach()[:, None].contiguous(), right=True).squeeze(-1) - 1
+        index = torch.minimum(index.clamp_min(0), self.last.expand(batch))
+        first, final = self._pick(grid, index * 0), self._pick(grid, self.last.expand(batch) + 1)
+        moving = ((time >= first) & (time <= final)).to(time.dtype)[:, None]
+        since = (time.clamp(first, final) - self._pick(grid, index))[:, None]
+        velocity, omega = self._pick(self.velocity_m_s, index), self._pick(self.omega_world_rad_s, index)
+        position = self._pick(self.position_m, index) + velocity * since
+        quat = quat_multiply(quat_exp(omega * since), self._pick(self.quat_wxyz, index))
+        return Motion(position, quat, velocity * moving, omega * moving)
+
+    @staticmethod
+    def _pick(values: Tensor, index: Tensor) -> Tensor:
+        rows = torch.arange(index.shape[0], device=index.device)
+        return values.expand(index.shape[0], *values.shape[1:])[rows, index]
+
+
+def _prepare(track: Track, longest: int, like: Tensor) -> tuple[Tensor, ...]:
+    times = torch.as_tensor(track.time_s).to(like)
+    position = torch.as_tensor(track.position_m).to(like)
+    if track.quat_wxyz is None:
+        quat = torch.zeros(len(times), 4).to(like)
+        quat[:, 0] = 1.0
+    else:
+        quat = torch.as_tensor(track.quat_wxyz).to(like)
+    length = times.diff()[:, None]
+    turn = quat_log(quat_multiply(quat_conjugate(quat[:-1]), quat[1:]))
+    velocity, omega = position.diff(dim=0) / length, quat_rotate(quat[:-1], turn) / length
+    still = torch.zeros(1, 3).to(like)
+    padding = longest - len(times)
+    late = times[-1:] + torch.arange(1, padding + 1).to(like)
+    return (
+        torch.cat((times, late)),
+        torch.cat((position, position[-1:].expand(padding, 3))),
+        torch.cat((quat, quat[-1:].expand(padding, 4))),
+        torch.cat((velocity, still.expand(padding + 1, 3))),
+        torch.cat((omega, still.expand(padding + 1, 3))),
+        torch.tensor(len(times) - 2),
+    )

@@ -1,0 +1,307 @@
+"""Rollouts: the world stepped through time, batched, from given initial states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ...schemas import InputDataError
+from .contact import ContactGroup, Side
+from .distance import union_distance
+from .driven import Drive
+from .motion import Inertia, Motion, advance, finish, start
+from .rotation import cross, quat_to_matrix
+from .world import Body, State, World
+
+if TYPE_CHECKING:
+    from ...datasets.tracks import Track
+
+PAIR_SMOOTHING_M = 1e-3
+"""Width of the smooth minimum in distances between two bodies of spheres [m]."""
+
+
+@dataclass(frozen=True)
+class ContactRecord:
+    """The contacts of a rollout, summed over the steps since the previous frame.
+
+    body_a (C,), body_b (C,) int, -1 for the ground; impulse_n_s (B, T, C, 3) on body a; position_m (B, T, C, 3);
+    normal (B, T, C, 3) from b to a; distance_m (B, T, C), negative where they overlap; sliding (B, T, C) bool. World
+    frame.
+    """
+
+    body_a: Tensor
+    body_b: Tensor
+    impulse_n_s: Tensor
+    position_m: Tensor
+    normal: Tensor
+    distance_m: Tensor
+    sliding: Tensor
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Poses and velocities at the frames: times_s (T,) or (B, T); the others (B, T, nb, ...) as in `State`."""
+
+    times_s: Tensor
+    position_m: Tensor
+    quat_wxyz: Tensor
+    velocity_m_s: Tensor
+    omega_body_rad_s: Tensor
+    contacts: ContactRecord | None = None
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The contacts between one pair of bodies in one step."""
+
+    a: int
+    b: int
+    gap: Tensor
+    normal: Tensor
+    point: Tensor
+    impulse: Tensor
+
+
+def simulate(
+    world: World,
+    state: State,
+    times_s: Tensor,
+    driven: Mapping[str, Track | Drive] | None = None,
+    record_contacts: bool = False,
+) -> Rollout:
+    """Roll the world out from `state`, open loop.
+
+    Args:
+        world: The world; its tensors and the state's broadcast over the batch B.
+        state: The state at the first time; driven and fixed bodies take theirs from `driven` or keep it.
+        times_s: Frame times [s], increasing, shape (T,) or (B, T).
+        driven: The command of each driven body: a track, or a prepared `Drive`.
+        record_contacts: Whether to keep the contacts of every frame.
+
+    Returns:
+        The rollout at the frame times.
+
+    Raises:
+        InputDataError: If a driven body has no track.
+    """
+    engine = _Engine(world, state, times_s, driven or {})
+    motions = engine.begin(state)
+    frames = [engine.frame(motions)]
+    records = [engine.record([], motions)] if record_contacts else []
+    for interval in range(1, times_s.shape[-1]):
+        groups: list[list[_Group]] = []
+        for substep in range(engine.substeps[interval - 1]):
+            motions, touched = engine.step(motions, interval, substep)
+            if record_contacts:
+                groups.append(touched)
+        frames.append(engine.frame(motions))
+        if record_contacts:
+            records.append(engine.record(groups, motions))
+    position, quat, velocity, omega = (torch.stack([frame[k] for frame in frames], 1) for k in range(4))
+    contacts = engine.contacts(records) if record_contacts else None
+    return Rollout(times_s, position, quat, velocity, omega, contacts)
+
+
+class _Engine:
+    """The constants of one rollout, and its step."""
+
+    def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
+        self.world = world
+        self.inertias = [Inertia.of(body) for body in world.bodies]
+        self.times = times_s if times_s.ndim == 2 else times_s[None]
+        self.lengths = self.times.diff(dim=1)
+        longest = self.lengths.amax(0).tolist()
+        self.substeps = [max(1, math.ceil(length / world.step_s - 1e-6)) for length in longest]
+        self.pairs = _pairs(world)
+        self.drives: dict[int, Drive] = {}
+        for index, body in enumerate(world.bodies):
+            if body.motion == "driven":
+                if body.name not in driven:
+                    raise InputDataError(
+                        f"the driven body '{body.name}' has no track in this episode; its track is its command.",
+                        todo=f"add rows for '{body.name}' to the episode's tracks file.",
+                    )
+                command = driven[body.name]
+                like = state.position_m.detach()
+                self.drives[index] = command if isinstance(command, Drive) else Drive.of([command], like)
+
+    def begin(self, state: State) -> list[Motion]:
+        motions = []
+        for index, body in enumerate(self.world.bodies):
+            position, quat, velocity = (x[:, index] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
+            if index in self.drives:
+                motions.append(self.drives[index].at(self.times[:, 0]))
+            elif body.free:
+                motions.append(start(body, position, quat, velocity, state.omega_body_rad_s[:, index]))
+            else:
+                motions.append(Motion(position, quat, torch.zeros_like(position), torch.zeros_like(position)))
+        return motions
+
+    def step(self, motions: list[Motion], interval: int, substep: int) -> tuple[list[Motion], list[_Group]]:
+        count = self.substeps[interval - 1]
+        h = self.lengths[:, interval - 1] / count
+        gravity = self.world.gravity
+        # free velocities: gravity acts, angular momentum stays
+        ahead = [
+            Motion(m.com, m.quat_wxyz, m.velocity + h[:, None] * gravity, m.spin) if body.free else m
+            for body, m in zip(self.world.bodies, motions, strict=True)
+        ]
+        rotations = [quat_to_matrix(m.quat_wxyz) for m in motions]
+        groups = self._contacts(ahead, rotations, h)
+        velocity, spin = self._after(ahead, groups)
+        moved = []
+        for index, body in enumerate(self.world.bodies):
+            if body.free:
+                moved.append(advance(self.inertias[index], motions[index], velocity[index], spin[index], h))
+            elif index in self.drives:
+                moved.append(self.drives[index].at(self.times[:, interval - 1] + (substep + 1) * h))
+            else:
+                moved.append(motions[index])
+        return moved, groups
+
+    def _contacts(self, motions: list[Motion], rotations: list[Tensor], h: Tensor) -> list[_Group]:
+        """Return the contacts of a step with their impulses: the closed form, then further sweeps where wanted."""
+        centers = [self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))]
+        groups, prepared = [], []
+        for a, b in self.pairs:
+            gap, normal, point = self._geometry(a, b, centers)
+            sides = [self._side(i, motions[i], rotations[i], point) if i >= 0 else None for i in (a, b)]
+            assert sides[0] is not None
+            group, impulse = ContactGroup.of(self.world.contact, gap, normal, sides[0], sides[1], h)
+            groups.append(_Group(a, b, gap, normal, point, impulse))
+            prepared.append(group)
+        for _ in range(1, self.world.sweeps):
+            velocity, spin = self._after(motions, groups)
+            moving = [replace(m, velocity=v, spin=s) for m, v, s in zip(motions, velocity, spin, strict=True)]
+            swept = []
+            for group, contact in zip(groups, prepared, strict=True):
+                side_a = self._side(group.a, moving[group.a], rotations[group.a], group.point)
+                relative = side_a.point_velocity()
+                if group.b >= 0:
+                    relative = (
+                        relative
+                        - self._side(group.b, moving[group.b], rotations[group.b], group.point).point_velocity()
+                    )
+                swept.append(replace(group, impulse=contact.sweep(group.impulse, relative)))
+            groups = swept
+        return groups
+
+    def _after(self, motions: list[Motion], groups: list[_Group]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return velocities and angular momenta after the groups' impulses."""
+        velocity = [m.velocity for m in motions]
+        spin = [m.spin for m in motions]
+        for group in groups:
+            for index, sign in ((group.a, 1.0), (group.b, -1.0)):
+                if index >= 0 and self.world.bodies[index].free:
+                    arms = group.point - motions[index].com[:, None]
+                    impulse = sign * group.impulse
+                    velocity[index] = velocity[index] + impulse.sum(1) / self.inertias[index].mass[:, None]
+                    spin[index] = spin[index] + cross(arms, impulse).sum(1)
+        return velocity, spin
+
+    def _centers(self, index: int, motion: Motion, rotation: Tensor) -> Tensor:
+        body = self.world.bodies[index]
+        reference = body.com if body.free else torch.zeros_like(body.com)
+        return motion.com[:, None] + (body.centers - reference[:, None]) @ rotation.transpose(-1, -2)
+
+    def _geometry(self, a: int, b: int, centers: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        body_a = self.world.bodies[a]
+        if b < 0:
+            normal, offset = self.world.ground_normal, self.world.ground_offset
+            assert normal is not None and offset is not None  # a pair with -1 exists only with a ground
+            gap = centers[a] @ normal - offset[:, None] - body_a.radii
+            point = centers[a] - body_a.radii[..., None] * normal
+            return gap, normal.expand_as(point), point
+        body_b = self.world.bodies[b]
+        distance, outward = union_distance(centers[b], centers[a], body_a.radii, PAIR_SMOOTHING_M)
+        gap = distance - body_b.radii
+        point = centers[b] - (body_b.radii + 0.5 * gap)[..., None] * outward
+        return gap, -outward, point
+
+    def _side(self, index: int, motion: Motion, rotation: Tensor, point: Tensor) -> Side:
+        body, inertia = self.world.bodies[index], self.inertias[index]
+        arms = point - motion.com[:, None]
+        if not body.free:
+            zero = torch.zeros_like(motion.com[:, 0])
+            nothing = torch.zeros_like(rotation)
+            return Side(motion.velocity, motion.spin, zero, nothing, arms)
+        root = rotation @ inertia.root
+        omega = (root @ (root.transpose(-1, -2) @ motion.spin[..., None])).squeeze(-1)
+        return Side(motion.velocity, omega, 1 / inertia.mass, root, arms)
+
+    def frame(self, motions: list[Motion]) -> tuple[Tensor, ...]:
+        columns = []
+        for index, (body, motion) in enumerate(zip(self.world.bodies, motions, strict=True)):
+            if body.free:
+                columns.append(finish(body, self.inertias[index], motion))
+            else:
+                omega = (quat_to_matrix(motion.quat_wxyz).transpose(-1, -2) @ motion.spin[..., None]).squeeze(-1)
+                columns.append((motion.com, motion.quat_wxyz, motion.velocity, omega))
+        batch = max(value.shape[0] for column in columns for value in column)
+        return tuple(
+            torch.stack([column[k].expand(batch, column[k].shape[-1]) for column in columns], 1) for k in range(4)
+        )
+
+    def record(self, steps: list[list[_Group]], motions: list[Motion]) -> tuple[Tensor, ...]:
+        """Sum the impulses of an interval; where none acted, tell the geometry at its end."""
+        rotations = [quat_to_matrix(m.quat_wxyz) for m in motions]
+        centers = [self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))]
+        columns = []
+        for number, (a, b) in enumerate(self.pairs):
+            gap, normal, point = self._geometry(a, b, centers)
+            total = torch.zeros_like(point)
+            weighted, weight = torch.zeros_like(point), torch.zeros_like(gap)
+            sliding = torch.zeros_like(gap)
+            for step in steps:
+                group = step[number]
+                along = (group.impulse * group.normal).sum(-1)
+                across = (group.impulse - along[..., None] * group.normal).square().sum(-1).sqrt()
+                total = total + group.impulse
+                weighted, weight = weighted + along[..., None] * group.point, weight + along
+                slides = across > 0.99 * self.world.contact.friction[:, None] * along
+                sliding = sliding + along * slides.to(along.dtype)
+            acted = weight > 0
+            place = torch.where(acted[..., None], weighted / weight.clamp_min(1e-30)[..., None], point)
+            columns.append((total, place, normal, gap, (sliding > 0.5 * weight) & acted))
+        if not columns:
+            batch = motions[0].com.shape[0] if motions else 1
+            empty = self.times.new_zeros((batch, 0))
+            vector = self.times.new_zeros((batch, 0, 3))
+            return vector, vector, vector, empty, empty.bool()
+        return tuple(torch.cat([column[k] for column in columns], 1) for k in range(5))
+
+    def contacts(self, records: list[tuple[Tensor, ...]]) -> ContactRecord:
+        counts = [self._count(a, b) for a, b in self.pairs]
+        body_a = torch.tensor([a for (a, _), n in zip(self.pairs, counts, strict=True) for _ in range(n)])
+        body_b = torch.tensor([b for (_, b), n in zip(self.pairs, counts, strict=True) for _ in range(n)])
+        return ContactRecord(body_a, body_b, *(torch.stack([r[k] for r in records], 1) for k in range(5)))
+
+    def _count(self, a: int, b: int) -> int:
+        return self.world.bodies[a if b < 0 else b].radii.shape[-1]
+
+
+def _pairs(world: World) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that can touch: each free body with the ground (-1) and with every other body.
+
+    The body with more spheres comes first: its union is the surface that the other's spheres touch.
+    """
+    pairs = []
+    bodies = world.bodies
+    for index, body in enumerate(bodies):
+        if body.free and world.ground_normal is not None:
+            pairs.append((index, -1))
+    for i, first in enumerate(bodies):
+        for j in range(i + 1, len(bodies)):
+            if first.free or bodies[j].free:
+                more = _sphere_count(first) >= _sphere_count(bodies[j])
+                pairs.append((i, j) if more else (j, i))
+    return pairs
+
+
+def _sphere_count(body: Body) -> int:
+    return body.radii.shape[-1]

@@ -1,0 +1,111 @@
+"""Rotations as unit quaternions (w, x, y, z; Hamilton), batched and differentiable.
+
+Formulas: J. Sola, "Quaternion kinematics for the error-state Kalman filter" (arXiv 1711.02508), sections 1 to 4.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_SMALL_ANGLE2 = 1e-8
+"""Below this squared angle [rad2] the series is exact to double precision."""
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Return the quaternion product a b, both (..., 4): first b rotates, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        -1,
+    )
+
+
+def quat_conjugate(quat_wxyz: Tensor) -> Tensor:
+    """Return the inverse of unit quaternions (..., 4)."""
+    return torch.cat((quat_wxyz[..., :1], -quat_wxyz[..., 1:]), -1)
+
+
+def quat_normalize(quat_wxyz: Tensor) -> Tensor:
+    """Return quaternions (..., 4) scaled to unit length."""
+    return quat_wxyz / quat_wxyz.square().sum(-1, keepdim=True).sqrt()
+
+
+def quat_to_matrix(quat_wxyz: Tensor) -> Tensor:
+    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = quat_wxyz.unbind(-1)
+    x2, y2, z2 = x + x, y + y, z + z
+    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
+    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quat(matrix: Tensor) -> Tensor:
+    """Return unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
+
+    The largest of the four components is taken from the diagonal, so that no division is small (Shepperd 1978).
+    """
+    m = matrix
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    yz, zx, xy = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    sxy, sxz, syz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    candidates = torch.stack(
+        (
+            torch.stack((1 + xx + yy + zz, yz, zx, xy), -1),
+            torch.stack((yz, 1 + xx - yy - zz, sxy, sxz), -1),
+            torch.stack((zx, sxy, 1 - xx + yy - zz, syz), -1),
+            torch.stack((xy, sxz, syz, 1 - xx - yy + zz), -1),
+        ),
+        -2,
+    )
+    best = candidates.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    chosen = torch.gather(candidates, -2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    quat = quat_normalize(chosen)
+    return torch.where(quat[..., :1] < 0, -quat, quat)
+
+
+def quat_exp(rotation_vector: Tensor) -> Tensor:
+    """Return the unit quaternion (..., 4) of rotation vectors (..., 3) [rad]."""
+    angle2 = rotation_vector.square().sum(-1, keepdim=True)
+    small = angle2 < _SMALL_ANGLE2
+    half = 0.5 * torch.where(small, torch.ones_like(angle2), angle2).sqrt()
+    cosine = torch.where(small, 1 - angle2 / 8, half.cos())
+    sinc = torch.where(small, 0.5 - angle2 / 48, half.sin() / (2 * half))
+    return torch.cat((cosine, sinc * rotation_vector), -1)
+
+
+def quat_log(quat_wxyz: Tensor) -> Tensor:
+    """Return the shortest rotation vectors (..., 3) [rad] of unit quaternions (..., 4)."""
+    quat = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)
+    w, vector = quat[..., :1], quat[..., 1:]
+    sine2 = vector.square().sum(-1, keepdim=True)
+    small = sine2 < _SMALL_ANGLE2
+    sine = torch.where(small, torch.ones_like(sine2), sine2).sqrt()
+    factor = torch.where(small, 2 / w * (1 - sine2 / (3 * w * w)), 2 * torch.atan2(sine, w) / sine)
+    return factor * vector
+
+
+def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:
+    """Rotate vectors (..., 3) by unit quaternions (..., 4)."""
+    axis = quat_wxyz[..., 1:]
+    twice = 2 * cross(axis, vector)
+    return vector + quat_wxyz[..., :1] * twice + cross(axis, twice)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return the cross product of vectors (..., 3); batch dimensions broadcast."""
+    ax, ay, az = a.unbind(-1)
+    bx, by, bz = b.unbind(-1)
+    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
+
+
+def geodesic_angle(a_wxyz: Tensor, b_wxyz: Tensor) -> Tensor:
+    """Return the angle [rad] (...) of the rotation that takes a to b, both unit quaternions (..., 4)."""
+    return quat_log(quat_multiply(quat_conjugate(a_wxyz), b_wxyz)).square().sum(-1).sqrt()

@@ -1,0 +1,132 @@
+"""What the engine simulates: bodies of spheres, the ground, gravity and the contact law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...schemas import InputDataError
+from .contact import ContactLaw
+
+if TYPE_CHECKING:
+    from ...datasets.models import Model
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body made of spheres. Every tensor has a batch dimension of 1 or B.
+
+    mass (B,) [kg]; inertia (B, 3, 3) [kg m2] about the centre of mass, body axes; com (B, 3) [m] in the body frame;
+    centers (B, N, 3) [m] in the body frame; radii (B, N) [m].
+    """
+
+    name: str
+    motion: str
+    mass: Tensor
+    inertia: Tensor
+    com: Tensor
+    centers: Tensor
+    radii: Tensor
+
+    @property
+    def free(self) -> bool:
+        """Whether the body moves by physics."""
+        return self.motion == "free"
+
+
+@dataclass(frozen=True)
+class World:
+    """The bodies and what surrounds them; gravity (B, 3) [m/s2], ground normal (3,) and offset (B,) [m]."""
+
+    bodies: tuple[Body, ...]
+    gravity: Tensor
+    ground_normal: Tensor | None
+    ground_offset: Tensor | None
+    contact: ContactLaw
+    step_s: float = 0.001
+    sweeps: int = 4
+
+    @property
+    def body_names(self) -> list[str]:
+        """Names of the bodies, in the order of the state."""
+        return [body.name for body in self.bodies]
+
+    @property
+    def free(self) -> list[int]:
+        """Indices of the free bodies."""
+        return [index for index, body in enumerate(self.bodies) if body.free]
+
+    @staticmethod
+    def from_model(model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu") -> World:
+        """Build the world of a fitted model.
+
+        Raises:
+            InputDataError: If the model has no fitted physics yet.
+        """
+        file = model.file
+        if file.contact is None:
+            raise InputDataError(
+                f"{model.root}: the model has no fitted physics, only the scene.",
+                todo="run 'cgwm fit CAPTURE --stage phys-geo --from MODEL --out NEW' first.",
+            )
+
+        def tensor(value: object) -> Tensor:
+            return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)[None]
+
+        bodies = []
+        for body in file.bodies:
+            spheres = model.collision[body.name]
+            bodies.append(
+                Body(
+                    body.name,
+                    body.motion,
+                    tensor(body.mass_kg),
+                    tensor(symmetric(body.inertia_kg_m2)),
+                    tensor(body.com_m),
+                    tensor(spheres.means),
+                    tensor(spheres.scales * body.radius_factor),
+                )
+            )
+        law = ContactLaw(
+            *(tensor(v) for v in (file.contact.friction, file.contact.contact_time_s, file.contact.damping_ratio))
+        )
+        ground = file.ground
+        return World(
+            tuple(bodies),
+            tensor(file.gravity_m_s2),
+            tensor(ground.normal)[0] if ground else None,
+            tensor(ground.offset_m) if ground else None,
+            law,
+            file.solver.step_s,
+            file.solver.sweeps,
+        )
+
+    def with_body(self, index: int, **changes: Tensor) -> World:
+        """Return a copy in which some tensors of one body are replaced."""
+        bodies = list(self.bodies)
+        bodies[index] = replace(bodies[index], **changes)
+        return replace(self, bodies=tuple(bodies))
+
+
+@dataclass(frozen=True)
+class State:
+    """Poses and velocities of all bodies at one time, in the order of the world's bodies.
+
+    position_m (B, nb, 3): body frame origin, world; quat_wxyz (B, nb, 4); velocity_m_s (B, nb, 3): of the body frame
+    origin, world; omega_body_rad_s (B, nb, 3): body frame.
+    """
+
+    position_m: Tensor
+    quat_wxyz: Tensor
+    velocity_m_s: Tensor
+    omega_body_rad_s: Tensor
+
+
+def symmetric(six: tuple[float, ...]) -> np.ndarray:
+    """Return the symmetric matrix (3, 3) of (xx, yy, zz) or (xx, yy, zz, xy, xz, yz)."""
+    xx, yy, zz, xy, xz, yz = (*six, 0.0, 0.0, 0.0)[:6]
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
