@@ -13,17 +13,21 @@ import numpy as np
 
 from ..datasets.atomic import new_file
 from ..datasets.capture import Capture
+from ..datasets.check import check_capture
+from ..datasets.kinds import refuse_other_kind
 from ..datasets.progress import progress
 from ..schemas import (
     CalibrateConfig,
     CameraIntrinsics,
     CamerasFile,
+    CaptureManifest,
     InputDataError,
     NotConvergedError,
     PosedImage,
     PosedVideo,
     Scale,
     UsageError,
+    read_toml,
 )
 from ..schemas.calibration import (
     CalibrationAttempt,
@@ -127,8 +131,14 @@ def require_metric(cameras: CamerasFile) -> None:
 
 
 def _open(root: Path, overwrite: bool) -> Capture:
-    capture = Capture.open(root)
-    if capture.cameras is not None and not overwrite:
+    if overwrite:
+        # The old cameras may name photos that are gone: that is a reason to replace them, not to refuse.
+        refuse_other_kind(root, "capture")
+        capture = Capture(root, read_toml(root / "capture.toml", CaptureManifest))
+        check_capture(capture)
+    else:
+        capture = Capture.open(root)
+    if capture.cameras is not None:
         raise UsageError(
             f"{root} has cameras already ({len(capture.cameras.images)} images, "
             f"{len(capture.cameras.videos)} videos; scale: {capture.cameras.scale.kind}).",
