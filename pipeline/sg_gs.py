@@ -245,6 +245,8 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     started = time.perf_counter()
     path = stage.capture.root / POINTS_NAME
     points = read_points(path)[0] if path.is_file() else None
+    if points is None and stage.ground is None:
+        stage.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
     centers, scales = scene_seeds(stage.train, stage.ground, points, config.max_scene_spheres, config.seed)
     if len(scales) == 0:
         raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")

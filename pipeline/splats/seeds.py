@@ -97,7 +97,8 @@ def scene_seeds(
     """Return spheres for what is not a body: ground, SfM points, and a shell far away.
 
     Ground that the photos show is covered by cells, small where its picture has detail; elsewhere SfM points stand for
-    the surfaces; rays that meet neither end on a shell, which is closed, so that no view looks out of the world.
+    the surfaces, or random points where there is neither. Rays that meet nothing end on a shell, which is closed, so
+    that no view looks out of the world.
 
     Args:
         views: The photos; pixels of bodies are left out.
@@ -117,7 +118,9 @@ def scene_seeds(
     rest = max_spheres - shell_budget
     parts: list[tuple[Array, Array]] = []
     standing = points
-    if points is not None and ground is not None:
+    if points is None and ground is None:
+        standing = _random_points(views, rest, rng)
+    elif points is not None and ground is not None:
         standing = points[points @ np.array(ground.normal) - ground.offset_m > 0.02 * spread]
     if standing is not None and len(standing) > 3:
         parts.append(_with_neighbour_scales(standing, rest if ground is None else rest // 4, rng))
@@ -128,6 +131,21 @@ def scene_seeds(
         sample = sample.chosen(~hits)
     parts.append(_shell(sample, cameras, points, shell_budget))
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Array:
+    """Return points in a ball around where the cameras look, (count, 3): a start where nothing else is known."""
+    system, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        axis = view.camera.T_world_cam[:3, 2]
+        across = np.eye(3) - np.outer(axis, axis)
+        system += across
+        right += across @ view.camera.center
+    focus = np.linalg.lstsq(system, right, rcond=None)[0]
+    radius = float(np.median([np.linalg.norm(view.camera.center - focus) for view in views]))
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return focus + 1.5 * radius * rng.random((count, 1)) ** (1 / 3) * directions
 
 
 @dataclass(frozen=True)

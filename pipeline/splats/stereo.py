@@ -79,7 +79,7 @@ def _pass(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[V
     size = solid.size()
     offsets = np.linspace(-_DEEPEST * size, _OUTWARD * size, _OFFSETS)
     scores, pairs = _agreement(solid, points, normals, offsets, views, body)
-    near = np.asarray(KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1])
+    near: Array = np.asarray(KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1])
     alike = np.einsum("id,ijd->ij", normals, normals[near]) > 0.85
     weight = alike * pairs[near]
     pooled = (weight[..., None] * scores[near]).sum(1) / np.maximum(weight.sum(1), 1e-9)[:, None]
@@ -197,7 +197,7 @@ def _smoothed(shift: Array, confidence: Array, near: Array, alike: Array) -> Arr
     # A sample that contradicts the median of its neighbours is an outlier.
     known = np.where(alike & (confidence[near] > 0), shift[near], np.nan)
     with np.errstate(all="ignore"):
-        middle = np.nanmedian(np.where(np.isfinite(known).any(1)[:, None], known, 0.0), axis=1)
+        middle = np.nanmedian(np.where(np.isfinite(known).any(axis=1, keepdims=True), known, 0.0), axis=1)
     trust = confidence * (np.abs(shift - middle) < 0.25 * np.abs(shift).max() + 1e-12)
     result = np.where(trust > 0, shift, middle)
     for _ in range(12):
@@ -216,8 +216,8 @@ def _tangents(normals: Array) -> tuple[Array, Array]:
 def _deformed(solid: Volume, points: Array, shift: Array) -> Volume:
     """Move the surface by `shift` [m] along its normals, as given at some of its points."""
     where = grid_points(solid.distance.shape, solid.origin, solid.pitch)
-    distance = solid.distance.reshape(-1)
-    touched = np.abs(distance) < 2 * _DEEPEST * solid.size()
+    distance: Array = solid.distance.reshape(-1)
+    touched: Array = np.abs(distance) < 2 * _DEEPEST * solid.size()
     field = distance.copy()
     field[touched] -= _interpolated(points, shift, where[touched], solid.pitch)
     field = field.reshape(solid.distance.shape)
@@ -226,7 +226,7 @@ def _deformed(solid: Volume, points: Array, shift: Array) -> Volume:
     tips = solid.corners
     if len(tips):
         moved = _interpolated(points, shift, tips, solid.pitch)
-        tips = tips[np.asarray(moved > -0.5 * solid.pitch)]
+        tips = np.compress(moved > -0.5 * solid.pitch, tips, axis=0)
     return Volume.from_inside(field < 0, solid.origin, solid.pitch, np.concatenate([surface, tips]), len(tips))
 
 
