@@ -117,7 +117,7 @@ def scene_seeds(
     shell_budget = int((_SHELL_SHARE_GROUND if ground is not None else _SHELL_SHARE) * max_spheres)
     rest = max_spheres - shell_budget
     parts: list[tuple[Array, Array]] = []
-    standing = points
+    standing = points = None if points is None else points[~_on_bodies(points, views)]
     if points is None and ground is None:
         standing = _random_points(views, rest, rng)
     elif points is not None and ground is not None:
@@ -131,6 +131,22 @@ def scene_seeds(
         sample = sample.chosen(~hits)
     parts.append(_shell(sample, cameras, points, shell_budget))
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def _on_bodies(points: Array, views: Sequence[View]) -> Array:
+    """Return which points lie in the masks of most views that have them in the picture, (n,): they are on a body."""
+    inside, seen = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        if view.cover is None:
+            continue
+        width, height = view.size
+        pixel, depth = view.camera.resized(width, height).project(points)
+        column, row = (np.floor(np.nan_to_num(pixel[:, k], nan=-1)).astype(int) for k in range(2))
+        visible = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        cover = view.cover.sum(0).cpu().numpy()
+        inside += visible & (cover[row.clip(0, height - 1), column.clip(0, width - 1)] > 0.5)
+        seen += visible
+    return inside > 0.6 * np.maximum(seen, 1)
 
 
 def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Array:
