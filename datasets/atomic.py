@@ -36,7 +36,7 @@ def new_directory(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     _clean_stale(path)
-    _refuse_existing(path, overwrite)
+    refuse_existing(path, overwrite)
     temporary = _temporary(path)
     try:
         temporary.mkdir()  # inside, so that a signal that arrives right after it still removes it
@@ -61,13 +61,13 @@ def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     if path.is_dir():
         raise UsageError(f"{path} is a directory; a file is written here.", todo="choose another name.")
     _clean_stale(path)
-    _refuse_existing(path, overwrite)
+    refuse_existing(path, overwrite)
     temporary = _temporary(path, path.suffix)
     try:
         yield temporary
         _sync(temporary)
         if not overwrite:
-            _refuse_existing(path, overwrite)
+            refuse_existing(path, overwrite)
         os.replace(temporary, path)
         _sync(path.parent)
     except BaseException:
@@ -89,7 +89,12 @@ def sha256(path: Path | str) -> str:
     return digest.hexdigest()
 
 
-def _refuse_existing(path: Path, overwrite: bool) -> None:
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Refuse an output that exists, unless it may be replaced; called before long work starts.
+
+    Raises:
+        UsageError: If it exists and `overwrite` is not given, or replacing it would remove more than an output.
+    """
     if not os.path.lexists(path):
         return
     if not overwrite:
@@ -156,7 +161,7 @@ def _put_in_place(temporary: Path, path: Path, overwrite: bool) -> None:
         os.rename(temporary, path)
         _sync(path.parent)
         return
-    _refuse_existing(path, overwrite)
+    refuse_existing(path, overwrite)
     aside = _sibling(path, _REPLACED)
     os.rename(path, aside)
     try:

@@ -4,8 +4,9 @@
 2. Initial states from each episode's warm-up, by the model itself.
 3. A global search (cross-entropy) on the open-loop error, many rollouts at once: what the model is for is to predict
    long unseen motion, and that error has several valleys.
-4. Levenberg-Marquardt from there with exact forward-mode derivatives, states and parameters together. It is kept
-   where the open-loop error agrees (it is the sharper estimate if the model is right, and misleads where it is not).
+4. With few episodes, Levenberg-Marquardt from there with exact forward-mode derivatives, states and parameters
+   together. It is kept where the open-loop error agrees: it is the sharper estimate if the model is right, and
+   misleads where it is not. With many, the scatter between episodes gives the intervals.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ from .estimation.search import SearchResult, cross_entropy, episode_covariance
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
 from .physics.contact import restitution
-from .physics.parameters import CONTACT_PARAMETERS, GROUND_OFFSET, Parameter, apply_parameters
+from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
 from .physics.rollout import simulate
 from .physics.rotation import geodesic_angle
 from .physics.world import State, World
 
-START = {"friction": 0.3, "contact_time_s": 0.005, "damping_ratio": 0.4, "ground_offset_m": 0.0}
-SPREAD = {"friction": 0.5, "contact_time_s": 0.4, "damping_ratio": 0.6, "ground_offset_m": 0.0007}
+START = {"friction": 0.3, "contact_time_s": 0.005, "damping_ratio": 0.4, "ground_shift_m": 0.0}
+SPREAD = {"friction": 0.5, "contact_time_s": 0.4, "damping_ratio": 0.6, "ground_shift_m": 0.0007}
 """First spread of the search, in the fitted coordinate (natural logarithm where the parameter is logarithmic)."""
 MAX_SPAN_S = 1.2
 """Longer episodes are fitted on this much after their start: what follows a dozen impacts is noise to the fit."""
@@ -45,6 +46,9 @@ MAX_ROLLOUTS = 1200
 """Rollouts in one batch of the search."""
 OPEN_LOOP_TOLERANCE = 1.1
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
+ENOUGH_EPISODES = 8
+"""From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
+without trusting the model. With fewer, the estimate is refined by Levenberg-Marquardt."""
 UNOBSERVABLE_LOG_STD = 1.0
 """A logarithmic parameter known to no better than a factor e is called not observable."""
 
@@ -53,8 +57,8 @@ UNOBSERVABLE_LOG_STD = 1.0
 class PhysicsFit:
     """What the stage found.
 
-    contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there is no ground;
-    noise: position [m], rotation [rad]; record: for `fit.json`; warnings.
+    contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there
+    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings.
     """
 
     contact: ContactParameters
@@ -105,7 +109,7 @@ def fit_physics(
     ]
     estimated = estimate_noise(free_tracks)
     sigma = (noise[0] or estimated[0], noise[1] or estimated[1])
-    names = [*CONTACT_PARAMETERS, *([GROUND_OFFSET] if world.ground_normal is not None else [])]
+    names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if world.ground_normal is not None else [])]
     windows = [_span(tracks) for _, tracks in episodes]
     observations = Observations.of(world, episodes, windows)
     warm = warmup_frames(world, observations, config.warmup_s)
@@ -116,25 +120,40 @@ def fit_physics(
         raise NotConvergedError(
             "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
         )
-    solution, misfit = _refine(world, observations, names, search.best, sigma, config)
-    refined_cost = float(_open_loop(world, observations, warm, names)(solution.shared.numpy()[None]).mean())
-    keep = solution.shared.isfinite().all() and refined_cost <= OPEN_LOOP_TOLERANCE * search.cost
-    best = solution.shared.numpy() if keep else search.best
-    covariance = episode_covariance(search, best)
-    if covariance is None:
-        covariance = _model_covariance(solution)
-    record = {
+    record: dict[str, Any] = {
         "episodes": len(episodes),
         "noise_estimated": {"position_m": estimated[0], "rotation_rad": estimated[1]},
         "search_open_loop_m": search.history,
+    }
+    best, covariance = search.best, episode_covariance(search, search.best, ENOUGH_EPISODES)
+    if covariance is None:
+        best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
+    record["correlation"] = _correlation(covariance).tolist()
+    return _result(world, names, best, covariance, sigma, record)
+
+
+def _refined(
+    world: World,
+    observations: Observations,
+    warm: Tensor,
+    names: list[Parameter],
+    search: SearchResult,
+    sigma: tuple[float, float],
+    config: PhysConfig,
+    record: dict[str, Any],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the refined estimate, or the search's where it predicts clearly better, and the covariance."""
+    solution, misfit = _refine(world, observations, names, search.best, sigma, config)
+    cost = float(_open_loop(world, observations, warm, names)(solution.shared.numpy()[None]).mean())
+    keep = math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.cost
+    record |= {
         "refinement_cost": solution.costs,
         "refinement_converged": solution.converged,
         "model_misfit": {"position_m": misfit[0], "rotation_rad": misfit[1]},
-        "open_loop_m": {"search": search.cost, "refined": refined_cost},
+        "open_loop_m": {"search": search.cost, "refined": cost},
         "kept": "refined" if keep else "search",
-        "correlation": _correlation(covariance).tolist(),
     }
-    return _result(world, names, best, covariance, sigma, record)
+    return solution.shared.numpy() if keep else search.best, _model_covariance(solution)
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:
@@ -293,6 +312,8 @@ def _result(
 ) -> PhysicsFit:
     std = np.sqrt(np.diag(covariance))
     fitted = [_parameter(p, z, s) for p, z, s in zip(names, best, std, strict=True)]
+    if world.ground_offset is not None:
+        fitted[-1] = _absolute(fitted[-1], float(world.ground_offset[0]))
     value = {p.name: p.estimate for p in fitted}
     contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
     warnings = [
@@ -305,6 +326,19 @@ def _result(
         sigma,
         record,
         tuple(warnings),
+    )
+
+
+def _absolute(shift: FittedParameter, offset: float) -> FittedParameter:
+    """Return the ground's height where its shift was fitted."""
+    assert shift.interval_95 is not None and shift.bounds is not None
+    return shift.model_copy(
+        update={
+            "name": "ground_offset_m",
+            "estimate": shift.estimate + offset,
+            "interval_95": (shift.interval_95[0] + offset, shift.interval_95[1] + offset),
+            "bounds": (shift.bounds[0] + offset, shift.bounds[1] + offset),
+        }
     )
 
 

@@ -43,7 +43,8 @@ class Parameter:
 FRICTION = Parameter("friction", "1", (0.01, 2.0), True, "sliding on the ground")
 CONTACT_TIME = Parameter("contact_time_s", "s", (0.001, 0.03), True, "an impact sampled faster than the contact lasts")
 DAMPING_RATIO = Parameter("damping_ratio", "1", (0.02, 3.0), True, "an impact and the rebound after it")
-GROUND_OFFSET = Parameter("ground_offset_m", "m", (-0.02, 0.02), False, "resting on the ground")
+GROUND_SHIFT = Parameter("ground_shift_m", "m", (-0.02, 0.02), False, "resting on the ground")
+"""How far the ground lies above where the world has it; it also takes up an error of the body's size."""
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
 
 
@@ -57,8 +58,8 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
         column.get("damping_ratio", law.damping_ratio),
     )
     world = replace(world, contact=contact)
-    if "ground_offset_m" in column:
-        world = replace(world, ground_offset=column["ground_offset_m"])
+    if "ground_shift_m" in column and world.ground_offset is not None:
+        world = replace(world, ground_offset=world.ground_offset + column["ground_shift_m"])
     for index, body in enumerate(world.bodies):
         com = [column.get(f"{body.name}.com_{axis}_m") for axis in "xyz"]
         if any(value is not None for value in com):

@@ -1,0 +1,279 @@
+"""`cgwm fit`: from a capture to a model, stage by stage."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..datasets.atomic import refuse_existing, sha256
+from ..datasets.capture import Capture
+from ..datasets.models import Model, read_model, write_model
+from ..schemas import (
+    Body,
+    BodyModel,
+    ContactParameters,
+    FitFile,
+    InputDataError,
+    ModelFile,
+    Parameter,
+    PhysConfig,
+    Pose,
+    Provenance,
+    Solver,
+    SplatConfig,
+)
+from .phys_geo import PhysicsFit, fit_physics, track_episodes
+from .physics.world import World, symmetric
+from .sg_gs import SgGsResult, fit_scene
+
+Stage = Literal["all", "sg-gs", "phys-geo"]
+
+ASSUMED_DENSITY_KG_M3 = 500.0
+"""Stands in for a mass that is not given; free motion and contact with the ground do not depend on it."""
+
+
+def fit(
+    capture: Path,
+    out: Path,
+    stage: Stage = "all",
+    parent: Path | None = None,
+    split: str = "train",
+    splat_config: SplatConfig | None = None,
+    phys_config: PhysConfig | None = None,
+    overwrite: bool = False,
+) -> ModelFile:
+    """Fit a capture and write the model.
+
+    Args:
+        capture: The capture's directory.
+        out: The model's directory; it appears when the fit is complete.
+        stage: `sg-gs` (shape and looks), `phys-geo` (contact, needs a shape or `parent`), or all that the capture has
+            inputs for.
+        parent: A model to start from; it is not changed.
+        split: The episodes to fit.
+        splat_config: Settings of sg-gs.
+        phys_config: Settings of phys-geo.
+        overwrite: Replace an existing model.
+
+    Returns:
+        What stands in `model.json`.
+
+    Raises:
+        UsageError: If `out` exists, or the split does not.
+        InputDataError: If the capture lacks what the stage needs.
+        NotConvergedError: If the fit diverges; nothing is written then.
+    """
+    splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
+    refuse_existing(out, overwrite)
+    opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
+    started = time.perf_counter()
+    model = _start(opened, stage, parent, splat_config)
+    config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
+    if stage == "phys-geo" or (stage == "all" and _has_motion(opened, split)):
+        model = _with_physics(model, opened, split, phys_config)
+    provenance = Provenance(
+        capture=opened.root.resolve().name,
+        input_sha256=_input_hashes(opened, split),
+        versions=_versions(),
+        seed=phys_config.seed,
+        parent=str(parent) if parent is not None else None,
+        config={"stage": stage, "split": split, **config},
+    )
+    stages = model.fit.stages | {"total": {"seconds": round(time.perf_counter() - started, 2)}}
+    file = model.file.model_copy(update={"provenance": provenance})
+    fit_file = FitFile(stages=stages, warnings=file.warnings)
+    return write_model(out, replace(model, file=file, fit=fit_file), overwrite).file
+
+
+def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatConfig) -> Model:
+    """Return the model that the physics starts from: the parent's, or a new one from the stage sg-gs."""
+    if not capture.manifest.bodies and stage == "phys-geo":
+        raise InputDataError(
+            f"{capture.root / 'capture.toml'}: no [[bodies]], so there is nothing whose physics could be fitted.",
+            todo="describe the body: [[bodies]] with a name.",
+        )
+    if parent is not None:
+        model = read_model(parent)
+        names = [body.name for body in model.file.bodies]
+        if names != capture.body_names:
+            raise InputDataError(
+                f"{parent}: its bodies are {names}, those of {capture.root} are {capture.body_names}.",
+                "a model of this capture's bodies.",
+            )
+        return model if stage == "phys-geo" else _from_scene(capture, fit_scene(capture, config))
+    if stage == "phys-geo":
+        lacking = [body.name for body in capture.manifest.bodies if body.shape is None]
+        if lacking:
+            raise InputDataError(
+                f"{capture.root / 'capture.toml'}: body '{lacking[0]}' has no shape, and physics needs one.",
+                "shape = { box | sphere | mesh | splats }, or a model with spheres from photos.",
+                f"run 'cgwm fit {capture.root} --stage all --out MODEL', or pass --from MODEL.",
+            )
+    return _from_scene(capture, fit_scene(capture, config))
+
+
+def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
+    bodies, warnings = [], list(scene.warnings)
+    for body in capture.manifest.bodies:
+        found = scene.bodies[body.name]
+        mass = body.mass_kg or ASSUMED_DENSITY_KG_M3 * found.mass_properties.volume_m3
+        inertia = (
+            _six(symmetric(body.inertia_kg_m2)) if body.inertia_kg_m2 else _six(mass * found.mass_properties.inertia_m2)
+        )
+        bodies.append(
+            BodyModel(
+                name=body.name,
+                motion=body.motion,
+                mass_kg=mass,
+                inertia_kg_m2=inertia,
+                com_m=body.com_m or _three(found.mass_properties.com_m),
+                photo_pose=found.photo_pose or Pose(),
+                shape=body.shape,
+                collision_distance_m=found.collision_distance_m,
+                radius_factor=scene.radius_factor,
+            )
+        )
+    world = capture.manifest.world
+    file = ModelFile(
+        gravity_m_s2=world.gravity_m_s2,
+        ground=world.ground,
+        bodies=tuple(bodies),
+        parameters=tuple(
+            p
+            for body, fitted in zip(capture.manifest.bodies, bodies, strict=True)
+            for p in _mass_parameters(body, fitted)
+        ),
+        warnings=tuple(warnings),
+        provenance=Provenance(capture=capture.root.name),
+    )
+    return Model(
+        None,
+        file,
+        {name: body.visual for name, body in scene.bodies.items() if body.visual is not None},
+        {name: body.collision for name, body in scene.bodies.items()},
+        scene.scene,
+        FitFile(stages={"sg-gs": scene.record}),
+    )
+
+
+def _mass_parameters(body: Body, fitted: BodyModel) -> list[Parameter]:
+    """Say where mass and centre of mass come from; neither is fitted to the motion."""
+    if body.motion != "free":
+        return []
+    given = body.mass_kg is not None
+    note = (
+        ""
+        if given
+        else (
+            f"assumed density {ASSUMED_DENSITY_KG_M3:g} kg/m3; weigh the body, or record a collision with a known one"
+        )
+    )
+    rows = [
+        Parameter(
+            name=f"{body.name}.mass_kg",
+            unit="kg",
+            estimate=fitted.mass_kg,
+            state="given" if given else "not_observable",
+            note=note,
+        )
+    ]
+    source = "given" if body.com_m is not None else "derived"
+    rows += [
+        Parameter(
+            name=f"{body.name}.com_{axis}_m",
+            unit="m",
+            estimate=value,
+            state=source,
+            note="" if source == "given" else "from the shape, at uniform density",
+        )
+        for axis, value in zip("xyz", fitted.com_m, strict=True)
+    ]
+    return rows
+
+
+def _has_motion(capture: Capture, split: str) -> bool:
+    if split not in capture.manifest.splits:
+        return False
+    episodes = capture.episodes(split)
+    return any(capture.tracks(name) or capture.videos(name) for name in episodes)
+
+
+def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig) -> Model:
+    from .calibrate import require_metric
+
+    uses_photos = any(name in model.body_splats for name in capture.body_names)
+    if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
+        require_metric(capture.cameras)
+    if not any(body.motion == "free" for body in model.file.bodies):
+        raise InputDataError(
+            f"{capture.root / 'capture.toml'}: no body is free, so no motion tells about contact.",
+            'motion = "free" for the body whose physics is wanted.',
+        )
+    start = model.file.model_copy(update={"contact": ContactParameters(), "solver": Solver(step_s=config.step_s)})
+    ready = replace(model, file=start)
+    world = World.from_model(ready)
+    started = time.perf_counter()
+    if config.supervise == "tracks":
+        measured = capture.manifest.measurement
+        noise = (measured.position_std_m, measured.rotation_std_rad)
+        found = fit_physics(world, track_episodes(capture, split), config, noise)
+    else:
+        from .phys_images import fit_physics_from_images
+
+        found = fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both")
+    record = found.record | {"seconds": round(time.perf_counter() - started, 2), "supervise": config.supervise}
+    fitted = _merge(start, found)
+    ready = replace(ready, file=fitted, fit=FitFile(stages=ready.fit.stages | {"phys-geo": record}))
+    if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
+        from .exposure import estimate_exposures
+
+        exposures = estimate_exposures(ready, capture, split, config.device)
+        ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures}))
+    return ready
+
+
+def _has_video(capture: Capture, split: str) -> bool:
+    return any(capture.videos(name) for name in capture.episodes(split))
+
+
+def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
+    fresh = {parameter.name for parameter in found.parameters}
+    kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
+    ground = file.ground
+    if ground is not None and found.ground_offset_m is not None:
+        ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
+    return file.model_copy(
+        update={
+            "contact": found.contact,
+            "ground": ground,
+            "parameters": (*found.parameters, *kept),
+            "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
+            "warnings": (*file.warnings, *found.warnings),
+        }
+    )
+
+
+def _input_hashes(capture: Capture, split: str) -> dict[str, str]:
+    names = ["capture.toml", "cameras.json"]
+    if split in capture.manifest.splits:
+        names += [f"tracks/{episode}.csv" for episode in capture.episodes(split)]
+    return {name: sha256(capture.root / name) for name in names if (capture.root / name).is_file()}
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("cgwm", "torch", "numpy", "scipy")}
+
+
+def _six(matrix: np.ndarray) -> tuple[float, float, float, float, float, float]:
+    xx, yy, zz, xy, xz, yz = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+    return xx, yy, zz, xy, xz, yz
+
+
+def _three(vector: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in vector)
+    return x, y, z
