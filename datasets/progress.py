@@ -15,5 +15,14 @@ def progress(iterable: Iterable | None = None, desc: str = "", total: int | None
     The bar's `set_postfix_str` takes a physical number to show beside the rate ("rms 1.8 mm"). Without an
     iterable, call `update(n)` on what is returned.
     """
-    watched = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not os.environ.get("CGWM_QUIET")
-    return tqdm(iterable, desc=desc, total=total, unit=unit, file=sys.stderr, disable=not watched, leave=False)
+    return tqdm(iterable, desc=desc, total=total, unit=unit, file=sys.stderr, disable=not _watched(), leave=False)
+
+
+def note(text: str) -> None:
+    """Write a line on stderr, above the bars that are running; under the same condition as a bar."""
+    if _watched():
+        tqdm.write(text, file=sys.stderr)
+
+
+def _watched() -> bool:
+    return sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not os.environ.get("CGWM_QUIET")

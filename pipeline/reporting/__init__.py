@@ -1,0 +1,1 @@
+"""Pieces of reports: the page, its charts and pictures, the verdict, and estimates next to the truth."""

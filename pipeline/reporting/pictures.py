@@ -1,0 +1,181 @@
+"""Pictures of reports: strips of frames, real and predicted, and false-colour depth and masks."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+TILE_WIDTH = 264
+"""Width of a frame in a report [px]; on a page of 1100 px six stand side by side."""
+_ASPECT = 4 / 3
+_MARGIN = 0.12
+_OUTLINE = (255, 214, 10)
+_LABEL_COLORS = np.array([[32, 36, 44], [240, 165, 40], [70, 160, 220], [120, 200, 120], [220, 110, 150]], np.uint8)
+
+
+@dataclass(frozen=True)
+class FrameStrip:
+    """All frames of one episode from one camera.
+
+    Attributes:
+        episode: Name of the episode.
+        camera: Name of the video camera.
+        times_s: Of the frames [s], shape (T,).
+        real: uint8 RGB, shape (T, H, W, 3).
+        predicted: The same moments as the model renders them, same shape.
+        masks: True masks, 0 background, shape (T, H, W); None where there are none.
+    """
+
+    episode: str
+    camera: str
+    times_s: NDArray[np.float64]
+    real: Image
+    predicted: Image
+    masks: Image | None = None
+
+
+@dataclass(frozen=True)
+class RolloutTile:
+    """One moment of one synthesized rollout: uint8 RGB (H, W, 3), depth [m] with 0 for none (H, W), labels (H, W)."""
+
+    rollout: int
+    time_s: float
+    image: Image
+    depth_m: NDArray[np.float32]
+    mask: Image
+
+
+def tiles(strip: FrameStrip, width: int = TILE_WIDTH) -> tuple[Image, Image]:
+    """Return the real and the predicted frames, cut to where the object moves and reduced to `width` pixels.
+
+    Where masks are known, the predicted frames carry the outline of where the object truly was.
+
+    Returns:
+        Two arrays, uint8 RGB, shape (T, 3/4 width, width, 3).
+    """
+    x, y, w, h = _window(strip)
+    size = (width, round(width / _ASPECT))
+    cut = (slice(None), slice(y, y + h), slice(x, x + w))
+    real = np.stack([_resized(frame, size) for frame in strip.real[cut]])
+    predicted = np.stack([_resized(frame, size) for frame in strip.predicted[cut]])
+    if strip.masks is not None:
+        for frame, mask in zip(predicted, strip.masks[cut], strict=True):
+            _outline(frame, mask)
+    return real, predicted
+
+
+def telling(strip: FrameStrip, wanted: int) -> list[int]:
+    """Return frame numbers between which the object moves about equally far; evenly spread where no masks are known."""
+    if strip.masks is None:
+        return evenly(len(strip.real), wanted)
+    seen = strip.masks > 0
+    changed = (seen[1:] != seen[:-1]).sum((1, 2)) / max(1.0, float(seen.sum((1, 2)).mean()))
+    # A still object counts a little too, so that its rest at the end is not left out.
+    way = np.concatenate([[0.0], np.cumsum(changed + 0.05)])
+    return [int(k) for k in np.unique(np.searchsorted(way, np.linspace(0, way[-1], wanted)))]
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """Return `wanted` frame numbers spread evenly over `count` frames, first and last among them.
+
+    >>> evenly(36, 6)
+    [0, 7, 14, 21, 28, 35]
+    """
+    return [int(k) for k in np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))]
+
+
+def sprite(frames: Image) -> Image:
+    """Return frames (T, H, W, 3) side by side, shape (H, T W, 3)."""
+    return np.concatenate(list(frames), axis=1)
+
+
+def contact_sheet(rows: Sequence[Image], gutter: int = 4) -> Image:
+    """Return rows of equally many frames, each (T, H, W, 3), one below the other with white gutters."""
+    count, height, width = rows[0].shape[:3]
+    sheet = np.full((len(rows) * (height + gutter) - gutter, count * (width + gutter) - gutter, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for k, frame in enumerate(row):
+            top, left = i * (height + gutter), k * (width + gutter)
+            sheet[top : top + height, left : left + width] = frame
+    return sheet
+
+
+def depth_colors(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> Image:
+    """Return depth in false colour (viridis, near bright); black where there is no surface. Shape (H, W, 3)."""
+    place = np.clip((far_m - depth_m) / max(far_m - near_m, 1e-9), 0, 1)
+    colors = cv2.applyColorMap((255 * place).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
+    colors[depth_m <= 0] = 0
+    return np.asarray(colors, np.uint8)
+
+
+def label_colors(labels: Image) -> Image:
+    """Return a mask in colours, a dark background and one for each body. Shape (H, W, 3)."""
+    return _LABEL_COLORS[np.where(labels == 0, 0, (labels.astype(int) - 1) % (len(_LABEL_COLORS) - 1) + 1)]
+
+
+def jpeg_uri(image: Image, quality: int = 78) -> str:
+    """Return an RGB image as a data URI (JPEG)."""
+    return _uri(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality], "image/jpeg")
+
+
+def png_uri(image: Image) -> str:
+    """Return an RGB image as a data URI (PNG)."""
+    return _uri(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9], "image/png")
+
+
+def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
+    """Return an RGB image as a PNG file below a size: noise and fine shades are given up as far as is needed."""
+    for bits in range(8, 3, -1):
+        step = 1 << (8 - bits)
+        reduced = image if bits == 8 else np.minimum(cv2.medianBlur(image, 3) // step * step + step // 2, 255)
+        data = _encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        if len(data) <= most_bytes:
+            return data
+    height, width = image.shape[:2]
+    return small_png(_resized(image, (round(0.8 * width), round(0.8 * height))), most_bytes)
+
+
+def _window(strip: FrameStrip) -> tuple[int, int, int, int]:
+    """Return left, top, width, height [px] of the part of the frames where the object moves, at the tiles' aspect."""
+    height, width = strip.real.shape[1:3]
+    if strip.masks is None or not strip.masks.any():
+        low, high = np.zeros(2), np.array([width, height], float)
+    else:
+        seen = (strip.masks > 0).any(0)
+        rows, columns = np.nonzero(seen)
+        low, high = np.array([columns.min(), rows.min()], float), np.array([columns.max() + 1, rows.max() + 1], float)
+    middle, extent = (low + high) / 2, (high - low) * (1 + 2 * _MARGIN)
+    w = min(max(extent[0], extent[1] * _ASPECT), width, height * _ASPECT)
+    h = w / _ASPECT
+    left = int(np.clip(middle[0] - w / 2, 0, width - w))
+    top = int(np.clip(middle[1] - h / 2, 0, height - h))
+    return left, top, int(w), int(h)
+
+
+def _outline(frame: Image, mask: Image) -> None:
+    """Draw the outline of a mask onto a frame of another size, in place."""
+    height, width = frame.shape[:2]
+    reduced = cv2.resize((mask > 0).astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
+    contours, _ = cv2.findContours(reduced, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(frame, contours, -1, _OUTLINE, 1, cv2.LINE_AA)
+
+
+def _resized(image: Image, size: tuple[int, int]) -> Image:
+    shrinks = size[0] < image.shape[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
+
+
+def _uri(image: Image, suffix: str, options: list[int], kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(_encoded(image, suffix, options)).decode('ascii')}"
+
+
+def _encoded(image: Image, suffix: str, options: list[int]) -> bytes:
+    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
+    return data.tobytes()
