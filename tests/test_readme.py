@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from cgwm.cli.app import app
-from cgwm.schemas import CaptureManifest, InputDataError, read_toml
+from cgwm.cli.settings import StageSettings
+from cgwm.schemas import CaptureManifest, InputDataError, PhysConfig, SplatConfig, read_toml
 from typer.main import get_command
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
@@ -45,6 +46,15 @@ def test_the_commands_exist(line: str) -> None:
     assert verb in verbs
     options = {name for parameter in verbs[verb].params for name in parameter.opts}
     assert {word for word in words if word.startswith("-")} <= options
+
+
+def test_the_settings_exist() -> None:
+    stages = {"sg-gs": SplatConfig, "phys-geo": PhysConfig}
+    assignments = re.findall(r"--set (\S+)", README)
+    assert assignments
+    settings = StageSettings(stages, None, assignments)
+    for stage, config in stages.items():
+        assert settings.configure(stage, config) != config()
 
 
 def test_there_are_commands() -> None:

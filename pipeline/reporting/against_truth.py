@@ -125,7 +125,7 @@ def true_parameters(truth: TruthFile) -> dict[str, float]:
         "friction": contact.friction,
         "contact_time_s": tau,
         "damping_ratio": zeta,
-        "ground_shift_m": 0.0,
+        "ground_offset_m": 0.0,  # the scenes stand on z = 0
         "restitution": float(restitution(torch.tensor(zeta, dtype=torch.float64))),
         "stiffness_n_m": mass / tau**2,
         "damping_n_s_m": 2 * zeta * mass / tau,
