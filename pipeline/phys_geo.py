@@ -109,7 +109,9 @@ def fit_physics(
     ]
     estimated = estimate_noise(free_tracks)
     sigma = (noise[0] or estimated[0], noise[1] or estimated[1])
-    names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if world.ground_normal is not None else [])]
+    # few episodes cannot tell the ground's height from the way of bouncing, and the manifest gives the height
+    height = world.ground_normal is not None and len(episodes) >= ENOUGH_EPISODES
+    names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
     windows = [_span(tracks) for _, tracks in episodes]
     observations = Observations.of(world, episodes, windows)
     warm = warmup_frames(world, observations, config.warmup_s)
@@ -129,7 +131,7 @@ def fit_physics(
     if covariance is None:
         best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
     record["correlation"] = _correlation(covariance).tolist()
-    return _result(world, names, best, covariance, sigma, record)
+    return physics_fit(world, names, best, covariance, sigma, record)
 
 
 def _refined(
@@ -302,7 +304,7 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
     return covariance / np.outer(std, std)
 
 
-def _result(
+def physics_fit(
     world: World,
     names: list[Parameter],
     best: np.ndarray,
@@ -310,9 +312,19 @@ def _result(
     sigma: tuple[float, float],
     record: dict[str, Any],
 ) -> PhysicsFit:
+    """Return the stage's result from an estimate and its covariance.
+
+    Args:
+        world: The world that was fitted.
+        names: What was fitted; `GROUND_SHIFT`, if any, last.
+        best: Estimate in fitted coordinates (P,).
+        covariance: Of the same coordinates (P, P).
+        sigma: Noise of the tracks (position [m], rotation [rad]).
+        record: For `fit.json`.
+    """
     std = np.sqrt(np.diag(covariance))
     fitted = [_parameter(p, z, s) for p, z, s in zip(names, best, std, strict=True)]
-    if world.ground_offset is not None:
+    if GROUND_SHIFT in names and world.ground_offset is not None:
         fitted[-1] = _absolute(fitted[-1], float(world.ground_offset[0]))
     value = {p.name: p.estimate for p in fitted}
     contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})

@@ -31,7 +31,7 @@ class SplatConfig(FileModel):
     iterations: Annotated[int, Field(ge=1)] = 400
     max_body_spheres: Annotated[int, Field(ge=16)] = 2500
     max_scene_spheres: Annotated[int, Field(ge=16)] = 6000
-    max_collision_spheres: Annotated[int, Field(ge=8)] = 256
+    max_collision_spheres: Annotated[int, Field(ge=8)] = 128
     image_size: Annotated[int, Field(ge=32)] = 320
     """Photos are reduced to this longer side [px] for fitting."""
     test_every: Annotated[int, Field(ge=2)] = 8

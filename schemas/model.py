@@ -69,7 +69,7 @@ class Solver(FileModel):
 
     contact_model: Literal["closed_form"] = "closed_form"
     step_s: Annotated[float, Field(gt=0)] = 0.001
-    sweeps: Annotated[int, Field(ge=1)] = 4
+    sweeps: Annotated[int, Field(ge=1)] = 10
     """Projected sweeps over the contacts; 1 is the closed form alone, more let contacts that touch at once agree."""
 
 

@@ -15,7 +15,8 @@ Array = NDArray[np.float64]
 
 FRAME_RATE = 30.0
 TRAIN_FRAMES, TEST_FRAMES = 15, 36
-_TRIES = 400
+_TRIES = 600
+_RESTARTS = 6
 
 
 def plan_fall(seed: int) -> ScenePlan:
@@ -40,13 +41,13 @@ def _toss(
     duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
     cameras = video_cameras(seed).values()
     for _ in range(_TRIES):
-        qpos, qvel = _release(rng, solid, (0.10, 0.16) if split == "train" else (0.12, 0.25))
+        qpos, qvel = _release(rng, solid, (0.09, 0.16) if split == "train" else (0.10, 0.18))
         if any(turned_deg(qpos[3:7], other) < 35 for other in others):
             continue
         motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
         useful = _instructive(motion) if split == "train" else _settles(motion)
         near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
-        if useful and near and stays_in_view(solid, motion, cameras):
+        if useful and near and stays_in_view(solid, motion, cameras) and _predictable(rng, model, motion, duration):
             return motion
     raise NotConvergedError(f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.")
 
@@ -60,7 +61,7 @@ def _release(rng: np.random.Generator, solid: SolidObject, height: tuple[float, 
     position = -direction * rng.uniform(0.06, 0.14)
     position[2] = lowest(solid, quat_wxyz) + rng.uniform(*height)
     spin = rng.standard_normal(3)
-    omega_body = spin / np.linalg.norm(spin) * rng.uniform(1.0, 4.0)
+    omega_body = spin / np.linalg.norm(spin) * rng.uniform(0.5, 3.0)
     return np.concatenate([position, quat_wxyz]), np.concatenate([speed * direction, omega_body])
 
 
@@ -70,6 +71,27 @@ def _instructive(motion: Motion) -> bool:
         return False
     hit, end = motion.qpos[motion.row(motion.first_contact)], motion.qpos[-1]
     return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.03
+
+
+def _predictable(rng: np.random.Generator, model: MjModel, motion: Motion, duration: float) -> bool:
+    """Tell whether the true engine itself repeats the toss from a start that is off by what a warm-up cannot see.
+
+    A die that lands on an edge is no test of a model: two starts that no measurement tells apart end on different
+    faces. Each try moves the start by the accuracy of a state measured over 0.1 s.
+    """
+    for _ in range(_RESTARTS):
+        qpos, qvel = motion.qpos[0].copy(), motion.qvel[0].copy()
+        qpos[:3] += 0.0003 * rng.standard_normal(3)
+        qpos[3:7] += 0.5 * 0.003 * rng.standard_normal(4)
+        qpos[3:7] /= np.linalg.norm(qpos[3:7])
+        qvel[:3] += 0.006 * rng.standard_normal(3)
+        qvel[3:6] += 0.06 * rng.standard_normal(3)
+        again = simulate(model, qpos, qvel, motion.start, duration)
+        shift = np.linalg.norm(again.qpos[:, :3] - motion.qpos[:, :3], axis=1).mean()
+        turns = [turned_deg(a, b) for a, b in zip(again.qpos[::200, 3:7], motion.qpos[::200, 3:7], strict=True)]
+        if shift > 0.008 or np.mean(turns) > 8:
+            return False
+    return True
 
 
 def _settles(motion: Motion) -> bool:

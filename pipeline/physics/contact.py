@@ -13,7 +13,7 @@ anisotropy of polyhedral rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -77,6 +77,16 @@ class Side:
     inverse_mass: Tensor
     inverse_inertia_root: Tensor
     arms: Tensor
+
+    def moving(self, velocity: Tensor, spin: Tensor) -> Side:
+        """Return the side with another velocity (B, 3) and, of a free body, angular momentum (B, 3) [kg m2/s].
+
+        A driven body keeps its motion.
+        """
+        if not bool(self.inverse_mass.any()):
+            return self
+        root = self.inverse_inertia_root
+        return replace(self, velocity=velocity, omega=((spin[:, None] @ root) @ root.transpose(-1, -2)).squeeze(1))
 
     def point_velocity(self) -> Tensor:
         """Return the velocity of the contact points (B, C, 3) [m/s]."""

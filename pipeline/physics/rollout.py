@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 PAIR_SMOOTHING_M = 1e-3
 """Width of the smooth minimum in distances between two bodies of spheres [m]."""
+FASTEST_M_S = 30.0
+"""Bodies whose surfaces are further apart than this speed covers in a step cannot touch in it, and are skipped."""
 
 
 @dataclass(frozen=True)
@@ -167,27 +169,27 @@ class _Engine:
     def _contacts(self, motions: list[Motion], rotations: list[Tensor], h: Tensor) -> list[_Group]:
         """Return the contacts of a step with their impulses: the closed form, then further sweeps where wanted."""
         centers = [self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))]
-        groups, prepared = [], []
+        groups: list[_Group] = []
+        prepared: dict[int, tuple[ContactGroup, Side, Side | None]] = {}
         for a, b in self.pairs:
             gap, normal, point = self._geometry(a, b, centers)
-            sides = [self._side(i, motions[i], rotations[i], point) if i >= 0 else None for i in (a, b)]
-            assert sides[0] is not None
-            group, impulse = ContactGroup.of(self.world.contact, gap, normal, sides[0], sides[1], h)
+            if float(gap.detach().amin()) > FASTEST_M_S * float(h.detach().amax()):
+                groups.append(_Group(a, b, gap, normal, point, torch.zeros_like(point)))
+                continue
+            side_a = self._side(a, motions[a], rotations[a], point)
+            side_b = self._side(b, motions[b], rotations[b], point) if b >= 0 else None
+            group, impulse = ContactGroup.of(self.world.contact, gap, normal, side_a, side_b, h)
             groups.append(_Group(a, b, gap, normal, point, impulse))
-            prepared.append(group)
-        for _ in range(1, self.world.sweeps):
+            prepared[len(groups) - 1] = (group, side_a, side_b)
+        for _ in range(1, self.world.sweeps if prepared else 1):
             velocity, spin = self._after(motions, groups)
-            moving = [replace(m, velocity=v, spin=s) for m, v, s in zip(motions, velocity, spin, strict=True)]
-            swept = []
-            for group, contact in zip(groups, prepared, strict=True):
-                side_a = self._side(group.a, moving[group.a], rotations[group.a], group.point)
-                relative = side_a.point_velocity()
-                if group.b >= 0:
-                    relative = (
-                        relative
-                        - self._side(group.b, moving[group.b], rotations[group.b], group.point).point_velocity()
-                    )
-                swept.append(replace(group, impulse=contact.sweep(group.impulse, relative)))
+            swept = list(groups)
+            for number, (contact, side_a, side_b) in prepared.items():
+                group = groups[number]
+                relative = side_a.moving(velocity[group.a], spin[group.a]).point_velocity()
+                if side_b is not None:
+                    relative = relative - side_b.moving(velocity[group.b], spin[group.b]).point_velocity()
+                swept[number] = replace(group, impulse=contact.sweep(group.impulse, relative))
             groups = swept
         return groups
 
@@ -228,11 +230,9 @@ class _Engine:
         arms = point - motion.com[:, None]
         if not body.free:
             zero = torch.zeros_like(motion.com[:, 0])
-            nothing = torch.zeros_like(rotation)
-            return Side(motion.velocity, motion.spin, zero, nothing, arms)
-        root = rotation @ inertia.root
-        omega = (root @ (root.transpose(-1, -2) @ motion.spin[..., None])).squeeze(-1)
-        return Side(motion.velocity, omega, 1 / inertia.mass, root, arms)
+            return Side(motion.velocity, motion.spin, zero, torch.zeros_like(rotation), arms)
+        still = Side(motion.velocity, motion.spin, 1 / inertia.mass, rotation @ inertia.root, arms)
+        return still.moving(motion.velocity, motion.spin)
 
     def frame(self, motions: list[Motion]) -> tuple[Tensor, ...]:
         columns = []

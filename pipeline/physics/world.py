@@ -48,7 +48,7 @@ class World:
     ground_offset: Tensor | None
     contact: ContactLaw
     step_s: float = 0.001
-    sweeps: int = 4
+    sweeps: int = 10
 
     @property
     def body_names(self) -> list[str]:

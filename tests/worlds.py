@@ -1,0 +1,61 @@
+"""Worlds for the tests of physics: a box of eight corner spheres, a ball."""
+
+import torch
+from cgwm.pipeline.physics import Body, ContactLaw, State, World
+
+F64 = torch.float64
+
+
+def batch(value: object) -> torch.Tensor:
+    return torch.as_tensor(value, dtype=F64)[None]
+
+
+def law(friction: float = 0.3, contact_time_s: float = 0.004, damping_ratio: float = 0.3) -> ContactLaw:
+    return ContactLaw(batch(friction), batch(contact_time_s), batch(damping_ratio))
+
+
+def box_body(half: tuple[float, float, float] = (0.05, 0.04, 0.03), mass: float = 0.4, radius: float = 0.001) -> Body:
+    extent = torch.tensor(half, dtype=F64)
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=F64)] * 3)
+    squares = extent.square()
+    inertia = torch.diag(mass / 3 * (squares.sum() - squares))
+    return Body(
+        "box",
+        "free",
+        batch(mass),
+        inertia[None],
+        torch.zeros(1, 3, dtype=F64),
+        (signs * (extent - radius))[None],
+        torch.full((1, 8), radius, dtype=F64),
+    )
+
+
+def ball_body(radius: float = 0.04, mass: float = 0.2, name: str = "ball", copies: int = 1) -> Body:
+    inertia = 0.4 * mass * radius**2 * torch.eye(3, dtype=F64)
+    centers, radii = torch.zeros(1, copies, 3, dtype=F64), torch.full((1, copies), radius, dtype=F64)
+    return Body(name, "free", batch(mass), inertia[None], torch.zeros(1, 3, dtype=F64), centers, radii)
+
+
+def world_of(
+    *bodies: Body, contact: ContactLaw | None = None, ground: bool = True, gravity: float = 9.81, step_s: float = 0.001
+) -> World:
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+    return World(
+        bodies,
+        batch([0.0, 0.0, -gravity]),
+        up if ground else None,
+        batch(0.0) if ground else None,
+        contact or law(),
+        step_s,
+    )
+
+
+def state_of(*rows: tuple, count: int = 1) -> State:
+    """Rows of (position, quat_wxyz, velocity, omega_body), one a body."""
+    columns = [torch.tensor([row[k] for row in rows], dtype=F64)[None].repeat(count, 1, 1) for k in range(4)]
+    columns[1] = columns[1] / columns[1].norm(dim=-1, keepdim=True)
+    return State(*columns)
+
+
+def times(duration_s: float, rate_hz: float = 100.0) -> torch.Tensor:
+    return torch.arange(round(duration_s * rate_hz) + 1, dtype=F64) / rate_hz
