@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +82,8 @@ def fit(
         input_sha256=_input_hashes(opened, split),
         versions=_versions(),
         seed=phys_config.seed,
-        parent=str(parent) if parent is not None else None,
+        # relative, so that models which are moved together still know each other
+        parent=None if parent is None else os.path.relpath(parent, Path(out).parent),
         config={"stage": stage, "split": split, **config},
     )
     stages = model.fit.stages | {"total": {"seconds": round(time.perf_counter() - started, 2)}}

@@ -193,7 +193,7 @@ def _images_only(result: DemoResult) -> str:
     rows.append(_summary_row("from the pose track", result.evaluation.model_dump()))
     header = ["medians over the test episodes", "translation [mm]", "at the end [mm]", "rotation [deg]"]
     header += ["at the end [deg]", "PSNR object [dB]", "PSNR frame [dB]"]
-    fitted = [p for p in fit.parameters if p.parameter.state != "given" and p.parameter.interval_95]
+    fitted = [p for p in fit.parameters if p.parameter.state not in ("given", "derived")]
     return section(
         title,
         paragraph(intro),

@@ -95,6 +95,7 @@ class Provenance(FileModel):
     versions: dict[str, str] = {}
     seed: int = 0
     parent: str | None = None
+    """The model that this one started from, relative to the folder that this one lies in."""
     config: dict[str, Any] = {}
 
 
