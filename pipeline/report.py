@@ -58,7 +58,7 @@ def report_html(result: DemoResult, pictures: ReportPictures) -> str:
         _warnings(result.warnings),
         film,
         curves_section(result.curves),
-        _errors(result.evaluation),
+        _errors(result.evaluation, result.selection),
         _parameters(result.parameters),
         _images_only(result),
         _calibration(result),
@@ -91,7 +91,7 @@ def _warnings(messages: Sequence[str]) -> str:
     return f'<div class="warnings">{"".join(paragraph(m) for m in messages)}</div>' if messages else ""
 
 
-def _errors(evaluation: EvalResult) -> str:
+def _errors(evaluation: EvalResult, selection: str) -> str:
     header = ["", "translation [mm]", "at the end [mm]", "rotation [deg]", "at the end [deg]"]
     header += ["PSNR object [dB]", "PSNR frame [dB]", "state-fitted [mm]", "start's noise [mm]"]
     rows = [
@@ -120,6 +120,7 @@ def _errors(evaluation: EvalResult) -> str:
         "Errors by episode",
         table(header, rows, numeric=range(1, len(header)), strong=[episodes]),
         paragraph(words, "soft"),
+        paragraph(selection, "soft") if selection else "",
         _warnings(evaluation.warnings),
     )
 

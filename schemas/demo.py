@@ -121,6 +121,8 @@ class DemoResult(FileModel):
     verdict: str
     targets: tuple[DemoTarget, ...]
     evaluation: EvalResult
+    selection: str = ""
+    """How the test episodes were chosen, where that bears on the errors."""
     parameters: tuple[ComparedParameter, ...]
     images_only: ImagesOnlyFit
     calibration: CalibrationCheck

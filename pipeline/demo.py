@@ -1,0 +1,272 @@
+"""`cgwm demo`: every stage one after the other, on a scene that it makes itself, with a report at the end."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from ..datasets.atomic import new_directory
+from ..datasets.capture import Capture
+from ..datasets.loader import RolloutReader
+from ..datasets.models import read_model
+from ..datasets.progress import note
+from ..datasets.scenes import TRUTH_MESH, make_scene, read_truth
+from ..schemas import (
+    CalibrateConfig,
+    CalibrationReport,
+    CgwmError,
+    DatasetSummary,
+    DemoResult,
+    ImagesOnlyFit,
+    ModelFile,
+    NotConvergedError,
+    PhysConfig,
+    SplatConfig,
+    SynthesizeConfig,
+)
+from .calibrate import calibrate
+from .eval import Evaluation, evaluate, evaluate_model
+from .fit import fit
+from .report import REPORT_HTML, REPORT_JSON, ReportPictures, write_report
+from .reporting.against_truth import check_calibration, check_splats, compare_parameters
+from .reporting.episodes import curves_of, strips_of
+from .reporting.pictures import RolloutTile, contact_sheet, small_png, telling, tiles
+from .reporting.verdict import targets_of, verdict_text
+from .sg_gs import resolve_device
+from .synthesize import synthesize
+
+ConfigT = TypeVar("ConfigT", CalibrateConfig, SplatConfig, PhysConfig, SynthesizeConfig)
+
+SELECTION = {
+    "fall": "The tosses are drawn so that what 0.1 s of measurement tells of the start decides their outcome: the "
+    "simulator itself, restarted with the errors of such a measurement, repeats each of them closely. A toss that "
+    "balances on an edge before it falls to either side is not among them."
+}
+"""How the scenes choose their episodes, where that makes them easier than any motion: the report says it."""
+WARMUP_S = 0.1
+SPLIT = "test"
+PICTURE = "demo.png"
+_PICTURE_COLUMNS = 5
+_PICTURE_TILE = 236
+_ROLLOUTS_SHOWN = 8
+# Of the seconds of a rollout, when its picture is taken: late enough that most have touched the ground.
+_SHOWN_AT = 0.5
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """Sizes and settings of the stages; seed and device are filled in by the demo."""
+
+    photos: int = 48
+    photo_size: tuple[int, int] = (640, 480)
+    video_size: tuple[int, int] = (480, 360)
+    calibrate: CalibrateConfig = field(default_factory=lambda: CalibrateConfig(max_features=2048))
+    splats: SplatConfig = field(default_factory=SplatConfig)
+    physics: PhysConfig = field(default_factory=PhysConfig)
+    synthesize: SynthesizeConfig = field(default_factory=lambda: SynthesizeConfig(rollouts=8))
+
+
+@dataclass(frozen=True)
+class _Demo:
+    """What the stages share: `folder` is where they write, `name` what the user calls it."""
+
+    folder: Path
+    name: Path
+    settings: DemoSettings
+    seed: int
+    device: str
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Announce a stage, time it, and let its errors name it."""
+        note(f"demo: {name} ...")
+        began = time.perf_counter()
+        try:
+            yield
+        except CgwmError as error:
+            raise self._named(error, name) from None
+        self.seconds[name] = round(time.perf_counter() - began, 2)
+        note(f"demo: {name}: {self.seconds[name]:.1f} s")
+
+    def plain(self, message: str) -> str:
+        """Return a message without the name that the directory has while it is being written."""
+        return message.replace(str(self.folder), str(self.name))
+
+    def _named(self, error: CgwmError, stage: str) -> CgwmError:
+        found = f"the demo failed in the stage '{stage}' (nothing was left in {self.name}): {error.found}"
+        return type(error)(self.plain(found), self.plain(error.allowed), self.plain(error.todo))
+
+
+def run_demo(
+    out: Path,
+    scene: str = "fall",
+    seed: int = 0,
+    renderer: str = "raycast",
+    device: str = "auto",
+    overwrite: bool = False,
+    settings: DemoSettings | None = None,
+) -> DemoResult:
+    """Make a scene, calibrate, fit, synthesize, evaluate and report; each by the function that its command calls.
+
+    Args:
+        out: The directory to write; it appears when all of it is complete.
+        scene: One of `datasets.scenes.SCENES`.
+        seed: Of the scene and of every stage.
+        renderer: One of `datasets.scenes.RENDERERS`.
+        device: auto, cpu or cuda.
+        overwrite: Replace what is at `out`.
+        settings: Sizes and settings of the stages.
+
+    Returns:
+        What stands in `report.json`.
+
+    Raises:
+        UsageError: If `out` exists, or a name is not allowed.
+        NotConvergedError: If a stage fails; its message names the stage, and nothing is written.
+    """
+    resolve_device(device)  # a wrong device is better told now than after minutes
+    settings = settings or DemoSettings()
+    with new_directory(Path(out), overwrite) as folder:
+        demo = _Demo(folder, Path(out), settings, seed, device)
+        return _run(demo, scene, renderer)
+
+
+def _run(demo: _Demo, scene: str, renderer: str) -> DemoResult:
+    settings, folder = demo.settings, demo.folder
+    capture, dataset = folder / "capture", folder / "dataset"
+    with demo.stage("make the scene"):
+        sizes = {"photo_size": settings.photo_size, "video_size": settings.video_size, "photos": settings.photos}
+        make_scene(scene, capture, demo.seed, renderer, **sizes)
+    with demo.stage("calibrate"):
+        calibration = calibrate(capture, _seeded(settings.calibrate, seed=demo.seed))
+    with demo.stage("fit"):
+        model = _fit(demo)
+    with demo.stage("fit from images alone"):
+        images_only = _fit_from_images(demo)
+    with demo.stage("synthesize"):
+        config = _seeded(settings.synthesize, seed=demo.seed, device=demo.device)
+        summary = synthesize(folder / "model", dataset, config)
+    with demo.stage("evaluate"):
+        evaluation = evaluate_model(
+            read_model(folder / "model"), Capture.open(capture), SPLIT, WARMUP_S, demo.device, keep_frames=True
+        )
+        if images_only.outcome == "fitted":
+            figures = evaluate(folder / "model-images", capture, SPLIT, WARMUP_S, demo.device)
+            images_only = images_only.model_copy(update={"evaluation": figures})
+    with demo.stage("report"):
+        result = _result(demo, (scene, renderer), calibration, model, images_only, summary, evaluation)
+        _write(demo, result, evaluation)
+    return result
+
+
+def _fit(demo: _Demo) -> ModelFile:
+    return fit(
+        demo.folder / "capture",
+        demo.folder / "model",
+        splat_config=_seeded(demo.settings.splats, seed=demo.seed, device=demo.device),
+        phys_config=_seeded(demo.settings.physics, seed=demo.seed, device=demo.device),
+    )
+
+
+def _fit_from_images(demo: _Demo) -> ImagesOnlyFit:
+    """Fit the physics from the video frames alone; that this may fail is a result, and no reason to stop."""
+    config = _seeded(demo.settings.physics, seed=demo.seed, device=demo.device, supervise="images")
+    try:
+        model = fit(
+            demo.folder / "capture",
+            demo.folder / "model-images",
+            stage="phys-geo",
+            parent=demo.folder / "model",
+            phys_config=config,
+        )
+    except NotConvergedError as error:
+        return ImagesOnlyFit(outcome="not_converged", message=demo.plain(error.found))
+    compared = compare_parameters(model.parameters, read_truth(demo.folder / "capture"))
+    return ImagesOnlyFit(outcome="fitted", parameters=compared)
+
+
+def _result(
+    demo: _Demo,
+    made: tuple[str, str],
+    calibration: CalibrationReport,
+    file: ModelFile,
+    images_only: ImagesOnlyFit,
+    summary: DatasetSummary,
+    evaluation: Evaluation,
+) -> DemoResult:
+    capture = demo.folder / "capture"
+    truth = read_truth(capture)
+    cameras = Capture.open(capture, check=False).cameras
+    assert cameras is not None  # calibrate has written them
+    targets = targets_of(evaluation.result)
+    paths = {"report": REPORT_HTML, "figures": REPORT_JSON, "picture": PICTURE, "capture": "capture", "model": "model"}
+    if images_only.outcome == "fitted":
+        paths["model from images alone"] = "model-images"
+    warnings = [f"calibrate: {message}" for message in calibration.warnings]
+    warnings += [f"fit: {message}" for message in file.warnings]
+    return DemoResult(
+        scene=made[0],
+        seed=demo.seed,
+        renderer=made[1],
+        device=str(resolve_device(demo.device)),
+        verdict=verdict_text(evaluation.result, targets, WARMUP_S),
+        targets=targets,
+        evaluation=evaluation.result,
+        selection=SELECTION.get(made[0], ""),
+        parameters=compare_parameters(file.parameters, truth),
+        images_only=images_only,
+        calibration=check_calibration(calibration, cameras, truth),
+        splats=check_splats(read_model(demo.folder / "model"), capture / TRUTH_MESH),
+        dataset=summary.model_copy(update={"dataset": "dataset"}),
+        curves=curves_of([episode.prediction for episode in evaluation.episodes], truth),
+        seconds=dict(demo.seconds),
+        peak_memory_bytes=_peak_memory_bytes(),
+        paths={**paths, "dataset": "dataset"},
+        warnings=tuple(demo.plain(message) for message in warnings),
+        provenance=file.provenance,
+    )
+
+
+def _write(demo: _Demo, result: DemoResult, evaluation: Evaluation) -> None:
+    """Write the report, its JSON and the picture that a README can show."""
+    strips = strips_of(evaluation.episodes, Capture.open(demo.folder / "capture", check=False))
+    write_report(demo.folder, result, ReportPictures(strips, _rollout_tiles(demo.folder / "dataset")))
+    if strips:
+        rows = tiles(strips[0], _PICTURE_TILE)
+        chosen = telling(strips[0], _PICTURE_COLUMNS)
+        (demo.folder / PICTURE).write_bytes(small_png(contact_sheet([frames[chosen] for frames in rows])))
+
+
+def _rollout_tiles(dataset: Path) -> list[RolloutTile]:
+    reader = RolloutReader(dataset)
+    shown = []
+    for number in range(min(_ROLLOUTS_SHOWN, len(reader))):
+        cameras = reader.cameras(number)
+        if not cameras:
+            continue
+        time_s = np.asarray(reader.read(number, "time"))
+        frame = int(_SHOWN_AT * (len(time_s) - 1))
+        image, depth, mask = (
+            reader.read(number, f"obs/{cameras[0]}_{kind}", frame, frame + 1)[0] for kind in ("image", "depth", "mask")
+        )
+        shown.append(RolloutTile(reader.rollouts[number].index, float(time_s[frame]), image, depth, mask))
+    reader.close()
+    return shown
+
+
+def _seeded(config: ConfigT, **values: object) -> ConfigT:
+    return type(config).model_validate({**config.model_dump(), **values})
+
+
+def _peak_memory_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
