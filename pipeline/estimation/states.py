@@ -1,0 +1,143 @@
+"""What the uncertainty of an initial state means for a whole rollout, and the state that fits a whole rollout best.
+
+Both look at states within the uncertainty of the warm-up's estimate. Rollouts with impacts are rough functions of
+their start, so derivatives are differences over one standard deviation of it, not exact ones at a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..physics.world import World
+from .least_squares import robust_loss
+from .observations import Observations
+from .trajectory import STATE_SIZE, TrajectoryResiduals
+
+MAX_STEP = (0.005, 0.05, 0.1, 0.5)
+"""Largest differences in position [m], rotation [rad], velocity [m/s], omega [rad/s], where nothing was measured."""
+DAMPINGS = (0.01, 0.1, 1.0, 10.0, 100.0)
+"""Levenberg-Marquardt dampings, tried side by side, in units of the warm-up's information."""
+ROBUST_SCALE = 3.0
+MAX_ITEMS = 128
+"""Rollouts in one batch: more run out of the processor's cache."""
+
+
+@dataclass(frozen=True)
+class StartUncertainty:
+    """Rollouts from states within the uncertainty of the start, for a batch of episodes.
+
+    Attributes:
+        world: The world.
+        observations: The episodes, their states at the warm-up's estimate.
+        covariance: Of the state changes, shape (B, S, S), S = 12 for each free body.
+        weight: Which frames count, shape (B, T, nf), 1 or 0.
+    """
+
+    world: World
+    observations: Observations
+    covariance: Tensor
+    weight: Tensor
+
+    def noise_floor(self, samples: int, seeds: Sequence[int]) -> Tensor:
+        """Return the mean distance (B,) [m] between rollouts from sampled states and the rollout from their mean.
+
+        Args:
+            samples: Number of samples for each episode.
+            seeds: A number for each episode, so that its samples do not depend on the others.
+        """
+        size = self.covariance.shape[-1]
+        normal = np.stack(
+            [
+                np.random.default_rng(np.random.SeedSequence(0, spawn_key=(s,))).standard_normal((samples, size))
+                for s in seeds
+            ]
+        )
+        changes = torch.as_tensor(normal).to(self.covariance) @ _root(self.covariance).transpose(1, 2)
+        rows = self._rows(torch.cat((torch.zeros_like(changes[:, :1]), changes), 1))[..., :3]
+        return self._distance(rows[:, 1:] - rows[:, :1]).mean(1)
+
+    def fit(self, noise: tuple[float, float], iterations: int) -> Tensor:
+        """Return the mean distance (B,) [m] to the measured track after fitting the state to the whole of it.
+
+        Gauss-Newton steps with Cauchy weights in the coordinates in which the start's covariance is the identity, with
+        several dampings side by side; a state is kept only where it lowers the distance, so the figure is never above
+        that of the start.
+
+        Args:
+            noise: Standard deviations of the measurement (position [m], rotation [rad]).
+            iterations: Number of steps.
+        """
+        root = _limited(_root(self.covariance))
+        directions = root.transpose(1, 2)  # row k: one standard deviation along the k-th coordinate
+        best = torch.zeros_like(directions[:, :1])
+        rows = self._rows(best)
+        distance = self._distance(rows)
+        for _ in range(iterations):
+            moved = self._rows(best + directions)
+            jacobian = moved - rows
+            steps = self._steps(rows[:, 0], jacobian, noise)
+            candidates = torch.cat((best, best + steps @ directions), 1)
+            all_rows = torch.cat((rows, self._rows(candidates[:, 1:])), 1)
+            distances = self._distance(all_rows)
+            choice = distances.argmin(1)
+            item = torch.arange(len(choice))
+            best, rows = candidates[item, choice][:, None], all_rows[item, choice][:, None]
+            distance = distances[item, choice][:, None]
+        return distance[:, 0]
+
+    def _steps(self, rows: Tensor, jacobian: Tensor, noise: tuple[float, float]) -> Tensor:
+        """Return the damped steps (B, dampings, S) of residuals (B, F, 6) and differences (B, S, F, 6)."""
+        counted = self.weight.flatten(1)[..., None].expand(-1, -1, 6)
+        scale = torch.cat([_spread(rows[..., k : k + 3], noise[k // 3]) for k in (0, 3)], -1)[:, None] / counted
+        scaled, slopes = rows / scale, jacobian / scale[:, None]
+        _, weight = robust_loss(scaled.square().sum(-1), ROBUST_SCALE)
+        flat = torch.nan_to_num(slopes.flatten(2), posinf=0.0, neginf=0.0)
+        weighted = flat * weight.repeat_interleave(6, -1)[:, None]
+        normal = weighted @ flat.transpose(1, 2)
+        gradient = -(weighted @ torch.nan_to_num(scaled).flatten(1)[..., None])
+        eye = torch.eye(normal.shape[-1]).to(normal)
+        return torch.stack([torch.linalg.solve(normal + d * eye, gradient).squeeze(-1) for d in DAMPINGS], 1)
+
+    def _rows(self, changes: Tensor) -> Tensor:
+        """Return residuals (B, K, F, 6) in metres and radians of state changes (B, K, S)."""
+        batch, count, size = changes.shape
+        items = [item for item in range(batch) for _ in range(count)]
+        flat = changes.reshape(-1, size)
+        parts = []
+        for first in range(0, len(items), MAX_ITEMS):
+            chosen = self.observations.select(items[first : first + MAX_ITEMS])
+            residuals = TrajectoryResiduals(self.world, [], chosen, 1.0, 1.0)
+            parts.append(residuals(flat.new_zeros(0), flat[first : first + MAX_ITEMS], False)[0])
+        return torch.cat(parts).unflatten(0, (batch, count))
+
+    def _distance(self, rows: Tensor) -> Tensor:
+        """Return the mean distance (B, K) [m] over the frames that count; infinite where a rollout diverged."""
+        weight = self.weight.flatten(1)[:, None]
+        distance = rows[..., :3].square().sum(-1).sqrt()
+        mean = (distance * weight).sum(-1) / weight.sum(-1)
+        return torch.nan_to_num(mean, nan=torch.inf, posinf=torch.inf)
+
+
+def _root(covariance: Tensor) -> Tensor:
+    """Return R with covariance = R R^T, shape (B, S, S)."""
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors * values.clamp_min(0.0).sqrt()[:, None]
+
+
+def _limited(root: Tensor) -> Tensor:
+    """Shrink the columns of a covariance root (B, S, S) to at most MAX_STEP."""
+    limit = torch.tensor([s for s in MAX_STEP for _ in range(3)]).to(root).repeat(root.shape[1] // STATE_SIZE)
+    excess = (root.abs() / limit[:, None]).amax(1, keepdim=True)
+    return root / excess.clamp_min(1.0)
+
+
+def _spread(rows: Tensor, noise: float) -> Tensor:
+    """Return for each item (B, 3) the noise together with the median residual: what one frame may be trusted for."""
+    size = rows.square().sum(-1).sqrt()
+    median = torch.nan_to_num(size.masked_fill(size == 0, torch.nan).nanmedian(1).values)
+    return (median.square() + noise**2).sqrt()[:, None].expand(-1, 3)

@@ -1,0 +1,296 @@
+"""Open-loop errors against measurements made by our own engine, so that the right answer is known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.cameras import Camera, to_intrinsics
+from cgwm.datasets.capture import Capture
+from cgwm.datasets.images import write_image
+from cgwm.datasets.models import Model, write_model
+from cgwm.datasets.tracks import Track, write_tracks
+from cgwm.pipeline.eval import Evaluation, evaluate, evaluate_model
+from cgwm.pipeline.image_errors import expose
+from cgwm.pipeline.labels import LabelRenderer
+from cgwm.pipeline.physics import State, World, simulate
+from cgwm.pipeline.prediction import Motion
+from cgwm.schemas import (
+    CamerasFile,
+    EvalResult,
+    Exposure,
+    InputDataError,
+    PosedVideo,
+    Scale,
+    Solver,
+    SynthesizeConfig,
+    UsageError,
+)
+from small_model import HALF, small_model
+
+NOISE_M, NOISE_RAD = 5e-4, 2e-3
+RATE_HZ, FRAMES = 50, 26
+VIDEO_HZ = 25.0
+EXPOSURE = Exposure(gain_rgb=(0.8, 0.9, 0.95))
+
+
+def quick(model: Model) -> Model:
+    """Return the model with a coarse solver: here it is at once the truth and the model."""
+    return replace(model, file=model.file.model_copy(update={"solver": Solver(step_s=0.004, sweeps=2)}))
+
+
+def truth() -> Model:
+    model = quick(small_model())
+    return replace(model, file=model.file.model_copy(update={"exposures": {"left": EXPOSURE}}))
+
+
+def thrown(seed: int) -> tuple[np.ndarray, Motion]:
+    """Return times and the noiseless motion of a cube that is thrown flat over the table, lands and slides."""
+    rng = np.random.default_rng(seed)
+    state = State(
+        torch.tensor([[[-0.1, 0.0, HALF + 0.07]]]).double() + 0.01 * torch.tensor(rng.standard_normal((1, 1, 3))),
+        torch.tensor([[[1.0, 0.0, 0.0, 0.0]]]).double(),
+        torch.tensor([[[0.9, 0.2, 0.1]]]).double(),
+        torch.tensor(0.2 * rng.standard_normal((1, 1, 3))),
+    )
+    times = np.arange(FRAMES) / RATE_HZ
+    rollout = simulate(World.from_model(truth()), state, torch.tensor(times))
+    return times, Motion(rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy())
+
+
+def measured(times: np.ndarray, motion: Motion, seed: int, turned: bool = True) -> Track:
+    rng = np.random.default_rng(100 + seed)
+    position = motion.position_m[:, 0] + NOISE_M * rng.standard_normal((len(times), 3))
+    half = 0.5 * NOISE_RAD * rng.standard_normal((len(times), 3))
+    w, x, y, z = motion.quat_wxyz[:, 0].T
+    a, b, c = half.T
+    quat = np.stack([w - x * a - y * b - z * c, x + w * a - z * b + y * c, y + z * a + w * b - x * c], 1)
+    quat = np.c_[quat, z - y * a + x * b + w * c]
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return Track(times, position, quat if turned else None)
+
+
+def write_capture(root: Path, episodes: int = 3, turned: bool = True, body: str = "cube") -> Path:
+    names = [f"{k:03d}" for k in range(episodes)]
+    text = [
+        'format = "cgwm-capture/1"',
+        "[world]",
+        "ground = { normal = [0.0, 0.0, 1.0], offset_m = 0.0 }",
+        f'[[bodies]]\nname = "{body}"\nmass_kg = 0.37',
+        f"shape = {{ box = {{ half_extents_m = [{HALF}, {HALF}, {HALF}] }} }}",
+        f"[measurement]\nposition_std_m = {NOISE_M}\nrotation_std_rad = {NOISE_RAD}",
+        f"[splits]\ntest = {json.dumps(names)}\nempty = []",
+        f"[video]\nframe_rate_hz = {VIDEO_HZ}",
+    ]
+    (root / "tracks").mkdir(parents=True)
+    (root / "capture.toml").write_text("\n".join(text) + "\n")
+    for seed, name in enumerate(names):
+        write_tracks(root / "tracks" / f"{name}.csv", {body: measured(*thrown(seed), seed, turned)})
+    return root
+
+
+def camera() -> Camera:
+    forward = np.array([0.0, 0.6, -0.3])
+    forward /= np.linalg.norm(forward)
+    right = np.array([1.0, 0.0, 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = [0.05, -0.55, 0.33]
+    K = np.array([[90.0, 0.0, 48.0], [0.0, 90.0, 36.0], [0.0, 0.0, 1.0]])
+    return Camera(96, 72, K, np.zeros(0), pose)
+
+
+def add_video(root: Path, masks: bool = True, episode: str = "000", kind: str = "metric") -> None:
+    """Film an episode with the model itself: the only errors left are those of the predicted motion."""
+    _, motion = thrown(int(episode))
+    rows = slice(0, None, round(RATE_HZ / VIDEO_HZ))
+    renderer = LabelRenderer(truth(), {"left": camera()})
+    blocks = list(renderer.blocks(motion.position_m[rows], motion.quat_wxyz[rows]))
+    images, labels = (np.concatenate([getattr(block, key) for block in blocks]) for key in ("image", "mask"))
+    for k, image in enumerate(images):
+        for folder, array in (("videos", (255 * expose(image, EXPOSURE)).round()), ("video_masks", labels[k])):
+            if folder == "videos" or masks:
+                path = root / folder / "left" / episode / f"{k:06d}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_image(path, array.astype(np.uint8))
+    pose = tuple(tuple(float(x) for x in row) for row in camera().T_world_cam)
+    cameras = CamerasFile(
+        scale=Scale(kind=kind),  # pyright: ignore[reportArgumentType]
+        cameras={"c": to_intrinsics(camera())},
+        videos={"left": PosedVideo(camera="c", T_world_cam=pose)},  # pyright: ignore[reportArgumentType]
+    )
+    (root / "cameras.json").write_text(cameras.model_dump_json())
+
+
+def with_friction(value: float) -> Model:
+    model = truth()
+    assert model.file.contact is not None
+    contact = model.file.contact.model_copy(update={"friction": value})
+    return replace(model, file=model.file.model_copy(update={"contact": contact}))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    root = write_capture(tmp_path_factory.mktemp("eval") / "capture")
+    add_video(root)
+    return Capture.open(root)
+
+
+@pytest.fixture(scope="module")
+def perfect(capture: Capture) -> Evaluation:
+    torch.set_num_threads(1)
+    return evaluate_model(truth(), capture, keep_frames=True)
+
+
+def test_true_model_is_as_good_as_the_noise_allows(perfect: Evaluation) -> None:
+    result = perfect.result
+    assert result.episodes == 3
+    assert result.state_noise_floor_m is not None and result.state_fitted_residual_m is not None
+    floor = np.hypot(result.state_noise_floor_m.median, NOISE_M * np.sqrt(8 / np.pi))  # mean distance of 3D noise
+    assert result.translation_error_m.median < 3 * floor
+    assert result.rotation_error_deg is not None and result.rotation_error_deg.median < 3.0
+    # a state fitted to all frames leaves little more than the noise
+    assert result.state_fitted_residual_m.median < 2 * NOISE_M * np.sqrt(8 / np.pi)
+
+
+def test_state_fit_is_never_worse_than_open_loop(capture: Capture) -> None:
+    for episode in evaluate_model(with_friction(0.8), capture).result.per_episode:
+        assert episode.state_fitted_residual_m is not None
+        assert episode.state_fitted_residual_m <= episode.translation_error_m + 1e-9
+
+
+def test_wrong_friction_is_told_from_the_right_one(capture: Capture, perfect: Evaluation) -> None:
+    wrong = evaluate_model(with_friction(0.1), capture).result
+    assert wrong.translation_error_m.median > 5 * perfect.result.translation_error_m.median
+    assert wrong.translation_error_m.final is not None
+    assert wrong.translation_error_m.final > wrong.translation_error_m.median  # it goes on sliding
+    assert wrong.psnr_object_db is not None and perfect.result.psnr_object_db is not None
+    assert wrong.psnr_object_db.median < perfect.result.psnr_object_db.median - 3
+
+
+def test_baselines_are_much_worse(perfect: Evaluation) -> None:
+    result = perfect.result
+    for name in ("frozen", "ballistic"):
+        figures = result.baselines[name]
+        assert figures["translation_error_m"]["median"] > 10 * result.translation_error_m.median
+        assert result.psnr_object_db is not None
+        assert figures["psnr_object_db"]["median"] < result.psnr_object_db.median - 5
+
+
+def test_baselines_are_what_they_say(perfect: Evaluation) -> None:
+    prediction = perfect.episodes[0].prediction
+    last = np.flatnonzero(prediction.warmup)[-1]
+    frozen, _ = prediction.predicted("frozen")
+    assert np.array_equal(frozen, np.broadcast_to(prediction.position_m[last], frozen.shape))
+    flying, _ = prediction.predicted("ballistic")
+    predicted, _ = prediction.predicted()
+    assert np.allclose(flying[last], predicted[last], atol=1e-12)
+    bend = np.diff(flying[:, 0], 2, axis=0) * RATE_HZ**2
+    assert np.allclose(bend, [0, 0, -9.81], atol=1e-6)
+
+
+def test_result_has_every_figure(perfect: Evaluation) -> None:
+    printed = json.loads(perfect.result.model_dump_json())
+    assert set(printed) == set(EvalResult.model_fields)
+    for name in ("translation_error_m", "rotation_error_deg"):
+        assert set(printed[name]) == {"mean", "median", "final"} and printed[name]["final"] > 0
+    episodes = printed["per_episode"]
+    assert [episode["episode"] for episode in episodes] == ["000", "001", "002"]
+    means = [episode["translation_error_m"] for episode in episodes]
+    assert printed["translation_error_m"]["mean"] == pytest.approx(np.mean(means))
+    assert printed["translation_error_m"]["median"] == pytest.approx(np.median(means))
+    # only the first episode was filmed
+    assert episodes[0]["psnr_db"] > 25 and episodes[1]["psnr_db"] is None
+    assert printed["psnr_db"]["mean"] == episodes[0]["psnr_db"]
+    assert printed["warnings"] == []
+
+
+def test_warm_up_ends_before_the_first_contact(perfect: Evaluation) -> None:
+    for seed, episode in enumerate(perfect.episodes):
+        times, motion = thrown(seed)
+        touches = times[np.argmax(motion.position_m[:, 0, 2] < HALF + 1e-3)]
+        assert 0.05 < episode.prediction.warmup_end_s <= min(0.1, touches) + 1e-9
+        assert episode.errors.frames == FRAMES - int(episode.prediction.warmup.sum())
+
+
+def test_frames_are_kept_side_by_side(perfect: Evaluation) -> None:
+    (video,) = perfect.episodes[0].videos
+    assert video.real is not None and video.predicted is not None
+    assert video.real.shape == video.predicted.shape == (len(video.time_s), 72, 96, 3)
+    assert video.time_s.min() > perfect.episodes[0].prediction.warmup_end_s
+    difference = np.abs(video.real.astype(float) - video.predicted).mean()
+    assert difference < 3  # of 255: gain and camera are right, and the cube is nearly where it was
+
+
+def test_without_masks_it_says_so(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "capture", episodes=1)
+    add_video(root, masks=False)
+    result = evaluate_model(truth(), Capture.open(root)).result
+    assert result.psnr_object_db is not None
+    assert any("predicted mask alone" in warning for warning in result.warnings)
+
+
+def test_centroid_tracks_have_no_rotation(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "capture", episodes=1, turned=False)
+    result = evaluate_model(truth(), Capture.open(root)).result
+    assert result.rotation_error_deg is None
+    assert result.per_episode[0].rotation_error_deg is None
+    assert result.baselines["frozen"]["rotation_error_deg"] is None
+    assert result.baselines["frozen"]["translation_error_m"]["median"] > 0.05
+
+
+def test_dataset_of_the_model_itself(tmp_path: Path) -> None:
+    from cgwm.pipeline.synthesize import synthesize
+
+    path = tmp_path / "model"
+    write_model(path, quick(small_model(visible=False)))
+    config = SynthesizeConfig.model_validate({"rollouts": 2, "seed": 3, "compression": "gzip", "duration_s": 0.6})
+    synthesize(path, tmp_path / "data", config)
+    result = evaluate(path, tmp_path / "data")
+    assert result.episodes == 2
+    assert [episode.episode for episode in result.per_episode] == ["demo_0", "demo_1"]
+    assert result.psnr_db is None
+    assert result.translation_error_m.median < 0.1 * result.baselines["frozen"]["translation_error_m"]["median"]
+
+
+def test_other_bodies_are_refused(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "capture", episodes=1, body="box")
+    with pytest.raises(InputDataError, match=r"the model's bodies are 'cube'; those of .* are 'box'"):
+        evaluate_model(truth(), Capture.open(root))
+
+
+def test_splits_without_episodes_are_refused(capture: Capture) -> None:
+    with pytest.raises(UsageError, match="no split 'tset'"):
+        evaluate_model(truth(), capture, "tset")
+    with pytest.raises(InputDataError, match="no episode of split 'empty' can be evaluated"):
+        evaluate_model(truth(), capture, "empty")
+
+
+def test_unscaled_cameras_are_refused(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "capture", episodes=1)
+    add_video(root, kind="unscaled")
+    with pytest.raises(InputDataError, match="The cameras are unscaled"):
+        evaluate_model(truth(), Capture.open(root))
+
+
+def test_model_without_physics_is_refused(capture: Capture) -> None:
+    model = truth()
+    model = replace(model, file=model.file.model_copy(update={"contact": None}))
+    with pytest.raises(InputDataError, match="no fitted physics"):
+        evaluate_model(model, capture)
+
+
+def test_warm_up_longer_than_every_episode_is_refused(capture: Capture) -> None:
+    rest = quick(small_model(visible=False))
+    position = Motion(np.tile([0.0, 0.0, HALF], (FRAMES, 1, 1)), np.tile([1.0, 0, 0, 0], (FRAMES, 1, 1)))
+    with pytest.raises(InputDataError, match="in none of the episodes does a measured frame follow the warm-up"):
+        _at_rest(capture.root.parent / "rest", position)
+        evaluate_model(rest, Capture.open(capture.root.parent / "rest"), warmup_s=5.0)
+
+
+def _at_rest(root: Path, motion: Motion) -> None:
+    write_capture(root, episodes=1)
+    path = root / "tracks" / "000.csv"
+    write_tracks(path, {"cube": measured(np.arange(FRAMES) / RATE_HZ, motion, 0)}, overwrite=True)
