@@ -1,0 +1,456 @@
+"""The image loss: real frames against renders of the background and the bodies at given poses.
+
+    L = mean over frames of  L1(gain * render, frame)  +  MASK_WEIGHT * L1(visible body, mask)
+
+Both over the whole picture. What does not move is rendered once a camera; then only a window around the moving bodies
+is rendered for each frame, with everything in it, and the rest of the sum is a constant of the window. Appearance and
+geometry are constants here: poses get a gradient from the renderer, {c, s} none (contact model notes, section 7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...datasets.models import Model
+from ...schemas import InputDataError
+from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
+from ..splats.render import MIN_ALPHA, render
+from ..splats.spheres import Spheres
+from .footage import Footage, Video
+
+MASK_WEIGHT = 1.0
+"""Weight of the silhouettes: a wrong pixel of mask costs as much as a wrong black-and-white one (choice of cgwm)."""
+DIFFERENCE_M = 5e-4
+"""Step of the differences for the curvature: a small part of a pixel."""
+HUBER = 0.1
+"""Tracking takes residuals below this as squares: least squares finds its way where the L1 norm creeps."""
+MIN_IOU = 0.5
+"""A pose whose silhouettes overlap the masks by less is no pose of the body."""
+MAX_ERROR_RATIO = 0.7
+"""Without masks: a body in the right place explains its pixels at least this much better than the background does."""
+MIN_AREA_PX = 12.0
+_TILE = 8
+_MAX_RENDERS = 128
+
+
+@dataclass(frozen=True)
+class PoseModel:
+    """Huber loss and its second-order model at poses: value (K,), slope (K, D), curvature (K, D, D); D = 6 free bodies.
+
+    Coordinates: translation [m], world; rotation vector [rad], body; for each free body.
+    """
+
+    value: Tensor
+    slope: Tensor
+    curvature: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PoseQuality:
+    """How poses (K) agree with the frames where the bodies are drawn.
+
+    iou (K,): of the free bodies' silhouettes with the masks, NaN without masks; error (K,): mean absolute colour error
+    on the bodies; blank (K,): the same of the background alone; area (K,): drawn pixels, 0 where no camera sees it.
+    """
+
+    iou: Tensor
+    error: Tensor
+    blank: Tensor
+    area: Tensor
+
+    @property
+    def found(self) -> Tensor:
+        """Which poses (K,) explain the frames: half of the mask, or the colours far better than no body does."""
+        agrees = torch.where(self.iou.isnan(), self.error < MAX_ERROR_RATIO * self.blank, self.iou >= MIN_IOU)
+        return agrees & (self.area > MIN_AREA_PX)
+
+
+@dataclass(frozen=True, eq=False)
+class _Backdrop:
+    """What a video shows where nothing moves.
+
+    plates (P, H, W, 3): renders of the static scene; plate_of (T,): the frame's plate; gain (3,): exposure of the
+    camera against the model; unexplained (T,): sum of |gain plate - frame| / 3.
+    """
+
+    plates: Tensor
+    plate_of: Tensor
+    gain: Tensor
+    unexplained: Tensor
+
+
+class ImageLoss:
+    """The loss of an episode's frames as a function of the bodies' poses.
+
+    Args:
+        model: A model with visual spheres and a background.
+        footage: The videos.
+        free: Indices of the bodies whose poses get derivatives.
+        min_alpha: As in :func:`render`; 0 makes the loss smooth (and slow).
+    """
+
+    def __init__(self, model: Model, footage: Footage, free: Sequence[int], min_alpha: float = MIN_ALPHA) -> None:
+        _check(model, free)
+        self.footage, self.free, self._min_alpha = footage, tuple(free), min_alpha
+        like = footage.videos[0].frames
+        self._count = len(model.file.bodies)
+        self._moving: list[tuple[int, Spheres]] = []
+        static = []
+        for index, body in enumerate(model.file.bodies):
+            if body.name not in model.body_splats:
+                continue
+            spheres = Spheres.from_numpy(model.body_splats[body.name], like.dtype, like.device)
+            if body.motion == "fixed":
+                pose = body.photo_pose
+                rotation = quat_to_matrix(torch.as_tensor(pose.quat_wxyz).to(like))
+                means = spheres.means @ rotation.T + torch.as_tensor(pose.position_m).to(like)
+                static.append(Spheres(means, spheres.scales, spheres.opacities, spheres.colors))
+            else:
+                self._moving.append((index, spheres))
+        assert model.scene is not None
+        static.append(Spheres.from_numpy(model.scene, like.dtype, like.device))
+        self._static = Spheres.joined(static)
+        self._features = self._labelled()
+        self.radii = {index: _radius(spheres) for index, spheres in self._moving}
+        self.centers = {index: spheres.means.mean(0) for index, spheres in self._moving}
+        self._backdrops = [self._backdrop(video) for video in footage.videos]
+
+    @property
+    def gains(self) -> dict[str, list[float]]:
+        """Exposure of each camera against the model's colours, by channel."""
+        return {v.camera: b.gain.tolist() for v, b in zip(self.footage.videos, self._backdrops, strict=True)}
+
+    def values(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
+        """Return the loss at poses, the mean over the cameras that saw the instant.
+
+        Args:
+            instants: Which instant of the footage each pose belongs to, shape (K,).
+            position_m: Body frame origins [m], world, shape (K, nb, 3).
+            quat_wxyz: Shape (K, nb, 4).
+
+        Returns:
+            Shape (K,); 0 where no camera saw the instant.
+        """
+        with torch.no_grad():
+            return self.parts(instants, position_m, quat_wxyz).sum(-1)
+
+    def parts(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
+        """Return the loss by its parts, photometric and (weighted) mask, shape (K, 2); differentiable in the poses."""
+        total = torch.zeros(len(instants), 2).to(self._static.means)
+        shots = torch.zeros(len(instants)).to(total)
+        for number, video in enumerate(self.footage.videos):
+            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
+                window = _window(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]))
+                color, mask = self._residuals(number, window, position_m[rows], quat_wxyz[rows])
+                photometric = color.abs().sum((1, 2, 3)) / 3 + self._outside(number, window)
+                silhouette = mask.abs().sum((1, 2, 3)) + _mask_outside(video, window)
+                pixels = video.size[0] * video.size[1]
+                pair = torch.stack([photometric, MASK_WEIGHT * silhouette], -1) / pixels
+                total = total.index_add(0, rows, pair)
+                shots[rows] += 1
+        return total / shots.clamp_min(1)[:, None]
+
+    def gradient(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Return values (K,) and exact gradients (K, 6 nf) by the poses, in the coordinates of `PoseModel`."""
+        values, slopes = [], []
+        for rows in torch.arange(len(instants)).split(_MAX_RENDERS // 4):
+            change = torch.zeros(len(rows), 6 * len(self.free)).to(self._static.means).requires_grad_()
+            moved = self.moved(position_m[rows], quat_wxyz[rows], change)
+            value = self.parts(instants[rows], *moved).sum(-1)
+            (slope,) = torch.autograd.grad(value.sum(), change)
+            values.append(value.detach())
+            slopes.append(slope)
+        return torch.cat(values), torch.cat(slopes)
+
+    @torch.no_grad()
+    def expand(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor, blur: int = 1) -> PoseModel:
+        """Return the Huber loss at poses, less that of the background alone, with slope and curvature by differences.
+
+        The curvature is that of re-weighted least squares, J^T diag(1 / max(|r|, HUBER)) J. Residuals averaged over
+        squares of `blur` pixels, half overlapping, widen the valley to about as many pixels.
+        """
+        count, size = len(instants), 6 * len(self.free)
+        like = self._static.means
+        value, slope = torch.zeros(count).to(like), torch.zeros(count, size).to(like)
+        curvature, shots = torch.zeros(count, size, size).to(like), torch.zeros(count).to(like)
+        steps = torch.cat(
+            [like.new_tensor([DIFFERENCE_M] * 3 + [DIFFERENCE_M / self.radii[index]] * 3) for index in self.free]
+        )
+        for number in range(len(self.footage.videos)):
+            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            for rows in (frames >= 0).nonzero()[:, 0].split(max(1, _MAX_RENDERS // (size + 1))):
+                pair = self._shot_model(number, frames[rows], position_m[rows], quat_wxyz[rows], steps, blur)
+                for target, part in zip((value, slope, curvature), pair, strict=True):
+                    target.index_add_(0, rows, part)
+                shots[rows] += 1
+        shots = shots.clamp_min(1)
+        return PoseModel(value / shots, slope / shots[:, None], curvature / shots[:, None, None])
+
+    @torch.no_grad()
+    def quality(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> PoseQuality:
+        """Say how well renders at poses agree with the frames where the bodies are."""
+        count, free = len(instants), list(self.free)
+        inside, union, error, blank, area = (torch.zeros(count).to(self._static.means) for _ in range(5))
+        for number, video in enumerate(self.footage.videos):
+            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
+                means = self._place(position_m[rows], quat_wxyz[rows])
+                window = _window(video, frames[rows], means)
+                picture = self._render(video, window, means)
+                shown = picture[..., 3:][..., free]
+                body = shown.sum(-1)
+                error[rows] += (self._color(number, window, picture).abs().mean(-1) * body).sum((1, 2))
+                blank[rows] += (self._blank(number, window)[0].abs().mean(-1) * body).sum((1, 2))
+                area[rows] += body.sum((1, 2))
+                if video.covers is not None:
+                    mine, cover = shown > 0.5, window.cut(video.covers.movedim(1, -1))[..., free] > 0.5
+                    whole = (video.covers[window.frames][:, free] > 0.5).sum((1, 2, 3))
+                    both = (mine & cover).sum((1, 2, 3))
+                    inside[rows] += both
+                    union[rows] += mine.sum((1, 2, 3)) + whole - both
+        return PoseQuality(inside / union, error / area, blank / area, area)
+
+    def difference(self, number: int, frame: int) -> Tensor:
+        """Return how much a frame differs from the background as the model sees it, mean of the channels (H, W)."""
+        drop, video = self._backdrops[number], self.footage.videos[number]
+        return (drop.gain * drop.plates[drop.plate_of[frame]] - video.frames[frame]).abs().mean(-1)
+
+    def moved(self, position_m: Tensor, quat_wxyz: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+        """Return poses of all bodies with those of the free ones changed by (K, 6 nf)."""
+        position, quat = list(position_m.to(change).unbind(1)), list(quat_wxyz.to(change).unbind(1))
+        for column, index in enumerate(self.free):
+            shift, turn = change[:, 6 * column : 6 * column + 6].split(3, -1)
+            position[index] = position[index] + shift
+            quat[index] = quat_multiply(quat[index], quat_exp(turn))
+        return torch.stack(position, 1), torch.stack(quat, 1)
+
+    def _shot_model(
+        self, number: int, frames: Tensor, position_m: Tensor, quat_wxyz: Tensor, steps: Tensor, blur: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        video, size = self.footage.videos[number], len(steps)
+        count = len(frames)
+        window = _window(video, frames, self._place(position_m, quat_wxyz), margin=2)
+        changes = torch.cat([torch.zeros(1, size).to(steps), torch.diag(steps)]).repeat_interleave(count, 0)
+        poses = self.moved(position_m.repeat(size + 1, 1, 1), quat_wxyz.repeat(size + 1, 1, 1), changes)
+        shown = _rows(*self._residuals(number, window.repeat(size + 1), *poses), blur).view(size + 1, count, -1)
+        blank = _rows(*self._blank(number, window), blur)
+        residual = shown[0]
+        jacobian = (shown[1:] - residual) / steps[:, None, None]
+        pixels = video.size[0] * video.size[1] / max(1, blur // 2) ** 2
+        weight = 1 / residual.abs().clamp_min(HUBER) / pixels
+        slope = torch.einsum("dkm,km->kd", jacobian, weight * residual)
+        curvature = torch.einsum("dkm,km,ekm->kde", jacobian, weight, jacobian)
+        return (_huber(residual) - _huber(blank)).sum(-1) / pixels, slope, curvature
+
+    def _residuals(self, number: int, window: _Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Return colour (S, h, w, 3) and mask (S, h, w, nb, or 0 without masks) residuals in the window."""
+        video = self.footage.videos[number]
+        picture = self._render(video, window, self._place(position_m, quat_wxyz))
+        color = self._color(number, window, picture)
+        if video.covers is None:
+            return color, picture[..., :0]
+        return color, picture[..., 3:] - window.cut(video.covers.movedim(1, -1))
+
+    def _outside(self, number: int, window: _Window) -> Tensor:
+        """Return the photometric sum outside the window (S,)."""
+        drop = self._backdrops[number]
+        return drop.unexplained[window.frames] - self._blank(number, window)[0].abs().sum((1, 2, 3)) / 3
+
+    def _color(self, number: int, window: _Window, picture: Tensor) -> Tensor:
+        """Return the colour residuals of a rendered window (S, h, w, 3)."""
+        exposed = (self._backdrops[number].gain * picture[..., :3]).clamp(0, 1)
+        return exposed - window.cut(self.footage.videos[number].frames)
+
+    def _blank(self, number: int, window: _Window) -> tuple[Tensor, Tensor]:
+        """Return the residuals of the background alone in the window, as :meth:`_residuals` does."""
+        video, drop = self.footage.videos[number], self._backdrops[number]
+        behind = (drop.gain * window.cut(drop.plates, drop.plate_of[window.frames])).clamp(0, 1)
+        color = behind - window.cut(video.frames)
+        return color, color[..., :0] if video.covers is None else -window.cut(video.covers.movedim(1, -1))
+
+    def _place(self, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
+        """Return the moving spheres' centres in the world, shape (S, N, 3)."""
+        like = self._static.means
+        parts = []
+        for index, spheres in self._moving:
+            rotation = quat_to_matrix(quat_wxyz[:, index].to(like))
+            parts.append(spheres.means @ rotation.transpose(1, 2) + position_m[:, index, None].to(like))
+        return torch.cat(parts, 1)
+
+    def _labelled(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return scales, opacities and features (colour, one-hot body) of the moving spheres, then the static ones."""
+        everything = Spheres.joined([*(spheres for _, spheres in self._moving), self._static])
+        label = torch.zeros(len(everything), self._count).to(everything.means)
+        first = 0
+        for index, spheres in self._moving:
+            label[first : first + len(spheres), index] = 1.0
+            first += len(spheres)
+        return everything.scales, everything.opacities, torch.cat([everything.colors, label], 1)
+
+    def _render(self, video: Video, window: _Window, means: Tensor) -> Tensor:
+        """Return colours and visible bodies in the window, shape (S, h, w, 3 + nb)."""
+        K = video.K.repeat(len(means), 1, 1)
+        K[:, :2, 2] -= window.corners.to(K)
+        near = self._near(video, window)
+        everything = torch.cat([means, self._static.means[near].expand(len(means), -1, -1)], 1)
+        chosen = torch.cat([torch.arange(means.shape[1]).to(near), means.shape[1] + near])
+        scales, opacities, features = (values[chosen] for values in self._features)
+        viewmats = video.viewmats[window.frames]
+        return render(
+            everything, scales, opacities, features, viewmats, K, *window.size, min_alpha=self._min_alpha
+        ).features
+
+    def _near(self, video: Video, window: _Window) -> Tensor:
+        """Return which static spheres may reach into the windows: a few, where all windows are about one place."""
+        static = self._static
+        if self._min_alpha <= 0:
+            return torch.arange(len(static), device=static.means.device)
+        near = torch.zeros(len(static), dtype=torch.bool, device=static.means.device)
+        reach = static.scales * (2 * (static.opacities / self._min_alpha).clamp_min(1.0).log()).sqrt()
+        moving = len(torch.unique(video.viewmats.flatten(1), dim=0)) > 1
+        for frame in torch.unique(window.frames).tolist() if moving else [int(window.frames[0])]:
+            corners = window.corners[window.frames == frame] if moving else window.corners
+            local = static.means @ video.viewmats[frame, :3, :3].T + video.viewmats[frame, :3, 3]
+            # a cone from the eye around the rectangle of all corners, widened by the spheres' reach
+            low = (corners.amin(0) - video.K[:2, 2] - 1) / video.K.diagonal()[:2]
+            size = torch.tensor(window.size).to(low)
+            high = (corners.amax(0) + size - video.K[:2, 2] + 1) / video.K.diagonal()[:2]
+            x, depth = local[:, :2], local[:, 2:]
+            inside = (x - low * depth) / (1 + low**2).sqrt() > -reach[:, None]
+            inside &= (high * depth - x) / (1 + high**2).sqrt() > -reach[:, None]
+            near |= inside.all(1) & (local[:, 2] > -reach)
+        return near.nonzero()[:, 0]
+
+    @torch.no_grad()
+    def _backdrop(self, video: Video) -> _Backdrop:
+        poses, plate_of = torch.unique(video.viewmats.flatten(1), dim=0, return_inverse=True)
+        spheres = self._static
+        plates = torch.cat(
+            [
+                render(
+                    spheres.means,
+                    spheres.scales,
+                    spheres.opacities,
+                    spheres.colors,
+                    pose.view(1, 4, 4),
+                    video.K[None],
+                    *video.size,
+                    min_alpha=self._min_alpha,
+                ).features
+                for pose in poses
+            ]
+        )
+        gain = _gain(video, plates, plate_of)
+        unexplained = torch.stack(
+            [
+                ((gain * plates[plate]).clamp(0, 1) - frame).abs().sum() / 3
+                for plate, frame in zip(plate_of, video.frames, strict=True)
+            ]
+        )
+        return _Backdrop(plates, plate_of, gain, unexplained)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Equal rectangles in some frames of a video: frames (S,), corners (S, 2) [px], size (width, height)."""
+
+    frames: Tensor
+    corners: Tensor
+    size: tuple[int, int]
+
+    def cut(self, pictures: Tensor, which: Tensor | None = None) -> Tensor:
+        """Return the rectangles of pictures (T, H, W, F), those of `which` or the window's frames: (S, h, w, F)."""
+        columns = self.corners[:, :1] + torch.arange(self.size[0], device=self.corners.device)
+        rows = self.corners[:, 1:] + torch.arange(self.size[1], device=self.corners.device)
+        frames = self.frames if which is None else which
+        return pictures[frames[:, None, None], rows[:, :, None], columns[:, None, :]]
+
+    def repeat(self, times: int) -> _Window:
+        return _Window(self.frames.repeat(times), self.corners.repeat(times, 1), self.size)
+
+
+def _window(video: Video, frames: Tensor, means: Tensor, margin: int = 0) -> _Window:
+    """Return windows that hold all spheres with these centres (S, N, 3), as far as they are in the picture.
+
+    The margin for the spheres' own size is generous for spheres much smaller than their body: cutting the last alpha
+    of 1/255 of a sphere at the rim changes nothing that counts.
+    """
+    with torch.no_grad():
+        viewmats = video.viewmats[frames]
+        local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
+        depth = local[..., 2]
+        seen = depth > 1e-3
+        pixel = local[..., :2] / depth.clamp_min(1e-3)[..., None] * video.K.diagonal()[:2] + video.K[:2, 2]
+        extent = torch.tensor(video.size).to(pixel)
+        low = torch.where(seen[..., None], pixel, torch.inf).amin(1)
+        high = torch.where(seen[..., None], pixel, -torch.inf).amax(1)
+        rim = margin + 0.08 * (high - low).clamp(0, 1e3).nan_to_num(0.0) + 4
+        low, high = (low - rim).clamp_min(0).minimum(extent), (high + rim).clamp_min(0).minimum(extent)
+        low = (low / _TILE).floor() * _TILE  # tiles, and squares of pixels, stay in place when the body moves a little
+        span = (high - low).clamp_min(1).amax(0)
+        size = [min(int(extent[k]), math.ceil(float(span[k]) / _TILE) * _TILE) for k in (0, 1)]
+        corners = low.minimum(extent - extent.new_tensor(size)).clamp_min(0).to(torch.int64)
+        return _Window(frames, corners, (size[0], size[1]))
+
+
+def _rows(color: Tensor, mask: Tensor, blur: int) -> Tensor:
+    """Return colour and mask residuals (S, h, w, F) as rows (S, m): weighted, averaged over squares of `blur`."""
+    residuals = torch.cat([color / 3, MASK_WEIGHT * mask], -1)
+    if blur > 1:
+        pictures = residuals.movedim(-1, 1)
+        residuals = torch.nn.functional.avg_pool2d(pictures, blur, max(1, blur // 2), blur // 2, ceil_mode=True)
+    return residuals.flatten(1)
+
+
+def _huber(residual: Tensor) -> Tensor:
+    size = residual.abs()
+    return torch.where(size < HUBER, 0.5 * size.square() / HUBER, size - 0.5 * HUBER)
+
+
+def _mask_outside(video: Video, window: _Window) -> Tensor:
+    """Return the sum of the masks outside the window (S,)."""
+    if video.covers is None:
+        return torch.zeros(len(window.frames)).to(video.frames)
+    inside = window.cut(video.covers.movedim(1, -1)).sum((1, 2, 3))
+    return video.covers[window.frames].sum((1, 2, 3)) - inside
+
+
+def _gain(video: Video, plates: Tensor, plate_of: Tensor) -> Tensor:
+    """Return the exposure (3,): the median ratio of the frames to the background's render, where no body covers it."""
+    behind = plates[plate_of]
+    bright = behind > 0.1
+    if video.covers is not None:
+        bright = bright & (video.covers.sum(1) < 0.01)[..., None]
+    gains = []
+    for channel in range(3):
+        rows = bright[..., channel]
+        ratio = video.frames[..., channel][rows] / behind[..., channel][rows]
+        gains.append(ratio.median() if ratio.numel() else ratio.new_tensor(1.0))
+    return torch.stack(gains)
+
+
+def _radius(spheres: Spheres) -> float:
+    """Return the mean distance of a body's spheres from their middle [m]."""
+    return float((spheres.means - spheres.means.mean(0)).norm(dim=1).mean().clamp_min(1e-4))
+
+
+def _check(model: Model, free: Sequence[int]) -> None:
+    todo = "run 'cgwm fit CAPTURE --stage sg-gs' on photos with masks, then pass the model with --from."
+    if model.scene is None:
+        raise InputDataError(
+            "the model has no background, so its renders cannot be compared with video frames.",
+            "a model with the stage sg-gs from photos.",
+            todo,
+        )
+    for index in free:
+        name = model.file.bodies[index].name
+        if name not in model.body_splats:
+            raise InputDataError(
+                f"the model has no visual spheres of the free body '{name}'.", "spheres from photos with masks.", todo
+            )
