@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 FRAME_RATE = 30.0
 TRAIN_FRAMES, TEST_FRAMES = 15, 36
 _TRIES = 600
-_RESTARTS = 6
+_RESTARTS = 3
+_CANDIDATES = 5
 
 
 def plan_fall(seed: int) -> ScenePlan:
@@ -40,28 +41,33 @@ def _toss(
     """Toss until a toss stays in view, is unlike the others, and shows what its split needs."""
     duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
     cameras = video_cameras(seed).values()
+    useful: list[tuple[float, Motion]] = []
     for _ in range(_TRIES):
-        qpos, qvel = _release(rng, solid, (0.09, 0.16) if split == "train" else (0.10, 0.18))
+        qpos, qvel = _release(rng, solid, (0.09, 0.15) if split == "train" else (0.10, 0.15))
         if any(turned_deg(qpos[3:7], other) < 35 for other in others):
             continue
         motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
-        useful = _instructive(motion) if split == "train" else _settles(motion)
+        wanted = _instructive(motion) if split == "train" else _settles(motion)
         near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
-        if useful and near and stays_in_view(solid, motion, cameras) and _predictable(rng, model, motion, duration):
-            return motion
-    raise NotConvergedError(f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.")
+        if wanted and near and stays_in_view(solid, motion, cameras):
+            useful.append((_unpredictability(rng, model, motion, duration), motion))
+        if len(useful) == _CANDIDATES:
+            break
+    if not useful:
+        raise NotConvergedError(f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.")
+    return min(useful, key=lambda one: one[0])[1]
 
 
 def _release(rng: np.random.Generator, solid: SolidObject, height: tuple[float, float]) -> tuple[Array, Array]:
     """Draw a release: pose and velocity of the body frame, lowest point within `height` above ground [m]."""
     quat_wxyz = rng.standard_normal(4)
     quat_wxyz /= np.linalg.norm(quat_wxyz)
-    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.15, 0.5)
+    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.15, 0.4)
     direction = np.array([np.cos(heading), np.sin(heading), 0])
     position = -direction * rng.uniform(0.06, 0.14)
     position[2] = lowest(solid, quat_wxyz) + rng.uniform(*height)
     spin = rng.standard_normal(3)
-    omega_body = spin / np.linalg.norm(spin) * rng.uniform(0.5, 3.0)
+    omega_body = spin / np.linalg.norm(spin) * rng.uniform(0.5, 2.0)
     return np.concatenate([position, quat_wxyz]), np.concatenate([speed * direction, omega_body])
 
 
@@ -73,12 +79,14 @@ def _instructive(motion: Motion) -> bool:
     return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.03
 
 
-def _predictable(rng: np.random.Generator, model: MjModel, motion: Motion, duration: float) -> bool:
-    """Tell whether the true engine itself repeats the toss from a start that is off by what a warm-up cannot see.
+def _unpredictability(rng: np.random.Generator, model: MjModel, motion: Motion, duration: float) -> float:
+    """Return how far the true engine itself ends up when it starts from what a warm-up cannot tell apart.
 
-    A die that lands on an edge is no test of a model: two starts that no measurement tells apart end on different
-    faces. Each try moves the start by the accuracy of a state measured over 0.1 s.
+    A die that lands on an edge is no test of a model: two starts that no measurement distinguishes end on different
+    faces. Each restart is off by the accuracy of a state measured over 0.1 s; the result is the largest mean error
+    over time, in units of 10 mm and 10 degrees.
     """
+    worst = 0.0
     for _ in range(_RESTARTS):
         qpos, qvel = motion.qpos[0].copy(), motion.qvel[0].copy()
         qpos[:3] += 0.0003 * rng.standard_normal(3)
@@ -89,9 +97,8 @@ def _predictable(rng: np.random.Generator, model: MjModel, motion: Motion, durat
         again = simulate(model, qpos, qvel, motion.start, duration)
         shift = np.linalg.norm(again.qpos[:, :3] - motion.qpos[:, :3], axis=1).mean()
         turns = [turned_deg(a, b) for a, b in zip(again.qpos[::200, 3:7], motion.qpos[::200, 3:7], strict=True)]
-        if shift > 0.008 or np.mean(turns) > 8:
-            return False
-    return True
+        worst = max(worst, float(shift) / 0.01 + float(np.mean(turns)) / 10)
+    return worst
 
 
 def _settles(motion: Motion) -> bool:
