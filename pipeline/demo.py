@@ -33,7 +33,7 @@ from ..schemas import (
     SynthesizeConfig,
 )
 from .calibrate import calibrate
-from .eval import Evaluation, evaluate, evaluate_model
+from .eval import Evaluation, evaluate_model
 from .fit import fit
 from .report import REPORT_HTML, REPORT_JSON, ReportPictures, write_report
 from .reporting.against_truth import check_calibration, check_splats, compare_parameters
@@ -71,6 +71,8 @@ class DemoSettings:
     calibrate: CalibrateConfig = field(default_factory=lambda: CalibrateConfig(max_features=2048))
     splats: SplatConfig = field(default_factory=SplatConfig)
     physics: PhysConfig = field(default_factory=PhysConfig)
+    images: PhysConfig = field(default_factory=lambda: PhysConfig(population=16, generations=4, iterations=6))
+    """A shorter search than by default: tracks from images are too rough for a finer one."""
     synthesize: SynthesizeConfig = field(default_factory=lambda: SynthesizeConfig(rollouts=8))
 
 
@@ -156,11 +158,9 @@ def _run(demo: _Demo, scene: str, renderer: str) -> DemoResult:
         config = _seeded(settings.synthesize, seed=demo.seed, device=demo.device)
         summary = synthesize(folder / "model", dataset, config)
     with demo.stage("evaluate"):
-        evaluation = evaluate_model(
-            read_model(folder / "model"), Capture.open(capture), SPLIT, WARMUP_S, demo.device, keep_frames=True
-        )
+        evaluation = _evaluate(demo, "model", keep_frames=True)
         if images_only.outcome == "fitted":
-            figures = evaluate(folder / "model-images", capture, SPLIT, WARMUP_S, demo.device)
+            figures = _evaluate(demo, "model-images", brief=True).result
             images_only = images_only.model_copy(update={"evaluation": figures})
     with demo.stage("report"):
         result = _result(demo, (scene, renderer), calibration, model, images_only, summary, evaluation)
@@ -179,7 +179,7 @@ def _fit(demo: _Demo) -> ModelFile:
 
 def _fit_from_images(demo: _Demo) -> ImagesOnlyFit:
     """Fit the physics from the video frames alone; that this may fail is a result, and no reason to stop."""
-    config = _seeded(demo.settings.physics, seed=demo.seed, device=demo.device, supervise="images")
+    config = _seeded(demo.settings.images, seed=demo.seed, device=demo.device, supervise="images")
     try:
         model = fit(
             demo.folder / "capture",
@@ -192,6 +192,13 @@ def _fit_from_images(demo: _Demo) -> ImagesOnlyFit:
         return ImagesOnlyFit(outcome="not_converged", message=demo.plain(error.found))
     compared = compare_parameters(model.parameters, read_truth(demo.folder / "capture"))
     return ImagesOnlyFit(outcome="fitted", parameters=compared)
+
+
+def _evaluate(demo: _Demo, model: str, *, keep_frames: bool = False, brief: bool = False) -> Evaluation:
+    capture = Capture.open(demo.folder / "capture", splits=(SPLIT,))
+    return evaluate_model(
+        read_model(demo.folder / model), capture, SPLIT, WARMUP_S, demo.device, keep_frames=keep_frames, brief=brief
+    )
 
 
 def _result(

@@ -78,6 +78,7 @@ def evaluate_model(
     warmup_s: float = 0.1,
     device: str = "auto",
     keep_frames: bool = False,
+    brief: bool = False,
 ) -> Evaluation:
     """Evaluate a model against the tracks of a capture, and its frames where model and cameras allow it.
 
@@ -88,6 +89,7 @@ def evaluate_model(
         warmup_s: Length of the start of an episode that the model may see [s].
         device: Where images are rendered: auto, cpu or cuda.
         keep_frames: Keep the predicted frames beside the real ones (tens of megabytes an episode).
+        brief: The errors of the poses and of the baselines alone: no frames, no fitted states.
 
     Raises:
         See :func:`evaluate`.
@@ -101,10 +103,12 @@ def evaluate_model(
             "tracks/<episode>.csv with rows for every free and driven body.",
             "add tracks, or name another split with --split.",
         )
-    cameras = _cameras(model, capture, [name for name, _ in episodes], warnings)
+    cameras = {} if brief else _cameras(model, capture, [name for name, _ in episodes], warnings)
     videos = VideoErrors(model, capture, _device(device), keep_frames) if cameras else None
     video_times = [_video_times(capture, name, cameras.get(name, [])) for name, _ in episodes]
-    predictions = _predict(model, world, episodes, _noise(model, capture, episodes), warmup_s, video_times)
+    noise = _noise(model, capture, episodes)
+    fits = 0 if brief else STATE_FIT_EPISODES
+    predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits)
 
     def compare(prediction: EpisodePrediction) -> tuple[VideoComparison, ...]:
         names = cameras.get(prediction.episode, [])
@@ -192,9 +196,10 @@ def _predict(
     noise: tuple[float, float],
     warmup_s: float,
     video_times: Sequence[Array],
+    state_fits: int = STATE_FIT_EPISODES,
 ) -> list[EpisodePrediction]:
     with progress(desc="eval: rollouts", total=len(episodes), unit="episode") as bar:
-        return predict(world, model.file, episodes, noise, warmup_s, video_times, bar.update)
+        return predict(world, model.file, episodes, noise, warmup_s, video_times, bar.update, state_fits)
 
 
 def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: list[str]) -> dict[str, list[str]]:
@@ -255,7 +260,7 @@ def _evaluation(
     if any(not video.true_masks for episode in episodes for video in episode.videos):
         warnings.append("psnr_object_db: without video_masks it is over the predicted mask alone where there are none.")
     fitted = sum(episode.prediction.state_fitted_m is not None for episode in episodes)
-    if fitted < len(episodes):
+    if 0 < fitted < len(episodes):
         warnings.append(
             f"state_fitted_residual_m is that of {fitted} of {len(episodes)} episodes, evenly spread "
             f"(at most {STATE_FIT_EPISODES} are fitted)."

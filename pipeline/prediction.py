@@ -115,6 +115,7 @@ def predict(
     warmup_s: float,
     video_times_s: Sequence[Array],
     on_step: Callable[[int], object] = lambda _: None,
+    state_fits: int = STATE_FIT_EPISODES,
 ) -> list[EpisodePrediction]:
     """Predict episodes open loop from their warm-ups.
 
@@ -126,6 +127,7 @@ def predict(
         warmup_s: Length of the warm-up [s].
         video_times_s: For each episode, further times at which to predict [s].
         on_step: Called with a number of finished episodes.
+        state_fits: For how many of them, at most, the state is fitted to the whole episode.
 
     Returns:
         The predictions, in the order of the episodes.
@@ -135,7 +137,7 @@ def predict(
     """
     count = len(episodes)
     samples = min(max(SAMPLES_IN_ALL // count, SAMPLES[0]), SAMPLES[1])
-    fitted = set(np.linspace(0, count - 1, min(count, STATE_FIT_EPISODES)).round().astype(int).tolist())
+    fitted = set(np.linspace(0, count - 1, min(count, state_fits)).round().astype(int).tolist())
     # those to fit in one batch; then episodes of similar length together, since a batch is as long as its longest
     order = sorted(range(count), key=lambda i: (i not in fitted, max(len(track) for track in episodes[i][1].values())))
     found: dict[int, EpisodePrediction] = {}

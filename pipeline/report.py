@@ -192,8 +192,8 @@ def _images_only(result: DemoResult) -> str:
         return section(title, paragraph(intro), paragraph(f"It did not converge: {fit.message}", "bad"))
     rows = [_summary_row("from images alone", fit.evaluation.model_dump())]
     rows.append(_summary_row("from the pose track", result.evaluation.model_dump()))
-    header = ["medians over the test episodes", "translation [mm]", "at the end [mm]", "rotation [deg]"]
-    header += ["at the end [deg]", "PSNR object [dB]", "PSNR frame [dB]"]
+    header = ["medians over the test episodes", "translation [mm]", "at the end [mm]"]
+    header += ["rotation [deg]", "at the end [deg]"]
     fitted = [p for p in fit.parameters if p.parameter.state not in ("given", "derived")]
     return section(
         title,

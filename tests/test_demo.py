@@ -32,6 +32,7 @@ SMALL = DemoSettings(
         iterations=40, max_body_spheres=300, max_scene_spheres=500, max_collision_spheres=64, image_size=160
     ),
     physics=PhysConfig(population=8, generations=2, iterations=2, step_s=0.002),
+    images=PhysConfig(population=8, generations=2, iterations=2, step_s=0.002),
     synthesize=SynthesizeConfig(rollouts=2, width=64, height=48, duration_s=0.5),
 )
 
