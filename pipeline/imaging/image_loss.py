@@ -9,7 +9,6 @@ geometry are constants here: poses get a gradient from the renderer, {c, s} none
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +21,7 @@ from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
 from ..splats.render import MIN_ALPHA, render
 from ..splats.spheres import Spheres
 from .footage import Footage, Video
+from .windows import Window, window_of
 
 MASK_WEIGHT = 1.0
 """Weight of the silhouettes: a wrong pixel of mask costs as much as a wrong black-and-white one (choice of cgwm)."""
@@ -34,7 +34,6 @@ MIN_IOU = 0.5
 MAX_ERROR_RATIO = 0.7
 """Without masks: a body in the right place explains its pixels at least this much better than the background does."""
 MIN_AREA_PX = 12.0
-_TILE = 8
 _MAX_RENDERS = 128
 
 
@@ -116,6 +115,7 @@ class ImageLoss:
         static.append(Spheres.from_numpy(model.scene, like.dtype, like.device))
         self._static = Spheres.joined(static)
         self._features = self._labelled()
+        self._reach = _reach(Spheres.joined([spheres for _, spheres in self._moving]), min_alpha or MIN_ALPHA)
         self.radii = {index: _radius(spheres) for index, spheres in self._moving}
         self.centers = {index: spheres.means.mean(0) for index, spheres in self._moving}
         self._backdrops = [self._backdrop(video) for video in footage.videos]
@@ -146,7 +146,7 @@ class ImageLoss:
         for number, video in enumerate(self.footage.videos):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
             for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
-                window = _window(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]))
+                window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
                 color, mask = self._residuals(number, window, position_m[rows], quat_wxyz[rows])
                 photometric = color.abs().sum((1, 2, 3)) / 3 + self._outside(number, window)
                 silhouette = mask.abs().sum((1, 2, 3)) + _mask_outside(video, window)
@@ -201,7 +201,7 @@ class ImageLoss:
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
             for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
                 means = self._place(position_m[rows], quat_wxyz[rows])
-                window = _window(video, frames[rows], means)
+                window = window_of(video, frames[rows], means, self._reach)
                 picture = self._render(video, window, means)
                 shown = picture[..., 3:][..., free]
                 body = shown.sum(-1)
@@ -235,7 +235,7 @@ class ImageLoss:
     ) -> tuple[Tensor, Tensor, Tensor]:
         video, size = self.footage.videos[number], len(steps)
         count = len(frames)
-        window = _window(video, frames, self._place(position_m, quat_wxyz), margin=2)
+        window = window_of(video, frames, self._place(position_m, quat_wxyz), self._reach, margin=2)
         changes = torch.cat([torch.zeros(1, size).to(steps), torch.diag(steps)]).repeat_interleave(count, 0)
         poses = self.moved(position_m.repeat(size + 1, 1, 1), quat_wxyz.repeat(size + 1, 1, 1), changes)
         shown = _rows(*self._residuals(number, window.repeat(size + 1), *poses), blur).view(size + 1, count, -1)
@@ -248,7 +248,7 @@ class ImageLoss:
         curvature = torch.einsum("dkm,km,ekm->kde", jacobian, weight, jacobian)
         return (_huber(residual) - _huber(blank)).sum(-1) / pixels, slope, curvature
 
-    def _residuals(self, number: int, window: _Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+    def _residuals(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
         """Return colour (S, h, w, 3) and mask (S, h, w, nb, or 0 without masks) residuals in the window."""
         video = self.footage.videos[number]
         picture = self._render(video, window, self._place(position_m, quat_wxyz))
@@ -257,17 +257,17 @@ class ImageLoss:
             return color, picture[..., :0]
         return color, picture[..., 3:] - window.cut(video.covers.movedim(1, -1))
 
-    def _outside(self, number: int, window: _Window) -> Tensor:
+    def _outside(self, number: int, window: Window) -> Tensor:
         """Return the photometric sum outside the window (S,)."""
         drop = self._backdrops[number]
         return drop.unexplained[window.frames] - self._blank(number, window)[0].abs().sum((1, 2, 3)) / 3
 
-    def _color(self, number: int, window: _Window, picture: Tensor) -> Tensor:
+    def _color(self, number: int, window: Window, picture: Tensor) -> Tensor:
         """Return the colour residuals of a rendered window (S, h, w, 3)."""
         exposed = (self._backdrops[number].gain * picture[..., :3]).clamp(0, 1)
         return exposed - window.cut(self.footage.videos[number].frames)
 
-    def _blank(self, number: int, window: _Window) -> tuple[Tensor, Tensor]:
+    def _blank(self, number: int, window: Window) -> tuple[Tensor, Tensor]:
         """Return the residuals of the background alone in the window, as :meth:`_residuals` does."""
         video, drop = self.footage.videos[number], self._backdrops[number]
         behind = (drop.gain * window.cut(drop.plates, drop.plate_of[window.frames])).clamp(0, 1)
@@ -293,7 +293,7 @@ class ImageLoss:
             first += len(spheres)
         return everything.scales, everything.opacities, torch.cat([everything.colors, label], 1)
 
-    def _render(self, video: Video, window: _Window, means: Tensor) -> Tensor:
+    def _render(self, video: Video, window: Window, means: Tensor) -> Tensor:
         """Return colours and visible bodies in the window, shape (S, h, w, 3 + nb)."""
         K = video.K.repeat(len(means), 1, 1)
         K[:, :2, 2] -= window.corners.to(K)
@@ -306,13 +306,13 @@ class ImageLoss:
             everything, scales, opacities, features, viewmats, K, *window.size, min_alpha=self._min_alpha
         ).features
 
-    def _near(self, video: Video, window: _Window) -> Tensor:
+    def _near(self, video: Video, window: Window) -> Tensor:
         """Return which static spheres may reach into the windows: a few, where all windows are about one place."""
         static = self._static
         if self._min_alpha <= 0:
             return torch.arange(len(static), device=static.means.device)
         near = torch.zeros(len(static), dtype=torch.bool, device=static.means.device)
-        reach = static.scales * (2 * (static.opacities / self._min_alpha).clamp_min(1.0).log()).sqrt()
+        reach = _reach(static, self._min_alpha)
         moving = len(torch.unique(video.viewmats.flatten(1), dim=0)) > 1
         for frame in torch.unique(window.frames).tolist() if moving else [int(window.frames[0])]:
             corners = window.corners[window.frames == frame] if moving else window.corners
@@ -356,49 +356,6 @@ class ImageLoss:
         return _Backdrop(plates, plate_of, gain, unexplained)
 
 
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """Equal rectangles in some frames of a video: frames (S,), corners (S, 2) [px], size (width, height)."""
-
-    frames: Tensor
-    corners: Tensor
-    size: tuple[int, int]
-
-    def cut(self, pictures: Tensor, which: Tensor | None = None) -> Tensor:
-        """Return the rectangles of pictures (T, H, W, F), those of `which` or the window's frames: (S, h, w, F)."""
-        columns = self.corners[:, :1] + torch.arange(self.size[0], device=self.corners.device)
-        rows = self.corners[:, 1:] + torch.arange(self.size[1], device=self.corners.device)
-        frames = self.frames if which is None else which
-        return pictures[frames[:, None, None], rows[:, :, None], columns[:, None, :]]
-
-    def repeat(self, times: int) -> _Window:
-        return _Window(self.frames.repeat(times), self.corners.repeat(times, 1), self.size)
-
-
-def _window(video: Video, frames: Tensor, means: Tensor, margin: int = 0) -> _Window:
-    """Return windows that hold all spheres with these centres (S, N, 3), as far as they are in the picture.
-
-    The margin for the spheres' own size is generous for spheres much smaller than their body: cutting the last alpha
-    of 1/255 of a sphere at the rim changes nothing that counts.
-    """
-    with torch.no_grad():
-        viewmats = video.viewmats[frames]
-        local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
-        depth = local[..., 2]
-        seen = depth > 1e-3
-        pixel = local[..., :2] / depth.clamp_min(1e-3)[..., None] * video.K.diagonal()[:2] + video.K[:2, 2]
-        extent = torch.tensor(video.size).to(pixel)
-        low = torch.where(seen[..., None], pixel, torch.inf).amin(1)
-        high = torch.where(seen[..., None], pixel, -torch.inf).amax(1)
-        rim = margin + 0.08 * (high - low).clamp(0, 1e3).nan_to_num(0.0) + 4
-        low, high = (low - rim).clamp_min(0).minimum(extent), (high + rim).clamp_min(0).minimum(extent)
-        low = (low / _TILE).floor() * _TILE  # tiles, and squares of pixels, stay in place when the body moves a little
-        span = (high - low).clamp_min(1).amax(0)
-        size = [min(int(extent[k]), math.ceil(float(span[k]) / _TILE) * _TILE) for k in (0, 1)]
-        corners = low.minimum(extent - extent.new_tensor(size)).clamp_min(0).to(torch.int64)
-        return _Window(frames, corners, (size[0], size[1]))
-
-
 def _rows(color: Tensor, mask: Tensor, blur: int) -> Tensor:
     """Return colour and mask residuals (S, h, w, F) as rows (S, m): weighted, averaged over squares of `blur`."""
     residuals = torch.cat([color / 3, MASK_WEIGHT * mask], -1)
@@ -413,7 +370,7 @@ def _huber(residual: Tensor) -> Tensor:
     return torch.where(size < HUBER, 0.5 * size.square() / HUBER, size - 0.5 * HUBER)
 
 
-def _mask_outside(video: Video, window: _Window) -> Tensor:
+def _mask_outside(video: Video, window: Window) -> Tensor:
     """Return the sum of the masks outside the window (S,)."""
     if video.covers is None:
         return torch.zeros(len(window.frames)).to(video.frames)
@@ -433,6 +390,11 @@ def _gain(video: Video, plates: Tensor, plate_of: Tensor) -> Tensor:
         ratio = video.frames[..., channel][rows] / behind[..., channel][rows]
         gains.append(ratio.median() if ratio.numel() else ratio.new_tensor(1.0))
     return torch.stack(gains)
+
+
+def _reach(spheres: Spheres, min_alpha: float) -> Tensor:
+    """Return how far from its centre a sphere's alpha reaches `min_alpha` [m], shape (N,)."""
+    return spheres.scales * (2 * (spheres.opacities / min_alpha).clamp_min(1.0).log()).sqrt()
 
 
 def _radius(spheres: Spheres) -> float:

@@ -1,0 +1,280 @@
+"""Physics from images: exact gradients through contact, poses from renders, a loss that falls, honest refusals."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture import Capture
+from cgwm.datasets.models import Model
+from cgwm.datasets.tracks import Track
+from cgwm.pipeline.estimation.observations import Observations
+from cgwm.pipeline.imaging.coarse import coarse_model, merged
+from cgwm.pipeline.imaging.footage import Footage, Video, load_footage
+from cgwm.pipeline.imaging.image_loss import ImageLoss
+from cgwm.pipeline.imaging.pose_tracks import PoseTracker, rotation_grid
+from cgwm.pipeline.imaging.refinement import ImageObjective, TrackTerm, refine_end_to_end
+from cgwm.pipeline.phys_images import fit_physics_from_images
+from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION, apply_parameters
+from cgwm.pipeline.physics.rollout import Rollout, simulate
+from cgwm.pipeline.physics.rotation import geodesic_angle, quat_exp, quat_to_matrix
+from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.splats.render import render
+from cgwm.pipeline.splats.spheres import Spheres
+from cgwm.schemas import InputDataError, NotConvergedError, PhysConfig, Solver
+from small_model import collision_splats, cube_splats, small_model, table_splats
+
+FRAMES, RATE = 8, 30.0
+WIDTH, HEIGHT = 64, 48
+GAIN = {"left": (0.9, 1.0, 1.1), "right": (1.1, 1.05, 0.95)}
+NAMES = [FRICTION, DAMPING_RATIO]
+TRUTH = torch.tensor([math.log(0.4), math.log(0.3)], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def tiny_model() -> Model:
+    """The cube with few spheres; its colours vary slowly enough for pixels of a centimetre."""
+    model = small_model()
+    body = cube_splats(150)
+    colors = np.clip(0.5 + body.means / 0.1 * np.array([0.9, 0.9, 0.9]), 0.05, 0.95)
+    file = model.file.model_copy(update={"solver": Solver(step_s=0.004, sweeps=2)})
+    corners = {"cube": collision_splats(2)}
+    return replace(
+        model, file=file, collision=corners, body_splats={"cube": replace(body, colors=colors)}, scene=table_splats(12)
+    )
+
+
+def viewmat(azimuth_deg: float, distance: float = 0.55, height: float = 0.35) -> torch.Tensor:
+    azimuth = math.radians(azimuth_deg)
+    eye = np.array([distance * math.cos(azimuth), distance * math.sin(azimuth), height])
+    forward = np.array([0, 0, 0.08]) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    return torch.as_tensor(matrix)
+
+
+def film(model: Model, rollout: Rollout, masks: bool = True, noise: float = 0.01, dtype=torch.float32) -> Footage:
+    """Render a rollout from two cameras, with exposures and noise."""
+    generator = torch.Generator().manual_seed(0)
+    K = torch.tensor([[70.0, 0, WIDTH / 2], [0, 70.0, HEIGHT / 2], [0, 0, 1]], dtype=dtype)
+    body, scene = (Spheres.from_numpy(s, dtype) for s in (model.body_splats["cube"], model.scene) if s is not None)
+    videos = []
+    for camera, azimuth in (("left", 20.0), ("right", 115.0)):
+        view = viewmat(azimuth).to(dtype)
+        pictures, covers = [], []
+        for k in range(rollout.position_m.shape[1]):
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[:3, :3] = quat_to_matrix(rollout.quat_wxyz[0, k, 0])
+            pose[:3, 3] = rollout.position_m[0, k, 0]
+            spheres = Spheres.joined([body.moved(pose.to(dtype)), scene])
+            label = torch.cat([torch.ones(len(body)), torch.zeros(len(scene))]).to(dtype)[:, None]
+            features = torch.cat([spheres.colors, label], 1)
+            picture = render(
+                spheres.means, spheres.scales, spheres.opacities, features, view[None], K[None], WIDTH, HEIGHT
+            ).features[0]
+            exposed = torch.tensor(GAIN[camera], dtype=dtype) * picture[..., :3]
+            pictures.append((exposed + noise * torch.randn(exposed.shape, generator=generator)).clamp(0, 1).to(dtype))
+            covers.append((picture[None, ..., 3] > 0.5).to(dtype))
+        count = len(pictures)
+        videos.append(
+            Video(
+                camera,
+                np.arange(count) / RATE,
+                torch.stack(pictures),
+                torch.stack(covers) if masks else None,
+                K,
+                view.expand(count, 4, 4),
+            )
+        )
+    return Footage.of("000", tuple(videos))
+
+
+def start_state() -> State:
+    """A tilted cube above the table, moving sideways: it hits within five frames."""
+
+    def row(*values: float) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float64).view(1, 1, -1)
+
+    quat = quat_exp(torch.tensor([0.3, 0.5, 0.2], dtype=torch.float64)).view(1, 1, 4)
+    return State(row(-0.05, -0.03, 0.125), quat, row(0.4, 0.2, -0.6), row(1.5, -2.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Model, World, Rollout]:
+    model = tiny_model()
+    world = apply_parameters(World.from_model(model), NAMES, TRUTH.exp()[None])
+    times = torch.arange(FRAMES, dtype=torch.float64) / RATE
+    rollout = simulate(world, start_state(), times, record_contacts=True)
+    assert rollout.contacts is not None and float(rollout.contacts.impulse_n_s[..., 2].sum()) > 0.1
+    return model, world, rollout
+
+
+def observed(world: World, rollout: Rollout) -> Observations:
+    track = Track(rollout.times_s.numpy(), rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy())
+    observations = Observations.of(world, [("000", {"cube": track})], [(-1.0, 10.0)])
+    return replace(observations, state=start_state())
+
+
+def objective_of(scene: tuple[Model, World, Rollout], footage: Footage, min_alpha: float = 1 / 255) -> ImageObjective:
+    model, world, rollout = scene
+    loss = ImageLoss(model, footage, [0], min_alpha)
+    columns = torch.arange(FRAMES).repeat(2, 1)
+    return ImageObjective(world, NAMES, observed(world, rollout), [loss], [columns])
+
+
+@pytest.mark.parametrize("with_tracks", [False, True])
+def test_gradient_is_that_of_finite_differences_through_contact(
+    scene: tuple[Model, World, Rollout], with_tracks: bool
+) -> None:
+    """The chain renderer (reverse mode) times rollout (forward mode) against differences of the whole loss."""
+    model, _, rollout = scene
+    footage = Footage.of("000", film(model, rollout, noise=0.05, dtype=torch.float64).videos[:1])
+    objective = objective_of(scene, footage, min_alpha=1e-12)
+    if with_tracks:
+        objective = replace(objective, tracks=TrackTerm(objective.observations, (0.02, 0.2)), scale=0.02)
+    shared = TRUTH + torch.tensor([0.1, -0.15], dtype=torch.float64)
+    states = torch.zeros(1, 12, dtype=torch.float64)
+    states[0, [0, 2, 4, 6, 8, 10]] = torch.tensor([0.004, -0.003, 0.03, 0.05, -0.04, 0.2], dtype=torch.float64)
+    here = objective.rollout(shared, states)
+    _, slope = objective.normal_equations(shared, states, here, objective.curvature(here))
+
+    z = torch.cat([shared, states[0]])
+    for index, step in ((0, 1e-4), (1, 1e-4), (2, 1e-6), (6, 1e-5), (10, 1e-5), (12, 1e-4))[:: 1 + with_tracks]:
+        ends = []
+        for sign in (1, -1):
+            moved = z.clone()
+            moved[index] += sign * step
+            ends.append(objective.value(objective.parts(objective.rollout(moved[:2], moved[2:][None]))))
+        difference = (ends[0] - ends[1]) / (2 * step)
+        # a pixel of the L1 norm changes its sign here and there within the step, hence a few per cent
+        assert difference == pytest.approx(float(slope[index]), rel=0.05, abs=2e-3 * float(slope.abs().max())), index
+
+
+def test_window_and_constant_give_the_loss_of_the_whole_picture(scene: tuple[Model, World, Rollout]) -> None:
+    model, _, rollout = scene
+    footage = film(model, rollout)
+    loss = ImageLoss(model, footage, [0])
+    position, quat = rollout.position_m[0] + 0.01, rollout.quat_wxyz[0]
+    parts = loss.parts(torch.arange(FRAMES), position, quat)
+
+    shown = film(model, replace(rollout, position_m=rollout.position_m + 0.01), noise=0.0)
+    expected = torch.zeros(FRAMES, 2)
+    for number, (video, mine) in enumerate(zip(footage.videos, shown.videos, strict=True)):
+        assert video.covers is not None
+        exposed = torch.tensor(loss.gains[video.camera]) / torch.tensor(GAIN[video.camera])
+        expected[:, 0] += (exposed * mine.frames - video.frames).abs().mean((1, 2, 3)) / 2
+        assert number < 2
+    assert torch.allclose(parts[:, 0], expected[:, 0], atol=2e-4)
+    assert loss.gains["left"] == pytest.approx(GAIN["left"], abs=0.02)
+    assert loss.gains["right"] == pytest.approx(GAIN["right"], abs=0.02)
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_poses_are_found_again(scene: tuple[Model, World, Rollout], masks: bool) -> None:
+    model, _, rollout = scene
+    footage = film(model, rollout, masks)
+    nothing = torch.zeros(FRAMES, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(FRAMES, 1, 1)
+    tracker = PoseTracker(ImageLoss(coarse_model(model), footage, [0]), ImageLoss(model, footage, [0]), *nothing)
+    found = tracker.run()
+    assert bool(found.found.all())
+    # a pixel is 8 mm and 4 degrees here
+    assert (found.position_m - rollout.position_m[0]).norm(dim=-1).max() < 3e-3
+    assert geodesic_angle(found.quat_wxyz, rollout.quat_wxyz[0]).max() < math.radians(3)
+    std = found.covariance.diagonal(dim1=1, dim2=2).sqrt().mean(0)
+    assert 1e-5 < float(std[:3].max()) < 5e-3
+    if masks:
+        assert float(found.quality.iou.median()) > 0.9
+    else:
+        assert bool(found.quality.iou.isnan().all())
+
+
+def test_a_video_of_something_else_is_refused(scene: tuple[Model, World, Rollout]) -> None:
+    model, _, rollout = scene
+    away = replace(rollout, position_m=rollout.position_m * 0 + torch.tensor([0.0, 0.0, 5.0]).double())
+    footage = film(model, away)
+    nothing = torch.zeros(FRAMES, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(FRAMES, 1, 1)
+    loss = ImageLoss(model, footage, [0])
+    with pytest.raises(NotConvergedError, match=r"found in 0 of 8 instants(.|\n)*--supervise tracks"):
+        PoseTracker(loss, loss, *nothing).run()
+
+
+def test_refinement_lowers_the_image_loss_and_never_raises_it(scene: tuple[Model, World, Rollout]) -> None:
+    model, _, rollout = scene
+    objective = objective_of(scene, film(model, rollout))
+    shared = TRUTH + torch.tensor([0.2, -0.3], dtype=torch.float64)
+    states = torch.zeros(1, 12, dtype=torch.float64)
+    states[0, [0, 2, 6, 8]] = torch.tensor([0.006, 0.004, 0.05, 0.05], dtype=torch.float64)
+    bounds = torch.tensor([p.limits for p in NAMES], dtype=torch.float64)
+    refined = refine_end_to_end(objective, shared, states, bounds, 4)
+    assert all(b < a for a, b in zip(refined.history, refined.history[1:], strict=False))
+    truth = objective.value(objective.parts(objective.rollout(TRUTH, torch.zeros_like(states))))
+    assert refined.history[-1] - truth < 0.35 * (refined.history[0] - truth)
+    moved = objective.rollout(refined.shared, refined.states).position_m[0]
+    before = objective.rollout(shared, states).position_m[0]
+    assert (moved - rollout.position_m[0]).norm() < 0.5 * (before - rollout.position_m[0]).norm()
+
+
+def test_cameras_with_a_time_offset_share_one_time_line(scene: tuple[Model, World, Rollout]) -> None:
+    model, _, rollout = scene
+    left, right = film(model, rollout).videos
+    footage = Footage.of("000", (left, replace(right, times_s=right.times_s + 0.01)))
+    assert len(footage.times_s) == 2 * FRAMES
+    assert (footage.frame_at[0][::2] == np.arange(FRAMES)).all()
+    assert (footage.frame_at[1][1::2] == np.arange(FRAMES)).all()
+    assert (footage.frame_at >= 0).sum(0).max() == 1
+
+
+def test_merged_spheres_keep_the_mean_and_the_count_falls() -> None:
+    splats = cube_splats(600)
+    fewer = merged(splats, 0.02)
+    weight, less = splats.scales**2 * splats.opacities, fewer.scales**2 * fewer.opacities
+    assert len(fewer) < 0.5 * len(splats)
+    assert (
+        np.abs(np.average(fewer.means, axis=0, weights=less) - np.average(splats.means, axis=0, weights=weight)).max()
+        < 5e-3
+    )
+
+
+def test_rotation_grid_covers_all_rotations() -> None:
+    grid = rotation_grid(72)
+    assert torch.allclose(grid.norm(dim=1), torch.ones(72, dtype=torch.float64))
+    random = torch.nn.functional.normalize(
+        torch.randn(500, 4, generator=torch.Generator().manual_seed(0)).double(), dim=1
+    )
+    nearest = 2 * torch.acos((random @ grid.T).abs().amax(1).clamp_max(1))
+    assert math.degrees(float(nearest.max())) < 60
+
+
+def test_a_capture_without_cameras_or_videos_is_told_what_to_do(tmp_path: Path) -> None:
+    text = 'format = "cgwm-capture/1"\n[[bodies]]\nname = "cube"\n[splits]\ntrain = ["000"]\n'
+    (tmp_path / "capture.toml").write_text(text)
+    capture = Capture.open(tmp_path, check=False)
+    model = small_model()
+    with pytest.raises(InputDataError, match=r"episode '000' has no video(.|\n)*--supervise tracks"):
+        fit_physics_from_images(World.from_model(model), model, capture, "train", PhysConfig(), False)
+    folder = tmp_path / "videos" / "left" / "000"
+    folder.mkdir(parents=True)
+    with pytest.raises(InputDataError, match="cgwm calibrate"):
+        load_footage(capture, "000", 64)
+
+
+def test_a_model_without_background_is_refused(scene: tuple[Model, World, Rollout]) -> None:
+    model, _, rollout = scene
+    footage = film(model, replace(rollout, position_m=rollout.position_m[:, :3], quat_wxyz=rollout.quat_wxyz[:, :3]))
+    with pytest.raises(InputDataError, match="no background"):
+        ImageLoss(replace(model, scene=None), footage, [0])
+    with pytest.raises(InputDataError, match="no visual spheres of the free body 'cube'"):
+        ImageLoss(replace(model, body_splats={}), footage, [0])
