@@ -24,8 +24,8 @@ def film_section(strips: Sequence[FrameStrip]) -> tuple[str, str]:
                 rules.append(f".{name}{{background-image:url({jpeg_uri(sprite(frames), 72)});{size}}}")
         pieces += [f"<h3>Test episode {text(episode)}</h3>", _player(own, names), _sheet(own, names)]
     words = (
-        "Above, what the cameras recorded; below, what the model predicts from the first frames alone, rendered from "
-        "its spheres. The yellow outline is where the object really was. Cut to where the object moves."
+        "Above, what the cameras recorded; below, what the model predicts from the first 0.1 s of the pose track, "
+        "rendered from its spheres. The yellow outline is where the object really was. Cut to where the object moves."
     )
     return section("Real above predicted", paragraph(words), *pieces), "\n" + "\n".join(rules)
 

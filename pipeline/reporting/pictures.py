@@ -15,7 +15,7 @@ Image = NDArray[np.uint8]
 TILE_WIDTH = 264
 """Width of a frame in a report [px]; on a page of 1100 px six stand side by side."""
 _ASPECT = 4 / 3
-_MARGIN = 0.12
+_MARGIN = 0.2
 _OUTLINE = (255, 214, 10)
 _LABEL_COLORS = np.array([[32, 36, 44], [240, 165, 40], [70, 160, 220], [120, 200, 120], [220, 110, 150]], np.uint8)
 
