@@ -40,7 +40,7 @@ from .physics.world import State, World
 START = {"friction": 0.3, "contact_time_s": 0.005, "damping_ratio": 0.4, "ground_shift_m": 0.0}
 SPREAD = {"friction": 0.5, "contact_time_s": 0.4, "damping_ratio": 0.6, "ground_shift_m": 0.0007}
 """First spread of the search, in the fitted coordinate (natural logarithm where the parameter is logarithmic)."""
-MAX_SPAN_S = 1.2
+MAX_SPAN_S = 0.8
 """Longer episodes are fitted on this much after their start: what follows a dozen impacts is noise to the fit."""
 MAX_ROLLOUTS = 1200
 """Rollouts in one batch of the search."""

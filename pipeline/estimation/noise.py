@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from ...datasets.tracks import Track
 
-WINDOW = 7
-"""Frames of a window; short enough for free flight to be a parabola and a steady turn in it."""
+WINDOW = 5
+"""Frames of a window; short enough for free flight to be a parabola in position and rotation."""
 MAD_TO_STD = 1.4826
 FLOOR_M, FLOOR_RAD = 1e-5, 1e-4
 """Smallest noise admitted: noiseless tracks would give infinite weights."""
@@ -21,7 +21,8 @@ FLOOR_M, FLOOR_RAD = 1e-5, 1e-4
 def estimate_noise(tracks: Iterable[Track]) -> tuple[float, float]:
     """Return the standard deviations of position [m] and rotation [rad], for each axis.
 
-    Each window of consecutive frames is fitted by a parabola in position and a straight line in rotation vector; the
+    Each window of consecutive frames is fitted by a parabola in position and in rotation vector (a tumbling body turns
+    at a changing rate); the
     residuals' median absolute deviation, scaled for the degrees of freedom used up, ignores the few windows that hold
     an impact.
     """
@@ -33,7 +34,7 @@ def estimate_noise(tracks: Iterable[Track]) -> tuple[float, float]:
             positions.append(_residual(t, track.position_m[rows], degree=2))
             if track.quat_wxyz is not None:
                 turn = Rotation.from_quat(track.quat_wxyz[rows], scalar_first=True)
-                rotations.append(_residual(t, (turn[WINDOW // 2].inv() * turn).as_rotvec(), degree=1))
+                rotations.append(_residual(t, (turn[WINDOW // 2].inv() * turn).as_rotvec(), degree=2))
     return max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD)
 
 

@@ -109,5 +109,5 @@ def episode_covariance(result: SearchResult, at: np.ndarray, minimum: int = 8) -
     # a direction without curvature is one that the data do not see: give it the width of the search
     floor = np.maximum(eigenvalues, 1e-3 * eigenvalues[-1])
     inverse = vectors @ np.diag(1 / floor) @ vectors.T
-    covariance = inverse @ np.cov(slopes) @ inverse / episodes
+    covariance = inverse @ np.atleast_2d(np.cov(slopes)) @ inverse / episodes
     return covariance * np.outer(scale, scale)

@@ -57,7 +57,7 @@ class StartUncertainty:
                 for s in seeds
             ]
         )
-        changes = torch.as_tensor(normal).to(self.covariance) @ _root(self.covariance).transpose(1, 2)
+        changes = torch.as_tensor(normal).to(self.covariance) @ covariance_root(self.covariance).transpose(1, 2)
         rows = self._rows(torch.cat((torch.zeros_like(changes[:, :1]), changes), 1))[..., :3]
         return self._distance(rows[:, 1:] - rows[:, :1]).mean(1)
 
@@ -72,7 +72,7 @@ class StartUncertainty:
             noise: Standard deviations of the measurement (position [m], rotation [rad]).
             iterations: Number of steps.
         """
-        root = _limited(_root(self.covariance))
+        root = _limited(covariance_root(self.covariance))
         directions = root.transpose(1, 2)  # row k: one standard deviation along the k-th coordinate
         best = torch.zeros_like(directions[:, :1])
         rows = self._rows(best)
@@ -123,10 +123,14 @@ class StartUncertainty:
         return torch.nan_to_num(mean, nan=torch.inf, posinf=torch.inf)
 
 
-def _root(covariance: Tensor) -> Tensor:
-    """Return R with covariance = R R^T, shape (B, S, S)."""
-    values, vectors = torch.linalg.eigh(covariance)
-    return vectors * values.clamp_min(0.0).sqrt()[:, None]
+def covariance_root(covariance: Tensor) -> Tensor:
+    """Return R with covariance = R R^T, shape (B, S, S).
+
+    Cholesky's, of the correlations: it is unique, where eigenvectors of equal variances turn with the last bit.
+    """
+    std = covariance.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
+    correlation = covariance / (std[:, :, None] * std[:, None])
+    return std[:, :, None] * torch.linalg.cholesky(correlation + 1e-9 * torch.eye(std.shape[1]).to(std))
 
 
 def _limited(root: Tensor) -> Tensor:

@@ -1,0 +1,168 @@
+"""Least squares, search and the stage phys-geo: synthetic truth in, parameters out, intervals that cover it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets import Track
+from cgwm.pipeline.estimation.least_squares import minimise
+from cgwm.pipeline.estimation.noise import estimate_noise
+from cgwm.pipeline.estimation.observations import Observations
+from cgwm.pipeline.estimation.search import SearchResult, cross_entropy, episode_covariance
+from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
+from cgwm.pipeline.phys_geo import fit_physics
+from cgwm.pipeline.physics import restitution, simulate
+from cgwm.schemas import PhysConfig
+from scipy.spatial.transform import Rotation
+from worlds import F64, box_body, law, state_of, times, world_of
+
+NOISE = (0.0005, 0.005)
+SMALL = PhysConfig(population=10, generations=3, iterations=5)
+
+
+def toss(seed: int, contact=None, duration_s: float = 0.4, height: float = 0.09) -> Track:
+    """A noisy track of a box that falls, hits the ground and slides on, simulated by the engine itself."""
+    rng = np.random.default_rng(seed)
+    quat = np.array([1.0, 0.25, 0.1, 0.0]) + 0.1 * rng.standard_normal(4)
+    start = state_of(((0, 0, height), tuple(quat), (0.4, 0.1, -0.6), tuple(0.8 * rng.standard_normal(3))))
+    rollout = simulate(world_of(box_body(), contact=contact or law()), start, times(duration_s, 120))
+    position = rollout.position_m[0, :, 0].numpy() + NOISE[0] * rng.standard_normal((len(rollout.times_s), 3))
+    turned = Rotation.from_quat(rollout.quat_wxyz[0, :, 0].numpy(), scalar_first=True)
+    turned = turned * Rotation.from_rotvec(NOISE[1] * rng.standard_normal(position.shape))
+    return Track(rollout.times_s.numpy(), position, turned.as_quat(scalar_first=True))
+
+
+def test_noise_is_estimated_from_a_track_with_impacts() -> None:
+    position, rotation = estimate_noise([toss(seed, height=0.2) for seed in range(4)])
+    assert position == pytest.approx(NOISE[0], rel=0.25)
+    assert rotation == pytest.approx(NOISE[1], rel=0.25)
+
+
+def test_levenberg_marquardt_solves_a_shared_slope_with_offsets_of_its_own() -> None:
+    """y = slope t + offset_i: the answer and its covariance are those of ordinary least squares."""
+    generator = torch.Generator().manual_seed(0)
+    t = torch.linspace(0, 1, 20, dtype=F64)
+    y = 2.5 * t + torch.tensor([[1.0], [-3.0]], dtype=F64) + 0.1 * torch.randn(2, 20, generator=generator, dtype=F64)
+
+    def residuals(shared, states, with_jacobian):
+        r = ((shared * t + states) - y) / 0.1
+        jacobian = torch.stack((t.expand(2, 20), torch.ones(2, 20, dtype=F64)), -1)[:, :, None] / 0.1
+        return r[..., None], jacobian if with_jacobian else None
+
+    bounds = torch.tensor([[-10.0, 10.0]], dtype=F64)
+    found = minimise(residuals, torch.zeros(1, dtype=F64), torch.zeros(2, 1, dtype=F64), bounds)
+    design = np.zeros((40, 3))
+    design[:, 0], design[:20, 1], design[20:, 2] = t.repeat(2), 1, 1
+    expected = np.linalg.lstsq(design, y.flatten().numpy(), rcond=None)[0]
+    assert found.converged
+    np.testing.assert_allclose(float(found.shared[0]), expected[0], rtol=1e-8)
+    np.testing.assert_allclose(found.states[:, 0].numpy(), expected[1:], rtol=1e-8)
+    variance = 0.01 * np.linalg.inv(design.T @ design)[0, 0]
+    np.testing.assert_allclose(1 / float(found.information[0, 0]), variance, rtol=1e-6)
+
+
+def test_a_parameter_stops_on_its_bound_and_says_so() -> None:
+    def residuals(shared, states, with_jacobian):
+        r = (shared - 5.0).expand(1, 1, 1)
+        return r, torch.ones(1, 1, 1, 1, dtype=F64) if with_jacobian else None
+
+    bounds = torch.tensor([[0.0, 2.0]], dtype=F64)
+    found = minimise(residuals, torch.ones(1, dtype=F64), torch.zeros(1, 0, dtype=F64), bounds)
+    assert float(found.shared[0]) == 2.0
+    assert not bool(found.free[0])
+
+
+def test_cross_entropy_finds_the_deeper_of_two_valleys() -> None:
+    def costs(z: np.ndarray) -> np.ndarray:
+        deep, shallow = (z[:, :1] - 3) ** 2, 0.5 * (z[:, :1] + 3) ** 2 + 2
+        return np.minimum(deep, shallow)
+
+    found = cross_entropy(
+        costs, np.array([[-6.0, 6.0]]), np.array([-3.0]), np.array([1.0]), seed=0, population=24, generations=10
+    )
+    assert found.best[0] == pytest.approx(3, abs=0.1)
+
+
+def test_covariance_from_the_scatter_between_episodes_is_that_of_the_mean() -> None:
+    """Cost of episode i is (z - c_i)^2: the minimiser is the mean of c, with variance var(c) / n."""
+    rng = np.random.default_rng(0)
+    centres = 1 + 0.3 * rng.standard_normal(40)
+    samples = rng.normal(centres.mean(), 0.3, (200, 1))
+    result = SearchResult(centres.mean(keepdims=True), 0.0, samples, (samples - centres) ** 2, [])
+    covariance = episode_covariance(result, centres.mean(keepdims=True))
+    assert covariance is not None
+    assert covariance[0, 0] == pytest.approx(centres.var(ddof=1) / 40, rel=1e-3)
+    assert episode_covariance(result, centres.mean(keepdims=True), minimum=41) is None
+
+
+def test_the_warm_up_ends_at_the_first_contact_and_its_state_is_unbiased() -> None:
+    world = world_of(box_body())
+    episodes = [(str(seed), {"box": toss(seed, duration_s=0.25, height=0.13)}) for seed in range(8)]
+    observations = Observations.of(world, episodes, [(0.0, 1.0)] * 8)
+    warm = warmup_frames(world, observations, 0.1)
+    assert bool((warm.sum(1) >= 6).all()) and bool((warm.sum(1) <= 13).all())
+    assert not bool((warm & ~flight_frames(world, observations))[:, 2:].any())
+    found, solution = estimate_states(world, observations, warm, NOISE)
+    speed = found.state.velocity_m_s[:, 0] - torch.tensor([0.4, 0.1, -0.6], dtype=F64)
+    std = solution.state_cov.diagonal(dim1=1, dim2=2)[:, 6:9].sqrt()
+    assert float((speed / std).square().mean()) == pytest.approx(1.0, abs=0.6)
+
+
+def test_one_toss_gives_back_the_parameters_that_made_it() -> None:
+    true = law(friction=0.25, contact_time_s=0.004, damping_ratio=0.4)
+    start = world_of(box_body(), contact=law(friction=0.5, damping_ratio=0.2))
+    fit = fit_physics(start, [("000", {"box": toss(3, true, duration_s=0.3)})], SMALL, NOISE)
+    found = {parameter.name: parameter for parameter in fit.parameters}
+    for name, value in (("friction", 0.25), ("damping_ratio", 0.4)):
+        estimate = found[name]
+        assert estimate.std_error is not None
+        assert abs(estimate.estimate - value) < max(4 * estimate.std_error, 0.02 * value)
+        assert estimate.estimate == pytest.approx(value, rel=0.15)
+    assert found["restitution"].estimate == pytest.approx(float(restitution(torch.tensor(0.4))), rel=0.1)
+    assert found["restitution"].state == "derived"
+    assert fit.ground_offset_m is None  # one episode cannot tell it
+
+
+def test_two_fits_with_one_seed_are_identical() -> None:
+    episodes = [("000", {"box": toss(3, duration_s=0.2)})]
+    config = PhysConfig(population=8, generations=2, iterations=1, seed=5)
+    first, second = (fit_physics(world_of(box_body()), episodes, config, NOISE) for _ in range(2))
+    assert first.parameters == second.parameters
+
+
+def test_friction_of_a_body_that_never_touches_is_not_observable() -> None:
+    world = world_of(box_body())
+    flight = toss(1, duration_s=0.3, height=2.0)
+    fit = fit_physics(world, [("000", {"box": flight})], SMALL, NOISE)
+    assert {p.name: p.state for p in fit.parameters}["friction"] == "not_observable"
+    assert any("friction is not observable" in warning and "sliding" in warning for warning in fit.warnings)
+
+
+def test_many_tosses_give_the_ground_height_too() -> None:
+    """From eight episodes on the ground's height is fitted, with an interval from the scatter between episodes."""
+    tosses = [(str(seed), {"box": toss(seed, duration_s=0.25)}) for seed in range(8)]
+    lowered = replace(world_of(box_body()), ground_offset=torch.tensor([0.001], dtype=F64))
+    fit = fit_physics(lowered, tosses, PhysConfig(population=12, generations=5), NOISE)
+    found = {parameter.name: parameter for parameter in fit.parameters}
+    assert fit.ground_offset_m == found["ground_offset_m"].estimate
+    for name, truth in (("ground_offset_m", 0.0), ("friction", 0.3)):
+        parameter = found[name]
+        assert parameter.std_error is not None
+        assert abs(parameter.estimate - truth) < 3 * parameter.std_error + 0.02 * truth
+    assert found["friction"].estimate == pytest.approx(0.3, rel=0.25)
+
+
+@pytest.mark.evidence
+def test_intervals_cover_the_truth() -> None:
+    """Of 20 captures of one toss each, the 95 % intervals of friction and damping hold the truth in at least 16."""
+    true = {"friction": 0.3, "damping_ratio": 0.3}
+    hits = dict.fromkeys(true, 0)
+    for seed in range(20):
+        fit = fit_physics(world_of(box_body()), [("0", {"box": toss(100 + seed)})], PhysConfig(seed=seed), NOISE)
+        for parameter in fit.parameters:
+            if parameter.name in true and parameter.interval_95 is not None:
+                low, high = parameter.interval_95
+                hits[parameter.name] += low <= true[parameter.name] <= high
+    print(f"coverage of 20: {hits}")
+    assert all(count >= 16 for count in hits.values()), hits
