@@ -12,6 +12,7 @@ from cgwm.datasets.capture import Capture
 from cgwm.datasets.images import write_image
 from cgwm.datasets.models import Model, write_model
 from cgwm.datasets.tracks import Track, write_tracks
+from cgwm.pipeline.estimation.states import covariance_root
 from cgwm.pipeline.eval import Evaluation, evaluate, evaluate_model
 from cgwm.pipeline.image_errors import expose
 from cgwm.pipeline.labels import LabelRenderer
@@ -207,6 +208,34 @@ def test_result_has_every_figure(perfect: Evaluation) -> None:
     assert printed["warnings"] == []
 
 
+def test_two_evaluations_agree_bit_for_bit(capture: Capture) -> None:
+    first, second = (evaluate_model(truth(), capture, brief=True).result for _ in range(2))
+    assert first.model_dump_json() == second.model_dump_json()
+
+
+def test_covariance_root_is_one() -> None:
+    factor = torch.tensor(np.random.default_rng(4).standard_normal((2, 12, 12))).double()
+    covariance = factor @ factor.transpose(1, 2) * torch.logspace(-4, 1, 12)[:, None] * torch.logspace(-4, 1, 12)
+    root = covariance_root(covariance)
+    scale = covariance.diagonal(dim1=1, dim2=2).sqrt()
+    error = (root @ root.transpose(1, 2) - covariance) / (scale[:, :, None] * scale[:, None])
+    assert float(error.abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.3, 3.0, 6.0])
+def test_rotation_error_is_the_geodesic_angle(perfect: Evaluation, angle: float) -> None:
+    prediction = perfect.episodes[0].prediction
+    turn = np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])
+    ones = np.tile([1.0, 0.0, 0.0, 0.0], (len(prediction.grid_s), 1, 1))
+    turned = replace(
+        prediction,
+        quat_wxyz=np.broadcast_to(turn, prediction.quat_wxyz.shape),
+        motions={"model": Motion(prediction.motions["model"].position_m, ones)},
+    )
+    wanted = np.degrees(min(angle, 2 * np.pi - angle))
+    assert turned.rotation_error_deg() == pytest.approx(wanted, rel=1e-9)
+
+
 def test_warm_up_ends_before_the_first_contact(perfect: Evaluation) -> None:
     for seed, episode in enumerate(perfect.episodes):
         times, motion = thrown(seed)
@@ -234,7 +263,7 @@ def test_without_masks_it_says_so(tmp_path: Path) -> None:
 
 def test_centroid_tracks_have_no_rotation(tmp_path: Path) -> None:
     root = write_capture(tmp_path / "capture", episodes=1, turned=False)
-    result = evaluate_model(truth(), Capture.open(root)).result
+    result = evaluate_model(truth(), Capture.open(root), brief=True).result
     assert result.rotation_error_deg is None
     assert result.per_episode[0].rotation_error_deg is None
     assert result.baselines["frozen"]["rotation_error_deg"] is None
@@ -287,7 +316,7 @@ def test_warm_up_longer_than_every_episode_is_refused(capture: Capture) -> None:
     position = Motion(np.tile([0.0, 0.0, HALF], (FRAMES, 1, 1)), np.tile([1.0, 0, 0, 0], (FRAMES, 1, 1)))
     with pytest.raises(InputDataError, match="in none of the episodes does a measured frame follow the warm-up"):
         _at_rest(capture.root.parent / "rest", position)
-        evaluate_model(rest, Capture.open(capture.root.parent / "rest"), warmup_s=5.0)
+        evaluate_model(rest, Capture.open(capture.root.parent / "rest"), warmup_s=5.0, brief=True)
 
 
 def _at_rest(root: Path, motion: Motion) -> None:
