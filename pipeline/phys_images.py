@@ -401,6 +401,11 @@ def _warnings(episodes: Sequence[_Episode]) -> list[str]:
         lost = int((~episode.found.found).sum())
         if lost:
             texts.append(f"{episode.name}: the body was not found in {lost} of {len(episode.found.found)} instants.")
+        if episode.footage is not None and all(video.covers is None for video in episode.footage.videos):
+            texts.append(
+                f"{episode.name}: videos without masks; orientations rest on colours alone, which changing light on a "
+                f"turning body can mislead. Add video_masks/ to be sure."
+            )
         if episode.footage is not None and len(episode.footage.videos) == 1:
             texts.append(f"{episode.name}: one camera; depth comes from the body's size alone.")
     return texts

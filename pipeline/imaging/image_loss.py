@@ -217,9 +217,17 @@ class ImageLoss:
         return PoseQuality(inside / union, error / area, blank / area, area)
 
     def difference(self, number: int, frame: int) -> Tensor:
-        """Return how much a frame differs from the background as the model sees it, mean of the channels (H, W)."""
+        """Return how much a frame differs from what is behind the bodies, mean of the channels (H, W).
+
+        Behind them is the model's background and, where the camera stands still, the median of all frames: a pixel
+        must differ from both, for renders of textured ground err at every edge.
+        """
         drop, video = self._backdrops[number], self.footage.videos[number]
-        return (drop.gain * drop.plates[drop.plate_of[frame]] - video.frames[frame]).abs().mean(-1)
+        difference = (drop.gain * drop.plates[drop.plate_of[frame]] - video.frames[frame]).abs().mean(-1)
+        if len(drop.plates) > 1:
+            return difference
+        usual = (video.frames.median(0).values - video.frames[frame]).abs().mean(-1)
+        return difference.minimum(usual)
 
     def moved(self, position_m: Tensor, quat_wxyz: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return poses of all bodies with those of the free ones changed by (K, 6 nf)."""
