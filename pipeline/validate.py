@@ -37,9 +37,7 @@ def validate(thing: Path | str) -> ValidationReport:
 
         return validate_dataset(path)
     found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset"
-    raise InputDataError(
-        f"{path}: {found}.", "a directory with capture.toml, model.json or dataset.json."
-    )
+    raise InputDataError(f"{path}: {found}.", "a directory with capture.toml, model.json or dataset.json.")
 
 
 def validate_capture(path: Path | str) -> ValidationReport:

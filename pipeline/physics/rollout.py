@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ...schemas import InputDataError
 from .contact import ContactGroup, Side
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 PAIR_SMOOTHING_M = 1e-3
 """Width of the smooth minimum in distances between two bodies of spheres [m]."""
+ROUNDING_M = 1e-9
+"""Spheres this near to touching are kept: their distance is computed anew, in other order."""
 FASTEST_M_S = 30.0
 """Bodies whose surfaces are further apart than this speed covers in a step cannot touch in it, and are skipped."""
 
@@ -91,7 +94,7 @@ def simulate(
     Raises:
         InputDataError: If a driven body has no track.
     """
-    engine = _Engine(world, state, times_s, driven or {})
+    engine = _Engine(world, state, times_s, driven or {}, record_contacts)
     motions = engine.begin(state)
     frames = [engine.frame(motions)]
     records = [engine.record([], motions)] if record_contacts else []
@@ -112,8 +115,16 @@ def simulate(
 class _Engine:
     """The constants of one rollout, and its step."""
 
-    def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
+    def __init__(
+        self,
+        world: World,
+        state: State,
+        times_s: Tensor,
+        driven: Mapping[str, Track | Drive],
+        every_contact: bool = False,
+    ) -> None:
         self.world = world
+        self.every_contact = every_contact  # a record of contacts names those that do not touch, too
         self.inertias = [Inertia.of(body) for body in world.bodies]
         self.times = times_s if times_s.ndim == 2 else times_s[None]
         self.lengths = self.times.diff(dim=1)
@@ -168,11 +179,19 @@ class _Engine:
 
     def _contacts(self, motions: list[Motion], rotations: list[Tensor], h: Tensor) -> list[_Group]:
         """Return the contacts of a step with their impulses: the closed form, then further sweeps where wanted."""
-        centers = [self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))]
+        paired = {index for a, b in self.pairs if b >= 0 or self.every_contact for index in (a, b)}
+        centers = {index: self._centers(index, motions[index], rotations[index]) for index in paired - {-1}}
         groups: list[_Group] = []
         prepared: dict[int, tuple[ContactGroup, Side, Side | None]] = {}
         for a, b in self.pairs:
-            gap, normal, point = self._geometry(a, b, centers)
+            if b < 0 and not self.every_contact:
+                touching = self._touch_ground(a, motions[a], rotations[a], h)
+                if touching is None:
+                    continue
+                near = {a: self._centers(a, motions[a], rotations[a], touching)}
+                gap, normal, point = self._geometry(a, b, near, touching)
+            else:
+                gap, normal, point = self._geometry(a, b, centers)
             if float(gap.detach().amin()) > FASTEST_M_S * float(h.detach().amax()):
                 groups.append(_Group(a, b, gap, normal, point, torch.zeros_like(point)))
                 continue
@@ -206,18 +225,44 @@ class _Engine:
                     spin[index] = spin[index] + cross(arms, impulse).sum(1)
         return velocity, spin
 
-    def _centers(self, index: int, motion: Motion, rotation: Tensor) -> Tensor:
+    def _touch_ground(self, index: int, motion: Motion, rotation: Tensor, h: Tensor) -> Tensor | None:
+        """Return which spheres (B, K) of a body touch the ground, as many for each item as any has; None for none.
+
+        The others get no impulse (`ContactGroup.of` gives them no target) and have no part in the crowding, so that
+        leaving them out changes nothing. Heights and their rates are products in the body frame, without derivatives:
+        n . (R r) = (R^T n) . r and n . (omega x R r) = (R^T (n x omega)) . r.
+        """
+        body, normal, offset = self.world.bodies[index], self.world.ground_normal, self.world.ground_offset
+        assert normal is not None and offset is not None  # a pair with the ground exists only with one
+        with torch.no_grad():
+            values = (rotation, motion.com, motion.velocity, motion.spin, self.inertias[index].root, body.com, offset)
+            rotation, com, velocity, spin, root, body_com, offset = (_plain(value) for value in values)
+            root = rotation @ root
+            omega = (root @ (root.transpose(-1, -2) @ spin[..., None])).squeeze(-1)
+            arms = _plain(body.centers) - body_com[:, None]
+            axes = torch.stack((normal.expand_as(omega), cross(normal.expand_as(omega), omega)), -1)
+            height, rate = _along(arms, rotation.transpose(-1, -2) @ axes).unbind(-1)
+            gap = height + (com @ normal - offset)[:, None] - _plain(body.radii)
+            depth = torch.minimum(gap, gap + _plain(h)[:, None] * (rate + (velocity @ normal)[:, None]))
+            most = int((depth < ROUNDING_M).sum(1).max())
+            return depth.topk(most, dim=1, largest=False, sorted=False).indices if most else None
+
+    def _centers(self, index: int, motion: Motion, rotation: Tensor, chosen: Tensor | None = None) -> Tensor:
         body = self.world.bodies[index]
         reference = body.com if body.free else torch.zeros_like(body.com)
-        return motion.com[:, None] + (body.centers - reference[:, None]) @ rotation.transpose(-1, -2)
+        arms = _pick(body.centers - reference[:, None], chosen)
+        return motion.com[:, None] + arms @ rotation.transpose(-1, -2)
 
-    def _geometry(self, a: int, b: int, centers: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    def _geometry(
+        self, a: int, b: int, centers: Mapping[int, Tensor], chosen: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         body_a = self.world.bodies[a]
         if b < 0:
             normal, offset = self.world.ground_normal, self.world.ground_offset
             assert normal is not None and offset is not None  # a pair with -1 exists only with a ground
-            gap = centers[a] @ normal - offset[:, None] - body_a.radii
-            point = centers[a] - body_a.radii[..., None] * normal
+            radii = _pick(body_a.radii, chosen)
+            gap = centers[a] @ normal - offset[:, None] - radii
+            point = centers[a] - radii[..., None] * normal
             return gap, normal.expand_as(point), point
         body_b = self.world.bodies[b]
         distance, outward = union_distance(centers[b], centers[a], body_a.radii, PAIR_SMOOTHING_M)
@@ -250,7 +295,7 @@ class _Engine:
     def record(self, steps: list[list[_Group]], motions: list[Motion]) -> tuple[Tensor, ...]:
         """Sum the impulses of an interval; where none acted, tell the geometry at its end."""
         rotations = [quat_to_matrix(m.quat_wxyz) for m in motions]
-        centers = [self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))]
+        centers = {i: self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))}
         columns = []
         for number, (a, b) in enumerate(self.pairs):
             gap, normal, point = self._geometry(a, b, centers)
@@ -283,6 +328,27 @@ class _Engine:
 
     def _count(self, a: int, b: int) -> int:
         return self.world.bodies[a if b < 0 else b].radii.shape[-1]
+
+
+def _plain(value: Tensor) -> Tensor:
+    """Return a tensor without its derivatives, forward or backward."""
+    return forward_ad.unpack_dual(value).primal.detach()
+
+
+def _along(arms: Tensor, axes: Tensor) -> Tensor:
+    """Return the components (B, N, 2) of arms (1 or B, N, 3) along axes (B, 3, 2)."""
+    if arms.shape[0] > 1:
+        return arms @ axes
+    return (arms[0] @ axes.transpose(0, 1).flatten(1)).unflatten(1, (-1, 2)).transpose(0, 1)
+
+
+def _pick(values: Tensor, chosen: Tensor | None) -> Tensor:
+    """Return the chosen spheres (B, K, ...) of values (1 or B, N, ...); all for None."""
+    if chosen is None:
+        return values
+    if values.ndim == 3:
+        chosen = chosen[..., None].expand(-1, -1, values.shape[-1])
+    return values.expand(chosen.shape[0], *values.shape[1:]).gather(1, chosen)
 
 
 def _pairs(world: World) -> list[tuple[int, int]]:
