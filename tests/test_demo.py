@@ -119,7 +119,7 @@ def test_the_whole_demo_in_small(tmp_path: Path, scene: str) -> None:
     assert html.count("Test episode") == result.evaluation.episodes == 3
     assert result.verdict in html.replace("&#x27;", "'")
     assert 10_000 < (out / "demo.png").stat().st_size < 400_000
-    assert result.calibration.photos_registered == 24
+    assert result.calibration.photos_registered >= 22
     assert result.calibration.center_error_median_m < 0.005
     frozen = result.targets[0].frozen
     assert result.targets[0].value < frozen

@@ -10,6 +10,7 @@ from .page import paragraph, section
 
 KINDS = ("model", "frozen", "ballistic")
 _MM = 1e3
+_MOST = 1e3
 
 
 def curves_section(curves: Sequence[EpisodeCurves]) -> str:
@@ -31,8 +32,9 @@ def curves_section(curves: Sequence[EpisodeCurves]) -> str:
             ("moment", "first contact"),
         )
     )
-    words = "Distance and angle between prediction and measured track, on logarithmic scales. Nothing after the "
-    words += "warm-up is shown to the model: the errors are those of one uninterrupted rollout."
+    words = "Distance and angle between prediction and measured track, on logarithmic scales; what exceeds "
+    words += "a scale runs along its rim. Nothing of the object's motion after the warm-up is shown to the model: the "
+    words += "errors are those of one uninterrupted rollout."
     return section("Error over time", paragraph(words), f'<div class="legend">{legend}</div>', *rows)
 
 
@@ -41,6 +43,7 @@ def _chart_row(
 ) -> str:
     """Return one chart for each episode, all on one scale."""
     low, high = decades([value for line in values.values() for value in line], floor)
+    high = min(high, _MOST)  # a ballistic object falls through the ground, and would flatten everything else
     charts = []
     for curve in curves:
         lines = [Line(kind, kind, values[curve.episode, kind]) for kind in KINDS if values[curve.episode, kind]]
