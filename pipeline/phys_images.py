@@ -370,7 +370,7 @@ def _loss_record(objective: ImageObjective, refined: Refined) -> dict[str, Any]:
         "after": parts(refined.after),
         "history": refined.history,
         "iterations": len(refined.history) - 1,
-        "converged": refined.converged,
+        "stopped": refined.stopped,
     }
 
 

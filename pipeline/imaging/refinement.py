@@ -28,7 +28,7 @@ TRACK_WEIGHT = 0.01
 TRACK_ROBUST_SCALE = 4.0
 CURVATURE_BLUR = 8
 """Pixels over which the curvature (not the gradient) averages residuals: without it the L1 norm's steps are tiny."""
-ATTEMPTS = 4
+ATTEMPTS = 7
 SMALLEST_FALL = 3e-4
 """The refinement ends when the objective falls by less than this fraction."""
 
@@ -175,14 +175,17 @@ def _difference(poses: Observations, measured: Observations) -> Tensor:
 
 @dataclass(frozen=True)
 class Refined:
-    """Where the refinement ended: shared (P,), states (B, S), parts (3,) of the loss before and after, history."""
+    """Where the refinement ended: shared (P,), states (B, S), parts (3,) of the loss before and after, history.
+
+    stopped: why it ended: `small fall`, `no lower point along the step` (not a minimum for sure) or `iterations`.
+    """
 
     shared: Tensor
     states: Tensor
     before: Tensor
     after: Tensor
     history: list[float]
-    converged: bool
+    stopped: str
 
 
 def refine_end_to_end(
@@ -199,7 +202,7 @@ def refine_end_to_end(
     """
     rollout = objective.rollout(shared, states)
     before = parts = objective.parts(rollout)
-    history, damping, converged = [objective.value(parts)], 1e-2, False
+    history, damping, stopped = [objective.value(parts)], 1e-2, "iterations"
     curvature = objective.curvature(rollout)
     for _ in progress(range(iterations), "phys-geo: images end to end", iterations):
         matrix, slope = objective.normal_equations(shared, states, rollout, curvature)
@@ -211,17 +214,17 @@ def refine_end_to_end(
             if objective.value(trial_parts) < history[-1]:
                 accepted = True
                 break
-            damping *= 8
+            damping *= 6
         if not accepted:
-            converged = True
+            stopped = "no lower point along the step"
             break
         shared, states, rollout, parts = next_shared, next_states, trial, trial_parts
         damping = max(damping / 5, 1e-4)
         history.append(objective.value(parts))
         if history[-2] - history[-1] < SMALLEST_FALL * history[-2]:
-            converged = True
+            stopped = "small fall"
             break
-    return Refined(shared, states, before, parts, history, converged)
+    return Refined(shared, states, before, parts, history, stopped)
 
 
 def _step(
