@@ -331,6 +331,11 @@ def physics_fit(
     warnings = [
         f"{p.name} is on its bound ({p.estimate:g} {p.unit}): {p.note}" for p in fitted if p.state == "on_bound"
     ] + [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
+    if record.get("episodes", 0) < ENOUGH_EPISODES:
+        warnings.append(
+            f"the intervals assume that the contact model is right: with fewer than {ENOUGH_EPISODES} episodes nothing "
+            "checks that, and against another simulator they were too narrow"
+        )
     return PhysicsFit(
         contact,
         (*fitted, *_derived(world, names, best, covariance)),
