@@ -2,11 +2,12 @@
 
 1. The noise of the tracks, given or estimated from them.
 2. Initial states from each episode's warm-up, by the model itself.
-3. A global search (cross-entropy) on the open-loop error, many rollouts at once: what the model is for is to predict
-   long unseen motion, and that error has several valleys.
-4. With few episodes, Levenberg-Marquardt from there with exact forward-mode derivatives, states and parameters
-   together. It is kept where the open-loop error agrees: it is the sharper estimate if the model is right, and
-   misleads where it is not. With many, the scatter between episodes gives the intervals.
+3. A global search (adaptive importance sampling) on the open-loop error, many rollouts at once: what the model is for
+   is to predict long unseen motion, and that error has several valleys. The estimate is the mean over the samples
+   that predict about equally well, not the luckiest one.
+4. Where a few episodes are explained down to their noise, Levenberg-Marquardt with exact forward-mode derivatives,
+   states and parameters together: the sharper estimate if the model is right, and misleading if it is not. With many
+   episodes, their scatter gives the intervals.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ..schemas import Parameter as FittedParameter
 from .estimation.least_squares import Solution, minimise
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
-from .estimation.search import SearchResult, cross_entropy, episode_covariance
+from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
 from .physics.contact import restitution
@@ -37,20 +38,31 @@ from .physics.rollout import simulate
 from .physics.rotation import geodesic_angle
 from .physics.world import State, World
 
-START = {"friction": 0.3, "contact_time_s": 0.005, "damping_ratio": 0.4, "ground_shift_m": 0.0}
-SPREAD = {"friction": 0.5, "contact_time_s": 0.4, "damping_ratio": 0.6, "ground_shift_m": 0.0007}
-"""First spread of the search, in the fitted coordinate (natural logarithm where the parameter is logarithmic)."""
+PRIOR = {
+    "friction": (0.3, 0.5),
+    "contact_time_s": (0.005, 0.4),
+    "damping_ratio": (0.4, 0.6),
+    "ground_shift_m": (0.0, 0.002),
+}
+"""Median and standard deviation before any data, the latter in the fitted coordinate (natural logarithm where the
+parameter is logarithmic). One toss hardly shows some of them; this keeps those plausible."""
+ERRORS_PER_EPISODE = 3.0
+"""Independent errors in one episode's open-loop error; `docs/benchmarks.md` has how the intervals cover with it."""
 MAX_SPAN_S = 0.8
 """Longer episodes are fitted on this much after their start: what follows a dozen impacts is noise to the fit."""
 MAX_ROLLOUTS = 1200
 """Rollouts in one batch of the search."""
+POPULATION = (24, 96)
+"""Fewest and most samples in a generation, where the settings leave it open: about `MAX_ROLLOUTS` rollouts."""
+EXPLAINED = 1.4
+"""Up to this many times the error that noise alone makes, a motion counts as explained and is worth refining."""
 OPEN_LOOP_TOLERANCE = 1.1
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
 ENOUGH_EPISODES = 8
 """From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
-without trusting the model. With fewer, the estimate is refined by Levenberg-Marquardt."""
-UNOBSERVABLE_LOG_STD = 1.0
-"""A logarithmic parameter known to no better than a factor e is called not observable."""
+without trusting the model."""
+UNOBSERVABLE_SHARE = 0.8
+"""A parameter that the data leave with more than this share of its prior's width is called not observable."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +129,8 @@ def fit_physics(
     warm = warmup_frames(world, observations, config.warmup_s)
     observations, _ = estimate_states(world, observations, warm, sigma)
 
-    search = _search(world, observations, warm, names, config)
-    if not math.isfinite(search.cost):
+    search = _search(world, observations, warm, names, _noise_floor(world, observations, sigma), config)
+    if not math.isfinite(search.lowest):
         raise NotConvergedError(
             "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
         )
@@ -126,12 +138,21 @@ def fit_physics(
         "episodes": len(episodes),
         "noise_estimated": {"position_m": estimated[0], "rotation_rad": estimated[1]},
         "search_open_loop_m": search.history,
+        "search_effective_samples": search.effective_samples,
     }
-    best, covariance = search.best, episode_covariance(search, search.best, ENOUGH_EPISODES)
+    best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
     if covariance is None:
-        best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
+        best, covariance = search.mean, search.covariance
+        if search.lowest < EXPLAINED * _noise_floor(world, observations, sigma):
+            best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
     record["correlation"] = _correlation(covariance).tolist()
     return physics_fit(world, names, best, covariance, sigma, record)
+
+
+def _noise_floor(world: World, observations: Observations, sigma: tuple[float, float]) -> float:
+    """Return the displacement of a point on the surface [m] that the noise of the tracks alone looks like."""
+    size = float(torch.stack([_surface_radius(world, index) for index in observations.free]).mean())
+    return math.sqrt(3 * sigma[0] ** 2 + 3 * (size * sigma[1]) ** 2)
 
 
 def _refined(
@@ -144,18 +165,18 @@ def _refined(
     config: PhysConfig,
     record: dict[str, Any],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the refined estimate, or the search's where it predicts clearly better, and the covariance."""
-    solution, misfit = _refine(world, observations, names, search.best, sigma, config)
+    """Return the refined estimate and its covariance, or the search's where that predicts clearly better."""
+    solution, misfit = _refine(world, observations, names, search.mean, sigma, config)
     cost = float(_open_loop(world, observations, warm, names)(solution.shared.numpy()[None]).mean())
-    keep = math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.cost
+    keep = math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
     record |= {
         "refinement_cost": solution.costs,
         "refinement_converged": solution.converged,
         "model_misfit": {"position_m": misfit[0], "rotation_rad": misfit[1]},
-        "open_loop_m": {"search": search.cost, "refined": cost},
+        "open_loop_m": {"search": search.lowest, "refined": cost},
         "kept": "refined" if keep else "search",
     }
-    return solution.shared.numpy() if keep else search.best, _model_covariance(solution)
+    return (solution.shared.numpy(), _model_covariance(solution)) if keep else (search.mean, search.covariance)
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:
@@ -165,11 +186,19 @@ def _span(tracks: dict[str, Track]) -> tuple[float, float]:
 
 
 def _search(
-    world: World, observations: Observations, warm: Tensor, names: list[Parameter], config: PhysConfig
+    world: World,
+    observations: Observations,
+    warm: Tensor,
+    names: list[Parameter],
+    floor: float,
+    config: PhysConfig,
 ) -> SearchResult:
-    bounds = np.array([parameter.limits for parameter in names])
-    start = np.array([p.encode(START[p.name]) for p in names])
-    spread = np.array([SPREAD[p.name] for p in names])
+    episodes = len(observations.names)
+    prior = Prior(
+        np.array([p.encode(PRIOR[p.name][0]) for p in names]),
+        np.array([PRIOR[p.name][1] for p in names]),
+        np.array([p.limits for p in names]),
+    )
     bar = progress(range(config.generations), "phys-geo: search", total=config.generations)
     steps = iter(bar)
 
@@ -177,14 +206,14 @@ def _search(
         next(steps, None)
         bar.set_postfix_str(f"open loop {1e3 * cost:.1f} mm")
 
-    result = cross_entropy(
+    result = importance_search(
         _open_loop(world, observations, warm, names),
-        bounds,
-        start,
-        spread,
+        prior,
         seed=config.seed,
-        population=config.population,
+        population=config.population or min(max(MAX_ROLLOUTS // episodes, POPULATION[0]), POPULATION[1]),
         generations=config.generations,
+        errors=ERRORS_PER_EPISODE * episodes,
+        floor=floor,
         on_generation=advance,
     )
     bar.close()
@@ -367,7 +396,8 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
     slope = estimate if parameter.logarithmic else 1.0
     on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
     state = "on_bound" if on_bound else "fitted"
-    if parameter.logarithmic and std > UNOBSERVABLE_LOG_STD:
+    centre, width = PRIOR[parameter.name]
+    if std > UNOBSERVABLE_SHARE * width:
         state = "not_observable"
     note = f"{parameter.reveals} would reveal it"
     return FittedParameter(
@@ -377,7 +407,7 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
         std_error=float(slope * std),
         interval_95=(interval[0], interval[1]),
         bounds=parameter.bounds,
-        prior="uniform in its logarithm" if parameter.logarithmic else "uniform",
+        prior=f"normal{' in its logarithm' if parameter.logarithmic else ''} about {centre:g}, std {width:g}",
         state=state,
         note=note,
     )

@@ -50,7 +50,7 @@ STATE_NOISE = (0.003, 0.03)
 tracks'."""
 STATE_STEPS = (2e-4, 2e-3, 5e-3, 5e-2)
 """Differences in position [m], rotation [rad], velocity [m/s] and omega [rad/s]."""
-TRUST_STD = 3.0
+TRUST_STD = 1.5
 """The images move a parameter by at most this many standard errors of the tracks' fit: what neither sees stays."""
 UNCERTAINTY_NOTE = "standard error from the pose tracks, not lowered by the image refinement"
 

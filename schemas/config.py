@@ -46,10 +46,10 @@ class PhysConfig(FileModel):
     device: Device = "auto"
     supervise: Literal["tracks", "images", "both"] = "tracks"
     step_s: Annotated[float, Field(gt=0)] = 0.001
-    population: Annotated[int, Field(ge=8)] = 24
-    """Samples in a generation of the global search."""
+    population: Annotated[int, Field(ge=8)] | None = None
+    """Samples in a generation of the global search; left out, 24 to 96, the fewer the more episodes there are."""
     generations: Annotated[int, Field(ge=2)] = 8
-    """Generations of the global search; the first also draws from the whole admissible box (several starts)."""
+    """Generations of the global search; the first draws from the prior."""
     iterations: Annotated[int, Field(ge=1)] = 10
     """Most steps of the local refinement (Levenberg-Marquardt)."""
     warmup_s: Annotated[float, Field(gt=0)] = 0.1

@@ -9,7 +9,7 @@ from cgwm.datasets import Track
 from cgwm.pipeline.estimation.least_squares import minimise
 from cgwm.pipeline.estimation.noise import estimate_noise
 from cgwm.pipeline.estimation.observations import Observations
-from cgwm.pipeline.estimation.search import SearchResult, cross_entropy, episode_covariance
+from cgwm.pipeline.estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
 from cgwm.pipeline.phys_geo import fit_physics
 from cgwm.pipeline.physics import restitution, simulate
@@ -73,15 +73,31 @@ def test_a_parameter_stops_on_its_bound_and_says_so() -> None:
     assert not bool(found.free[0])
 
 
-def test_cross_entropy_finds_the_deeper_of_two_valleys() -> None:
+def test_search_finds_the_deeper_of_two_valleys() -> None:
     def costs(z: np.ndarray) -> np.ndarray:
-        deep, shallow = (z[:, :1] - 3) ** 2, 0.5 * (z[:, :1] + 3) ** 2 + 2
-        return np.minimum(deep, shallow)
+        deep, shallow = (z[:, :1] - 3) ** 2 / 10, 0.05 * (z[:, :1] + 3) ** 2 + 0.5
+        return np.minimum(deep, shallow) + 0.1
 
-    found = cross_entropy(
-        costs, np.array([[-6.0, 6.0]]), np.array([-3.0]), np.array([1.0]), seed=0, population=24, generations=10
-    )
-    assert found.best[0] == pytest.approx(3, abs=0.1)
+    prior = Prior(np.array([-3.0]), np.array([3.0]), np.array([[-8.0, 8.0]]))
+    found = importance_search(costs, prior, seed=0, population=48, generations=8, errors=40.0, floor=0.01)
+    assert found.mean[0] == pytest.approx(3, abs=0.3)
+
+
+def test_search_gives_the_posterior_of_a_linear_model() -> None:
+    """Cost sqrt(c0^2 + z^T A z): the tempered posterior is normal, of precision errors * A / c0^2 and the prior's."""
+    curvature = np.array([[4.0, 1.5], [1.5, 2.0]])
+    centre = np.array([0.5, -0.3])
+
+    def costs(z: np.ndarray) -> np.ndarray:
+        return np.sqrt(0.04 + np.einsum("ki,ij,kj->k", z - centre, curvature, z - centre))[:, None]
+
+    prior = Prior(np.zeros(2), np.array([1.0, 0.5]), np.array([[-9.0, 9.0]] * 2))
+    found = importance_search(costs, prior, seed=1, population=400, generations=8, errors=3.0, floor=0.01)
+    precision = 3.0 * curvature / found.lowest**2 + np.diag(1 / prior.std**2)
+    expected = np.linalg.solve(precision, 3.0 * curvature / found.lowest**2 @ centre)
+    np.testing.assert_allclose(found.mean, expected, atol=0.03)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=0.15, atol=1e-3)
+    assert found.effective_samples > 400
 
 
 def test_covariance_from_the_scatter_between_episodes_is_that_of_the_mean() -> None:
@@ -89,7 +105,7 @@ def test_covariance_from_the_scatter_between_episodes_is_that_of_the_mean() -> N
     rng = np.random.default_rng(0)
     centres = 1 + 0.3 * rng.standard_normal(40)
     samples = rng.normal(centres.mean(), 0.3, (200, 1))
-    result = SearchResult(centres.mean(keepdims=True), 0.0, samples, (samples - centres) ** 2, [])
+    result = SearchResult(centres.mean(keepdims=True), np.eye(1), 0.0, samples, (samples - centres) ** 2, [], 200.0)
     covariance = episode_covariance(result, centres.mean(keepdims=True))
     assert covariance is not None
     assert covariance[0, 0] == pytest.approx(centres.var(ddof=1) / 40, rel=1e-3)

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from .friction import CoulombFriction
 from .objects import SolidObject
 
 Array = NDArray[np.float64]
@@ -83,17 +84,10 @@ class Motion:
         return np.round((times - self.start) * STEPS_PER_S).astype(np.int64)
 
 
-FRICTION_TIME_S = 0.004
-"""MuJoCo's time constant of friction [s]. MuJoCo couples friction to the normal force; this value comes nearest to
-Coulomb's law for a ball that hits the ground obliquely (1.5 m/s down, 0.5 to 3 m/s along, e = 0.40): the rebound stays
-within 4 % of that of a head-on impact and the tangential speed within 1 % of the analytic one. With the normal's own
-constant (10 ms) the ball leaves 5 % too fast along the ground, with 2 ms it rebounds 6 % and with 1 ms 16 % lower."""
-
-
 def build_model(solid: SolidObject, contact: ContactTruth, fingertip: bool, mat_half: float = 1.0) -> MjModel:
     """Build the MuJoCo model: ground plane z = 0, the object with a free joint, and where asked a fingertip.
 
-    Contacts are explicit pairs with their own `solreffriction` (see `FRICTION_TIME_S`).
+    Contacts are explicit pairs, whose friction `CoulombFriction` looks after.
 
     Args:
         solid: The object.
@@ -165,13 +159,14 @@ def simulate(
     data.qpos[:7], data.qvel[:6] = qpos, qvel
     count = round((end - start) * STEPS_PER_S) + 1
     positions, velocities = np.empty((count, model.nq)), np.empty((count, model.nv))
-    first_contact = None
+    first_contact, friction = None, CoulombFriction(model, OBJECT)
     partner = model.geom("ground" if command is None else FINGERTIP).id
     for step in range(count):
         if command is not None:
             data.qpos[7:], data.qvel[6:] = command[0][step], command[1][step]
         positions[step], velocities[step] = data.qpos, data.qvel
         mujoco.mj_step(model, data)
+        friction.update(data)
         # All contacts are with `partner`, but for those with the ground while there is a fingertip.
         if first_contact is None and data.ncon and partner in data.contact.geom:
             first_contact = start + step / STEPS_PER_S
@@ -255,7 +250,7 @@ def _pair(geom: str, other: str, friction: float, contact: ContactTruth) -> str:
     impedance = f"{contact.impedance} {contact.impedance} 0.001"
     return (
         f'<pair geom1="{geom}" geom2="{other}" condim="3" friction="{friction} {friction} 0.005 0.0001 0.0001" '
-        f'solref="{solref}" solreffriction="{FRICTION_TIME_S} 1" solimp="{impedance}"/>'
+        f'solref="{solref}" solimp="{impedance}"/>'
     )
 
 

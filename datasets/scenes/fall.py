@@ -1,12 +1,14 @@
-"""Scene `fall`: an object is dropped, tumbles, bounces, slides and comes to rest."""
+"""Scene `fall`: an object is tossed, tumbles, bounces, slides and comes to rest."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import NotConvergedError
-from .dynamics import MjModel, Motion, build_model, draw_contact, lowest, rest_pose, simulate
+from .dynamics import GRAVITY, ContactTruth, MjModel, Motion, build_model, draw_contact, lowest, rest_pose, simulate
 from .objects import SolidObject, make_object, resting_down
 from .plan import EXPOSURE_LEAD_S, EpisodePlan, ScenePlan, stays_in_view, turned_deg
 from .rig import video_cameras
@@ -15,9 +17,13 @@ Array = NDArray[np.float64]
 
 FRAME_RATE = 30.0
 TRAIN_FRAMES, TEST_FRAMES = 15, 36
+_LOWEST_RELEASE_M = 0.01
 _TRIES = 600
-_RESTARTS = 3
 _CANDIDATES = 5
+_PREDICTABLE = 0.7
+"""A toss that repeats this well is taken at once, in units of 10 mm and 10 degrees; otherwise the best candidate."""
+_MATERIALS = ((1.1, 1.1), (0.9, 0.9), (1.1, 0.9))
+"""What a fit may leave of friction and damping ratio, as factors: each restart has one."""
 
 
 def plan_fall(seed: int) -> ScenePlan:
@@ -31,44 +37,55 @@ def plan_fall(seed: int) -> ScenePlan:
     for name in ("000", "001", "002", "003"):
         split, frames = ("train", TRAIN_FRAMES) if name == "000" else ("test", TEST_FRAMES)
         others = [episode.motion.qpos[0, 3:7] for episode in episodes]
-        episodes.append(EpisodePlan(name, split, frames, _toss(rng, seed, model, solid, split, others)))
+        episodes.append(EpisodePlan(name, split, frames, _toss(rng, seed, model, solid, contact, split, others)))
     return ScenePlan("fall", seed, solid, contact, photo_qpos, FRAME_RATE, tuple(episodes), fingertip=False)
 
 
 def _toss(
-    rng: np.random.Generator, seed: int, model: MjModel, solid: SolidObject, split: str, others: list[Array]
+    rng: np.random.Generator,
+    seed: int,
+    model: MjModel,
+    solid: SolidObject,
+    contact: ContactTruth,
+    split: str,
+    others: list[Array],
 ) -> Motion:
     """Toss until a toss stays in view, is unlike the others, and shows what its split needs."""
     duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
     cameras = video_cameras(seed).values()
     useful: list[tuple[float, Motion]] = []
     for _ in range(_TRIES):
-        qpos, qvel = _release(rng, solid, (0.09, 0.15) if split == "train" else (0.10, 0.15))
+        qpos, qvel = _release(rng, solid)
         if any(turned_deg(qpos[3:7], other) < 35 for other in others):
+            continue
+        if qpos[2] < lowest(solid, qpos[3:7]) + _LOWEST_RELEASE_M:
             continue
         motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
         wanted = _instructive(motion) if split == "train" else _settles(motion)
         near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
         if wanted and near and stays_in_view(solid, motion, cameras):
-            useful.append((_unpredictability(rng, model, motion, duration), motion))
-        if len(useful) == _CANDIDATES:
-            break
+            best = min((value for value, _ in useful), default=np.inf)
+            useful.append((_unpredictability(rng, solid, contact, motion, duration, best), motion))
+            if useful[-1][0] < _PREDICTABLE or len(useful) == _CANDIDATES:
+                break
     if not useful:
         raise NotConvergedError(f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.")
     return min(useful, key=lambda one: one[0])[1]
 
 
-def _release(rng: np.random.Generator, solid: SolidObject, height: tuple[float, float]) -> tuple[Array, Array]:
-    """Draw a release: pose and velocity of the body frame, lowest point within `height` above ground [m]."""
+def _release(rng: np.random.Generator, solid: SolidObject) -> tuple[Array, Array]:
+    """Draw a release, tossed a little upwards: pose and velocity of the body frame, by when it lands and how fast."""
     quat_wxyz = rng.standard_normal(4)
     quat_wxyz /= np.linalg.norm(quat_wxyz)
-    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.15, 0.4)
+    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.1, 0.35)
     direction = np.array([np.cos(heading), np.sin(heading), 0])
     position = -direction * rng.uniform(0.06, 0.14)
-    position[2] = lowest(solid, quat_wxyz) + rng.uniform(*height)
+    rise, landing = rng.uniform(0.1, 0.4), rng.uniform(0.145, 0.18)
+    position[2] = lowest(solid, quat_wxyz) + GRAVITY / 2 * landing**2 - rise * landing
     spin = rng.standard_normal(3)
     omega_body = spin / np.linalg.norm(spin) * rng.uniform(0.5, 2.0)
-    return np.concatenate([position, quat_wxyz]), np.concatenate([speed * direction, omega_body])
+    velocity = speed * direction + (0, 0, rise)
+    return np.concatenate([position, quat_wxyz]), np.concatenate([velocity, omega_body])
 
 
 def _instructive(motion: Motion) -> bool:
@@ -79,26 +96,37 @@ def _instructive(motion: Motion) -> bool:
     return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.03
 
 
-def _unpredictability(rng: np.random.Generator, model: MjModel, motion: Motion, duration: float) -> float:
-    """Return how far the true engine itself ends up when it starts from what a warm-up cannot tell apart.
+def _unpredictability(
+    rng: np.random.Generator,
+    solid: SolidObject,
+    contact: ContactTruth,
+    motion: Motion,
+    duration: float,
+    enough: float,
+) -> float:
+    """Return how far the true engine itself ends up when it starts from what a fit and a warm-up cannot tell apart.
 
     A die that lands on an edge is no test of a model: two starts that no measurement distinguishes end on different
-    faces. Each restart is off by the accuracy of a state measured over 0.1 s; the result is the largest mean error
-    over time, in units of 10 mm and 10 degrees.
+    faces. Each restart is off by the accuracy of a state measured over 0.1 s and has another of `_MATERIALS`; the
+    result is the mean error over time and restarts, in units of 10 mm and 10 degrees. Once it must exceed `enough`
+    no more restarts are made.
     """
-    worst = 0.0
-    for _ in range(_RESTARTS):
+    total = 0.0
+    for friction, damping in _MATERIALS:
         qpos, qvel = motion.qpos[0].copy(), motion.qvel[0].copy()
         qpos[:3] += 0.0003 * rng.standard_normal(3)
         qpos[3:7] += 0.5 * 0.003 * rng.standard_normal(4)
         qpos[3:7] /= np.linalg.norm(qpos[3:7])
         qvel[:3] += 0.006 * rng.standard_normal(3)
         qvel[3:6] += 0.06 * rng.standard_normal(3)
-        again = simulate(model, qpos, qvel, motion.start, duration)
+        other = replace(contact, friction=friction * contact.friction, damping_ratio=damping * contact.damping_ratio)
+        again = simulate(build_model(solid, other, fingertip=False), qpos, qvel, motion.start, duration)
         shift = np.linalg.norm(again.qpos[:, :3] - motion.qpos[:, :3], axis=1).mean()
         turns = [turned_deg(a, b) for a, b in zip(again.qpos[::200, 3:7], motion.qpos[::200, 3:7], strict=True)]
-        worst = max(worst, float(shift) / 0.01 + float(np.mean(turns)) / 10)
-    return worst
+        total += (float(shift) / 0.01 + float(np.mean(turns)) / 10) / len(_MATERIALS)
+        if total > enough:
+            break
+    return total
 
 
 def _settles(motion: Motion) -> bool:

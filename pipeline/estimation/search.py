@@ -1,6 +1,7 @@
-"""Global search for a loss landscape that is bad: the cross-entropy method, and intervals from its samples.
+"""Global search for a loss landscape that is bad: adaptive importance sampling, and uncertainty from its samples.
 
-Open-loop errors of bouncing bodies are rough in the parameters: gradients mislead, sampled averages do not.
+Open-loop errors of bouncing bodies are rough in the parameters: gradients mislead and the best sample of many is luck,
+averages over samples are neither.
 """
 
 from __future__ import annotations
@@ -9,73 +10,122 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-Costs = Callable[[np.ndarray], np.ndarray]
+Array = NDArray[np.float64]
+Costs = Callable[[Array], Array]
 """Samples (K, P) -> costs of every episode (K, E); not finite where the model diverges."""
+
+_WIDENING = 1.5
+"""Each generation's proposal has this many times the covariance of the samples before it, so as not to miss tails."""
+_LEAST_STD = 0.03
+"""Least spread of a proposal, as a share of the prior's."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A normal prior in the fitted coordinates: mean (P,), std (P,), cut off at bounds (P, 2)."""
+
+    mean: Array
+    std: Array
+    bounds: Array
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What the search saw: best (P,); cost: its mean over episodes; samples (N, P); costs (N, E); history."""
+    """What the search saw.
 
-    best: np.ndarray
-    cost: float
-    samples: np.ndarray
-    costs: np.ndarray
+    mean (P,), covariance (P, P): of the tempered posterior; lowest: the lowest mean cost over episodes; samples
+    (N, P); costs (N, E); history: the lowest cost after every generation; effective_samples: of the N.
+    """
+
+    mean: Array
+    covariance: Array
+    lowest: float
+    samples: Array
+    costs: Array
     history: list[float]
+    effective_samples: float
 
 
-def cross_entropy(
+def importance_search(
     costs: Costs,
-    bounds: np.ndarray,
-    start: np.ndarray,
-    spread: np.ndarray,
+    prior: Prior,
     *,
     seed: int,
-    population: int = 24,
-    generations: int = 8,
+    population: int,
+    generations: int,
+    errors: float,
+    floor: float,
     on_generation: Callable[[int, float], None] | None = None,
 ) -> SearchResult:
-    """Minimise the mean cost over episodes by the cross-entropy method (Rubinstein 1999), elites a quarter.
+    """Sample the posterior under a tempered likelihood, exp(-errors / 2 * (cost / scale)^2) with scale the lowest cost.
 
-    The first generation draws from the whole box as well as around the start: several starts for a landscape with
-    several valleys.
+    A model that misses something misses it in every frame alike: a hundred frames of a toss hold a few independent
+    errors and not a hundred, and `errors` says how many (a generalised posterior; Bissiri, Holmes & Walker 2016). The
+    sampler is population Monte Carlo (Cappe et al. 2004): every generation draws from a normal fitted to the weighted
+    samples so far, and all samples are weighted against the mixture of all proposals. While fewer than a quarter of a
+    generation would count, the likelihood is flattened further.
 
     Args:
-        costs: See `Costs`.
-        bounds: Box (P, 2).
-        start: Centre of the first Gaussian (P,); itself a sample.
-        spread: Its standard deviations (P,).
+        costs: See `Costs`; errors in one unit, >= 0.
+        prior: The prior, also the first proposal.
         seed: Seed of the samples.
         population: Samples in a generation.
         generations: Number of generations.
-        on_generation: Called with the generation and the best cost so far.
+        errors: Number of independent errors in the mean cost.
+        floor: Cost that the measurement's noise alone makes; the scale is never below it.
+        on_generation: Called with the generation and the lowest cost so far.
     """
     rng = np.random.default_rng(seed)
-    mean, std = start.astype(float), spread.astype(float)
-    all_samples, all_costs, history = [], [], []
-    best, best_cost = start, np.inf
+    size = len(prior.mean)
+    proposals = [(prior.mean.astype(float), np.diag(np.square(prior.std)))]
+    samples, found = np.empty((0, size)), np.empty((0, 0))
+    history: list[float] = []
+    mean, covariance, effective = *proposals[0], 0.0
     for generation in range(generations):
-        samples = mean + std * rng.standard_normal((population, len(start)))
+        drawn = rng.multivariate_normal(*proposals[-1], population).clip(prior.bounds[:, 0], prior.bounds[:, 1])
         if generation == 0:
-            samples[population // 2 :] = rng.uniform(bounds[:, 0], bounds[:, 1], samples[population // 2 :].shape)
-        samples[0] = mean if generation else start
-        samples = samples.clip(bounds[:, 0], bounds[:, 1])
-        found = costs(samples)
+            drawn[0] = prior.mean
+        new = costs(drawn)
+        samples, found = np.concatenate([samples, drawn]), np.concatenate([found.reshape(-1, new.shape[1]), new])
         total = np.where(np.isfinite(found).all(1), found.mean(1), np.inf)
-        order = np.argsort(total, kind="stable")[: max(3, population // 4)]
-        order = order[np.isfinite(total[order])]
-        if len(order) and total[order[0]] < best_cost:
-            best, best_cost = samples[order[0]], float(total[order[0]])
-        if len(order) >= 2:
-            mean = samples[order].mean(0)
-            std = 0.7 * samples[order].std(0) + 0.3 * std * 0.7
-        all_samples.append(samples)
-        all_costs.append(found)
-        history.append(best_cost)
+        history.append(float(total.min()))
         if on_generation:
-            on_generation(generation, best_cost)
-    return SearchResult(best, best_cost, np.concatenate(all_samples), np.concatenate(all_costs), history)
+            on_generation(generation, history[-1])
+        if not np.isfinite(history[-1]):
+            continue
+        fit = -0.5 * (np.square(total) - history[-1] ** 2) / max(history[-1], floor) ** 2
+        weight, effective = _weights(
+            _log_ratio(samples, prior, proposals), fit, errors, max(population / 4, 2.0 * size)
+        )
+        mean = weight @ samples
+        covariance = (samples - mean).T @ ((samples - mean) * weight[:, None])
+        proposals.append((mean, _WIDENING * covariance + np.diag(np.square(_LEAST_STD * prior.std))))
+    return SearchResult(mean, covariance, history[-1], samples, found, history, effective)
+
+
+def _log_ratio(samples: Array, prior: Prior, proposals: list[tuple[Array, Array]]) -> Array:
+    """Return log of the prior's density over the proposals' mixture (N,), up to a constant."""
+    logs = []
+    for mean, covariance in proposals:
+        offset = np.linalg.solve(np.linalg.cholesky(covariance), (samples - mean).T)
+        logs.append(-0.5 * np.square(offset).sum(0) - 0.5 * np.linalg.slogdet(covariance)[1])
+    log_prior = -0.5 * np.square((samples - prior.mean) / prior.std).sum(1)
+    return log_prior - np.logaddexp.reduce(np.array(logs), axis=0)
+
+
+def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple[Array, float]:
+    """Return normalised weights (N,) and their effective number, with as much of `errors` as leaves `least`."""
+    for _ in range(40):
+        log_weight = log_ratio + errors * np.where(np.isfinite(fit), fit, -np.inf)
+        weight = np.exp(log_weight - log_weight.max())
+        weight /= weight.sum()
+        effective = float(1 / np.square(weight).sum())
+        if effective >= min(least, len(weight) / 2):
+            break
+        errors *= 0.8
+    return weight, effective
 
 
 def episode_covariance(result: SearchResult, at: np.ndarray, minimum: int = 8) -> np.ndarray | None:

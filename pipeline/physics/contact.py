@@ -172,9 +172,9 @@ class ContactGroup:
         slip = relative - speed[..., None] * self.normal
         wanted = tangential - self.stop_t[..., None] * slip
         limit = self.friction[:, None] * along
-        # a smooth projection on the disc: the whole of a small impulse, the limit of a large one
-        size2 = wanted.square().sum(-1)
-        scale = limit / (limit.square() + size2 + 1e-24).sqrt()
+        # the projection on the disc; the tiny number keeps the derivative of a contact without impulses finite
+        size = (wanted.square().sum(-1) + 1e-24).sqrt()
+        scale = (limit / size).clamp_max(1.0)
         return along[..., None] * self.normal + scale[..., None] * wanted
 
 
