@@ -34,15 +34,20 @@ class Splats:
         scales: Standard deviations s [m], shape (N,), not their logarithms.
         opacities: Peak opacities in (0, 1), shape (N,).
         colors: sRGB values as stored in images, in [0, 1], shape (N, 3).
+        normals: Outward unit normals of the surface that the spheres show, in the frame of `means`, shape (N, 3), or
+            None where they are not known.
     """
 
     means: Array
     scales: Array
     opacities: Array
     colors: Array
+    normals: Array | None = None
 
     def __post_init__(self) -> None:
         count = len(self.means)
+        if self.normals is not None and self.normals.shape != (count, 3):
+            raise ValueError(f"normals must be ({count}, 3); found {self.normals.shape}")
         shapes = (self.means.shape, self.scales.shape, self.opacities.shape, self.colors.shape)
         if shapes != ((count, 3), (count,), (count,), (count, 3)):
             raise ValueError(f"means, scales, opacities, colors must be (N,3), (N,), (N,), (N,3); found {shapes}")
@@ -58,7 +63,7 @@ def write_splats(
     sh_degree: int = 0,
     overwrite: bool = False,
 ) -> None:
-    """Write spheres as a binary .ply: opacity as logit, log scale three times, unit quaternion, no normals.
+    """Write spheres as a binary .ply: opacity as logit, log scale three times, unit quaternion, unknown normals as 0.
 
     Args:
         path: The file.
@@ -74,6 +79,8 @@ def write_splats(
     column = {name: k for k, name in enumerate(names)}
     opacities = np.clip(np.asarray(splats.opacities, np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
     table[:, :3] = splats.means
+    if splats.normals is not None:
+        table[:, 3:6] = splats.normals
     table[:, 6:9] = (np.asarray(splats.colors, np.float64) - 0.5) / SH_C0
     table[:, column["opacity"]] = np.log(opacities / (1 - opacities))
     table[:, column["scale_0"] : column["scale_2"] + 1] = np.log(np.asarray(splats.scales, np.float64))[:, None]
@@ -122,7 +129,19 @@ def read_splats(path: Path | str) -> Splats:
         scales=np.exp(log_scales.mean(axis=1)),
         opacities=1 / (1 + np.exp(-table["opacity"])),
         colors=np.clip(0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1), 0.0, 1.0),
+        normals=_unit_normals(columns),
     )
+
+
+def _unit_normals(columns: dict[str, Array]) -> Array | None:
+    """Return the normals (N, 3), or None if the file has none: other programs write zeros."""
+    if any(name not in columns for name in ("nx", "ny", "nz")):
+        return None
+    normals = np.stack([np.asarray(columns[name], np.float64) for name in ("nx", "ny", "nz")], axis=1)
+    length = np.linalg.norm(normals, axis=1)
+    if not (np.isfinite(length) & (length > 1e-6)).all():
+        return None
+    return normals / length[:, None]
 
 
 def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:

@@ -233,9 +233,11 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
     ready = replace(ready, file=fitted, fit=FitFile(stages=ready.fit.stages | {"phys-geo": record}))
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
         from .exposure import estimate_exposures
+        from .lighting import estimate_light
 
         exposures = estimate_exposures(ready, capture, split, config.device)
-        ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures}))
+        light = estimate_light(ready, capture, exposures, split)
+        ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures, "light": light}))
     return ready
 
 

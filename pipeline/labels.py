@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from ..datasets.models import Model
 from ..datasets.ply import Splats
 from ..datasets.rollouts import CHUNK_FRAMES, FrameBlock
 from .physics.rotation import quat_to_matrix
+from .splats.relighting import Relighting
 from .splats.render import MIN_ALPHA, render
 
 TILE = 8
@@ -48,6 +49,15 @@ class _Spheres:
 class _Moving:
     body: int
     spheres: _Spheres
+    relighting: Relighting | None
+
+    def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> _Spheres:
+        spheres = _placed(self.spheres, position_m, quat_wxyz)
+        if self.relighting is None:
+            return spheres
+        features = spheres.features.clone()
+        features[:, :3] = (features[:, :3] * self.relighting.factors(quat_wxyz)[:, None]).clamp(0, 1)
+        return replace(spheres, features=features)
 
 
 @dataclass
@@ -85,7 +95,10 @@ class LabelRenderer:
                 pose = body.photo_pose
                 static.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
             else:
-                self._moving.append(_Moving(index, spheres))
+                light, normals = model.file.light, model.body_splats[body.name].normals
+                known = light is not None and normals is not None
+                relighting = Relighting.of(light, body, self._float(normals)) if known else None
+                self._moving.append(_Moving(index, spheres, relighting))
         nothing = torch.zeros(0, 3, device=device)
         empty = _Spheres(nothing, nothing[:, 0], nothing[:, 0], torch.zeros(0, 3 + self._labels, device=device))
         self._static = _joined([*static, empty])
@@ -126,8 +139,7 @@ class LabelRenderer:
 
     def _place(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> _Spheres:
         moved = [
-            _placed(part.spheres, self._float(position_m[part.body]), self._float(quat_wxyz[part.body]))
-            for part in self._moving
+            part.placed(self._float(position_m[part.body]), self._float(quat_wxyz[part.body])) for part in self._moving
         ]
         return _joined([*moved, _cut(self._static, slice(0, 0))])
 

@@ -430,6 +430,7 @@ def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance:
         (slope,) = torch.autograd.grad(value, z)
         std = math.sqrt(float(slope.numpy() @ covariance @ slope.numpy()))
         estimate = float(value.detach())
+        reach = math.exp(1.96 * std / estimate)  # first order in the logarithm: they are positive
         note = (
             "speed ratio of a head-on impact" if name == "restitution" else f"of one contact that carries {mass:g} kg"
         )
@@ -439,7 +440,7 @@ def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance:
                 unit=unit,
                 estimate=estimate,
                 std_error=std,
-                interval_95=(estimate - 1.96 * std, estimate + 1.96 * std),
+                interval_95=(estimate / reach, estimate * reach),
                 state="derived",
                 note=note,
             )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..datasets.capture import Capture
@@ -197,7 +198,11 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
         collision, distance = spheres.splats(stage.config.radius_factor), spheres.distance_m
         mass_properties = _turned(solid.mass_properties(), T_body_world)
         stage.record[body.name]["collision"] = _collision_record(spheres)
-    visual = None if world is None else world.moved(_tensor(T_body_world, stage.device)).to_numpy()
+    visual = None
+    if world is not None and solid is not None:
+        visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
+        nearest = cKDTree(solid.surface).query(world.means.cpu().numpy())[1]
+        visual = replace(visual, normals=solid.normals[nearest] @ T_body_world[:3, :3].T)
     pose = body.photo_pose or _pose(T_world_body)
     return BodyResult(visual, collision, distance, pose, mass_properties), world
 

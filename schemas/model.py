@@ -87,6 +87,16 @@ class Exposure(FileModel):
     offset_rgb: Vector3 = (0.0, 0.0, 0.0)
 
 
+class Light(FileModel):
+    """The light that falls on bodies, as brightness by direction of the surface.
+
+    A white surface of unit normal n (world frame) has brightness 1 + coefficients . Y(n), with Y = (x, y, z, 2xy, 2yz,
+    2xz, (3z^2 - 1)/2, x^2 - y^2).
+    """
+
+    coefficients: tuple[float, float, float, float, float, float, float, float]
+
+
 class Provenance(FileModel):
     """Where the model comes from."""
 
@@ -117,6 +127,8 @@ class ModelFile(FileModel):
     """Background spheres (PLY, world frame), where there are any."""
     exposures: dict[str, Exposure] = {}
     """By video camera."""
+    light: Light | None = None
+    """Where the videos tell it; None leaves a body in the light of the photos, however it turns."""
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

@@ -19,10 +19,10 @@ FRAME_RATE = 30.0
 TRAIN_FRAMES, TEST_FRAMES = 15, 36
 _LOWEST_RELEASE_M = 0.01
 _TRIES = 600
-_CANDIDATES = 5
-_PREDICTABLE = 0.7
+_CANDIDATES = 8
+_PREDICTABLE = 0.5
 """A toss that repeats this well is taken at once, in units of 10 mm and 10 degrees; otherwise the best candidate."""
-_MATERIALS = ((1.1, 1.1), (0.9, 0.9), (1.1, 0.9))
+_MATERIALS = ((1.2, 1.1), (0.8, 0.9), (1.2, 0.9))
 """What a fit may leave of friction and damping ratio, as factors: each restart has one."""
 
 
@@ -93,7 +93,7 @@ def _instructive(motion: Motion) -> bool:
     if motion.first_contact is None or not 0.12 < motion.first_contact < 0.2:
         return False
     hit, end = motion.qpos[motion.row(motion.first_contact)], motion.qpos[-1]
-    return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.03
+    return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.04
 
 
 def _unpredictability(

@@ -78,7 +78,7 @@ def make_mat(rng: np.random.Generator, markers: tuple[PrintedMarker, ...]) -> Sh
 
 
 def make_paint(rng: np.random.Generator, solid: SolidObject) -> Faceted:
-    """Paint every side of an object, each around its own tone of one palette."""
+    """Paint every side of an object, each around its own tone of one palette, with specks half way to its colours."""
     palette = _PAINTS[rng.integers(len(_PAINTS))]
     normals = facet_normals(solid)
     sheets = []
@@ -86,7 +86,8 @@ def make_paint(rng: np.random.Generator, solid: SolidObject) -> Faceted:
         base = palette[rng.integers(2)]
         tone = tuple(float(v) for v in np.array(base) * rng.uniform(0.88, 1.12))
         red, green, blue = tone
-        image = paint(rng, _FACET_PIXELS, _FACET_SIDE, ((red, green, blue), *palette), 12000, (0.002, 0.012))
+        specks = [((red + r) / 2, (green + g) / 2, (blue + b) / 2) for r, g, b in palette]
+        image = paint(rng, _FACET_PIXELS, _FACET_SIDE, ((red, green, blue), *specks), 12000, (0.002, 0.012))
         sheets.append(make_sheet(image, _FACET_SIDE))
     return Faceted(normals, tuple(sheets))
 
