@@ -14,7 +14,7 @@ help:
 	@echo 'make test      lint, type check and tests, as the continuous integration runs them'
 	@echo 'make install   only install cgwm into $(VENV)/ (the two above do it by themselves)'
 	@echo 'make lint      ruff and pyright alone'
-	@echo 'make evidence  the measurements that take longer than tests may'
+	@echo 'make evidence  the measurements that take longer than tests may; resumable, results in out/evidence/'
 	@echo 'make clean     remove what make made: $(VENV)/, build/, out/'
 
 install: $(VENV)/linked
@@ -33,6 +33,7 @@ lint: install
 
 evidence: install
 	$(BIN)/pytest -m evidence
+	cd benchmarks && for one in calibrate tosses fall coverage; do echo "== $$one"; ../$(BIN)/python $$one.py || echo "$$one: a bar was missed"; done
 
 clean:
 	rm -rf $(VENV) build out *.egg-info .pytest_cache .ruff_cache

@@ -11,10 +11,8 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +20,9 @@ import numpy as np
 from cgwm.pipeline.calibrate import calibrate
 from cgwm.pipeline.sfm.scale import umeyama
 from cgwm.schemas import CalibrateConfig, CamerasFile, read_json
+from store import Store, shared_data
 
 MANIFEST = 'format = "cgwm-capture/1"\n'
-
-
-def shared_data() -> Path | None:
-    """Return the folder of measured data, or None: `CGWM_SHARED_DATA`, or `shared/data` beside the repository."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("CGWM_SHARED_DATA", beside))
-    return folder if folder.is_dir() else None
 
 
 def make_capture(photos: Path, folder: Path) -> Path:
@@ -57,7 +49,6 @@ def center_errors(cameras: CamerasFile, transforms: dict[str, Any]) -> np.ndarra
 def run_once(photos: Path, config: CalibrateConfig) -> dict[str, Any]:
     """Calibrate a folder of photos from scratch and return the figures."""
     with tempfile.TemporaryDirectory() as folder:
-        start, cpu = time.perf_counter(), time.process_time()
         report = calibrate(make_capture(photos, Path(folder) / "capture"), config)
         path = Path(folder) / "capture" / "cameras.json"
         figures: dict[str, Any] = {
@@ -66,8 +57,6 @@ def run_once(photos: Path, config: CalibrateConfig) -> dict[str, Any]:
             "attempts": len(report.attempts),
             "worst_strong_pair": report.self_check.worst.consistent if report.self_check.worst else None,
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
-            "wall_s": round(time.perf_counter() - start, 1),
-            "cpu_s": round(time.process_time() - cpu, 1),
         }
         transforms = photos.parent / "transforms.json"
         if transforms.is_file():
@@ -87,17 +76,21 @@ def main() -> int:
     if data is None:
         print("no measured data: set CGWM_SHARED_DATA", file=sys.stderr)
         return 2
+    fox = data / "fox" / "images"
+    store, features = Store("calibrate"), arguments.max_features
     good = True
     for seed in (int(value) for value in arguments.seeds.split(",")):
-        config = CalibrateConfig(seed=seed, max_features=arguments.max_features)
-        runs = [run_once(data / "fox" / "images", config) for _ in range(2)]
-        for run in runs:
-            print(json.dumps({"set": "fox", "seed": seed, **run}), flush=True)
-            good &= run["registered"] == run["photos"] == 50 and run["center_error_percent_median"] < 0.2
+        config = CalibrateConfig(seed=seed, max_features=features)
+        runs = [
+            store.result(f"fox, {features} features, seed {seed}, run {turn}", lambda c=config: run_once(fox, c))
+            for turn in (1, 2)
+        ]
+        good &= all(run["registered"] == run["photos"] == 50 for run in runs)
+        good &= all(run["center_error_percent_median"] < 0.2 for run in runs)
         good &= runs[0]["sha256"] == runs[1]["sha256"]
     for name, folder in (("kermit", "images"), ("et", "et")):
-        run = run_once(data / "kermit" / folder, CalibrateConfig(max_features=arguments.max_features))
-        print(json.dumps({"set": name, "seed": 0, **run}), flush=True)
+        photos, config = data / "kermit" / folder, CalibrateConfig(max_features=features)
+        run = store.result(f"{name}, {features} features, seed 0", lambda p=photos, c=config: run_once(p, c))
         good &= run["registered"] == run["photos"]
     return 0 if good else 1
 

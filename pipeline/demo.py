@@ -46,9 +46,9 @@ from .synthesize import synthesize
 ConfigT = TypeVar("ConfigT", CalibrateConfig, SplatConfig, PhysConfig, SynthesizeConfig)
 
 SELECTION = {
-    "fall": "The tosses are drawn so that what 0.1 s of measurement tells of the start decides their outcome: the "
-    "simulator itself, restarted with the errors of such a measurement, repeats each of them closely. A toss that "
-    "balances on an edge before it falls to either side is not among them."
+    "fall": "The tosses are drawn so that what can be measured decides their outcome: the simulator itself, restarted "
+    "with the errors of 0.1 s of measurement and with friction and damping off by a fifth and a tenth, repeats each of "
+    "them closely. A toss that balances on an edge before it falls to either side is not among them."
 }
 """How the scenes choose their episodes, where that makes them easier than any motion: the report says it."""
 WARMUP_S = 0.1
@@ -71,8 +71,8 @@ class DemoSettings:
     calibrate: CalibrateConfig = field(default_factory=lambda: CalibrateConfig(max_features=2048))
     splats: SplatConfig = field(default_factory=SplatConfig)
     physics: PhysConfig = field(default_factory=PhysConfig)
-    images: PhysConfig = field(default_factory=lambda: PhysConfig(population=16, generations=4, iterations=6))
-    """A shorter search than by default: tracks from images are too rough for a finer one."""
+    images: PhysConfig = field(default_factory=lambda: PhysConfig(population=48, generations=5, iterations=6))
+    """A shorter search than by default: tracks from images are too rough for a longer one."""
     synthesize: SynthesizeConfig = field(default_factory=lambda: SynthesizeConfig(rollouts=8))
 
 

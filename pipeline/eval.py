@@ -199,7 +199,7 @@ def _predict(
     state_fits: int = STATE_FIT_EPISODES,
 ) -> list[EpisodePrediction]:
     with progress(desc="eval: rollouts", total=len(episodes), unit="episode") as bar:
-        return predict(world, model.file, episodes, noise, warmup_s, video_times, bar.update, state_fits)
+        return predict(world, episodes, noise, warmup_s, video_times, bar.update, state_fits)
 
 
 def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: list[str]) -> dict[str, list[str]]:

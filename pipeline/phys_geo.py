@@ -362,8 +362,8 @@ def physics_fit(
     ] + [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
     if record.get("episodes", 0) < ENOUGH_EPISODES:
         warnings.append(
-            f"the intervals assume that the contact model is right: with fewer than {ENOUGH_EPISODES} episodes nothing "
-            "checks that, and against another simulator they were too narrow"
+            f"with fewer than {ENOUGH_EPISODES} episodes the intervals rest on an assumption: that the errors of the "
+            f"contact model in one episode count as {ERRORS_PER_EPISODE:g} independent ones"
         )
     return PhysicsFit(
         contact,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datasets.tracks import Track
-from ..schemas import ModelFile, NotConvergedError
+from ..schemas import NotConvergedError
 from .estimation.observations import Observations
 from .estimation.states import StartUncertainty
 from .estimation.warmup import estimate_states, warmup_frames
@@ -109,7 +109,6 @@ class EpisodePrediction:
 
 def predict(
     world: World,
-    file: ModelFile,
     episodes: Sequence[Episode],
     noise: tuple[float, float],
     warmup_s: float,
@@ -121,7 +120,6 @@ def predict(
 
     Args:
         world: The model's world.
-        file: `model.json`; fixed bodies stand where it says.
         episodes: Names, and tracks of all free and driven bodies.
         noise: Standard deviations of the measurement (position [m], rotation [rad]).
         warmup_s: Length of the warm-up [s].
@@ -143,7 +141,7 @@ def predict(
     found: dict[int, EpisodePrediction] = {}
     for first in range(0, count, BATCH):
         numbers = order[first : first + BATCH]
-        batch = _Batch.of(world, file, [episodes[i] for i in numbers], noise, warmup_s)
+        batch = _Batch.of(world, [episodes[i] for i in numbers], noise, warmup_s)
         floor = batch.uncertainty().noise_floor(samples, numbers)
         best = batch.state_fitted([k for k, number in enumerate(numbers) if number in fitted], noise)
         for k, prediction in enumerate(batch.predictions([video_times_s[i] for i in numbers])):
@@ -163,11 +161,9 @@ class _Batch:
     covariance: Tensor
 
     @staticmethod
-    def of(
-        world: World, file: ModelFile, episodes: Sequence[Episode], noise: tuple[float, float], warmup_s: float
-    ) -> _Batch:
+    def of(world: World, episodes: Sequence[Episode], noise: tuple[float, float], warmup_s: float) -> _Batch:
         everything = [(-np.inf, np.inf)] * len(episodes)
-        observations = _fixed_in_place(Observations.of(world, episodes, everything), file)
+        observations = Observations.of(world, episodes, everything)
         warm = warmup_frames(world, observations, warmup_s)
         observations, solution = estimate_states(world, observations, warm, noise, WARMUP_ITERATIONS)
         return _Batch(world, observations, warm, solution.state_cov)
@@ -267,16 +263,6 @@ def _ballistic(world: World, grid: Array, rollout: Rollout, item: int, model: Mo
         position[:, body] = (path - quat_to_matrix(turned) @ com).numpy()
         quat[:, body] = turned.numpy()
     return Motion(position, quat)
-
-
-def _fixed_in_place(observations: Observations, file: ModelFile) -> Observations:
-    """Return the observations with the states of fixed bodies where the model says that they stand."""
-    position, quat = observations.state.position_m.clone(), observations.state.quat_wxyz.clone()
-    for index, body in enumerate(file.bodies):
-        if body.motion == "fixed":
-            position[:, index] = torch.tensor(body.photo_pose.position_m).to(position)
-            quat[:, index] = torch.tensor(body.photo_pose.quat_wxyz).to(quat)
-    return replace(observations, state=replace(observations.state, position_m=position, quat_wxyz=quat))
 
 
 def _lengths(observations: Observations) -> Tensor:

@@ -182,3 +182,13 @@ def test_intervals_cover_the_truth() -> None:
                 hits[parameter.name] += low <= true[parameter.name] <= high
     print(f"coverage of 20: {hits}")
     assert all(count >= 16 for count in hits.values()), hits
+
+
+def test_a_fixed_body_stands_where_the_world_has_it() -> None:
+    place = torch.tensor([[0.1, -0.2, 0.3, 0.0, 1.0, 0.0, 0.0]], dtype=F64)
+    wall = replace(box_body(), name="wall", motion="fixed", place=place)
+    world = world_of(box_body())
+    world = replace(world, bodies=(*world.bodies, wall))
+    observations = Observations.of(world, [("000", {"box": toss(1, duration_s=0.2)})], [(0.0, 1.0)])
+    torch.testing.assert_close(observations.state.position_m[:, 1], place[:, :3])
+    torch.testing.assert_close(observations.state.quat_wxyz[:, 1], place[:, 3:])

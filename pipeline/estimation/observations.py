@@ -157,8 +157,11 @@ def first_state(world: World, observations: Observations) -> State:
 
 
 def _resting(world: World, batch: int) -> State:
-    """All bodies at the origin of the world, unturned and at rest."""
+    """Return all bodies unturned and at rest: fixed ones where they stand, the others at the origin of the world."""
     like = world.gravity
     zero = torch.zeros(batch, len(world.bodies), 3).to(like)
-    quat = matrix_to_quat(torch.eye(3).to(like)).expand(batch, len(world.bodies), 4).clone()
-    return State(zero, quat, zero, zero)
+    position, quat = zero.clone(), matrix_to_quat(torch.eye(3).to(like)).expand(batch, len(world.bodies), 4).clone()
+    for index, body in enumerate(world.bodies):
+        if body.motion == "fixed" and body.place is not None:
+            position[:, index], quat[:, index] = body.place[:, :3], body.place[:, 3:]
+    return State(position, quat, zero, zero)

@@ -21,7 +21,7 @@ class Body:
     """A rigid body made of spheres. Every tensor has a batch dimension of 1 or B.
 
     mass (B,) [kg]; inertia (B, 3, 3) [kg m2] about the centre of mass, body axes; com (B, 3) [m] in the body frame;
-    centers (B, N, 3) [m] in the body frame; radii (B, N) [m].
+    centers (B, N, 3) [m] in the body frame; radii (B, N) [m]; place (1, 7): position [m] and quat_wxyz of a fixed body.
     """
 
     name: str
@@ -31,6 +31,7 @@ class Body:
     com: Tensor
     centers: Tensor
     radii: Tensor
+    place: Tensor | None = None
 
     @property
     def free(self) -> bool:
@@ -89,6 +90,7 @@ class World:
                     tensor(body.com_m),
                     tensor(spheres.means),
                     tensor(spheres.scales * body.radius_factor),
+                    tensor((*body.photo_pose.position_m, *body.photo_pose.quat_wxyz)),
                 )
             )
         law = ContactLaw(
