@@ -232,12 +232,12 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
     fitted = _merge(start, found)
     ready = replace(ready, file=fitted, fit=FitFile(stages=ready.fit.stages | {"phys-geo": record}))
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
+        from .appearance import learn_appearance
         from .exposure import estimate_exposures
-        from .lighting import estimate_light
 
         exposures = estimate_exposures(ready, capture, split, config.device)
-        light = estimate_light(ready, capture, exposures, split)
-        ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures, "light": light}))
+        ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures}))
+        ready = learn_appearance(ready, capture, exposures, split)
     return ready
 
 

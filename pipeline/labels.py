@@ -96,8 +96,9 @@ class LabelRenderer:
                 static.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
             else:
                 light, normals = model.file.light, model.body_splats[body.name].normals
-                known = light is not None and normals is not None
-                relighting = Relighting.of(light, body, self._float(normals)) if known else None
+                relighting = None
+                if light is not None and normals is not None:
+                    relighting = Relighting.of(light, body, self._float(normals))
                 self._moving.append(_Moving(index, spheres, relighting))
         nothing = torch.zeros(0, 3, device=device)
         empty = _Spheres(nothing, nothing[:, 0], nothing[:, 0], torch.zeros(0, 3 + self._labels, device=device))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..datasets.capture import Capture
@@ -201,7 +201,7 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
     visual = None
     if world is not None and solid is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
-        nearest = cKDTree(solid.surface).query(world.means.cpu().numpy())[1]
+        nearest = KDTree(solid.surface).query(world.means.cpu().numpy())[1]
         visual = replace(visual, normals=solid.normals[nearest] @ T_body_world[:3, :3].T)
     pose = body.photo_pose or _pose(T_world_body)
     return BodyResult(visual, collision, distance, pose, mass_properties), world

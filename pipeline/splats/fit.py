@@ -232,6 +232,13 @@ def mean_colors(spheres: Spheres, views: Sequence[View], body: int | None = None
     return spread_colors(spheres.means, total[:, :3] / total[:, 3:].clamp_min(1e-6), total[:, 3])
 
 
+def sphere_weights(spheres: Spheres, view: View) -> Tensor:
+    """Return each sphere's weight in a photo, summed over its pixels [px], shape (N,)."""
+    features = torch.zeros(len(spheres), 1, device=spheres.means.device, requires_grad=True)
+    image = render_view(Spheres(spheres.means, spheres.scales, spheres.opacities, features), view).features[0]
+    return torch.autograd.grad(image.sum(), features)[0][:, 0]
+
+
 def spread_colors(means: Tensor, colors: Tensor, seen: Tensor, least: float = 0.5, neighbours: int = 4) -> Tensor:
     """Give spheres that are hardly seen the mean colour of the nearest ones that are.
 

@@ -22,7 +22,7 @@ _COARSE = 40
 _FINEST = 128
 _PITCH_PX = 0.6
 _BORDER_SMOOTHING_PX = 0.7
-_BORDER_BIAS_PX = 0.3
+_BORDER_BIAS_PX = 0.5
 _TIP_DIRECTIONS = 500
 _MIN_VIEWS = 3
 
@@ -67,7 +67,7 @@ def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = 
             f"at least {_MIN_VIEWS}; 20 or more from all sides give a good shape.",
             "add masks, or give the body a shape in capture.toml.",
         )
-    fields = [_signed_distance_px(view.mask) for view in views]
+    fields = [signed_distance_px(view.mask) for view in views]
     center, radius = _bounds(views)
     pitch = 2 * radius / (_COARSE - 1)
     origin = center - radius
@@ -136,7 +136,7 @@ def _refined(
     return coarse, origin, pitch
 
 
-def _signed_distance_px(mask: NDArray[np.bool_]) -> Array:
+def signed_distance_px(mask: NDArray[np.bool_]) -> Array:
     """Return the distance from the mask's border at pixel centres [px], positive inside, shape (H, W)."""
     image = mask.astype(np.uint8)
     inner = cv2.distanceTransform(np.pad(image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

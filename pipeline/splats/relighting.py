@@ -54,4 +54,8 @@ class Relighting:
 
     def factors(self, quat_wxyz: Tensor) -> Tensor:
         """Return the factors (N,) of the colours at an orientation (4,)."""
-        return brightness(self.light, self.normals @ quat_to_matrix(quat_wxyz).T) / self.in_photos
+        return self.turned(quat_to_matrix(quat_wxyz))
+
+    def turned(self, rotation: Tensor) -> Tensor:
+        """Return the factors (N,) of the colours at an orientation (3, 3)."""
+        return brightness(self.light, self.normals @ rotation.T) / self.in_photos

@@ -2,7 +2,9 @@
 
 Silhouettes bound a flat or hollow surface only where some view grazes it; elsewhere the hull bulges. So patches of the
 surface are moved along the normal to where the photos agree on them (normalised cross-correlation, as in multi-view
-stereo), and the hull is carved down to there. Where there is no texture to tell, the hull stays.
+stereo), and the hull is carved down to there. Where there is no texture to tell, the hull stays; and so do edges and
+corners: every point of a hull is on the outline of some photo, but one that is on the outlines of many is on the body,
+and patches that reach around an edge would tell otherwise.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
+from .hull import signed_distance_px
 from .views import View
 from .volume import Array, Volume, crossings, grid_points
 
@@ -32,6 +35,9 @@ _LEAST_PEAK = 0.4
 _LEAST_CONTRAST = 0.12
 _PRIOR = 0.02
 _PASSES = 2
+_RIM_PX = 1.2
+_RIM_SHARE = 0.2
+"""A point within `_RIM_PX` of the outline in more than this share of the photos is on the body, and stays."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +91,26 @@ def _pass(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[V
     pooled = (weight[..., None] * scores[near]).sum(1) / np.maximum(weight.sum(1), 1e-9)[:, None]
     shift, confidence = _peaks(pooled, offsets)
     confidence *= weight.sum(1) > 0
-    shift = _smoothed(shift, confidence, near, alike)
+    pinned = _outlined(points, views, body) > _RIM_SHARE * len(views)
+    shift, confidence = np.where(pinned, 0.0, shift), np.where(pinned, 1.0, confidence)
+    shift = np.where(pinned, 0.0, _smoothed(shift, confidence, near, alike))
     record = Refinement(float(shift.mean()), float(shift.min()), float((confidence > 0).mean()))
     return _deformed(solid, points, shift), record
+
+
+def _outlined(points: Array, views: Sequence[View], body: int) -> Array:
+    """Return in how many photos each point (n, 3) lies on the body's outline, shape (n,)."""
+    count = np.zeros(len(points))
+    for view in views:
+        silhouette = view.silhouette(body)
+        if silhouette is None or not silhouette.mask.any():
+            continue
+        distance = signed_distance_px(silhouette.mask)
+        pixel, depth = view.camera.project(points)
+        column, row = (np.floor(np.nan_to_num(pixel[:, k], nan=-1)).astype(int) for k in range(2))
+        seen = (depth > 0) & (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
+        count[seen] += np.abs(distance[row[seen], column[seen]]) < _RIM_PX
+    return count
 
 
 def _smooth_normals(solid: Volume, index: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.lighting import fit_light
+from cgwm.pipeline.appearance import fit_light
 from cgwm.pipeline.physics.rotation import quat_to_matrix
 from cgwm.pipeline.splats.relighting import Relighting, brightness, light_basis
 from cgwm.schemas import Light
@@ -33,14 +33,14 @@ def test_light_is_found_from_brightness_ratios_with_outliers() -> None:
     ratio = (brightness(LIGHT, torch.as_tensor(now)) / brightness(LIGHT, torch.as_tensor(photo))).numpy()
     ratio *= 1 + 0.05 * rng.standard_normal(3000)
     ratio[:300] *= 0.5  # a cast shadow
-    found = fit_light(ratio, now, photo)
+    found = fit_light(ratio, now, photo, 3000)
     assert found.coefficients == pytest.approx(LIGHT.coefficients, abs=0.02)
 
 
 def test_what_the_motion_does_not_tell_stays_dark() -> None:
     """A body that did not turn says nothing: every ratio is 1, and so is the light."""
     photo = _directions(500, 6)
-    assert fit_light(np.ones(500), photo, photo).coefficients == pytest.approx((0.0,) * 8, abs=1e-9)
+    assert fit_light(np.ones(500), photo, photo, 500).coefficients == pytest.approx((0.0,) * 8, abs=1e-9)
 
 
 def test_photos_pose_keeps_its_colours_and_a_turn_does_not() -> None:

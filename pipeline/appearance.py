@@ -1,0 +1,258 @@
+"""What a measured motion adds to a body's looks: the light that falls on it, and the sides that no photo shows.
+
+The spheres carry the colours of the photos, where the body rests and hides its underside. Frames of a motion with known
+poses show its sides in other light: their ratio tells the light (`splats.relighting` applies it), and with it they tell
+the colours of what the photos did not show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datasets.cameras import Camera
+from ..datasets.capture import Capture
+from ..datasets.models import Model
+from ..datasets.ply import Splats
+from ..datasets.tracks import Track
+from ..schemas import Exposure, Light
+from .image_errors import usable_cameras, video_view
+from .physics.driven import Drive
+from .physics.rotation import quat_to_matrix
+from .splats.fit import sphere_weights
+from .splats.relighting import Relighting, light_basis
+from .splats.render import render
+from .splats.spheres import Spheres
+from .splats.views import load_views
+
+Array = NDArray[np.float64]
+
+EPISODES, FRAMES = 4, 12
+"""Episodes to look at, and frames of each camera of an episode."""
+PHOTOS, PHOTO_SIZE = 16, 320
+"""Photos, evenly spread, that tell which spheres were seen, and their longer side [px]."""
+SEEN_PX = 0.5
+"""A sphere with less weight than this in all these photos together was not seen."""
+BLOCK_PX = 4
+"""Means over blocks of this side are compared: texture that is a little off cancels in them."""
+MIN_BLOCKS = 200
+MIN_ALPHA = 0.95
+SATURATED = (0.03, 0.97)
+PRIOR_STD = (0.3,) * 3 + (0.1,) * 5
+"""Spread of the coefficients before any data: a lamp as bright as the room has at most 0.4 and 0.15 of each degree."""
+SIDE_STD = 0.1
+"""Relative error of a side's brightness in a frame: its texture is not quite the photos'."""
+SIDES_PER_FRAME = 3.0
+"""Blocks on one side err alike; a frame counts as this many independent ones."""
+IRLS_STEPS = 12
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A body in a frame: colours in the model's exposure (H, W, 3), where they count (H, W), camera, body's pose."""
+
+    body: int
+    image: Array
+    usable: NDArray[np.bool_]
+    camera: Camera
+    rotation: Tensor
+    position: Tensor
+
+
+def learn_appearance(model: Model, capture: Capture, exposures: dict[str, Exposure], split: str = "train") -> Model:
+    """Add to a model the light, and the colours of spheres that only the motion shows.
+
+    Args:
+        model: With spheres of the bodies, and normals on them.
+        capture: With calibrated cameras, photos, videos and measured tracks.
+        exposures: Of the video cameras; others are not looked at.
+        split: The episodes to look at.
+
+    Returns:
+        The model, unchanged where too little of a moving body is seen.
+    """
+    frames = _frames(model, capture, exposures, split)
+    seen = {name: _seen(model, capture, name) for name in {model.file.bodies[frame.body].name for frame in frames}}
+    rows = [row for frame in frames if (row := _ratios(model, frame, seen)) is not None]
+    if sum(len(ratio) for ratio, _, _ in rows) < MIN_BLOCKS:
+        return model
+    ratio, now, photo = (np.concatenate([row[k] for row in rows]) for k in range(3))
+    light = fit_light(ratio, now, photo, SIDES_PER_FRAME * len(rows))
+    splats = dict(model.body_splats)
+    for index, body in enumerate(model.file.bodies):
+        mine = [frame for frame in frames if frame.body == index]
+        if mine:
+            splats[body.name] = _colored(model, index, mine, light, seen[body.name])
+    return replace(model, file=model.file.model_copy(update={"light": light}), body_splats=splats)
+
+
+def fit_light(ratio: Array, normals_now: Array, normals_photo: Array, independent: float) -> Light:
+    """Fit L to brightness ratios: ratio * L(n_photo) = L(n_now), linear in the coefficients, robustly.
+
+    Args:
+        ratio: Brightness in a frame over that of the photos' colours, shape (n,).
+        normals_now: Normals in the frame, world, shape (n, 3).
+        normals_photo: Of the same places in the photos, world, shape (n, 3).
+        independent: How many of the ratios are independent of each other.
+    """
+    now, photo = (light_basis(torch.as_tensor(n)).numpy() for n in (normals_now, normals_photo))
+    design, wanted = now - ratio[:, None] * photo, ratio - 1
+    share = min(1.0, independent / len(ratio)) / SIDE_STD**2
+    prior = np.diag(1 / np.square(PRIOR_STD))
+    weight = np.ones(len(ratio))
+    fit = np.zeros(8)
+    for _ in range(IRLS_STEPS):
+        weighted = share * design.T * weight
+        fit = np.linalg.solve(weighted @ design + prior, weighted @ wanted)
+        residual = wanted - design @ fit
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        weight = 1 / (1 + np.square(residual / (2 * scale)))
+    x, y, z, xy, yz, xz, zz, xx_yy = (float(value) for value in fit)
+    return Light(coefficients=(x, y, z, xy, yz, xz, zz, xx_yy))
+
+
+def _frames(model: Model, capture: Capture, exposures: dict[str, Exposure], split: str) -> list[_Frame]:
+    found = []
+    for episode in capture.episodes(split)[:EPISODES]:
+        tracks = capture.tracks(episode)
+        for camera in usable_cameras(capture, episode)[0]:
+            if camera not in exposures:
+                continue
+            for index, body in enumerate(model.file.bodies):
+                track, splats = tracks.get(body.name), model.body_splats.get(body.name)
+                shown = body.motion == "free" and splats is not None and splats.normals is not None
+                if shown and track is not None and track.quat_wxyz is not None:
+                    found += _body_frames(capture, exposures[camera], camera, episode, index, track)
+    return found
+
+
+def _body_frames(
+    capture: Capture, exposure: Exposure, camera: str, episode: str, index: int, track: Track
+) -> list[_Frame]:
+    times = capture.frame_times(camera, episode)
+    inside = np.flatnonzero((times >= track.time_s[0] - 1e-6) & (times <= track.time_s[-1] + 1e-6))
+    if not len(inside):
+        return []
+    chosen = np.unique(inside[np.linspace(0, len(inside) - 1, FRAMES).round().astype(int)])
+    frames, numbers = capture.video_frames(camera, episode), capture.frame_numbers(camera, episode)
+    masks = capture.video_masks(camera, episode)
+    drive = Drive.of([track], torch.zeros(0, dtype=torch.float64))
+    gain, offset = np.asarray(exposure.gain_rgb), np.asarray(exposure.offset_rgb)
+    found = []
+    for k in chosen:
+        pose = drive.at(torch.tensor([times[k]], dtype=torch.float64))
+        view = video_view(capture, camera, episode, int(numbers[k]), frames.shape[2:0:-1])
+        real, plain = view.undistorted(frames[k])
+        image = real.astype(np.float64) / 255
+        usable = view.undistorted(np.full(real.shape[:2], 255, np.uint8))[0] == 255
+        usable &= (image > SATURATED[0]).all(-1) & (image < SATURATED[1]).all(-1)
+        if masks is not None:
+            label = (view.undistorted(masks[k], labels=True)[0] == index + 1).astype(np.uint8)
+            usable &= cv2.erode(label, np.ones((3, 3))) > 0
+        rotation = quat_to_matrix(pose.quat_wxyz[0])
+        found.append(_Frame(index, (image - offset) / gain, usable, plain, rotation, pose.com[0]))
+    return found
+
+
+def _seen(model: Model, capture: Capture, name: str) -> NDArray[np.bool_]:
+    """Return which spheres (N,) of a body the photos show."""
+    splats = model.body_splats[name]
+    if capture.cameras is None:
+        return np.ones(len(splats), bool)
+    posed = [photo for photo in capture.photos() if photo in capture.cameras.images]
+    picked = np.unique(np.linspace(0, len(posed) - 1, PHOTOS).round().astype(int)) if posed else []
+    views = load_views(capture, [posed[k] for k in picked], PHOTO_SIZE, torch.device("cpu"))
+    parts = []
+    for body in [
+        next(b for b in model.file.bodies if b.name == name),
+        *(b for b in model.file.bodies if b.name != name),
+    ]:
+        if body.name in model.body_splats:
+            T_world_body = torch.eye(4)
+            T_world_body[:3, :3] = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz))
+            T_world_body[:3, 3] = torch.tensor(body.photo_pose.position_m)
+            parts.append(Spheres.from_numpy(model.body_splats[body.name]).moved(T_world_body))
+    if model.scene is not None:
+        parts.append(Spheres.from_numpy(model.scene))
+    weight = sum((sphere_weights(Spheres.joined(parts), view)[: len(splats)] for view in views), torch.zeros(()))
+    return (weight.expand(len(splats)) >= SEEN_PX).numpy()
+
+
+@torch.no_grad()
+def _ratios(model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]]) -> tuple[Array, Array, Array] | None:
+    """Return brightness ratios (n,) and normals now and in the photos (n, 3) of blocks on a body that photos show."""
+    body = model.file.bodies[frame.body]
+    splats = model.body_splats[body.name]
+    assert splats.normals is not None  # `_frames` has no others
+    known = seen[body.name].astype(np.float64)[:, None]
+    features, alpha = _pictured(splats, frame, np.concatenate([splats.colors, splats.normals, known], 1))
+    brightness = [frame.image.sum(-1)[..., None], features[..., :3].sum(-1)[..., None]]
+    blocks = _blocks(np.concatenate([*brightness, features[..., 3:]], -1), frame.usable & (alpha > MIN_ALPHA))
+    length = np.linalg.norm(blocks[:, 2:5], axis=1)
+    kept = (length > 0.8) & (blocks[:, 1] > 0.05) & (blocks[:, 5] > 0.9)  # not across an edge
+    if not kept.any():
+        return None
+    direction = blocks[kept, 2:5] / length[kept, None]
+    resting = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz, dtype=torch.float64)).numpy()
+    return blocks[kept, 0] / blocks[kept, 1], direction @ frame.rotation.numpy().T, direction @ resting.T
+
+
+def _pictured(splats: Splats, frame: _Frame, features: Array) -> tuple[Array, Array]:
+    """Return features (H, W, F) and alpha (H, W) of a body alone in a frame."""
+    spheres = _in_frame(splats, frame, torch.as_tensor(features, dtype=torch.float32))
+    picture = _rendered(spheres, frame.camera)
+    return picture.features[0].double().numpy(), picture.alpha[0].numpy()
+
+
+def _in_frame(splats: Splats, frame: _Frame, features: Tensor) -> Spheres:
+    spheres = Spheres.from_numpy(splats)
+    means = spheres.means @ frame.rotation.float().T + frame.position.float()
+    return Spheres(means, spheres.scales, spheres.opacities, features)
+
+
+def _rendered(spheres: Spheres, camera: Camera):
+    viewmat, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (camera.T_cam_world, camera.K))
+    size = (camera.width, camera.height)
+    return render(spheres.means, spheres.scales, spheres.opacities, spheres.colors, viewmat, K, *size)
+
+
+def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, seen: NDArray[np.bool_]) -> Splats:
+    """Return a body's spheres with the colours of those that only the frames show, in the light of the photos.
+
+    What neither shows takes the mean of what is seen, as bright as its side would be.
+    """
+    body = model.file.bodies[index]
+    splats = model.body_splats[body.name]
+    if seen.all() or not seen.any():
+        return splats
+    relighting = Relighting.of(light, body, torch.as_tensor(splats.normals, dtype=torch.float64))
+    total = torch.zeros(len(splats), 4, dtype=torch.float64)
+    for frame in frames:
+        features = torch.zeros(len(splats), 4, requires_grad=True)
+        picture = _rendered(_in_frame(splats, frame, features), frame.camera).features[0]
+        usable = torch.as_tensor(frame.usable, dtype=torch.float32)[..., None]
+        real = torch.cat([torch.as_tensor(frame.image, dtype=torch.float32), torch.ones_like(usable)], -1)
+        sums = torch.autograd.grad((picture * real * usable).sum(), features)[0].double()
+        turn = relighting.turned(frame.rotation)
+        total += torch.cat([sums[:, :3] / turn[:, None], sums[:, 3:]], 1)
+    in_photos = relighting.in_photos.numpy()
+    colors = np.array(splats.colors, np.float64)
+    plain = np.median(colors[seen] / in_photos[seen, None], axis=0)
+    shown = ~seen & (total[:, 3].numpy() >= SEEN_PX)
+    colors[~seen] = in_photos[~seen, None] * plain
+    colors[shown] = (total[:, :3] / total[:, 3:].clamp_min(1e-9)).numpy()[shown]
+    return replace(splats, colors=colors.clip(0, 1))
+
+
+def _blocks(table: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return the means (n, C) of the blocks of a table (H, W, C) all of whose pixels are usable."""
+    height, width = (size // BLOCK_PX for size in usable.shape)
+    whole = table[: height * BLOCK_PX, : width * BLOCK_PX].reshape(height, BLOCK_PX, width, BLOCK_PX, -1)
+    full = usable[: height * BLOCK_PX, : width * BLOCK_PX].reshape(height, BLOCK_PX, width, BLOCK_PX).all((1, 3))
+    return whole.mean((1, 3))[full]
