@@ -191,7 +191,7 @@ def _ratios(model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]]) -> 
     splats = model.body_splats[body.name]
     assert splats.normals is not None  # `_frames` has no others
     known = seen[body.name].astype(np.float64)[:, None]
-    features, alpha = _pictured(splats, frame, np.concatenate([splats.colors, splats.normals, known], 1))
+    features, alpha = _pictured(splats, frame, np.concatenate([splats.colors, splats.normals, known], 1).astype(float))
     brightness = [frame.image.sum(-1)[..., None], features[..., :3].sum(-1)[..., None]]
     blocks = _blocks(np.concatenate([*brightness, features[..., 3:]], -1), frame.usable & (alpha > MIN_ALPHA))
     length = np.linalg.norm(blocks[:, 2:5], axis=1)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.appearance import fit_light
+from cgwm.datasets.cameras import Camera
+from cgwm.datasets.models import Model
+from cgwm.datasets.ply import Splats
+from cgwm.pipeline.appearance import _colored, _Frame, _in_frame, _ratios, _rendered, fit_light
 from cgwm.pipeline.physics.rotation import quat_to_matrix
 from cgwm.pipeline.splats.relighting import Relighting, brightness, light_basis
 from cgwm.schemas import Light
@@ -53,3 +58,49 @@ def test_photos_pose_keeps_its_colours_and_a_turn_does_not() -> None:
     expected = brightness(LIGHT, normals @ quat_to_matrix(over).T) / relighting.in_photos
     torch.testing.assert_close(relighting.factors(over), expected)
     assert float(relighting.factors(over).std()) > 0.1
+
+
+def _ball_filmed(light: Light) -> tuple[Model, Splats, list[_Frame]]:
+    """Return a ball's model, its true colours in the light of the photos, and frames of it turning in that light."""
+    model = small_model()
+    normals = _directions(900, 8)
+    albedo = 0.35 + 0.1 * (normals[:, :1] > 0) + 0.1 * np.array([1.0, 0.0, -1.0]) * (normals[:, 1:2] > 0)
+    body = model.file.bodies[0]
+    relighting = Relighting.of(light, body, torch.as_tensor(normals))
+    colors = albedo * relighting.in_photos.numpy()[:, None]
+    ball = Splats(0.05 * normals, np.full(900, 0.003), np.full(900, 0.95), colors, normals)
+    camera = Camera(96, 72, np.array([[150.0, 0, 48], [0, 150, 36], [0, 0, 1]]), np.zeros(0), np.eye(4))
+    position = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64)
+    frames = []
+    for quat in np.random.default_rng(9).standard_normal((24, 4)):
+        rotation = quat_to_matrix(torch.as_tensor(quat / np.linalg.norm(quat)))
+        blank = _Frame(0, np.zeros((72, 96, 3)), np.ones((72, 96), bool), camera, rotation, position)
+        lit = torch.as_tensor(colors) * relighting.turned(rotation)[:, None]
+        picture = _rendered(_in_frame(ball, blank, lit.float()), camera)
+        usable = picture.alpha[0].numpy() > 0.97
+        frames.append(replace(blank, image=picture.features[0].double().numpy(), usable=usable))
+    return replace(model, body_splats={body.name: ball}), ball, frames
+
+
+def test_light_is_found_from_frames_of_a_turning_ball() -> None:
+    model, ball, frames = _ball_filmed(LIGHT)
+    rows = [_ratios(model, frame, {"cube": np.ones(len(ball), bool)}) for frame in frames]
+    ratio, now, photo = (np.concatenate([row[k] for row in rows if row is not None]) for k in range(3))
+    found = fit_light(ratio, now, photo, 3 * len(rows))
+    directions = torch.as_tensor(_directions(500, 10))
+    np.testing.assert_allclose(brightness(found, directions), brightness(LIGHT, directions), atol=0.12)
+
+
+def test_sides_that_no_photo_shows_get_their_colours_from_the_frames() -> None:
+    model, ball, frames = _ball_filmed(LIGHT)
+    assert ball.normals is not None
+    seen = ball.normals[:, 2] > -0.5
+    hidden = replace(ball, colors=np.where(seen[:, None], ball.colors, 0.9))
+    model = replace(model, body_splats={"cube": hidden})
+    found = _colored(model, 0, frames, LIGHT, seen)
+    np.testing.assert_array_equal(found.colors[seen], hidden.colors[seen])
+    error = np.abs(found.colors - ball.colors)[~seen]
+    assert np.median(error) < 0.03
+    # without frames, the mean of what is seen stands in, as bright as that side would be
+    blind = _colored(model, 0, [], LIGHT, seen)
+    assert np.median(np.abs(blind.colors - ball.colors)[~seen]) < 0.12

@@ -10,7 +10,7 @@ import torch
 from cgwm.datasets import Track
 from cgwm.pipeline.estimation.forward import batched_jacobian
 from cgwm.pipeline.physics import State, restitution, simulate
-from cgwm.pipeline.physics.distance import smooth_min, union_distance
+from cgwm.pipeline.physics.distance import plane_contacts, smooth_min, union_distance
 from cgwm.pipeline.physics.rotation import quat_rotate, quat_to_matrix
 from cgwm.pipeline.splats.collision import shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
@@ -259,3 +259,32 @@ def test_initial_states_pass_through_unchanged() -> None:
     for key in ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s"):
         torch.testing.assert_close(getattr(rollout, key)[:, 0], getattr(start, key), atol=1e-12, rtol=0)
     assert quat_to_matrix(rollout.quat_wxyz).shape == (1, 3, 1, 3, 3)
+
+
+def test_a_plane_touches_a_box_of_many_spheres_by_its_corners() -> None:
+    """The 8 corners have the whole support function; what the other spheres of a side add is nothing."""
+    splats, _ = shape_to_spheres(Shape(box=BoxShape(half_extents_m=(0.05, 0.04, 0.03))), Path(), 120)
+    centers, radii = torch.as_tensor(splats.means), torch.as_tensor(2 * splats.scales)
+    chosen = plane_contacts(centers, radii)
+    assert len(chosen) == 8 < len(radii)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)).double())
+    reach = centers @ directions.T + radii[:, None]
+    assert float((reach.amax(0) - reach[chosen].amax(0)).max()) < 1.5e-4
+
+
+def test_recording_contacts_changes_no_motion_where_the_ground_sees_fewer_spheres() -> None:
+    body = box_body()
+    inner = torch.cat([body.centers, 0.5 * body.centers], 1)
+    body = replace(body, centers=inner, radii=torch.full((1, 16), 0.001, dtype=F64))
+    on_plane = plane_contacts(body.centers[0], body.radii[0])
+    assert on_plane.tolist() == list(range(8))
+    world = world_of(replace(body, on_plane=on_plane))
+    start = state_of(((0, 0, 0.1), (0.9, 0.3, 0.2, 0.1), (0.3, 0.1, -0.5), (2.0, 1.0, -1.0)), count=2)
+    plain, recorded, every = (
+        simulate(one, start, times(0.4), record_contacts=record)
+        for one, record in ((world, False), (world, True), (world_of(body), False))
+    )
+    torch.testing.assert_close(plain.position_m, recorded.position_m, rtol=0, atol=1e-9)
+    torch.testing.assert_close(plain.position_m, every.position_m, rtol=0, atol=1e-9)
+    assert recorded.contacts is not None
+    assert recorded.contacts.impulse_n_s.shape[2] == 8

@@ -5,6 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..splats.directions import fibonacci_directions
+
+_PLANE_DIRECTIONS = 2000
+
 
 def smooth_min(distances: Tensor, width: float) -> tuple[Tensor, Tensor]:
     """Return the smoothed minimum of signed distances and its weights.
@@ -60,3 +64,28 @@ def union_distance(points: Tensor, centers: Tensor, radii: Tensor, width: float)
     up[..., 2] = 1.0
     known = norm2 > 1e-16
     return value, torch.where(known, gradient / torch.where(known, norm2, torch.ones_like(norm2)).sqrt(), up)
+
+
+def plane_contacts(centers: Tensor, radii: Tensor, tolerance_m: float = 1e-4) -> Tensor:
+    """Return the indices (K,) of the spheres by which a plane touches a union of spheres.
+
+    A plane sees of a union only its support function, the largest n . c + r, and most spheres on a flat side add
+    nothing to it that the corners do not have. Spheres are taken greedily where the support function of those taken
+    lacks most, until it lacks less than the tolerance.
+
+    Args:
+        centers: Sphere centres [m], shape (N, 3).
+        radii: Sphere radii [m], shape (N,).
+        tolerance_m: How much of the support function may be lost [m].
+    """
+    directions = torch.as_tensor(fibonacci_directions(_PLANE_DIRECTIONS)).to(centers)
+    reach = centers @ directions.T + radii[:, None]
+    full, taken = reach.amax(0), torch.full_like(reach[0], -torch.inf)
+    chosen: list[int] = []
+    while True:
+        lacking = full - taken
+        place = int(lacking.argmax())
+        if float(lacking[place]) <= tolerance_m:
+            return torch.tensor(sorted(chosen), device=centers.device)
+        chosen.append(int(reach[:, place].argmax()))
+        taken = torch.maximum(taken, reach[chosen[-1]])

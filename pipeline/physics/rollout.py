@@ -179,15 +179,17 @@ class _Engine:
 
     def _contacts(self, motions: list[Motion], rotations: list[Tensor], h: Tensor) -> list[_Group]:
         """Return the contacts of a step with their impulses: the closed form, then further sweeps where wanted."""
-        paired = {index for a, b in self.pairs if b >= 0 or self.every_contact for index in (a, b)}
-        centers = {index: self._centers(index, motions[index], rotations[index]) for index in paired - {-1}}
+        paired = {index for a, b in self.pairs if b >= 0 for index in (a, b)}
+        centers = {index: self._centers(index, motions[index], rotations[index]) for index in paired}
         groups: list[_Group] = []
         prepared: dict[int, tuple[ContactGroup, Side, Side | None]] = {}
         for a, b in self.pairs:
-            if b < 0 and not self.every_contact:
-                touching = self._touch_ground(a, motions[a], rotations[a], h)
-                if touching is None:
-                    continue
+            if b < 0:
+                touching = self._on_plane(a, motions[a]) if self.every_contact else None
+                if not self.every_contact:
+                    touching = self._touch_ground(a, motions[a], rotations[a], h)
+                    if touching is None:
+                        continue
                 near = {a: self._centers(a, motions[a], rotations[a], touching)}
                 gap, normal, point = self._geometry(a, b, near, touching)
             else:
@@ -244,8 +246,15 @@ class _Engine:
             height, rate = _along(arms, rotation.transpose(-1, -2) @ axes).unbind(-1)
             gap = height + (com @ normal - offset)[:, None] - _plain(body.radii)
             depth = torch.minimum(gap, gap + _plain(h)[:, None] * (rate + (velocity @ normal)[:, None]))
+            if body.on_plane is not None:
+                depth = torch.full_like(depth, torch.inf).index_copy(1, body.on_plane, depth[:, body.on_plane])
             most = int((depth < ROUNDING_M).sum(1).max())
             return depth.topk(most, dim=1, largest=False, sorted=False).indices if most else None
+
+    def _on_plane(self, index: int, motion: Motion) -> Tensor | None:
+        """Return the spheres (B, K) of a body that the ground can touch; None for all."""
+        chosen = self.world.bodies[index].on_plane
+        return None if chosen is None else chosen.expand(motion.com.shape[0], -1)
 
     def _centers(self, index: int, motion: Motion, rotation: Tensor, chosen: Tensor | None = None) -> Tensor:
         body = self.world.bodies[index]
@@ -298,7 +307,12 @@ class _Engine:
         centers = {i: self._centers(i, m, r) for i, (m, r) in enumerate(zip(motions, rotations, strict=True))}
         columns = []
         for number, (a, b) in enumerate(self.pairs):
-            gap, normal, point = self._geometry(a, b, centers)
+            if b < 0:
+                chosen = self._on_plane(a, motions[a])
+                near = {a: self._centers(a, motions[a], rotations[a], chosen)}
+                gap, normal, point = self._geometry(a, b, near, chosen)
+            else:
+                gap, normal, point = self._geometry(a, b, centers)
             total = torch.zeros_like(point)
             weighted, weight = torch.zeros_like(point), torch.zeros_like(gap)
             sliding = torch.zeros_like(gap)
@@ -327,7 +341,8 @@ class _Engine:
         return ContactRecord(body_a, body_b, *(torch.stack([r[k] for r in records], 1) for k in range(5)))
 
     def _count(self, a: int, b: int) -> int:
-        return self.world.bodies[a if b < 0 else b].radii.shape[-1]
+        body = self.world.bodies[a if b < 0 else b]
+        return body.radii.shape[-1] if b >= 0 or body.on_plane is None else len(body.on_plane)
 
 
 def _plain(value: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...schemas import InputDataError
 from .contact import ContactLaw
+from .distance import plane_contacts
 
 if TYPE_CHECKING:
     from ...datasets.models import Model
@@ -21,7 +22,8 @@ class Body:
     """A rigid body made of spheres. Every tensor has a batch dimension of 1 or B.
 
     mass (B,) [kg]; inertia (B, 3, 3) [kg m2] about the centre of mass, body axes; com (B, 3) [m] in the body frame;
-    centers (B, N, 3) [m] in the body frame; radii (B, N) [m]; place (1, 7): position [m] and quat_wxyz of a fixed body.
+    centers (B, N, 3) [m] in the body frame; radii (B, N) [m]; place (1, 7): position [m] and quat_wxyz of a fixed body;
+    on_plane (K,): which spheres the ground can touch, all where None.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Body:
     centers: Tensor
     radii: Tensor
     place: Tensor | None = None
+    on_plane: Tensor | None = None
 
     @property
     def free(self) -> bool:
@@ -81,6 +84,7 @@ class World:
         bodies = []
         for body in file.bodies:
             spheres = model.collision[body.name]
+            centers, radii = tensor(spheres.means), tensor(spheres.scales * body.radius_factor)
             bodies.append(
                 Body(
                     body.name,
@@ -88,9 +92,10 @@ class World:
                     tensor(body.mass_kg),
                     tensor(symmetric(body.inertia_kg_m2)),
                     tensor(body.com_m),
-                    tensor(spheres.means),
-                    tensor(spheres.scales * body.radius_factor),
+                    centers,
+                    radii,
                     tensor((*body.photo_pose.position_m, *body.photo_pose.quat_wxyz)),
+                    plane_contacts(centers[0], radii[0]),
                 )
             )
         law = ContactLaw(
