@@ -77,13 +77,13 @@ def _release(rng: np.random.Generator, solid: SolidObject) -> tuple[Array, Array
     """Draw a release, tossed a little upwards: pose and velocity of the body frame, by when it lands and how fast."""
     quat_wxyz = rng.standard_normal(4)
     quat_wxyz /= np.linalg.norm(quat_wxyz)
-    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.1, 0.35)
+    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.1, 0.3)
     direction = np.array([np.cos(heading), np.sin(heading), 0])
     position = -direction * rng.uniform(0.06, 0.14)
-    rise, landing = rng.uniform(0.1, 0.4), rng.uniform(0.145, 0.18)
+    rise, landing = rng.uniform(0.2, 0.45), rng.uniform(0.145, 0.18)
     position[2] = lowest(solid, quat_wxyz) + GRAVITY / 2 * landing**2 - rise * landing
     spin = rng.standard_normal(3)
-    omega_body = spin / np.linalg.norm(spin) * rng.uniform(0.5, 2.0)
+    omega_body = spin / np.linalg.norm(spin) * rng.uniform(0.5, 1.5)
     velocity = speed * direction + (0, 0, rise)
     return np.concatenate([position, quat_wxyz]), np.concatenate([velocity, omega_body])
 
