@@ -20,7 +20,7 @@ from ..schemas import (
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
 from .manifest import write_manifest
-from .progress import progress
+from .progress import note, progress
 from .tracks import Track, tracks_csv
 
 Array = NDArray[np.float64]
@@ -75,6 +75,8 @@ def import_contactnets(
     with new_directory(out, overwrite) as directory:
         tosses = _read(Path(source))
         names = [f"{number:03d}" for number in sorted(tosses.tracks)]
+        if len(names) < n_train + n_test:
+            note(f"only {len(names)} tosses, {n_train + n_test} were asked for: a third is 'train', the rest 'test'")
         manifest = _manifest(tosses.half_width_m, _splits(names, n_train, n_test, seed))
         write_manifest(directory / "capture.toml", manifest)
         (directory / "tracks").mkdir()

@@ -181,6 +181,11 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
         solid = _hull(stage, index, body)
     elif masked:
         solid = _moved(shape_volume(body.shape, stage.capture.root, stage.config.radius_factor), T_world_body)
+    elif stage.train:
+        stage.warnings.append(
+            f"body '{body.name}': no mask shows it, so that it has a shape for contact and no looks; masks/ with label "
+            f"{index + 1} would give it some."
+        )
     world = None if solid is None else _fit_spheres(stage, index, body, solid)
     if body.photo_pose is None and body.shape is None and world is not None:
         T_world_body = np.eye(4)
