@@ -237,7 +237,8 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
 
         exposures = estimate_exposures(ready, capture, split, config.device)
         ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures}))
-        ready = learn_appearance(ready, capture, exposures, split)
+        if config.supervise != "images":  # then measured tracks are not to be looked at
+            ready = learn_appearance(ready, capture, exposures, split)
     return ready
 
 
