@@ -40,12 +40,13 @@ from .physics.world import State, World
 
 PRIOR = {
     "friction": (0.3, 0.5),
-    "contact_time_s": (0.005, 0.4),
+    "contact_time_s": (0.0033, 0.5),
     "damping_ratio": (0.4, 0.6),
     "ground_shift_m": (0.0, 0.002),
 }
 """Median and standard deviation before any data, the latter in the fitted coordinate (natural logarithm where the
-parameter is logarithmic). One toss hardly shows some of them; this keeps those plausible."""
+parameter is logarithmic). One toss hardly shows some of them; this keeps those plausible. The contact time is that of
+the real cube tosses: what is called rigid touches for a few milliseconds."""
 ERRORS_PER_EPISODE = 3.0
 """Independent errors in one episode's open-loop error; `docs/benchmarks.md` has how the intervals cover with it."""
 MAX_SPAN_S = 0.8
