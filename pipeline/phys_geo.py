@@ -55,9 +55,11 @@ MAX_ROLLOUTS = 1200
 """Rollouts in one batch of the search."""
 POPULATION = (24, 96)
 """Fewest and most samples in a generation, where the settings leave it open: about `MAX_ROLLOUTS` rollouts."""
-EXPLAINED = 1.4
-"""Up to this many times the error that noise alone makes, a motion counts as explained and is worth refining."""
-OPEN_LOOP_TOLERANCE = 1.1
+WORTH_REFINING = 2.0
+"""Up to this many times the error that noise alone makes, a motion may be explained by the model, and is refined."""
+EXPLAINED = 0.5
+"""It is explained if after contact the model errs by no more than this share of the noise beyond the noise."""
+OPEN_LOOP_TOLERANCE = 1.5
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
 ENOUGH_EPISODES = 8
 """From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
@@ -144,7 +146,7 @@ def fit_physics(
     best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
     if covariance is None:
         best, covariance = search.mean, search.covariance
-        if search.lowest < EXPLAINED * _noise_floor(world, observations, sigma):
+        if search.lowest < WORTH_REFINING * _noise_floor(world, observations, sigma):
             best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
     record["correlation"] = _correlation(covariance).tolist()
     return physics_fit(world, names, best, covariance, sigma, record)
@@ -166,10 +168,11 @@ def _refined(
     config: PhysConfig,
     record: dict[str, Any],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the refined estimate and its covariance, or the search's where that predicts clearly better."""
+    """Return the refined estimate and its covariance; the search's where the motion is not explained after all."""
     solution, misfit = _refine(world, observations, names, search.mean, sigma, config)
     cost = float(_open_loop(world, observations, warm, names)(solution.shared.numpy()[None]).mean())
-    keep = math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
+    explained = all(error <= EXPLAINED * noise for error, noise in zip(misfit, sigma, strict=True))
+    keep = explained and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
     record |= {
         "refinement_cost": solution.costs,
         "refinement_converged": solution.converged,
@@ -431,7 +434,7 @@ def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance:
         (slope,) = torch.autograd.grad(value, z)
         std = math.sqrt(float(slope.numpy() @ covariance @ slope.numpy()))
         estimate = float(value.detach())
-        reach = math.exp(1.96 * std / estimate)  # first order in the logarithm: they are positive
+        reach = math.exp(min(1.96 * std / estimate, 30.0))  # first order in the logarithm: they are positive
         note = (
             "speed ratio of a head-on impact" if name == "restitution" else f"of one contact that carries {mass:g} kg"
         )

@@ -117,8 +117,8 @@ def test_the_body_is_where_it_stood(result):
     np.testing.assert_allclose(np.asarray(ball.visual.means).mean(0), 0, atol=1e-6)
     properties = ball.mass_properties
     np.testing.assert_allclose(properties.com_m, 0, atol=2e-3)
-    assert properties.volume_m3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.15)
-    np.testing.assert_allclose(properties.inertia_m2, 0.4 * RADIUS**2 * np.eye(3), atol=0.15 * 0.4 * RADIUS**2)
+    assert properties.volume_m3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.2)
+    np.testing.assert_allclose(properties.inertia_m2, 0.4 * RADIUS**2 * np.eye(3), atol=0.2 * 0.4 * RADIUS**2)
     reach = np.linalg.norm(ball.collision.means, axis=1) + result.radius_factor * ball.collision.scales
     # The hull of 9 silhouettes, each pixel 2.6 mm wide, is a polyhedron around the ball.
     assert RADIUS - 2e-3 < reach.max() < RADIUS + 12e-3

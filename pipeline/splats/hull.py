@@ -143,7 +143,9 @@ def signed_distance_px(mask: NDArray[np.bool_]) -> Array:
     outer = cv2.distanceTransform(np.pad(1 - image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     signed = np.where(mask, inner[1:-1, 1:-1] - 0.5, 0.5 - outer[1:-1, 1:-1])
     # The border runs in steps between pixel centres; a little smoothing takes them out of slanted edges. The least of
-    # many such distances, each uncertain by a part of a pixel, is too small: the bias was measured on known solids.
+    # many such distances, each uncertain by a part of a pixel, is too small, most of all at edges and corners, which
+    # are on the outlines of many views: the bias was measured there, on known solids with calibrated cameras. With
+    # exact cameras a smooth body comes out larger by a third of a pixel.
     return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BORDER_SMOOTHING_PX), np.float64) + _BORDER_BIAS_PX
 
 

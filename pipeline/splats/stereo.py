@@ -36,8 +36,8 @@ _LEAST_CONTRAST = 0.12
 _PRIOR = 0.02
 _PASSES = 2
 _RIM_PX = 1.2
-_RIM_SHARE = 0.2
-"""A point within `_RIM_PX` of the outline in more than this share of the photos is on the body, and stays."""
+_RIM_SHARE, _RIM_LEAST = 0.2, 4
+"""A point within `_RIM_PX` of the outline in more than this share and number of photos is on the body, and stays."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _pass(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[V
     pooled = (weight[..., None] * scores[near]).sum(1) / np.maximum(weight.sum(1), 1e-9)[:, None]
     shift, confidence = _peaks(pooled, offsets)
     confidence *= weight.sum(1) > 0
-    pinned = _outlined(points, views, body) > _RIM_SHARE * len(views)
+    pinned = _outlined(points, views, body) > max(_RIM_SHARE * len(views), _RIM_LEAST)
     shift, confidence = np.where(pinned, 0.0, shift), np.where(pinned, 1.0, confidence)
     shift = np.where(pinned, 0.0, _smoothed(shift, confidence, near, alike))
     record = Refinement(float(shift.mean()), float(shift.min()), float((confidence > 0).mean()))
