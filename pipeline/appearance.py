@@ -26,7 +26,7 @@ from .image_errors import usable_cameras, video_view
 from .physics.driven import Drive
 from .physics.rotation import quat_to_matrix
 from .splats.fit import sphere_weights
-from .splats.relighting import Relighting, light_basis
+from .splats.relighting import Relighting, light_terms
 from .splats.render import render
 from .splats.spheres import Spheres
 from .splats.views import load_views
@@ -37,20 +37,23 @@ EPISODES, FRAMES = 4, 12
 """Episodes to look at, and frames of each camera of an episode."""
 PHOTOS, PHOTO_SIZE = 16, 320
 """Photos, evenly spread, that tell which spheres were seen, and their longer side [px]."""
-SEEN_PX = 0.5
-"""A sphere with less weight than this in all these photos together was not seen."""
+SEEN_PX = 2.0
+"""A sphere with less weight than this in all these photos together, or in all frames, was not seen."""
 BLOCK_PX = 4
 """Means over blocks of this side are compared: texture that is a little off cancels in them."""
 MIN_BLOCKS = 200
 MIN_ALPHA = 0.95
 SATURATED = (0.03, 0.97)
-PRIOR_STD = (0.3,) * 3 + (0.1,) * 5
-"""Spread of the coefficients before any data: a lamp as bright as the room has at most 0.4 and 0.15 of each degree."""
-SIDE_STD = 0.1
+PRIOR_MEAN, PRIOR_STD = np.array([0.0, 0.0, 0.6, 0.2]), np.array([0.5, 0.5, 0.5, 0.1])
+"""Lamp and sky before any data: a lamp overhead about as bright as the room, and a floor that sends some light back."""
+SIDE_STD = 0.05
 """Relative error of a side's brightness in a frame: its texture is not quite the photos'."""
 SIDES_PER_FRAME = 3.0
 """Blocks on one side err alike; a frame counts as this many independent ones."""
-IRLS_STEPS = 12
+IRLS_STEPS = 20
+FACING = 0.15
+"""A surface is seen where the cosine between its normal and the way to the camera is above this; what shines through
+the rim of a body, or of the ground before it, has been seen by nobody."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ def learn_appearance(model: Model, capture: Capture, exposures: dict[str, Exposu
 
 
 def fit_light(ratio: Array, normals_now: Array, normals_photo: Array, independent: float) -> Light:
-    """Fit L to brightness ratios: ratio * L(n_photo) = L(n_now), linear in the coefficients, robustly.
+    """Fit L to brightness ratios, ratio * L(n_photo) = L(n_now), robustly and from several directions of the lamp.
 
     Args:
         ratio: Brightness in a frame over that of the photos' colours, shape (n,).
@@ -101,20 +104,35 @@ def fit_light(ratio: Array, normals_now: Array, normals_photo: Array, independen
         normals_photo: Of the same places in the photos, world, shape (n, 3).
         independent: How many of the ratios are independent of each other.
     """
-    now, photo = (light_basis(torch.as_tensor(n)).numpy() for n in (normals_now, normals_photo))
-    design, wanted = now - ratio[:, None] * photo, ratio - 1
-    share = min(1.0, independent / len(ratio)) / SIDE_STD**2
+    share = min(1.0, independent / len(ratio))
+    starts = [0.5 * np.array([x, y, 1.0]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    found = [_light_from(start, ratio, normals_now, normals_photo, share) for start in starts]
+    x, y, z, sky = (float(value) for value in min(found, key=lambda one: one[0])[1])
+    return Light(lamp=(x, y, z), sky=min(max(sky, -1.0), 1.0))
+
+
+def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: float) -> tuple[float, Array]:
+    """Return the cost of a light and its numbers (4,), by least squares with Cauchy weights from a first lamp (3,).
+
+    On each side of the terminator the residuals are linear, so each step is a linear problem.
+    """
+    seen, pictured = torch.as_tensor(now), torch.as_tensor(photo)
     prior = np.diag(1 / np.square(PRIOR_STD))
-    weight = np.ones(len(ratio))
-    fit = np.zeros(8)
+    best, fit = np.inf, np.array([*lamp, PRIOR_MEAN[3]])
+    numbers = fit
     for _ in range(IRLS_STEPS):
-        weighted = share * design.T * weight
-        fit = np.linalg.solve(weighted @ design + prior, weighted @ wanted)
+        terms = [light_terms(normals, torch.as_tensor(fit[:3])).numpy() for normals in (seen, pictured)]
+        design, wanted = terms[0] / ratio[:, None] - terms[1], 1 - 1 / ratio  # errors are relative to the brightness
         residual = wanted - design @ fit
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        scale = max(1.4826 * float(np.median(np.abs(residual))), SIDE_STD / 2)
         weight = 1 / (1 + np.square(residual / (2 * scale)))
-    x, y, z, xy, yz, xz, zz, xx_yy = (float(value) for value in fit)
-    return Light(coefficients=(x, y, z, xy, yz, xz, zz, xx_yy))
+        away = fit - PRIOR_MEAN
+        cost = share * float(np.log1p(np.square(residual / SIDE_STD)).sum()) + away @ prior @ away
+        if cost < best:
+            best, numbers = cost, fit
+        weighted = share / SIDE_STD**2 * design.T * weight
+        fit = np.linalg.solve(weighted @ design + prior, weighted @ wanted + prior @ PRIOR_MEAN)
+    return best, numbers
 
 
 def _frames(model: Model, capture: Capture, exposures: dict[str, Exposure], split: str) -> list[_Frame]:
@@ -180,8 +198,25 @@ def _seen(model: Model, capture: Capture, name: str) -> NDArray[np.bool_]:
             parts.append(Spheres.from_numpy(model.body_splats[body.name]).moved(T_world_body))
     if model.scene is not None:
         parts.append(Spheres.from_numpy(model.scene))
-    weight = sum((sphere_weights(Spheres.joined(parts), view)[: len(splats)] for view in views), torch.zeros(()))
-    return (weight.expand(len(splats)) >= SEEN_PX).numpy()
+    spheres, normals = Spheres.joined(parts), _resting_normals(model, name)
+    weight = torch.zeros(len(splats))
+    for view in views:
+        facing = _facing(parts[0].means, normals, torch.as_tensor(view.camera.T_world_cam[:3, 3]))
+        weight += sphere_weights(spheres, view)[: len(splats)] * facing
+    return (weight >= SEEN_PX).numpy()
+
+
+def _resting_normals(model: Model, name: str) -> Tensor:
+    """Return the normals (N, 3) of a body's spheres as it stands in the photos, world frame."""
+    body = next(body for body in model.file.bodies if body.name == name)
+    rotation = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz, dtype=torch.float64))
+    return torch.as_tensor(model.body_splats[name].normals, dtype=torch.float64) @ rotation.T
+
+
+def _facing(means: Tensor, normals: Tensor, eye: Tensor) -> Tensor:
+    """Return which surfaces (N,), as 0 or 1, face a camera at `eye` (3,); means and normals (N, 3), world frame."""
+    way = eye.to(means) - means
+    return ((way * normals.to(means)).sum(-1) > FACING * way.norm(dim=-1)).to(means)
 
 
 @torch.no_grad()
@@ -195,7 +230,7 @@ def _ratios(model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]]) -> 
     brightness = [frame.image.sum(-1)[..., None], features[..., :3].sum(-1)[..., None]]
     blocks = _blocks(np.concatenate([*brightness, features[..., 3:]], -1), frame.usable & (alpha > MIN_ALPHA))
     length = np.linalg.norm(blocks[:, 2:5], axis=1)
-    kept = (length > 0.8) & (blocks[:, 1] > 0.05) & (blocks[:, 5] > 0.9)  # not across an edge
+    kept = (length > 0.95) & (blocks[:, 1] > 0.05) & (blocks[:, 5] > 0.9)  # not across an edge
     if not kept.any():
         return None
     direction = blocks[kept, 2:5] / length[kept, None]
@@ -235,10 +270,13 @@ def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, s
     total = torch.zeros(len(splats), 4, dtype=torch.float64)
     for frame in frames:
         features = torch.zeros(len(splats), 4, requires_grad=True)
-        picture = _rendered(_in_frame(splats, frame, features), frame.camera).features[0]
+        spheres = _in_frame(splats, frame, features)
+        picture = _rendered(spheres, frame.camera).features[0]
         usable = torch.as_tensor(frame.usable, dtype=torch.float32)[..., None]
         real = torch.cat([torch.as_tensor(frame.image, dtype=torch.float32), torch.ones_like(usable)], -1)
         sums = torch.autograd.grad((picture * real * usable).sum(), features)[0].double()
+        eye = torch.as_tensor(frame.camera.T_world_cam[:3, 3])
+        sums *= _facing(spheres.means, relighting.normals @ frame.rotation.T, eye)[:, None]
         turn = relighting.turned(frame.rotation)
         total += torch.cat([sums[:, :3] / turn[:, None], sums[:, 3:]], 1)
     in_photos = relighting.in_photos.numpy()

@@ -88,13 +88,15 @@ class Exposure(FileModel):
 
 
 class Light(FileModel):
-    """The light that falls on bodies, as brightness by direction of the surface.
+    """The light that falls on bodies: the room's, brighter from above than from below, and one lamp far away.
 
-    A white surface of unit normal n (world frame) has brightness 1 + coefficients . Y(n), with Y = (x, y, z, 2xy, 2yz,
-    2xz, (3z^2 - 1)/2, x^2 - y^2).
+    A white surface of unit normal n (world frame) has brightness 1 + sky n_z + max(0, lamp . n).
     """
 
-    coefficients: tuple[float, float, float, float, float, float, float, float]
+    lamp: tuple[float, float, float]
+    """Direction to the lamp, world frame, times its brightness relative to the room's mean [1]."""
+    sky: float = Field(ge=-1, le=1)
+    """How much brighter the room is from above than from its side, relative to its mean [1]."""
 
 
 class Provenance(FileModel):

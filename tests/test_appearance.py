@@ -10,13 +10,13 @@ import torch
 from cgwm.datasets.cameras import Camera
 from cgwm.datasets.models import Model
 from cgwm.datasets.ply import Splats
-from cgwm.pipeline.appearance import _colored, _Frame, _in_frame, _ratios, _rendered, fit_light
+from cgwm.pipeline.appearance import PRIOR_MEAN, _colored, _facing, _Frame, _in_frame, _ratios, _rendered, fit_light
 from cgwm.pipeline.physics.rotation import quat_to_matrix
-from cgwm.pipeline.splats.relighting import Relighting, brightness, light_basis
+from cgwm.pipeline.splats.relighting import Relighting, brightness
 from cgwm.schemas import Light
 from small_model import small_model
 
-LIGHT = Light(coefficients=(0.2, -0.1, 0.3, 0.05, 0.0, -0.05, 0.1, 0.08))
+LIGHT = Light(lamp=(0.3, -0.4, 0.7), sky=0.15)
 
 
 def _directions(count: int, seed: int) -> np.ndarray:
@@ -24,12 +24,10 @@ def _directions(count: int, seed: int) -> np.ndarray:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def test_basis_is_orthogonal_over_the_sphere() -> None:
-    basis = light_basis(torch.as_tensor(_directions(20000, 2)))
-    gram = (basis.T @ basis / len(basis)).numpy()
-    off = gram - np.diag(np.diag(gram))
-    assert np.abs(off).max() < 0.01
-    assert float(basis.mean(0).abs().max()) < 0.01  # so that 1 is the mean brightness
+def test_brightness_is_lamberts_law_with_a_terminator() -> None:
+    normals = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
+    expected = torch.tensor([1 + 0.15 + 0.7, 1 - 0.15, 1 + 0.3, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(brightness(LIGHT, normals), expected)
 
 
 def test_light_is_found_from_brightness_ratios_with_outliers() -> None:
@@ -39,13 +37,21 @@ def test_light_is_found_from_brightness_ratios_with_outliers() -> None:
     ratio *= 1 + 0.05 * rng.standard_normal(3000)
     ratio[:300] *= 0.5  # a cast shadow
     found = fit_light(ratio, now, photo, 3000)
-    assert found.coefficients == pytest.approx(LIGHT.coefficients, abs=0.02)
+    assert found.lamp == pytest.approx(LIGHT.lamp, abs=0.03)
+    assert found.sky == pytest.approx(LIGHT.sky, abs=0.03)
 
 
-def test_what_the_motion_does_not_tell_stays_dark() -> None:
-    """A body that did not turn says nothing: every ratio is 1, and so is the light."""
+def test_what_the_motion_does_not_tell_comes_from_overhead() -> None:
+    """A body that did not turn says nothing: every ratio is 1, and the light is the usual one."""
     photo = _directions(500, 6)
-    assert fit_light(np.ones(500), photo, photo, 500).coefficients == pytest.approx((0.0,) * 8, abs=1e-9)
+    found = fit_light(np.ones(500), photo, photo, 500)
+    assert (*found.lamp, found.sky) == pytest.approx(tuple(PRIOR_MEAN), abs=1e-9)
+
+
+def test_a_surface_is_seen_only_from_its_front() -> None:
+    means, eye = torch.zeros(3, 3), torch.tensor([0.0, 0.0, 2.0])
+    normals = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.1]])
+    assert _facing(means, normals, eye).tolist() == [1.0, 0.0, 0.0]
 
 
 def test_photos_pose_keeps_its_colours_and_a_turn_does_not() -> None:
@@ -64,7 +70,7 @@ def _ball_filmed(light: Light) -> tuple[Model, Splats, list[_Frame]]:
     """Return a ball's model, its true colours in the light of the photos, and frames of it turning in that light."""
     model = small_model()
     normals = _directions(900, 8)
-    albedo = 0.35 + 0.1 * (normals[:, :1] > 0) + 0.1 * np.array([1.0, 0.0, -1.0]) * (normals[:, 1:2] > 0)
+    albedo = 0.25 + 0.1 * (normals[:, :1] > 0) + 0.1 * np.array([1.0, 0.0, -1.0]) * (normals[:, 1:2] > 0)
     body = model.file.bodies[0]
     relighting = Relighting.of(light, body, torch.as_tensor(normals))
     colors = albedo * relighting.in_photos.numpy()[:, None]

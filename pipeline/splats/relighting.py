@@ -1,9 +1,9 @@
 """A body in the light of another pose: photos show each side of it in one light, a motion shows it in others.
 
 Spheres carry the colours of the photos. In another pose a sphere's colour is multiplied by L(n) / L(n_photo), with
-L(n) = 1 + coefficients . Y(n) the brightness of a white surface of normal n (world frame) in a light that is the same
-everywhere: spherical harmonics of degree 1 and 2, which hold 98 % of a distant light on a matt surface (Ramamoorthi &
-Hanrahan 2001). Shadows that bodies cast and highlights are not in it.
+L(n) = 1 + sky n_z + max(0, lamp . n) the brightness of a white matt surface of normal n (world frame) in a room with
+one lamp: four numbers, which a short motion determines (eight spherical harmonics, the general form of soft light,
+fitted the frames better and other poses worse). Shadows that bodies cast and highlights are not in it.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from torch import Tensor
 from ...schemas import BodyModel, Light
 from ..physics.rotation import quat_to_matrix
 
-DARKEST, BRIGHTEST = 0.2, 3.0
-"""L is kept within these: a fit to few orientations says little about the others."""
+DARKEST = 0.2
+"""L is at least this: the light from below that a floor sends back."""
 
 
-def light_basis(normals: Tensor) -> Tensor:
-    """Return the real spherical harmonics of degree 1 and 2 (N, 8) at unit normals (N, 3), each of largest value 1."""
-    x, y, z = normals.unbind(-1)
-    return torch.stack((x, y, z, 2 * x * y, 2 * y * z, 2 * x * z, (3 * z * z - 1) / 2, x * x - y * y), -1)
+def light_terms(normals: Tensor, lamp: Tensor) -> Tensor:
+    """Return what the numbers of a light (lamp, sky) are multiplied by (N, 4) at unit normals (N, 3), world frame.
+
+    L - 1 is linear in them on each side of the lamp's terminator, whose place `lamp` (3,) tells.
+    """
+    return torch.cat((normals * (normals @ lamp > 0).to(normals)[:, None], normals[:, 2:]), -1)
 
 
 def brightness(light: Light, normals: Tensor) -> Tensor:
     """Return L (N,) at unit normals (N, 3), world frame."""
-    coefficients = torch.tensor(light.coefficients, dtype=normals.dtype, device=normals.device)
-    return (1 + light_basis(normals) @ coefficients).clamp(DARKEST, BRIGHTEST)
+    numbers = torch.tensor((*light.lamp, light.sky), dtype=normals.dtype, device=normals.device)
+    return (1 + light_terms(normals, numbers[:3]) @ numbers).clamp_min(DARKEST)
 
 
 @dataclass(frozen=True, eq=False)
