@@ -7,6 +7,7 @@ the colours of what the photos did not show.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -118,8 +119,8 @@ def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: floa
     """
     seen, pictured = torch.as_tensor(now), torch.as_tensor(photo)
     prior = np.diag(1 / np.square(PRIOR_STD))
-    best, fit = np.inf, np.array([*lamp, PRIOR_MEAN[3]])
-    numbers = fit
+    fit: Array = np.array([*lamp, PRIOR_MEAN[3]])
+    best, numbers = math.inf, fit
     for _ in range(IRLS_STEPS):
         terms = [light_terms(normals, torch.as_tensor(fit[:3])).numpy() for normals in (seen, pictured)]
         design, wanted = terms[0] / ratio[:, None] - terms[1], 1 - 1 / ratio  # errors are relative to the brightness
@@ -127,11 +128,11 @@ def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: floa
         scale = max(1.4826 * float(np.median(np.abs(residual))), SIDE_STD / 2)
         weight = 1 / (1 + np.square(residual / (2 * scale)))
         away = fit - PRIOR_MEAN
-        cost = share * float(np.log1p(np.square(residual / SIDE_STD)).sum()) + away @ prior @ away
+        cost = share * float(np.log1p(np.square(residual / SIDE_STD)).sum()) + float(away @ prior @ away)
         if cost < best:
             best, numbers = cost, fit
         weighted = share / SIDE_STD**2 * design.T * weight
-        fit = np.linalg.solve(weighted @ design + prior, weighted @ wanted + prior @ PRIOR_MEAN)
+        fit = np.asarray(np.linalg.solve(weighted @ design + prior, weighted @ wanted + prior @ PRIOR_MEAN))
     return best, numbers
 
 
