@@ -132,7 +132,7 @@ def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: floa
         if cost < best:
             best, numbers = cost, fit
         weighted = share / SIDE_STD**2 * design.T * weight
-        fit = np.asarray(np.linalg.solve(weighted @ design + prior, weighted @ wanted + prior @ PRIOR_MEAN))
+        fit = np.linalg.solve(weighted @ design + prior, weighted @ wanted + prior @ PRIOR_MEAN).astype(np.float64)
     return best, numbers
 
 
