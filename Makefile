@@ -56,8 +56,10 @@ $(VENV)/dependencies: pyproject.toml constraints.txt | $(VENV)/made
 	  $(PIP) install --quiet --no-deps 'torch==$(TORCH)+cpu' 2>/dev/null || \
 	  $(PIP) install --quiet --no-deps 'torch==$(TORCH)+cpu' --index-url https://download.pytorch.org/whl/cpu; \
 	else $(PIP) install --quiet --no-deps 'torch==$(TORCH)'; fi
-	@$(BIN)/python -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb')); \
-	  lists = project['build-system']['requires'], project['project']['dependencies'], project['project']['optional-dependencies']['dev']; \
+	@$(BIN)/python -c "import shutil, tomllib; project = tomllib.load(open('pyproject.toml', 'rb')); \
+	  extras = project['project']['optional-dependencies']; \
+	  lists = project['build-system']['requires'], project['project']['dependencies'], extras['dev'], \
+	    extras['gpu'] if shutil.which('nvidia-smi') else []; \
 	  print(*sum(lists, []), sep='\n')" > $(VENV)/requirements.txt
 	@$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements.txt
 	@touch $@

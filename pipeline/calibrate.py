@@ -111,25 +111,6 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     return report
 
 
-def require_metric(cameras: CamerasFile) -> None:
-    """Refuse cameras whose unit is not the metre: physics on them would fit an arbitrary gravity.
-
-    Raises:
-        InputDataError: If they are unscaled; the message says how to give the scale.
-    """
-    if cameras.scale.kind != "metric":
-        raise InputDataError(
-            "The cameras are unscaled: one unit of their poses is not one metre, so no physics can be fitted.",
-            "cameras with a metric scale: from an ArUco marker, a known distance or a known camera distance.",
-            "add one of these to capture.toml, then run 'cgwm calibrate --overwrite':\n"
-            "  [calibration]\n"
-            "  markers = [{ id = 0, side_m = 0.05 }]                                      # printed size, measured\n"
-            '  known_camera_distance = { distance_m = 0.40, images = ["a.jpg", "b.jpg"] }\n'
-            '  known_distance = { distance_m = 0.1, a_px = { "a.jpg" = [310.5, 220.0], "b.jpg" = [295.0, 241.5] }, '
-            'b_px = { "a.jpg" = [402.0, 219.0], "b.jpg" = [388.5, 243.0] } }',
-        )
-
-
 def _open(root: Path, overwrite: bool) -> Capture:
     if overwrite:
         # The old cameras may name photos that are gone: that is a reason to replace them, not to refuse.

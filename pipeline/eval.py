@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.cameras import require_metric
 from ..datasets.capture import Capture
 from ..datasets.kinds import kind_of
 from ..datasets.loader import RolloutReader
@@ -213,8 +214,6 @@ def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: 
     if capture.cameras is None:
         warnings.append(f"no PSNR: the cameras are not calibrated; run 'cgwm calibrate {capture.root}'.")
         return {}
-    from .calibrate import require_metric
-
     require_metric(capture.cameras)
     found = {name: usable_cameras(capture, name) for name in filmed}
     unknown = sorted({camera for _, lacking in found.values() for camera in lacking})

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ..datasets.atomic import refuse_existing, sha256
+from ..datasets.cameras import require_metric
 from ..datasets.capture import Capture
 from ..datasets.models import Model, read_model, write_model
 from ..schemas import (
@@ -206,8 +207,6 @@ def _has_motion(capture: Capture, split: str) -> bool:
 
 
 def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig) -> Model:
-    from .calibrate import require_metric
-
     uses_photos = any(name in model.body_splats for name in capture.body_names)
     if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
         require_metric(capture.cameras)

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..datasets.cameras import require_metric
 from ..datasets.capture import Capture
 from ..datasets.models import Model
 from ..datasets.tracks import Track
 from ..schemas import InputDataError, PhysConfig
-from .calibrate import require_metric
 from .estimation.least_squares import Residuals, minimise
 from .estimation.observations import Observations
 from .estimation.trajectory import TrajectoryResiduals, retract, state_prior

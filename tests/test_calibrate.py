@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cgwm.datasets.cameras import read_cameras
+from cgwm.datasets.cameras import read_cameras, require_metric
 from cgwm.pipeline import calibrate as stage
-from cgwm.pipeline.calibrate import calibrate, require_metric
+from cgwm.pipeline.calibrate import calibrate
 from cgwm.pipeline.sfm import colmap
 from cgwm.pipeline.sfm.inputs import background_flow
 from cgwm.pipeline.sfm.markers import dictionary

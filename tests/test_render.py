@@ -24,7 +24,7 @@ def twin(means, scales, opacities, features, viewmats, Ks, width, height, backgr
         depth = torch.zeros(height, width, dtype=means.dtype)
         for index in torch.argsort(local.norm(dim=1)):
             centre, scale = local[index], scales[index]
-            if centre.norm() <= scale:
+            if centre[2] <= scale:
                 continue
             dist2 = torch.linalg.cross(centre.expand_as(rays), rays).square().sum(-1)
             alpha = (opacities[index] * torch.exp(-dist2 / (2 * scale**2))).clamp_max(0.99)

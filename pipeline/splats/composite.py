@@ -58,42 +58,55 @@ class _Chunk:
     transmittance: Tensor  # (t, L, P) before each sphere
 
 
-def composite(coefficients: Tensor, features: Tensor, lists: TileLists) -> tuple[Tensor, Tensor]:
+def composite(
+    coefficients: Tensor, features: Tensor, lists: TileLists, median: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Composite the spheres of each tile front to back.
 
     Args:
         coefficients: Exponent coefficients of each (tile, sphere) pair, shape (M, 6).
         features: Features of each pair, shape (M, F).
         lists: The tiles.
+        median: Whether to look for the median of the last feature.
 
     Returns:
-        Features (T, P, F), not divided by alpha, and alpha (T, P).
+        Features (T, P, F), not divided by alpha, alpha (T, P), and the last feature of the sphere at which the light
+        that gets through falls to half, (T, P), without derivative; zero where it does not, or was not asked for.
     """
-    return _Composite.apply(coefficients, features, lists)  # type: ignore[return-value]
+    return _Composite.apply(coefficients, features, lists, median)  # type: ignore[return-value]
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, coefficients: Tensor, features: Tensor, lists: TileLists) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, coefficients: Tensor, features: Tensor, lists: TileLists, median: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
         tile_count, pixel_count = lists.counts.shape[0], lists.basis.shape[1]
         out = features.new_zeros(tile_count, pixel_count, features.shape[1])
         left = features.new_ones(tile_count, pixel_count)
+        middle = features.new_zeros(tile_count, pixel_count)
         table, padded_features = _with_empty_row(coefficients, features, lists)
         for batch in _batches(lists):
             remaining = features.new_ones(batch.shape[0], pixel_count)
             for chunk in _chunks(table, lists, batch, remaining):
                 values = chunk.weights.transpose(1, 2) @ padded_features[chunk.rows]
                 out.index_add_(0, batch[chunk.tiles], values)
+                if median:
+                    before = chunk.transmittance
+                    crossed = (before > 0.5) & (before - chunk.weights <= 0.5)
+                    last = padded_features[chunk.rows, -1][..., None]
+                    middle.index_add_(0, batch[chunk.tiles], torch.where(crossed, last, 0.0).sum(1))
             left[batch] = remaining
         ctx.save_for_backward(coefficients, features, out, left)
         ctx.lists = lists
-        return out, 1 - left
+        ctx.mark_non_differentiable(middle)
+        return out, 1 - left, middle
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
         coefficients, features, out, left = ctx.saved_tensors
         lists: TileLists = ctx.lists
-        grad_out, grad_alpha = (gradient.contiguous() for gradient in gradients)
+        grad_out, grad_alpha = (gradient.contiguous() for gradient in gradients[:2])
         # What lies behind a sphere, seen through it: starts at everything, and loses each sphere as it is passed.
         behind = (out * grad_out).sum(-1) - grad_alpha * left
         table, padded_features = _with_empty_row(coefficients, features, lists)
@@ -107,7 +120,7 @@ class _Composite(torch.autograd.Function):
                 along = padded_features[chunk.rows] @ grad_pixels.transpose(1, 2)
                 grad_exponent = _grad_exponent(chunk, along, rest)
                 grad_table[chunk.rows] = grad_exponent @ chunk.basis
-        return grad_table[:-1], grad_features[:-1], None
+        return grad_table[:-1], grad_features[:-1], None, None
 
 
 def _grad_exponent(chunk: _Chunk, along: Tensor, rest: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ when the camera turns.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -34,11 +34,17 @@ class RenderOutput:
         features: Composited features with the background behind them, shape (C, H, W, F).
         alpha: Opacity of all spheres together in [0, 1), shape (C, H, W).
         depth: Expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen.
+        median_depth: Depth of the sphere behind which less than half of the light gets through [m], shape (C, H, W);
+            0 where more does. It has no derivative. None where it was not asked for.
+        pairs: From the kernels of `rasterize`: how many pairs of tiles and spheres there are, to compare with the
+            capacity, int32 () on the device; otherwise None.
     """
 
     features: Tensor
     alpha: Tensor
     depth: Tensor
+    median_depth: Tensor | None = None
+    pairs: Tensor | None = None
 
 
 def render(
@@ -56,11 +62,14 @@ def render(
     min_alpha: float = MIN_ALPHA,
     min_transmittance: float = MIN_TRANSMITTANCE,
     tile_size: int = _TILE,
+    median: bool = False,
+    capacity: int | None = None,
 ) -> RenderOutput:
     """Render spheres into C cameras.
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn where its centre
-    lies in front of the camera by more than its scale.
+    lies in front of the camera by more than its scale. float32 tensors on CUDA go through the kernels of `rasterize`,
+    everything else (and cameras with distortion) through plain torch; both give the same pictures.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
@@ -75,11 +84,19 @@ def render(
         distortion: OpenCV's k1, k2, p1, p2 [, k3], shape (k,) or (C, k); none where left out.
         min_alpha: Smaller alphas are taken as 0 (0 keeps all, and every sphere meets every pixel).
         min_transmittance: What lies behind pixels that let less through than this is skipped.
-        tile_size: Side of the tiles [px]; changes the speed only.
+        tile_size: Side of the tiles of the torch path [px]; changes the speed only.
+        median: Whether to return the median depth.
+        capacity: Room for pairs of tiles and spheres in the kernels, see `rasterize.Raster`.
 
     Returns:
         Features, alpha and depth.
     """
+    if means.is_cuda and means.dtype == torch.float32 and distortion is None:
+        from .rasterize import Raster, rasterize  # Triton comes with torch's CUDA wheels, and not with the others
+
+        raster = Raster(width, height, min_alpha, min_transmittance, capacity)
+        values, alpha, depth, middle, pairs = rasterize(means, scales, opacities, features, viewmats, Ks, raster)
+        return replace(_finished(values, alpha, depth, background, middle if median else None), pairs=pairs)
     camera_count = viewmats.shape[0]
     local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     tiles = _Tiles.make(Ks, distortion, width, height, tile_size)
@@ -101,21 +118,21 @@ def render(
     lists = TileLists(
         tiles.basis, tiles.frame_of(every_tile), counts.cumsum(0) - counts, counts, min_alpha, min_transmittance
     )
-    values, alpha = composite(coefficients, channels, lists)
-    return _assemble(values, alpha, background, tiles, camera_count)
-
-
-def _assemble(
-    values: Tensor, alpha: Tensor, background: Tensor | None, tiles: _Tiles, camera_count: int
-) -> RenderOutput:
+    values, alpha, middle = composite(coefficients, channels, lists, median)
     image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
-    colours, depth, alpha = image[..., :-2], image[..., -2], image[..., -1]
+    median_depth = tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None
+    return _finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth)
+
+
+def _finished(
+    colours: Tensor, alpha: Tensor, weighted_depth: Tensor, background: Tensor | None, median_depth: Tensor | None
+) -> RenderOutput:
     if background is not None:
-        behind = background.expand(camera_count, -1)[:, None, None, :]
+        behind = background.expand(colours.shape[0], -1)[:, None, None, :]
         colours = colours + (1 - alpha)[..., None] * behind
     seen = alpha > 0
-    depth = torch.where(seen, depth / torch.where(seen, alpha, 1.0), 0.0)
-    return RenderOutput(colours, alpha, depth)
+    depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1.0), 0.0)
+    return RenderOutput(colours, alpha, depth, median_depth)
 
 
 def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
@@ -224,7 +241,7 @@ def _pairs(
         Tile number (camera * tiles + tile), camera and sphere of each pair, three arrays (M,).
     """
     distance = local.norm(dim=2)
-    drawn = (distance > scales) & torch.isfinite(distance)
+    drawn = (local[..., 2] > scales) & torch.isfinite(distance)
     if min_alpha > 0:
         drawn &= opacities > min_alpha
         reach = scales * (2 * (opacities / min_alpha).clamp_min(1.0).log()).sqrt()

@@ -1,0 +1,197 @@
+"""The renderer on CUDA: the kernels put together, with their derivative for torch.
+
+Spheres are sorted by distance once, over all cameras; then pairs of tiles and spheres are written in that order and
+sorted by tile with a stable sort. Keys of 16 bits need two passes of a radix sort where a key of tile and depth
+needs six.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from . import cuda, kernels
+
+TILE = 16
+"""Side of a tile [px]."""
+BLOCK = 16
+"""Spheres of a tile that a Triton program looks at together."""
+_WARPS = TILE * TILE // 64
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Size and thresholds of a rendering.
+
+    Attributes:
+        width: Of the pictures [px].
+        height: Of the pictures [px].
+        min_alpha: Smaller alphas are taken as 0.
+        min_transmittance: What lies behind pixels that let less through than this is skipped.
+        capacity: Room for pairs of tiles and spheres; None counts them, which waits for the device. With a capacity
+            nothing waits, so that a CUDA graph can capture the call; pairs beyond it are lost, and the caller is to
+            compare the number of pairs that `rasterize` returns.
+        kernels: What composites: the CUDA kernels (faster) or the Triton ones; auto takes the former where cuda.core is
+            installed to compile them.
+    """
+
+    width: int
+    height: int
+    min_alpha: float
+    min_transmittance: float
+    capacity: int | None = None
+    kernels: Literal["auto", "cuda", "triton"] = "auto"
+
+    @property
+    def columns(self) -> int:
+        """Return the number of tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def rows(self) -> int:
+        """Return the number of rows of tiles."""
+        return -(-self.height // TILE)
+
+    @property
+    def thresholds(self) -> tuple[float, float]:
+        """Return the two thresholds."""
+        return float(self.min_alpha), float(self.min_transmittance)
+
+    @property
+    def compiled(self) -> bool:
+        """Tell whether the CUDA kernels composite."""
+        return self.kernels == "cuda" or (self.kernels == "auto" and cuda.available())
+
+
+class _Lists(NamedTuple):
+    """Which spheres each tile composites, nearest first.
+
+    centres (C, N, 4), log_opacities (N,), spans (C * N, 4): as `kernels.project` writes them; rows (M,): camera * N +
+    sphere; starts (tiles + 1,): where each tile's rows begin; pairs (): how many rows all tiles need.
+    """
+
+    centres: Tensor
+    log_opacities: Tensor
+    spans: Tensor
+    rows: Tensor
+    starts: Tensor
+    pairs: Tensor
+
+
+def rasterize(
+    means: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, viewmats: Tensor, Ks: Tensor, raster: Raster
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return features (C, H, W, F), alpha (C, H, W), depth times alpha, median depth, and the number of pairs ().
+
+    Shapes as `render.render` has them; all float32 on one CUDA device. The last two have no derivative.
+    """
+    return _Rasterize.apply(means, scales, opacities, features, viewmats, Ks, raster)  # type: ignore[return-value]
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        viewmats: Tensor,
+        Ks: Tensor,
+        raster: Raster,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        means, scales, opacities, features, viewmats, Ks = (
+            value.detach().contiguous() for value in (means, scales, opacities, features, viewmats, Ks)
+        )
+        lists = _bin(means, scales, opacities, viewmats, Ks, raster)
+        cameras, channels = viewmats.shape[0], features.shape[1]
+        shape = (cameras, raster.height, raster.width)
+        out = features.new_empty(*shape, channels)
+        left, depth, median = (features.new_empty(shape) for _ in range(3))
+        tiles = cameras * raster.columns * raster.rows
+        numbers = (scales.shape[0], raster.columns, raster.rows, raster.width, raster.height)
+        if raster.compiled:
+            tensors = (*lists[:3], features, *lists[3:5], Ks, out, left, depth, median)
+            for first in range(0, channels, cuda.CHANNELS):
+                cuda.launch("composite_forward", tiles, tensors, (*numbers, *raster.thresholds), first)
+        else:
+            kernels.composite_forward[(tiles,)](
+                *lists[:2], features, *lists[3:5], Ks, out, left, depth, median, *numbers, *raster.thresholds,
+                F=channels, CHANNELS=_filled(channels), TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
+            )  # fmt: skip
+        ctx.save_for_backward(means, scales, opacities, features, viewmats, Ks, out, left, depth, *lists)
+        ctx.raster = raster
+        ctx.mark_non_differentiable(median, lists.pairs)
+        return out, 1 - left, depth, median, lists.pairs
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        means, scales, opacities, features, viewmats, Ks, out, left, depth, *parts = ctx.saved_tensors
+        lists, raster = _Lists(*parts), ctx.raster
+        grad_out, grad_alpha, grad_depth = (gradient.contiguous() for gradient in gradients[:3])
+        count, channels, cameras = scales.shape[0], features.shape[1], viewmats.shape[0]
+        tiles = cameras * raster.columns * raster.rows
+        numbers = (count, raster.columns, raster.rows, raster.width, raster.height)
+        rows = torch.zeros(cameras, count, cuda.gradient_width(channels), device=means.device)
+        pictures = (out, left, depth, grad_out, grad_alpha, grad_depth, rows)
+        if raster.compiled:
+            tensors = (*lists[:3], features, *lists[3:5], Ks, *pictures)
+            cuda.launch("composite_backward", tiles, tensors, (*numbers, *raster.thresholds))
+        else:
+            kernels.composite_backward[(tiles,)](
+                *lists[:2], features, *lists[3:5], Ks, *pictures, *numbers, *raster.thresholds,
+                F=channels, CHANNELS=_filled(channels), WIDE=rows.shape[2], TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
+            )  # fmt: skip
+        by_centre, summed = rows[..., :3], rows[..., 3:].sum(0)
+        grad_means = by_centre @ viewmats[:, :3, :3]
+        if means.dim() == 2:
+            grad_means = grad_means.sum(0)
+        grad_scales = summed[:, 0] / scales**3
+        grad_viewmats = None
+        if ctx.needs_input_grad[4]:
+            grad_viewmats = torch.zeros_like(viewmats)
+            grad_viewmats[:, :3, :3] = by_centre.transpose(1, 2) @ means
+            grad_viewmats[:, :3, 3] = by_centre.sum(1)
+        grad_opacities = torch.where(opacities > 1e-12, summed[:, 1] / opacities.clamp_min(1e-12), 0.0)
+        grad_features = summed[:, 2 : 2 + channels]
+        return grad_means, grad_scales, grad_opacities, grad_features, grad_viewmats, None, None
+
+
+def _filled(channels: int) -> int:
+    """Return the next power of two, which a side of a Triton tensor has to be."""
+    return 1 << (channels - 1).bit_length()
+
+
+def _bin(means: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, raster: Raster) -> _Lists:
+    cameras, count = viewmats.shape[0], scales.shape[0]
+    total, tiles = cameras * count, cameras * raster.columns * raster.rows
+    device = means.device
+    centres = torch.empty(cameras, count, 4, device=device)
+    log_opacities = torch.empty(count, device=device)
+    distances = torch.empty(total, device=device)
+    spans = torch.empty(total, 4, device=device)
+    counts = torch.empty(total, device=device, dtype=torch.int32)
+    kernels.project[(cameras, max(1, -(-count // kernels.PROJECT_BLOCK)))](
+        means, scales, opacities, viewmats, Ks, centres, log_opacities, distances, spans, counts,
+        count, raster.width, raster.height, raster.columns, raster.rows, raster.min_alpha,
+        PER_CAMERA=means.dim() == 3, HAS_LEAST=raster.min_alpha > 0, TILE=TILE, BLOCK=kernels.PROJECT_BLOCK,
+    )  # fmt: skip
+    order = torch.argsort(distances)
+    ends = counts[order].cumsum(0, dtype=torch.int32)
+    pairs = ends[-1] if total else torch.zeros((), device=device, dtype=torch.int32)
+    capacity = int(pairs) if raster.capacity is None else raster.capacity
+    key_type = torch.int16 if tiles < 2**15 else torch.int32
+    # what no pair fills sorts behind all tiles
+    keys = torch.full((capacity,), torch.iinfo(key_type).max, device=device, dtype=key_type)
+    rows = torch.zeros(capacity, device=device, dtype=torch.int32)
+    if total:
+        kernels.emit[(-(-total // kernels.EMIT_BLOCK),)](
+            order, ends, spans, keys, rows, total, count, capacity, raster.columns, raster.rows,
+            TILE=TILE, BLOCK=kernels.EMIT_BLOCK,
+        )  # fmt: skip
+    keys, place = torch.sort(keys, stable=True)
+    starts = torch.searchsorted(keys, torch.arange(tiles + 1, device=device, dtype=key_type), out_int32=True)
+    return _Lists(centres, log_opacities, spans, rows[place], starts, pairs)

@@ -1,0 +1,151 @@
+"""The kernels against the torch renderer in double precision: on a GPU, or in Triton's interpreter without one."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from cgwm.pipeline.splats.render import render
+from test_render import scene
+
+CUDA = torch.cuda.is_available()
+if not CUDA:
+    os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are imported
+pytest.importorskip("triton", reason="Triton has wheels for Linux only")
+from cgwm.pipeline.splats import cuda  # noqa: E402
+from cgwm.pipeline.splats.rasterize import Raster, rasterize  # noqa: E402
+
+DEVICE = "cuda" if CUDA else "cpu"
+SIZE = (21, 11)  # two tiles, of which one is cut
+NEEDS_GPU = pytest.mark.skipif(not (CUDA and cuda.available()), reason="needs a CUDA device and cuda.core")
+KERNELS = ["triton", pytest.param("cuda", marks=NEEDS_GPU)]
+
+
+def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3):
+    """Return outputs and gradients (outputs, gradients) of the torch renderer in double, and of the kernels."""
+    generator = torch.Generator().manual_seed(seed)
+    means, scales, opacities, features, viewmats, Ks = arguments
+    features = torch.rand(len(means), channels, generator=generator, dtype=torch.float64)
+    weights = torch.randn(len(Ks), SIZE[1], SIZE[0], channels + 2, generator=generator, dtype=torch.float64)
+    results = []
+    for exact in (True, False):
+        leaves = [means, scales, opacities, features, viewmats]
+        if not exact:
+            leaves = [leaf.float().to(DEVICE) for leaf in leaves]
+        leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
+        if exact:
+            seen = render(*leaves, Ks, *SIZE, min_alpha=min_alpha, min_transmittance=0.0, median=True)
+            assert seen.median_depth is not None
+            outputs = (seen.features, seen.alpha, seen.depth * seen.alpha, seen.median_depth)
+        else:
+            raster = Raster(*SIZE, min_alpha, 0.0, kernels=kernels)
+            outputs = rasterize(*leaves, Ks.float().to(DEVICE), raster)[:4]
+        loss = (torch.cat([outputs[0], *(o[..., None] for o in outputs[1:3])], -1) * weights.to(outputs[0])).sum()
+        gradients = torch.autograd.grad(loss, leaves)
+        results.append([[value.detach().double().cpu() for value in values] for values in (outputs, gradients)])
+    return results
+
+
+def assert_equal(results, pixels_off=0):
+    """Compare; an alpha at the threshold may fall on either side of it in single precision, in a few pixels."""
+    (outputs, gradients), (mine, my_gradients) = results
+    for exact, single in zip(outputs, mine, strict=True):
+        assert int(((exact - single).abs() > 5e-5 * exact.abs().clamp_min(1)).sum()) <= pixels_off
+    for exact, single in zip(gradients, my_gradients, strict=True):
+        assert (exact - single).norm() <= 1e-4 * exact.norm() + 1e-7
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+def test_values_and_gradients_equal_the_torch_renderer(kernels, min_alpha):
+    assert_equal(both(scene(24), kernels, min_alpha))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("channels", [1, 9])
+def test_any_number_of_channels(kernels, channels):
+    assert_equal(both(scene(12), kernels, channels=channels))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_bodies_that_stand_elsewhere_for_every_camera(kernels):
+    means, *others = scene(10)
+    shift = torch.tensor([[[0.0, 0, 0]], [[0.05, -0.02, 0.1]]], dtype=torch.float64)
+    means = means + shift
+    arguments = (means, *others)
+    (outputs, _), (mine, _) = (both_per_camera(arguments, kernels, exact) for exact in (True, False))
+    for exact, single in zip(outputs, mine, strict=True):
+        torch.testing.assert_close(single, exact, atol=1e-4, rtol=1e-4)
+
+
+def both_per_camera(arguments, kernels, exact):
+    """Return features, alpha and the derivative by means (C, N, 3), from the torch renderer or the kernels."""
+    tensors = [value if exact else value.float().to(DEVICE) for value in arguments]
+    means = tensors[0].clone().requires_grad_()
+    if exact:
+        seen = render(means, *tensors[1:], *SIZE, min_transmittance=0.0)
+        features, alpha = seen.features, seen.alpha
+    else:
+        features, alpha = rasterize(means, *tensors[1:], Raster(*SIZE, 1 / 255, 0.0, kernels=kernels))[:2]
+    (gradient,) = torch.autograd.grad(features.square().sum() + alpha.sum(), means)
+    return [value.detach().double().cpu() for value in (features, alpha, gradient)], None
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_edges(kernels):
+    """No spheres; one behind the camera; opacities 0 and 1; a sphere that the camera nearly touches; a far corner."""
+    means, scales, opacities, features, viewmats, Ks = scene(8, cameras=1)
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels=kernels)
+    nothing = [value.float().to(DEVICE) for value in (means[:0], scales[:0], opacities[:0], features[:0], viewmats, Ks)]
+    picture, alpha, *_ = rasterize(*nothing, raster)
+    assert float(picture.abs().max()) == float(alpha.abs().max()) == 0
+    means[0] = torch.tensor([0.0, 0, -9])
+    means[1] = torch.tensor([0.0, 0, -0.9])
+    means[2] = torch.tensor([5.0, 5, 0])
+    opacities[3], opacities[4] = 0.0, 1.0
+    assert_equal(both((means, scales, opacities, features, viewmats, Ks), kernels))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_a_capacity_changes_nothing_while_it_suffices(kernels):
+    arguments = [value.float().to(DEVICE) for value in scene(16)]
+    counted = rasterize(*arguments, Raster(*SIZE, 1 / 255, 1e-4, kernels=kernels))
+    roomy = rasterize(*arguments, Raster(*SIZE, 1 / 255, 1e-4, capacity=2 * int(counted[4]), kernels=kernels))
+    for one, other in zip(counted, roomy, strict=True):
+        torch.testing.assert_close(one, other, atol=0, rtol=0)
+
+
+@NEEDS_GPU
+def test_a_cuda_graph_captures_a_step():
+    arguments = [value.float().to(DEVICE) for value in scene(300)]
+    arguments[0].requires_grad_()
+
+    def step():
+        output = render(*arguments, 61, 47, capacity=20_000)
+        return torch.autograd.grad(output.features.square().sum(), arguments[0])[0]
+
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        expected = step()
+        step()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = step()
+    graph.replay()
+    torch.cuda.synchronize()
+    torch.testing.assert_close(result, expected, atol=1e-5, rtol=1e-4)
+
+
+@NEEDS_GPU
+@pytest.mark.parametrize("size", [(5_000, 4, 320, 240), (40_000, 1, 640, 480)])
+def test_large_scenes_equal_the_torch_renderer(size):
+    count, cameras, width, height = size
+    means, _, opacities, features, viewmats, Ks = scene(count, cameras=cameras)
+    Ks = Ks * torch.tensor([width / 26, height / 19, 1.0], dtype=torch.float64)[:, None]
+    scales = torch.full((count,), 0.004, dtype=torch.float64)
+    exact = render(means, scales, opacities, features, viewmats, Ks, width, height, min_transmittance=0.0)
+    single = [value.float().to(DEVICE) for value in (means, scales, opacities, features, viewmats, Ks)]
+    output = render(*single, width, height, min_transmittance=0.0)
+    assert (output.features.double().cpu() - exact.features).norm() < 1e-3 * exact.features.norm()
