@@ -6,6 +6,7 @@ them before anything is computed, and adds up eight derivatives at a time in the
 
 from __future__ import annotations
 
+import importlib
 from functools import cache
 from typing import Any
 
@@ -270,10 +271,10 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
 @cache
 def _core() -> Any:
     try:
-        from cuda import core
+        core = importlib.import_module("cuda.core")
     except ImportError:
         return None
-    return core if hasattr(core, "Program") else None
+    return core if hasattr(core, "Program") else None  # before 1.0 it was experimental by name
 
 
 def available() -> bool:

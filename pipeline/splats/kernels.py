@@ -3,6 +3,9 @@
 The torch path in `render` is their twin; `rasterize` puts them together.
 """
 
+# pyright: reportGeneralTypeIssues=false
+# (The language of the kernels is Triton's; what looks like its functions raises outside of a kernel.)
+
 from __future__ import annotations
 
 import triton

@@ -5,6 +5,9 @@ sorted by tile with a stable sort. Keys of 16 bits need two passes of a radix so
 needs six.
 """
 
+# pyright: reportArgumentType=false, reportCallIssue=false
+# (Triton annotates what is constant when it compiles; callers pass plain numbers, and num_warps beside them.)
+
 from __future__ import annotations
 
 from dataclasses import dataclass
