@@ -253,7 +253,8 @@ def composite_backward(
         tl.atomic_add(here + 2, tl.sum(by_z, 1), mask=valid, sem="relaxed")
         tl.atomic_add(here + 3, tl.sum(by_k, 1), mask=valid, sem="relaxed")
         tl.atomic_add(here + 4, tl.sum(exponent, 1), mask=valid, sem="relaxed")
-        by_value = tl.sum(weight[:, :, None] * by_color[None, :, :], 1)
+        # not over the middle axis: Triton makes a matrix product in tf32 of that
+        by_value = tl.sum(weight[:, None, :] * tl.trans(by_color)[None, :, :], 2)
         tl.atomic_add(here[:, None] + 5 + channel[None, :], by_value, mask=known, sem="relaxed")
         rest -= tl.sum(weight * along, 0)
         left *= tl.reduce(keep, 0, _multiply)
