@@ -30,6 +30,10 @@ def fit(
         typer.Option("--supervise", show_default="tracks", help="What the motion is compared with."),
     ] = None,
     split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to fit.")] = "train",
+    spheres: Annotated[
+        int | None,
+        typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres that go where needed."),
+    ] = None,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -46,7 +50,7 @@ def fit(
         from .settings import StageSettings
 
         settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
-        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device)
+        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, spheres=spheres)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
         emit(work(capture, out, stage, parent, split, splats, physics, overwrite), lambda model: _summary(model, out))
 

@@ -53,7 +53,7 @@ def read_model(path: Path | str) -> Model:
             body_splats[body.name] = collision[body.name] = read_splats(_inside(root, body.splats))
         if body.collision is not None:
             collision[body.name] = read_splats(_inside(root, body.collision))
-    scene = None if file.scene is None else read_splats(_inside(root, file.scene))
+    scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
     return Model(root, file, body_splats, collision, scene, fit)
 

@@ -18,6 +18,8 @@ SH_C0 = 0.28209479177387814
 """Constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc."""
 
 _OPACITY_MARGIN = 1e-6
+_HIGHER_TERMS = (3, 8, 15)
+"""Harmonics from degree 1 up to degree 1, 2 and 3."""
 _ISOTROPY_TOLERANCE = 0.01
 _PLY_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "char": "i1", "int8": "i1"}
 _PLY_TYPES |= {"uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2"}
@@ -36,6 +38,8 @@ class Splats:
         colors: sRGB values as stored in images, in [0, 1], shape (N, 3).
         normals: Outward unit normals of the surface that the spheres show, in the frame of `means`, shape (N, 3), or
             None where they are not known.
+        harmonics: Only of what never turns (a scene): coefficients of the spherical harmonics of degree 1 to 3 that add
+            to the colours, 3DGS's signs, shape (N, K, 3) with K = 3, 8 or 15; None: the same from all sides.
     """
 
     means: Array
@@ -43,11 +47,14 @@ class Splats:
     opacities: Array
     colors: Array
     normals: Array | None = None
+    harmonics: Array | None = None
 
     def __post_init__(self) -> None:
         count = len(self.means)
         if self.normals is not None and self.normals.shape != (count, 3):
             raise ValueError(f"normals must be ({count}, 3); found {self.normals.shape}")
+        if self.harmonics is not None and self.harmonics.shape not in [(count, terms, 3) for terms in _HIGHER_TERMS]:
+            raise ValueError(f"harmonics must be ({count}, 3, 8 or 15, 3); found {self.harmonics.shape}")
         shapes = (self.means.shape, self.scales.shape, self.opacities.shape, self.colors.shape)
         if shapes != ((count, 3), (count,), (count,), (count, 3)):
             raise ValueError(f"means, scales, opacities, colors must be (N,3), (N,), (N,), (N,3); found {shapes}")
@@ -69,10 +76,12 @@ def write_splats(
         path: The file.
         splats: The spheres.
         frame: The frame of the centres; it stands in a comment of the header.
-        sh_degree: Pad the colours with zeros up to this degree; INRIA's own loader wants 3.
+        sh_degree: Pad the colours with zeros up to this degree, if they have less; INRIA's own loader wants 3.
         overwrite: Replace an existing file.
     """
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    higher = np.zeros((len(splats), 0, 3)) if splats.harmonics is None else np.asarray(splats.harmonics)
+    terms = max((sh_degree + 1) ** 2 - 1, higher.shape[1])
+    rest = 3 * terms
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{k}" for k in range(3)), *(f"f_rest_{k}" for k in range(rest))]
     names += ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
     table = np.zeros((len(splats), len(names)), "<f4")
@@ -82,6 +91,9 @@ def write_splats(
     if splats.normals is not None:
         table[:, 3:6] = splats.normals
     table[:, 6:9] = (np.asarray(splats.colors, np.float64) - 0.5) / SH_C0
+    if rest:  # one channel after the other
+        padded = np.pad(higher, ((0, 0), (0, terms - higher.shape[1]), (0, 0)))
+        table[:, 9 : 9 + rest] = padded.transpose(0, 2, 1).reshape(len(splats), rest)
     table[:, column["opacity"]] = np.log(opacities / (1 - opacities))
     table[:, column["scale_0"] : column["scale_2"] + 1] = np.log(np.asarray(splats.scales, np.float64))[:, None]
     table[:, column["rot_0"]] = 1.0
@@ -93,8 +105,12 @@ def write_splats(
         temporary.write_bytes(("\n".join(header) + "\n").encode("ascii") + table.tobytes())
 
 
-def read_splats(path: Path | str) -> Splats:
-    """Read spheres from a .ply of 3D Gaussian splatting; the colour is that of degree 0.
+def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
+    """Read spheres from a .ply of 3D Gaussian splatting.
+
+    Args:
+        path: The file.
+        harmonics: Read the colours' dependence on the direction too; otherwise they are those of degree 0.
 
     Raises:
         InputDataError: If it is no such file, is cut off, is not in metres by its own word, holds a value that
@@ -124,13 +140,29 @@ def read_splats(path: Path | str) -> Splats:
             "three scales that are equal within 1 %.",
             "leave the shape out, so that cgwm fit makes spheres from the photos.",
         )
+    colors = 0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1)
+    higher = _harmonics(path, columns) if harmonics else None
     return Splats(
         means=np.stack([table[axis] for axis in "xyz"], axis=1),
         scales=np.exp(log_scales.mean(axis=1)),
         opacities=1 / (1 + np.exp(-table["opacity"])),
-        colors=np.clip(0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1), 0.0, 1.0),
+        colors=np.clip(colors, 0.0, 1.0) if higher is None else colors,
         normals=_unit_normals(columns),
+        harmonics=higher,
     )
+
+
+def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:
+    """Return the harmonics from degree 1 on (N, K, 3), or None where there are none or all are zero."""
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count == 0:
+        return None
+    if count % 3 or count // 3 not in _HIGHER_TERMS:
+        raise InputDataError(f"{path}: {count} properties 'f_rest_*'.", "9, 24 or 45 of them, of degree 1, 2 or 3.")
+    values = np.stack([np.asarray(columns[f"f_rest_{k}"], np.float64) for k in range(count)], axis=1)
+    if not np.isfinite(values).all():
+        raise InputDataError(f"{path}: 'f_rest_*' is not finite in {int((~np.isfinite(values)).any(1).sum())} splats.")
+    return values.reshape(-1, 3, count // 3).transpose(0, 2, 1) if values.any() else None
 
 
 def _unit_normals(columns: dict[str, Array]) -> Array | None:

@@ -139,9 +139,8 @@ def _pairs(capture: Capture, background: Spheres, camera: str, episode: str) -> 
         with torch.no_grad():
             viewmat, K = (torch.as_tensor(a).to(background.means)[None] for a in (plain.T_cam_world, plain.K))
             size = (plain.width, plain.height)
-            picture = render(
-                background.means, background.scales, background.opacities, background.colors, viewmat, K, *size
-            )
+            seen = background.seen_from(torch.as_tensor(plain.center))
+            picture = render(seen.means, seen.scales, seen.opacities, seen.colors, viewmat, K, *size)
         usable &= picture.alpha[0].cpu().numpy() > MIN_ALPHA
         found.append(_blocks(picture.features[0].cpu().numpy(), real.astype(np.float32) / 255, usable))
     return found

@@ -25,6 +25,7 @@ from ..datasets.rollouts import CHUNK_FRAMES, FrameBlock
 from .physics.rotation import quat_to_matrix
 from .splats.relighting import Relighting
 from .splats.render import MIN_ALPHA, render
+from .splats.spheres import Spheres
 
 TILE = 8
 """Crops begin and end on multiples of the renderer's tile [px], so that its tiles are those of the whole picture."""
@@ -62,8 +63,12 @@ class _Moving:
 
 @dataclass
 class _View:
-    """A camera, and its picture of what never moves: features (H, W, F) as :func:`_render` makes them, alpha (H, W)."""
+    """A camera; what never moves, as it sees it; and its picture of that.
 
+    features (H, W, F) as :func:`_render` makes them, alpha (H, W).
+    """
+
+    static: _Spheres
     viewmat: Tensor
     K: Tensor
     width: int
@@ -84,16 +89,15 @@ class LabelRenderer:
     def __init__(self, model: Model, cameras: Mapping[str, Camera], device: str = "cpu"):
         self._device = device
         self._labels = 1 + len(model.file.bodies)
-        static, self._moving = [], []
-        if model.scene is not None:
-            static.append(self._spheres(model.scene, 0))
+        fixed, self._moving = [], []
+        self._scene = model.scene
         for index, body in enumerate(model.file.bodies):
             if body.name not in model.body_splats:
                 continue
             spheres = self._spheres(model.body_splats[body.name], index + 1)
             if body.motion == "fixed":
                 pose = body.photo_pose
-                static.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
+                fixed.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
             else:
                 light, normals = model.file.light, model.body_splats[body.name].normals
                 relighting = None
@@ -102,7 +106,7 @@ class LabelRenderer:
                 self._moving.append(_Moving(index, spheres, relighting))
         nothing = torch.zeros(0, 3, device=device)
         empty = _Spheres(nothing, nothing[:, 0], nothing[:, 0], torch.zeros(0, 3 + self._labels, device=device))
-        self._static = _joined([*static, empty])
+        self._fixed = _joined([*fixed, empty])
         self._views = {name: self._view(camera) for name, camera in cameras.items()}
 
     @torch.no_grad()
@@ -134,15 +138,19 @@ class LabelRenderer:
     def _view(self, camera: Camera) -> _View:
         viewmat, K = self._float(camera.T_cam_world), self._float(camera.K)
         size = (camera.width, camera.height)
+        static = self._fixed
+        if self._scene is not None:
+            seen = Spheres.from_numpy(self._scene, device=self._device).seen_from(self._float(camera.center))
+            static = _joined([self._spheres(seen.to_numpy(), 0), static])
         with torch.no_grad():
-            picture = _render(self._static, viewmat, K, *size)
-        return _View(viewmat, K, *size, *picture)
+            picture = _render(static, viewmat, K, *size)
+        return _View(static, viewmat, K, *size, *picture)
 
     def _place(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> _Spheres:
         moved = [
             part.placed(self._float(position_m[part.body]), self._float(quat_wxyz[part.body])) for part in self._moving
         ]
-        return _joined([*moved, _cut(self._static, slice(0, 0))])
+        return _joined([*moved, _cut(self._fixed, slice(0, 0))])
 
     def _frame(self, view: _View, moving: _Spheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         features, alpha = view.features, view.alpha
@@ -152,7 +160,7 @@ class LabelRenderer:
             K = view.K.clone()
             K[0, 2] -= left
             K[1, 2] -= top
-            everything = _joined([moving, self._static])
+            everything = _joined([moving, view.static])
             crop = _render(everything, view.viewmat, K, right - left, bottom - top)
             features, alpha = features.clone(), alpha.clone()
             for whole, part in zip((features, alpha), crop, strict=True):

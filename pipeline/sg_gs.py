@@ -16,18 +16,22 @@ from ..datasets.capture import Capture
 from ..datasets.ply import Splats
 from ..schemas import Body, Ground, InputDataError, Pose, SplatConfig, UsageError
 from .sfm.points import POINTS_NAME, read_points
+from .splats.adaptive import fit_adaptively
 from .splats.collision import CollisionSpheres, distil, shape_to_spheres
 from .splats.fit import (
     Rates,
     Trainable,
     body_loss,
     body_windows,
+    camera_center,
     descend,
     mean_colors,
+    photometric,
     psnr,
     render_view,
     scene_loss,
     silhouette_loss,
+    ssim_map,
 )
 from .splats.hull import carve
 from .splats.seeds import body_seeds, scene_seeds, to_spheres
@@ -38,6 +42,8 @@ from .splats.views import View, load_views
 from .splats.volume import Array, MassProperties, Volume, grid_points
 
 _MIN_PHOTOS = 3
+_START_SHARE = 0.3
+"""Of a budget: spheres of the background at the beginning."""
 
 
 @dataclass(frozen=True)
@@ -257,14 +263,17 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     points = read_points(path)[0] if path.is_file() else None
     if points is None and stage.ground is None:
         stage.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
-    centers, scales = scene_seeds(stage.train, stage.ground, points, config.max_scene_spheres, config.seed)
+    count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))
+    centers, scales = scene_seeds(stage.train, stage.ground, points, count, config.seed)
     if len(scales) == 0:
         raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")
-    spheres = to_spheres(centers, scales, 0.9, stage.device)
+    spheres = to_spheres(centers, scales, 0.9 if config.spheres is None else 0.5, stage.device)
     standing = Spheres.joined(bodies) if bodies else None
     spheres = Spheres(
         spheres.means, spheres.scales, spheres.opacities, _background_colors(stage.train, standing, spheres)
     )
+    if config.spheres is not None:
+        return _adapted(stage, standing, spheres, config.spheres, started)
     trainable = Trainable(spheres, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
     losses = descend(trainable, stage.train, scene_loss(standing), stage.steps(0.75), config.seed, "background", 0.001)
     stage.record["scene"] = {
@@ -273,6 +282,41 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
         "seconds": round(time.perf_counter() - started, 2),
     }
     return _detached(trainable.spheres())
+
+
+def _adapted(stage: _Stage, bodies: Spheres | None, start: Spheres, budget: int, started: float) -> Spheres:
+    """Fit a background whose spheres multiply up to the budget."""
+    config = stage.config
+
+    def loss(spheres: Spheres, view: View) -> tuple[Tensor, Tensor]:
+        everything = spheres if bodies is None else Spheres.joined([bodies, spheres])
+        picture = render_view(everything, view).features[0]
+        return photometric(picture, view.image), picture
+
+    spheres, history = fit_adaptively(
+        start,
+        stage.train,
+        loss,
+        budget=budget,
+        degree=config.sh_degree,
+        iterations=config.adaptive_iterations,
+        spread=_spread(stage.train),
+        seed=config.seed,
+        what="background",
+    )
+    stage.record["scene"] = {
+        "spheres": len(spheres),
+        "sh_degree": config.sh_degree,
+        "history": [asdict(entry) for entry in history],
+        "seconds": round(time.perf_counter() - started, 2),
+    }
+    return spheres
+
+
+def _spread(views: Sequence[View]) -> float:
+    """Return the greatest distance of a camera from the cameras' mean [m], as a scale of the scene."""
+    centers = np.stack([view.camera.center for view in views])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
 def _background_colors(views: Sequence[View], bodies: Spheres | None, spheres: Spheres) -> Tensor:
@@ -289,21 +333,23 @@ def _held_out(stage: _Stage, bodies: list[Spheres], scene: Spheres | None) -> di
     shown = sum(len(part) for part in bodies)
     label = torch.zeros(len(everything), 1, device=everything.means.device)
     label[:shown] = 1.0
-    whole, inside, overlap = [], [], []
+    whole, similar, inside, overlap = [], [], [], []
     for view in stage.test:
-        colored = Spheres(
-            everything.means, everything.scales, everything.opacities, torch.cat([everything.colors, label], 1)
-        )
+        seen = everything.seen_from(camera_center(view.viewmat))
+        colored = Spheres(seen.means, seen.scales, seen.opacities, torch.cat([seen.colors, label], 1))
         features = render_view(colored, view).features[0]
-        whole.append(psnr(features[..., :3], view.image))
+        picture = features[..., :3].clamp(0, 1)
+        whole.append(psnr(picture, view.image))
+        similar.append(float(ssim_map(picture, view.image).mean()))
         if view.cover is not None and bodies:
             true, mine = view.cover.sum(0) > 0.5, features[..., 3] > 0.5
             if true.any():
-                inside.append(psnr(features[..., :3], view.image, true))
+                inside.append(psnr(picture, view.image, true))
                 overlap.append(float((true & mine).sum() / (true | mine).sum()))
     return {
         "photos": [view.name for view in stage.test],
         "psnr_db": _mean(whole),
+        "ssim": _mean(similar),
         "psnr_object_db": _mean(inside),
         "mask_iou": _mean(overlap),
         "psnr_db_by_photo": [round(value, 3) for value in whole],

@@ -31,6 +31,13 @@ class SplatConfig(FileModel):
     iterations: Annotated[int, Field(ge=1)] = 400
     max_body_spheres: Annotated[int, Field(ge=16)] = 2500
     max_scene_spheres: Annotated[int, Field(ge=16)] = 6000
+    spheres: Annotated[int, Field(ge=16)] | None = None
+    """Budget of a background whose spheres multiply and move to where they are needed; left out, `max_scene_spheres`
+    that stay about where they begin, which is faster by far."""
+    adaptive_iterations: Annotated[int, Field(ge=1)] = 7000
+    """Steps of the background's fit where there is a budget."""
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
+    """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
     max_collision_spheres: Annotated[int, Field(ge=8)] = 128
     image_size: Annotated[int, Field(ge=32)] = 320
     """Photos are reduced to this longer side [px] for fitting."""

@@ -18,6 +18,7 @@ from torch import Tensor
 from ...datasets.models import Model
 from ...schemas import InputDataError
 from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
+from ..splats.fit import camera_center
 from ..splats.render import MIN_ALPHA, render
 from ..splats.spheres import Spheres
 from .footage import Footage, Video
@@ -114,7 +115,7 @@ class ImageLoss:
         assert model.scene is not None
         static.append(Spheres.from_numpy(model.scene, like.dtype, like.device))
         self._static = Spheres.joined(static)
-        self._features = self._labelled()
+        self._features = self._labelled(torch.zeros(3).to(like))
         self._reach = _reach(Spheres.joined([spheres for _, spheres in self._moving]), min_alpha or MIN_ALPHA)
         self.radii = {index: _radius(spheres) for index, spheres in self._moving}
         self.centers = {index: spheres.means.mean(0) for index, spheres in self._moving}
@@ -291,9 +292,9 @@ class ImageLoss:
             parts.append(spheres.means @ rotation.transpose(1, 2) + position_m[:, index, None].to(like))
         return torch.cat(parts, 1)
 
-    def _labelled(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return scales, opacities and features (colour, one-hot body) of the moving spheres, then the static ones."""
-        everything = Spheres.joined([*(spheres for _, spheres in self._moving), self._static])
+    def _labelled(self, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return scales, opacities, features (colour seen from `eye`, one-hot body) of moving, then static spheres."""
+        everything = Spheres.joined([*(spheres for _, spheres in self._moving), self._static.seen_from(eye)])
         label = torch.zeros(len(everything), self._count).to(everything.means)
         first = 0
         for index, spheres in self._moving:
@@ -308,8 +309,11 @@ class ImageLoss:
         near = self._near(video, window)
         everything = torch.cat([means, self._static.means[near].expand(len(means), -1, -1)], 1)
         chosen = torch.cat([torch.arange(means.shape[1]).to(near), means.shape[1] + near])
-        scales, opacities, features = (values[chosen] for values in self._features)
         viewmats = video.viewmats[window.frames]
+        whole = self._features
+        if self._static.harmonics is not None:  # cameras of one window are close together
+            whole = self._labelled(torch.stack([camera_center(viewmat) for viewmat in viewmats]).mean(0))
+        scales, opacities, features = (values[chosen] for values in whole)
         return render(
             everything, scales, opacities, features, viewmats, K, *window.size, min_alpha=self._min_alpha
         ).features
@@ -338,22 +342,12 @@ class ImageLoss:
     @torch.no_grad()
     def _backdrop(self, video: Video) -> _Backdrop:
         poses, plate_of = torch.unique(video.viewmats.flatten(1), dim=0, return_inverse=True)
-        spheres = self._static
-        plates = torch.cat(
-            [
-                render(
-                    spheres.means,
-                    spheres.scales,
-                    spheres.opacities,
-                    spheres.colors,
-                    pose.view(1, 4, 4),
-                    video.K[None],
-                    *video.size,
-                    min_alpha=self._min_alpha,
-                ).features
-                for pose in poses
-            ]
-        )
+        plates = []
+        for pose in poses.view(-1, 1, 4, 4):
+            seen = self._static.seen_from(camera_center(pose[0]))
+            spheres = (seen.means, seen.scales, seen.opacities, seen.colors)
+            plates.append(render(*spheres, pose, video.K[None], *video.size, min_alpha=self._min_alpha).features)
+        plates = torch.cat(plates)
         gain = _gain(video, plates, plate_of)
         unexplained = torch.stack(
             [

@@ -78,6 +78,7 @@ class Trainable:
 def render_view(spheres: Spheres, view: View, background: Tensor | None = None) -> RenderOutput:
     """Render spheres (world frame) as a view sees them."""
     width, height = view.size
+    spheres = spheres.seen_from(camera_center(view.viewmat))
     return render(
         spheres.means,
         spheres.scales,
@@ -89,6 +90,11 @@ def render_view(spheres: Spheres, view: View, background: Tensor | None = None) 
         height,
         background,
     )
+
+
+def camera_center(viewmat: Tensor) -> Tensor:
+    """Return the centre of a camera, world frame, from T_cam_world (4, 4)."""
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
 def descend(

@@ -1,0 +1,61 @@
+"""Colours that depend on the direction from which they are seen: real spherical harmonics up to degree 3.
+
+Basis and signs are those of 3D Gaussian splatting (its rasteriser; arXiv 2308.04079), so that its viewers agree.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ...datasets.ply import SH_C0
+
+
+def term_count(degree: int) -> int:
+    """Return the number of harmonics up to a degree."""
+    return (degree + 1) ** 2
+
+
+def harmonics(directions: Tensor, degree: int) -> Tensor:
+    """Return the harmonics (N, (degree + 1)^2) of unit directions from the camera to the sphere (N, 3), world frame."""
+    x, y, z = directions.unbind(-1)
+    terms = [torch.full_like(x, SH_C0)]
+    if degree > 0:
+        c1 = 0.4886025119029199
+        terms += [-c1 * y, c1 * z, -c1 * x]
+    if degree > 1:
+        c2 = 1.0925484305920792
+        terms += [
+            c2 * x * y,
+            -c2 * y * z,
+            0.31539156525252005 * (2 * z * z - x * x - y * y),
+            -c2 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if degree > 2:
+        a, b = 0.5900435899266435, 0.4570457994644658
+        terms += [
+            -a * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -b * y * (4 * z * z - x * x - y * y),
+            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -b * x * (4 * z * z - x * x - y * y),
+            1.445305721320277 * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(terms, -1)
+
+
+def seen_colors(colors: Tensor, higher: Tensor, means: Tensor, eye: Tensor) -> Tensor:
+    """Return the colours (N, 3) of spheres seen from a camera, at least 0.
+
+    Args:
+        colors: Their mean over all directions, shape (N, 3).
+        higher: Coefficients of the harmonics from degree 1 on, shape (N, (degree + 1)^2 - 1, 3).
+        means: Centres, world frame, shape (N, 3).
+        eye: The camera's centre, world frame, shape (3,).
+    """
+    degree = round((higher.shape[1] + 1) ** 0.5) - 1
+    directions = torch.nn.functional.normalize(means - eye, dim=-1)
+    basis = harmonics(directions, degree)[:, 1:]
+    return (colors + (basis[:, :, None] * higher).sum(1)).clamp_min(0.0)
