@@ -10,6 +10,9 @@ from .atomic import new_directory
 from .kinds import refuse_other_kind
 from .ply import Splats, read_splats, write_splats
 
+HELD_OUT = "held_out.png"
+"""Name of the contact sheet in a model's directory."""
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -23,6 +26,7 @@ class Model:
             the model has no others.
         scene: Background spheres, world frame, or None.
         fit: `fit.json`.
+        held_out: `held_out.png`: photos that the fit did not see, its renders of them, and the error; or None.
     """
 
     root: Path | None
@@ -31,6 +35,7 @@ class Model:
     collision: dict[str, Splats] = field(default_factory=dict)
     scene: Splats | None = None
     fit: FitFile = field(default_factory=FitFile)
+    held_out: bytes | None = None
 
     def body(self, name: str) -> BodyModel:
         """Return the entry of a body in `model.json`."""
@@ -55,7 +60,8 @@ def read_model(path: Path | str) -> Model:
             collision[body.name] = read_splats(_inside(root, body.collision))
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
-    return Model(root, file, body_splats, collision, scene, fit)
+    held_out = (root / HELD_OUT).read_bytes() if (root / HELD_OUT).is_file() else None
+    return Model(root, file, body_splats, collision, scene, fit, held_out)
 
 
 def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
@@ -80,6 +86,8 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
             write_splats(directory / name, splats, "body")
         if model.scene is not None:
             write_splats(directory / "scene.ply", model.scene, "world")
+        if model.held_out is not None:
+            (directory / HELD_OUT).write_bytes(model.held_out)
         (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
         (directory / "model.json").write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)

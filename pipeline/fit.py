@@ -161,6 +161,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
         {name: body.collision for name, body in scene.bodies.items()},
         scene.scene,
         FitFile(stages={"sg-gs": scene.record}),
+        scene.held_out,
     )
 
 

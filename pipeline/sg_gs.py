@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..datasets.capture import Capture
 from ..datasets.ply import Splats
 from ..schemas import Body, Ground, InputDataError, Pose, SplatConfig, UsageError
+from .reporting.pictures import compared, small_png
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
 from .splats.collision import CollisionSpheres, distil, shape_to_spheres
@@ -75,6 +77,7 @@ class SgGsResult:
         radius_factor: Collision radius in units of the Gaussian scale.
         record: Losses, timings and held-out figures, for fit.json.
         warnings: What the user should know.
+        held_out: Contact sheet of the photos that the fit did not see, PNG, or None where it saw all.
     """
 
     bodies: dict[str, BodyResult]
@@ -82,6 +85,7 @@ class SgGsResult:
     radius_factor: float
     record: dict[str, Any]
     warnings: tuple[str, ...] = ()
+    held_out: bytes | None = None
 
 
 @dataclass
@@ -125,11 +129,12 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult
         if world is not None:
             placed.append(world)
     scene = _fit_background(stage, placed) if stage.train else None
+    sheet = None
     if stage.train:
-        stage.record["held_out"] = _held_out(stage, placed, scene)
+        stage.record["held_out"], sheet = _held_out(stage, placed, scene)
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     splats = None if scene is None else scene.to_numpy()
-    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings))
+    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), sheet)
 
 
 def _open(capture: Capture, config: SplatConfig) -> _Stage:
@@ -326,19 +331,21 @@ def _background_colors(views: Sequence[View], bodies: Spheres | None, spheres: S
 
 
 @torch.no_grad()
-def _held_out(stage: _Stage, bodies: list[Spheres], scene: Spheres | None) -> dict[str, Any]:
-    """Return PSNR and mask IoU on the photos that the fit did not see."""
+def _held_out(stage: _Stage, bodies: list[Spheres], scene: Spheres | None) -> tuple[dict[str, Any], bytes | None]:
+    """Return PSNR, SSIM and mask IoU on the photos that the fit did not see, and a contact sheet of them."""
     parts = [*bodies, *([] if scene is None else [scene])]
     everything = Spheres.joined(parts)
     shown = sum(len(part) for part in bodies)
     label = torch.zeros(len(everything), 1, device=everything.means.device)
     label[:shown] = 1.0
     whole, similar, inside, overlap = [], [], [], []
+    pictures: list[NDArray[np.uint8]] = []
     for view in stage.test:
         seen = everything.seen_from(camera_center(view.viewmat))
         colored = Spheres(seen.means, seen.scales, seen.opacities, torch.cat([seen.colors, label], 1))
         features = render_view(colored, view).features[0]
         picture = features[..., :3].clamp(0, 1)
+        pictures.append(_bytes(picture))
         whole.append(psnr(picture, view.image))
         similar.append(float(ssim_map(picture, view.image).mean()))
         if view.cover is not None and bodies:
@@ -346,7 +353,8 @@ def _held_out(stage: _Stage, bodies: list[Spheres], scene: Spheres | None) -> di
             if true.any():
                 inside.append(psnr(picture, view.image, true))
                 overlap.append(float((true & mine).sum() / (true | mine).sum()))
-    return {
+    sheet = small_png(compared([_bytes(view.image) for view in stage.test], pictures), 3_000_000) if pictures else None
+    figures = {
         "photos": [view.name for view in stage.test],
         "psnr_db": _mean(whole),
         "ssim": _mean(similar),
@@ -354,6 +362,11 @@ def _held_out(stage: _Stage, bodies: list[Spheres], scene: Spheres | None) -> di
         "mask_iou": _mean(overlap),
         "psnr_db_by_photo": [round(value, 3) for value in whole],
     }
+    return figures, sheet
+
+
+def _bytes(picture: Tensor) -> NDArray[np.uint8]:
+    return (picture * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def _collision_record(spheres: CollisionSpheres) -> dict[str, float]:

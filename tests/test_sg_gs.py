@@ -103,6 +103,28 @@ def test_the_fit_shows_photos_that_it_did_not_see(capture, result):
     assert np.mean(losses[-10:]) < np.mean(losses[:10])
 
 
+def test_the_contact_sheet_shows_photos_renders_and_errors(result):
+    sheet = cv2.imdecode(np.frombuffer(result.held_out, np.uint8), cv2.IMREAD_COLOR)
+    count = len(result.record["held_out"]["photos"])
+    width, gutter = 264, 4
+    assert sheet.shape == (3 * 198 + 2 * gutter, count * (width + gutter) - gutter, 3)
+    photos, errors = sheet[:198, :width], sheet[-198:, :width]
+    assert photos.mean() > 80
+    assert errors.mean() < 60  # a fit that errs by a quarter of full scale would be bright
+
+
+def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result):
+    config = CONFIG.model_copy(update={"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1})
+    adapted = fit_scene(capture, config)
+    scene = adapted.scene
+    assert scene is not None
+    assert 75 < len(scene) <= 250
+    assert scene.harmonics is not None
+    assert scene.harmonics.shape == (len(scene), 3, 3)
+    assert len(adapted.record["scene"]["history"]) == 3
+    np.testing.assert_array_equal(adapted.bodies["ball"].visual.means, result.bodies["ball"].visual.means)
+
+
 def test_psnr_rises_and_the_same_seed_gives_the_same_spheres(capture, result):
     few, again = (fit_scene(capture, CONFIG.model_copy(update={"iterations": 2})) for _ in range(2))
     assert result.record["held_out"]["psnr_db"] > few.record["held_out"]["psnr_db"] + 0.5

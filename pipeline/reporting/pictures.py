@@ -107,6 +107,28 @@ def contact_sheet(rows: Sequence[Image], gutter: int = 4) -> Image:
     return sheet
 
 
+def compared(photos: Sequence[Image], renders: Sequence[Image], wanted: int = 8, width: int = TILE_WIDTH) -> Image:
+    """Return a contact sheet: up to `wanted` photos, the renders below them, and the error below those.
+
+    The error is the mean difference of the channels in false colour (magma), brightest from a quarter of full scale on.
+
+    Args:
+        photos: uint8 RGB, each (H, W, 3); sizes may differ.
+        renders: Of the same sizes.
+        wanted: Most columns.
+        width: Of a tile [px]; its height is that of the first photo at this width.
+    """
+    chosen = evenly(len(photos), wanted)
+    size = (width, round(width * photos[chosen[0]].shape[0] / photos[chosen[0]].shape[1]))
+    rows: list[list[Image]] = [[], [], []]
+    for k in chosen:
+        error = np.abs(photos[k].astype(np.float32) - renders[k]).mean(-1)
+        colors = cv2.applyColorMap((error * 4).clip(0, 255).astype(np.uint8), cv2.COLORMAP_MAGMA)[..., ::-1]
+        for row, picture in zip(rows, (photos[k], renders[k], np.asarray(colors, np.uint8)), strict=True):
+            row.append(_fitted(picture, size))
+    return contact_sheet([np.stack(row) for row in rows])
+
+
 def depth_colors(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> Image:
     """Return depth in false colour (viridis, near bright); black where there is no surface. Shape (H, W, 3)."""
     place = np.clip((far_m - depth_m) / max(far_m - near_m, 1e-9), 0, 1)
@@ -170,6 +192,16 @@ def _outline(frame: Image, mask: Image) -> None:
 def _resized(image: Image, size: tuple[int, int]) -> Image:
     shrinks = size[0] < image.shape[1]
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
+
+
+def _fitted(image: Image, size: tuple[int, int]) -> Image:
+    """Return a picture reduced to fit into a tile (width, height) [px], with white beside it."""
+    scale = min(size[0] / image.shape[1], size[1] / image.shape[0])
+    small = _resized(image, (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))))
+    tile = np.full((size[1], size[0], 3), 255, np.uint8)
+    top, left = (size[1] - small.shape[0]) // 2, (size[0] - small.shape[1]) // 2
+    tile[top : top + small.shape[0], left : left + small.shape[1]] = small
+    return tile
 
 
 def _uri(image: Image, suffix: str, options: list[int], kind: str) -> str:
