@@ -59,6 +59,9 @@ WORTH_REFINING = 2.0
 """Up to this many times the error that noise alone makes, a motion may be explained by the model, and is refined."""
 EXPLAINED = 0.5
 """It is explained if after contact the model errs by no more than this share of the noise beyond the noise."""
+WITHIN_REACH = 2.0
+"""After the first steps of the refinement the model may err by this many times what `EXPLAINED` allows; beyond it, more
+steps would not explain the motion either, and they are what takes long."""
 OPEN_LOOP_TOLERANCE = 1.5
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
 ENOUGH_EPISODES = 8
@@ -289,6 +292,8 @@ def _refine(
     for rounds in range(2):
         residual, _ = raw(shared, states, False)
         misfit = _misfit(residual, observations, flight, sigma)
+        if rounds and any(error > WITHIN_REACH * EXPLAINED * noise for error, noise in zip(misfit, sigma, strict=True)):
+            break
         std = [
             torch.where(flight, torch.as_tensor(s), torch.as_tensor(math.hypot(s, m)))
             .repeat_interleave(len(observations.free), 1)[..., None]
@@ -301,7 +306,7 @@ def _refine(
             states,
             bounds,
             robust_scale=4.0,
-            iterations=config.iterations if rounds else max(2, config.iterations // 2),
+            iterations=config.iterations if rounds else max(2, config.iterations // 3),
             prior_information=prior,
         )
         shared, states = solution.shared, solution.states
