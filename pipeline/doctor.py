@@ -40,6 +40,7 @@ def doctor() -> DoctorReport:
         packages=tuple(packages),
         cuda_devices=cuda,
         triton=_version("triton"),
+        cuda_core=_version("cuda-core"),
         egl=_has_egl(),
         colmap=_colmap_version(pycolmap),
         colmap_cuda=colmap_cuda,
@@ -194,9 +195,18 @@ def _zstd_fault() -> str:
     return "" if np.array_equal(values, read_back) else "the values read back differ"
 
 
+def _renderer(cuda: bool) -> str:
+    if not cuda or not _version("triton"):
+        return "torch, in tiles"
+    if _version("cuda-core"):
+        return "CUDA kernels, compiled at run time"
+    return "Triton kernels (pip install 'cgwm[gpu]' for those in CUDA, two to four times faster)"
+
+
 def _uses(cuda: tuple[str, ...], zstd: bool) -> dict[str, str]:
     return {
         "device": f"cuda ({cuda[0]})" if cuda else f"cpu, {cpu_cores()} cores",
+        "renderer": _renderer(bool(cuda)),
         "photo_features": "COLMAP on the CPU, one thread (two runs agree bit for bit)",
         "demo_renderer": "ray casting, no OpenGL",
         "compression": "zstd" if zstd else "none: --set synthesize.compression=gzip works without the filter",

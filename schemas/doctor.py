@@ -39,7 +39,9 @@ class DoctorReport(FileModel):
     cuda_devices: tuple[str, ...] = ()
     """Names of the CUDA devices that torch sees."""
     triton: str | None = None
-    """Triton's version; never required."""
+    """Triton's version; on a CUDA device its kernels render, and it comes with torch's CUDA wheels."""
+    cuda_core: str | None = None
+    """cuda-core's version, which compiles the faster kernels; never required."""
     egl: bool = False
     """Whether libEGL loads; never required."""
     colmap: str | None = None

@@ -11,8 +11,10 @@ when the camera turns.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -69,7 +71,7 @@ def render(
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn where its centre
     lies in front of the camera by more than its scale. float32 tensors on CUDA go through the kernels of `rasterize`,
-    everything else (and cameras with distortion) through plain torch; both give the same pictures.
+    everything else (cameras with distortion, systems without Triton) through plain torch; both give the same pictures.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
@@ -91,8 +93,8 @@ def render(
     Returns:
         Features, alpha and depth.
     """
-    if means.is_cuda and means.dtype == torch.float32 and distortion is None:
-        from .rasterize import Raster, rasterize  # Triton comes with torch's CUDA wheels, and not with the others
+    if means.is_cuda and means.dtype == torch.float32 and distortion is None and _has_triton():
+        from .rasterize import Raster, rasterize  # imports Triton
 
         raster = Raster(width, height, min_alpha, min_transmittance, capacity)
         values, alpha, depth, middle, pairs = rasterize(means, scales, opacities, features, viewmats, Ks, raster)
@@ -122,6 +124,12 @@ def render(
     image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
     median_depth = tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None
     return _finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth)
+
+
+@cache
+def _has_triton() -> bool:
+    """Tell whether Triton is there: it comes with torch's CUDA wheels for Linux."""
+    return importlib.util.find_spec("triton") is not None
 
 
 def _finished(
