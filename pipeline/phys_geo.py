@@ -449,7 +449,8 @@ def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance:
                 unit=unit,
                 estimate=estimate,
                 std_error=std,
-                interval_95=(estimate / reach, estimate * reach),
+                # no impact gives back more than it took
+                interval_95=(estimate / reach, min(estimate * reach, 1.0 if name == "restitution" else math.inf)),
                 state="derived",
                 note=note,
             )

@@ -11,8 +11,9 @@ from cgwm.pipeline.estimation.noise import estimate_noise
 from cgwm.pipeline.estimation.observations import Observations
 from cgwm.pipeline.estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
-from cgwm.pipeline.phys_geo import fit_physics
+from cgwm.pipeline.phys_geo import _derived, fit_physics
 from cgwm.pipeline.physics import restitution, simulate
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
 from cgwm.schemas import PhysConfig
 from scipy.spatial.transform import Rotation
 from worlds import F64, box_body, law, state_of, times, world_of
@@ -193,3 +194,12 @@ def test_a_fixed_body_stands_where_the_world_has_it() -> None:
     observations = Observations.of(world, [("000", {"box": toss(1, duration_s=0.2)})], [(0.0, 1.0)])
     torch.testing.assert_close(observations.state.position_m[:, 1], place[:, :3])
     torch.testing.assert_close(observations.state.quat_wxyz[:, 1], place[:, 3:])
+
+
+def test_no_restitution_above_one_is_held_possible() -> None:
+    names = list(CONTACT_PARAMETERS)
+    best = np.array([parameter.encode(value) for parameter, value in zip(names, (0.3, 0.003, 0.1), strict=True)])
+    derived = {p.name: p for p in _derived(world_of(box_body()), names, best, np.diag([0.1, 0.3, 1.0]) ** 2)}
+    low, high = derived["restitution"].interval_95
+    assert 0 < low < derived["restitution"].estimate < high == 1.0
+    assert derived["stiffness_n_m"].interval_95[1] > derived["stiffness_n_m"].estimate
