@@ -202,7 +202,7 @@ def _seen(model: Model, capture: Capture, name: str) -> NDArray[np.bool_]:
     spheres, normals = Spheres.joined(parts), _resting_normals(model, name)
     weight = torch.zeros(len(splats))
     for view in views:
-        facing = _facing(parts[0].means, normals, torch.as_tensor(view.camera.T_world_cam[:3, 3]))
+        facing = _facing(parts[0].means, normals, torch.as_tensor(view.camera.center))
         weight += sphere_weights(spheres, view)[: len(splats)] * facing
     return (weight >= SEEN_PX).numpy()
 
@@ -276,7 +276,7 @@ def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, s
         usable = torch.as_tensor(frame.usable, dtype=torch.float32)[..., None]
         real = torch.cat([torch.as_tensor(frame.image, dtype=torch.float32), torch.ones_like(usable)], -1)
         sums = torch.autograd.grad((picture * real * usable).sum(), features)[0].double()
-        eye = torch.as_tensor(frame.camera.T_world_cam[:3, 3])
+        eye = torch.as_tensor(frame.camera.center)
         sums *= _facing(spheres.means, relighting.normals @ frame.rotation.T, eye)[:, None]
         turn = relighting.turned(frame.rotation)
         total += torch.cat([sums[:, :3] / turn[:, None], sums[:, 3:]], 1)

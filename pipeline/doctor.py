@@ -200,7 +200,7 @@ def _renderer(cuda: bool) -> str:
         return "torch, in tiles"
     if _version("cuda-core"):
         return "CUDA kernels, compiled at run time"
-    return "Triton kernels (pip install 'cgwm[gpu]' for those in CUDA, two to four times faster)"
+    return "Triton kernels (pip install 'cgwm[gpu]' for those in CUDA, 1.5 to 5 times faster)"
 
 
 def _uses(cuda: tuple[str, ...], zstd: bool) -> dict[str, str]:

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from ..datasets.cameras import Camera
 from ..datasets.models import Model
-from ..datasets.ply import Splats
 from ..datasets.rollouts import CHUNK_FRAMES, FrameBlock
 from .physics.rotation import quat_to_matrix
 from .splats.relighting import Relighting
@@ -90,11 +89,11 @@ class LabelRenderer:
         self._device = device
         self._labels = 1 + len(model.file.bodies)
         fixed, self._moving = [], []
-        self._scene = model.scene
+        self._scene = None if model.scene is None else Spheres.from_numpy(model.scene, device=device)
         for index, body in enumerate(model.file.bodies):
             if body.name not in model.body_splats:
                 continue
-            spheres = self._spheres(model.body_splats[body.name], index + 1)
+            spheres = self._labelled(Spheres.from_numpy(model.body_splats[body.name], device=device), index + 1)
             if body.motion == "fixed":
                 pose = body.photo_pose
                 fixed.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
@@ -126,11 +125,11 @@ class LabelRenderer:
                 image, depth, mask = (np.stack(parts) for parts in zip(*pictures, strict=True))
                 yield FrameBlock(name, start, image, depth, mask)
 
-    def _spheres(self, splats: Splats, label: int) -> _Spheres:
-        one_hot = torch.zeros(len(splats), self._labels, device=self._device)
+    def _labelled(self, spheres: Spheres, label: int) -> _Spheres:
+        one_hot = torch.zeros(len(spheres), self._labels, device=self._device)
         one_hot[:, label] = 1.0
-        features = torch.cat([self._float(splats.colors), one_hot], 1)
-        return _Spheres(self._float(splats.means), self._float(splats.scales), self._float(splats.opacities), features)
+        features = torch.cat([spheres.colors, one_hot], 1)
+        return _Spheres(spheres.means, spheres.scales, spheres.opacities, features)
 
     def _float(self, values: object) -> Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self._device)
@@ -140,8 +139,8 @@ class LabelRenderer:
         size = (camera.width, camera.height)
         static = self._fixed
         if self._scene is not None:
-            seen = Spheres.from_numpy(self._scene, device=self._device).seen_from(self._float(camera.center))
-            static = _joined([self._spheres(seen.to_numpy(), 0), static])
+            seen = self._scene.seen_from(self._float(camera.center))
+            static = _joined([self._labelled(seen, 0), static])
         with torch.no_grad():
             picture = _render(static, viewmat, K, *size)
         return _View(static, viewmat, K, *size, *picture)

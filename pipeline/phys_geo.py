@@ -174,8 +174,7 @@ def _refined(
     """Return the refined estimate and its covariance; the search's where the motion is not explained after all."""
     solution, misfit = _refine(world, observations, names, search.mean, sigma, config)
     cost = float(_open_loop(world, observations, warm, names)(solution.shared.numpy()[None]).mean())
-    explained = all(error <= EXPLAINED * noise for error, noise in zip(misfit, sigma, strict=True))
-    keep = explained and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
+    keep = _within(misfit, sigma, EXPLAINED) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
     record |= {
         "refinement_cost": solution.costs,
         "refinement_converged": solution.converged,
@@ -292,7 +291,7 @@ def _refine(
     for rounds in range(2):
         residual, _ = raw(shared, states, False)
         misfit = _misfit(residual, observations, flight, sigma)
-        if rounds and any(error > WITHIN_REACH * EXPLAINED * noise for error, noise in zip(misfit, sigma, strict=True)):
+        if rounds and not _within(misfit, sigma, WITHIN_REACH * EXPLAINED):
             break
         std = [
             torch.where(flight, torch.as_tensor(s), torch.as_tensor(math.hypot(s, m)))
@@ -312,6 +311,11 @@ def _refine(
         shared, states = solution.shared, solution.states
     assert solution is not None
     return solution, misfit
+
+
+def _within(misfit: tuple[float, float], sigma: tuple[float, float], share: float) -> bool:
+    """Tell whether the model's own errors are at most this share of the noise (each position [m], rotation [rad])."""
+    return all(error <= share * noise for error, noise in zip(misfit, sigma, strict=True))
 
 
 def _misfit(

@@ -23,12 +23,12 @@ from .splats.collision import CollisionSpheres, distil, shape_to_spheres
 from .splats.fit import (
     Rates,
     Trainable,
+    behind,
     body_loss,
     body_windows,
     camera_center,
     descend,
     mean_colors,
-    photometric,
     psnr,
     render_view,
     scene_loss,
@@ -293,15 +293,13 @@ def _adapted(stage: _Stage, bodies: Spheres | None, start: Spheres, budget: int,
     """Fit a background whose spheres multiply up to the budget."""
     config = stage.config
 
-    def loss(spheres: Spheres, view: View) -> tuple[Tensor, Tensor]:
-        everything = spheres if bodies is None else Spheres.joined([bodies, spheres])
-        picture = render_view(everything, view).features[0]
-        return photometric(picture, view.image), picture
+    def picture(spheres: Spheres, view: View) -> Tensor:
+        return render_view(behind(bodies, spheres), view).features[0]
 
     spheres, history = fit_adaptively(
         start,
         stage.train,
-        loss,
+        picture,
         budget=budget,
         degree=config.sh_degree,
         iterations=config.adaptive_iterations,
@@ -326,8 +324,7 @@ def _spread(views: Sequence[View]) -> float:
 
 def _background_colors(views: Sequence[View], bodies: Spheres | None, spheres: Spheres) -> Tensor:
     """Return the background's mean colours, with the bodies standing before it."""
-    everything = spheres if bodies is None else Spheres.joined([bodies, spheres])
-    return mean_colors(everything, views)[0 if bodies is None else len(bodies) :]
+    return mean_colors(behind(bodies, spheres), views)[0 if bodies is None else len(bodies) :]
 
 
 @torch.no_grad()

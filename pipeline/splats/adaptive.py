@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ...datasets.ply import SH_C0
 from ...datasets.progress import progress
-from .fit import psnr
-from .harmonics import SH_C0, term_count
+from .fit import photometric, psnr
+from .harmonics import term_count
 from .spheres import Spheres
 from .views import View
 
@@ -36,7 +37,7 @@ RATES = {"means": 1.6e-4, "log_scales": 5e-3, "logits": 5e-2, "colors": 2.5e-3 *
 
 @dataclass(frozen=True)
 class Progress:
-    """What a checkpointed fit reports: iteration, spheres, mean loss and PSNR [dB] of the last iterations."""
+    """How far a fit is: iteration, spheres, mean loss and PSNR [dB] of the last iterations."""
 
     iteration: int
     spheres: int
@@ -170,7 +171,7 @@ def _binomial(n: Tensor, k: int) -> Tensor:
 def fit_adaptively(
     start: Spheres,
     views: Sequence[View],
-    loss: Callable[[Spheres, View], tuple[Tensor, Tensor]],
+    picture: Callable[[Spheres, View], Tensor],
     *,
     budget: int,
     degree: int,
@@ -184,7 +185,7 @@ def fit_adaptively(
     Args:
         start: The spheres at the beginning, at most the budget.
         views: The photos; each round goes through all of them in a new order.
-        loss: The loss of one view [1], and its picture (H, W, 3).
+        picture: Renders the spheres as a view sees them (H, W, 3), with whatever stands before them.
         budget: Most spheres.
         degree: Of the harmonics of the colours.
         iterations: Number of steps.
@@ -207,14 +208,15 @@ def fit_adaptively(
             order = torch.randperm(len(views), generator=shuffle).tolist()
         view = views[order.pop()]
         spheres = population.spheres()
-        value, picture = loss(spheres, view)
+        seen = picture(spheres, view)
+        value = photometric(seen, view.image)
         value = value + OPACITY_WEIGHT * spheres.opacities.mean() + SCALE_WEIGHT * spheres.scales.mean() / spread
         value.backward()
         losses.append(value.detach())
         population.step(iteration / iterations, noise)
         if iteration % REFINED_EVERY == 0 or iteration == iterations - 1:
             mean = float(torch.stack(losses).mean())
-            history.append(Progress(iteration, len(population), mean, psnr(picture.detach(), view.image)))
+            history.append(Progress(iteration, len(population), mean, psnr(seen.detach(), view.image)))
             losses = []
             bar.set_postfix_str(f"{len(population)} spheres, loss {mean:.4f}, {history[-1].psnr_db:.1f} dB")
             if REFINED_FROM * iterations <= iteration < REFINED_UNTIL * iterations:

@@ -205,12 +205,16 @@ def body_loss(body: int) -> Callable[[Spheres, View, torch.Generator], Tensor]:
     return loss
 
 
+def behind(bodies: Spheres | None, spheres: Spheres) -> Spheres:
+    """Return the bodies, if there are any, and the spheres of the background behind them."""
+    return spheres if bodies is None else Spheres.joined([bodies, spheres])
+
+
 def scene_loss(bodies: Spheres | None) -> Callable[[Spheres, View, torch.Generator], Tensor]:
     """Return the loss of the background, with the bodies standing in it as they are."""
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> Tensor:
-        everything = spheres if bodies is None else Spheres.joined([bodies, spheres])
-        return photometric(render_view(everything, view).features[0], view.image)
+        return photometric(render_view(behind(bodies, spheres), view).features[0], view.image)
 
     return loss
 
