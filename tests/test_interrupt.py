@@ -42,7 +42,8 @@ def tosses(path: Path, count: int = 300) -> Path:
 
 def import_case(folder: Path) -> Case:
     out = folder / "capture"
-    return ["import", "contactnets", str(tosses(folder / "source")), "--out", str(out)], out
+    # many, so that a slow machine still sends the signal while they are written
+    return ["import", "contactnets", str(tosses(folder / "source", 3000)), "--out", str(out)], out
 
 
 def demo_case(folder: Path) -> Case:
