@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from cgwm.datasets.capture import Capture
 from cgwm.pipeline.sg_gs import fit_scene
-from cgwm.pipeline.splats.fit import psnr, ssim_map
+from cgwm.pipeline.splats.losses import psnr, ssim_map
 from cgwm.pipeline.splats.views import View, load_views
 from cgwm.schemas import SplatConfig
 from store import shared_data

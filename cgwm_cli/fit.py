@@ -34,6 +34,13 @@ def fit(
         int | None,
         typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres that go where needed."),
     ] = None,
+    joint: Annotated[
+        bool | None, typer.Option("--joint", help="Fit geometry and colours of bodies together, not geometry first.")
+    ] = None,
+    refine_poses: Annotated[
+        bool | None, typer.Option("--refine-poses", help="Refine the poses of the photos' cameras first.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a fit of MODEL that was interrupted.")] = False,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -50,9 +57,13 @@ def fit(
         from .settings import StageSettings
 
         settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
-        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, spheres=spheres)
+        looks = {"spheres": spheres, "joint": joint, "refine_poses": refine_poses}
+        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
-        emit(work(capture, out, stage, parent, split, splats, physics, overwrite), lambda model: _summary(model, out))
+        emit(
+            work(capture, out, stage, parent, split, splats, physics, overwrite, resume),
+            lambda model: _summary(model, out),
+        )
 
 
 def _summary(model: ModelFile, out: Path) -> str:

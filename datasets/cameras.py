@@ -6,14 +6,15 @@ functions put it at (0, 0): take 0.5 off the principal point before `K` is given
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedVideo, did_you_mean, read_json
+from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, PosedVideo, did_you_mean, read_json
 from .colmap_model import find_colmap_model, read_colmap_model
 from .transforms import read_transforms
 
@@ -80,11 +81,11 @@ class Camera:
         distorted = distort(normalised, self.distortion)
         return distorted @ self.K[:2, :2].T + self.K[:2, 2], depth
 
-    def undistorted(self, image: NDArray[np.uint8], labels: bool = False) -> tuple[NDArray[np.uint8], Camera]:
+    def undistorted(self, image: NDArray[Any], labels: bool = False) -> tuple[NDArray[Any], Camera]:
         """Return the image that a camera without distortion and with the same K takes, and that camera.
 
         Args:
-            image: Shape (height, width) or (height, width, 3).
+            image: Shape (height, width) or (height, width, channels), uint8 or float32.
             labels: Take the nearest pixel instead of interpolating.
         """
         camera = replace(self, distortion=np.zeros(0))
@@ -98,7 +99,7 @@ class Camera:
             K_opencv, self.distortion, np.eye(3), K_opencv, (self.width, self.height), cv2.CV_32FC1
         )
         method = cv2.INTER_NEAREST if labels else cv2.INTER_LINEAR
-        return np.asarray(cv2.remap(image, map_x, map_y, method), np.uint8), camera
+        return np.asarray(cv2.remap(image, map_x, map_y, method), image.dtype), camera
 
 
 def distort(normalised: Array, distortion: Array) -> Array:
@@ -182,6 +183,15 @@ def camera_of(
             todo="run 'cgwm calibrate', or add it to cameras.json.",
         )
     return from_intrinsics(cameras.cameras[entry.camera], pose)
+
+
+def posed(cameras: CamerasFile, T_world_cam: Mapping[str, Array]) -> CamerasFile:
+    """Return the cameras with other poses of the photos that are named."""
+    images = dict(cameras.images)
+    for name, pose in T_world_cam.items():
+        rows = tuple(tuple(float(value) for value in row) for row in pose)
+        images[name] = PosedImage.model_validate({"camera": images[name].camera, "T_world_cam": rows})
+    return cameras.model_copy(update={"images": images})
 
 
 def from_intrinsics(intrinsics: CameraIntrinsics, T_world_cam: Array) -> Camera:

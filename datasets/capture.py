@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean, read_toml
 from .cameras import Camera, camera_of, read_cameras
 from .files import files_under
+from .geometry_maps import GeometryMaps, read_maps
 from .images import IMAGE_SUFFIXES, read_label, read_rgb
 from .kinds import refuse_other_kind
 from .tracks import Track, read_tracks
@@ -108,6 +109,10 @@ class Capture:
         """Return a photo's labels (k: the k-th body), uint8, shape (height, width), or None without a mask."""
         path = self.root / "masks" / Path(name).with_suffix(".png")
         return read_label(path) if path.is_file() else None
+
+    def photo_maps(self, name: str) -> GeometryMaps:
+        """Return what is known about a photo's pixels besides their colours: depth, normals, features."""
+        return read_maps(self.root, name)
 
     def photo_camera(self, name: str) -> Camera:
         """Return the camera of a photo, at the photo's size."""

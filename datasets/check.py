@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..schemas import InputDataError, did_you_mean
 from .cameras import pose_count
 from .files import files_under
+from .geometry_maps import KINDS, map_names, read_map
 from .images import image_size, read_label
 from .meshes import mass_properties, read_mesh
 from .ply import read_splats
@@ -38,6 +39,7 @@ class CaptureFacts:
         photos: Number of photos.
         photos_with_camera: Number of those with a calibrated pose.
         masks: Number of masks.
+        geometry_maps: Number of depth, normal and feature maps, by kind.
         mask_coverage: Mean fraction of a mask's pixels that shows a body, by body.
         scale: "metric", "unscaled" or "none" (no cameras).
         bodies: Names of the bodies.
@@ -53,6 +55,7 @@ class CaptureFacts:
     photos: int = 0
     photos_with_camera: int = 0
     masks: int = 0
+    geometry_maps: dict[str, int] = field(default_factory=dict)
     mask_coverage: dict[str, float] = field(default_factory=dict)
     scale: str = "none"
     bodies: list[str] = field(default_factory=list)
@@ -104,6 +107,9 @@ def find_faults(capture: Capture) -> tuple[CaptureFacts, list[InputDataError]]:
     for name in capture.masks():
         attempt(_check_mask, capture, name, by_stem, sizes, coverage)
     facts.masks = len(coverage)
+    for kind in KINDS:
+        for name in map_names(capture.root, kind):
+            attempt(_check_map, capture, kind, name, by_stem, sizes, facts)
     if coverage:
         facts.mask_coverage = dict(zip(facts.bodies, np.mean(coverage, axis=0)[1:].tolist(), strict=True))
     attempt(_check_cameras, capture, sizes, facts)
@@ -209,6 +215,31 @@ def _check_mask(
     _check_labels(capture, path, labels, sizes[photo], f"images/{photo}")
     count = len(capture.manifest.bodies) + 1
     coverage.append(np.bincount(labels.ravel(), minlength=count)[:count] / labels.size)
+
+
+def _check_map(
+    capture: Capture,
+    kind: str,
+    name: str,
+    by_stem: dict[Path, str],
+    sizes: dict[str, tuple[int, int]],
+    facts: CaptureFacts,
+) -> None:
+    path = capture.root / kind / name
+    photo = by_stem.get(Path(name).with_suffix(""))
+    if photo is None:
+        raise InputDataError(
+            f"{path}: there is no photo of that name in images/.", "the photo's name, its suffix replaced."
+        )
+    if photo not in sizes:
+        return  # the photo itself is at fault, which has been told
+    height, width = read_map(path, kind).shape[:2]
+    if kind != "features" and (width, height) != sizes[photo]:
+        raise InputDataError(
+            f"{path}: the map has {width}x{height} px, images/{photo} has {sizes[photo][0]}x{sizes[photo][1]} px.",
+            "a map of its photo's size.",
+        )
+    facts.geometry_maps[kind] = facts.geometry_maps.get(kind, 0) + 1
 
 
 def _check_labels(capture: Capture, path: Path, labels: NDArray[np.uint8], size: tuple[int, int], shown: str) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..schemas import BodyModel, FitFile, InputDataError, ModelFile, read_json
+from ..schemas import BodyModel, CamerasFile, FitFile, InputDataError, ModelFile, read_json
 from .atomic import new_directory
 from .kinds import refuse_other_kind
 from .ply import Splats, read_splats, write_splats
 
-HELD_OUT = "held_out.png"
-"""Name of the contact sheet in a model's directory."""
+CAMERAS = "cameras.json"
+PICTURES = ("held_out.png", "separation.png", "turntable.mp4")
+"""What a model's directory may hold to look at: photos that the fit did not see, their renders and the error; how
+bodies were told from the scene where no masks did; and a film around what was fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,8 @@ class Model:
             the model has no others.
         scene: Background spheres, world frame, or None.
         fit: `fit.json`.
-        held_out: `held_out.png`: photos that the fit did not see, its renders of them, and the error; or None.
+        cameras: The photos' cameras, where the fit refined them (`cameras.json`), or None.
+        pictures: Contents of the files among `PICTURES` that there are, by name.
     """
 
     root: Path | None
@@ -35,7 +38,8 @@ class Model:
     collision: dict[str, Splats] = field(default_factory=dict)
     scene: Splats | None = None
     fit: FitFile = field(default_factory=FitFile)
-    held_out: bytes | None = None
+    cameras: CamerasFile | None = None
+    pictures: dict[str, bytes] = field(default_factory=dict)
 
     def body(self, name: str) -> BodyModel:
         """Return the entry of a body in `model.json`."""
@@ -60,8 +64,9 @@ def read_model(path: Path | str) -> Model:
             collision[body.name] = read_splats(_inside(root, body.collision))
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
-    held_out = (root / HELD_OUT).read_bytes() if (root / HELD_OUT).is_file() else None
-    return Model(root, file, body_splats, collision, scene, fit, held_out)
+    pictures = {name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()}
+    cameras = read_json(root / CAMERAS, CamerasFile) if (root / CAMERAS).is_file() else None
+    return Model(root, file, body_splats, collision, scene, fit, cameras, pictures)
 
 
 def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
@@ -86,8 +91,10 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
             write_splats(directory / name, splats, "body")
         if model.scene is not None:
             write_splats(directory / "scene.ply", model.scene, "world")
-        if model.held_out is not None:
-            (directory / HELD_OUT).write_bytes(model.held_out)
+        if model.cameras is not None:
+            (directory / CAMERAS).write_text(model.cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        for name, content in model.pictures.items():
+            (directory / name).write_bytes(content)
         (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
         (directory / "model.json").write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)

@@ -9,13 +9,24 @@ from collections.abc import Iterable
 from tqdm import tqdm
 
 
-def progress(iterable: Iterable | None = None, desc: str = "", total: int | None = None, unit: str = "it") -> tqdm:
+def progress(
+    iterable: Iterable | None = None, desc: str = "", total: int | None = None, unit: str = "it", initial: int = 0
+) -> tqdm:
     """Iterate with a tqdm bar on stderr; no bar if stderr is no terminal or a dumb one, or CGWM_QUIET is set.
 
-    The bar's `set_postfix_str` takes a physical number to show beside the rate ("rms 1.8 mm"). Without an
-    iterable, call `update(n)` on what is returned.
+    `initial` is where the bar begins, of work that was taken up again. The bar's `set_postfix_str` takes a physical
+    number to show beside the rate ("rms 1.8 mm"). Without an iterable, call `update(n)` on what is returned.
     """
-    return tqdm(iterable, desc=desc, total=total, unit=unit, file=sys.stderr, disable=not _watched(), leave=False)
+    return tqdm(
+        iterable,
+        desc=desc,
+        total=total,
+        unit=unit,
+        initial=initial,
+        file=sys.stderr,
+        disable=not _watched(),
+        leave=False,
+    )
 
 
 def note(text: str) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,6 +117,24 @@ def _folder_info(folder: Path) -> VideoInfo:
                 "frames of one size.",
             )
     return VideoInfo(len(files), width, height)
+
+
+def encoded_video(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float) -> bytes:
+    """Return RGB frames, each (height, width, 3) with even sides, as an MP4 file.
+
+    The codec is VP9, which browsers play, where this OpenCV has it; otherwise MPEG-4 part 2, which players play.
+    """
+    height, width = frames[0].shape[:2]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        for codec in ("vp09", "mp4v"):
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), frame_rate_hz, (width, height))
+            if writer.isOpened():
+                break
+        for frame in frames:
+            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        writer.release()
+        return path.read_bytes()
 
 
 def _open(path: Path) -> cv2.VideoCapture:

@@ -26,7 +26,7 @@ from ..schemas import Exposure, Light
 from .image_errors import usable_cameras, video_view
 from .physics.driven import Drive
 from .physics.rotation import quat_to_matrix
-from .splats.fit import sphere_weights
+from .splats.colors import sphere_weights
 from .splats.relighting import Relighting, light_terms
 from .splats.render import render
 from .splats.spheres import Spheres

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import time
 from dataclasses import replace
@@ -14,6 +15,7 @@ import numpy as np
 from ..datasets.atomic import refuse_existing, sha256
 from ..datasets.cameras import require_metric
 from ..datasets.capture import Capture
+from ..datasets.geometry_maps import KINDS
 from ..datasets.models import Model, read_model, write_model
 from ..schemas import (
     Body,
@@ -29,8 +31,10 @@ from ..schemas import (
     Solver,
     SplatConfig,
 )
+from .checkpoint import Checkpoint
 from .phys_geo import PhysicsFit, fit_physics, track_episodes
 from .physics.world import World, symmetric
+from .sfm.points import POINTS_NAME
 from .sg_gs import SgGsResult, fit_scene
 
 Stage = Literal["all", "sg-gs", "phys-geo"]
@@ -48,6 +52,7 @@ def fit(
     splat_config: SplatConfig | None = None,
     phys_config: PhysConfig | None = None,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> ModelFile:
     """Fit a capture and write the model.
 
@@ -61,6 +66,7 @@ def fit(
         splat_config: Settings of sg-gs.
         phys_config: Settings of phys-geo.
         overwrite: Replace an existing model.
+        resume: Go on with a fit of the same model that was interrupted, if there is one.
 
     Returns:
         What stands in `model.json`.
@@ -74,8 +80,9 @@ def fit(
     refuse_existing(out, overwrite)
     opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
     started = time.perf_counter()
-    model = _start(opened, stage, parent, splat_config)
     config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
+    checkpoint = Checkpoint.beside(Path(out), _made_of(opened, splat_config), resume, overwrite)
+    model = _start(opened, stage, parent, splat_config, checkpoint)
     if stage == "phys-geo" or (stage == "all" and _has_motion(opened, split)):
         model = _with_physics(model, opened, split, phys_config)
     provenance = Provenance(
@@ -90,10 +97,20 @@ def fit(
     stages = model.fit.stages | {"total": {"seconds": round(time.perf_counter() - started, 2)}}
     file = model.file.model_copy(update={"provenance": provenance})
     fit_file = FitFile(stages=stages, warnings=file.warnings)
-    return write_model(out, replace(model, file=file, fit=fit_file), overwrite).file
+    written = write_model(out, replace(model, file=file, fit=fit_file), overwrite)
+    checkpoint.remove()
+    return written.file
 
 
-def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatConfig) -> Model:
+def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:
+    """Return what the spheres are made of, so that checkpoints of anything else are refused."""
+    folders = ("images", "masks", *KINDS)
+    files = ("capture.toml", "cameras.json", "transforms.json", POINTS_NAME)
+    inputs = {name: sha256(capture.root / name) for name in (*folders, *files) if (capture.root / name).exists()}
+    return {"settings": config.model_dump_json(), "versions": json.dumps(_versions()), **inputs}
+
+
+def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatConfig, checkpoint: Checkpoint) -> Model:
     """Return the model that the physics starts from: the parent's, or a new one from the stage sg-gs."""
     if not capture.manifest.bodies and stage == "phys-geo":
         raise InputDataError(
@@ -108,7 +125,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
                 f"{parent}: its bodies are {names}, those of {capture.root} are {capture.body_names}.",
                 "a model of this capture's bodies.",
             )
-        return model if stage == "phys-geo" else _from_scene(capture, fit_scene(capture, config))
+        return model if stage == "phys-geo" else _from_scene(capture, fit_scene(capture, config, checkpoint))
     if stage == "phys-geo":
         lacking = [body.name for body in capture.manifest.bodies if body.shape is None]
         if lacking:
@@ -117,7 +134,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
                 "shape = { box | sphere | mesh | splats }, or a model with spheres from photos.",
                 f"run 'cgwm fit {capture.root} --stage all --out MODEL', or pass --from MODEL.",
             )
-    return _from_scene(capture, fit_scene(capture, config))
+    return _from_scene(capture, fit_scene(capture, config, checkpoint))
 
 
 def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
@@ -161,7 +178,8 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
         {name: body.collision for name, body in scene.bodies.items()},
         scene.scene,
         FitFile(stages={"sg-gs": scene.record}),
-        scene.held_out,
+        scene.cameras,
+        scene.pictures,
     )
 
 

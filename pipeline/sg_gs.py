@@ -9,43 +9,40 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn import functional
 
+from ..datasets.cameras import posed
 from ..datasets.capture import Capture
 from ..datasets.ply import Splats
-from ..schemas import Body, Ground, InputDataError, Pose, SplatConfig, UsageError
-from .reporting.pictures import compared, small_png
+from ..schemas import Body, CamerasFile, Ground, InputDataError, Pose, SplatConfig, UsageError
+from .checkpoint import Checkpoint, Slot
+from .held_out import look
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
 from .splats.collision import CollisionSpheres, distil, shape_to_spheres
-from .splats.fit import (
-    Rates,
-    Trainable,
-    behind,
-    body_loss,
-    body_windows,
-    camera_center,
-    descend,
-    mean_colors,
-    psnr,
-    render_view,
-    scene_loss,
-    silhouette_loss,
-    ssim_map,
-)
+from .splats.colors import mean_colors
+from .splats.fit import Rates, Trainable, descend
 from .splats.hull import carve
-from .splats.seeds import body_seeds, scene_seeds, to_spheres
+from .splats.losses import behind, body_loss, geometry_loss, scene_loss
+from .splats.photos import Corrections, learn_corrections
+from .splats.seeds import body_seeds, points_of_depth, scene_seeds, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
 from .splats.stereo import refine
-from .splats.views import View, load_views
+from .splats.views import View, body_windows, load_views, spread_of
 from .splats.volume import Array, MassProperties, Volume, grid_points
+from .turntable import turntable, upward
 
 _MIN_PHOTOS = 3
 _START_SHARE = 0.3
 """Of a budget: spheres of the background at the beginning."""
+_DEPTH_POINTS = 20_000
+_GEOMETRY_SHARE = 0.5
+"""How fast geometry still moves while colours are fitted, of how fast it moved before; 0 is the published form."""
+_EXPOSURE_STEPS, _POSE_STEPS = 0.4, 2.0
+"""Steps that learn the photos' corrections, in units of the setting `iterations`."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,9 @@ class SgGsResult:
         radius_factor: Collision radius in units of the Gaussian scale.
         record: Losses, timings and held-out figures, for fit.json.
         warnings: What the user should know.
-        held_out: Contact sheet of the photos that the fit did not see, PNG, or None where it saw all.
+        pictures: What there is to look at, by file name: a contact sheet of the photos that the fit did not see, a
+            film around what was fitted.
+        cameras: The photos' cameras as they were refined, or None where they stayed.
     """
 
     bodies: dict[str, BodyResult]
@@ -85,7 +84,8 @@ class SgGsResult:
     radius_factor: float
     record: dict[str, Any]
     warnings: tuple[str, ...] = ()
-    held_out: bytes | None = None
+    pictures: dict[str, bytes] = field(default_factory=dict)
+    cameras: CamerasFile | None = None
 
 
 @dataclass
@@ -95,33 +95,44 @@ class _Stage:
     capture: Capture
     config: SplatConfig
     device: torch.device
+    checkpoint: Checkpoint | None
     ground: Ground | None
     train: list[View]
     test: list[View]
     record: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def spread(self) -> float:
+        """Size of the cameras' arrangement [m]."""
+        return spread_of(self.train)
+
+    def slot(self, name: str) -> Slot | None:
+        return None if self.checkpoint is None else self.checkpoint.slot(name)
+
     def steps(self, share: float) -> int:
         return max(1, round(share * self.config.iterations))
 
 
-def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult:
+def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: Checkpoint | None = None) -> SgGsResult:
     """Fit spheres to the photos of a capture.
 
     Bodies need masks or a shape. With masks, a body's solid is its visual hull (or its shape); its spheres are fitted
-    geometry first, to the silhouettes, then appearance. Everything else becomes the background. Without photos, bodies
-    get colliding spheres from their shapes and no visual ones.
+    geometry first, to silhouettes and geometry maps, then appearance. Everything else becomes the background. Without
+    photos, bodies get colliding spheres from their shapes and no visual ones.
 
     Args:
         capture: The capture, calibrated where it has photos; the cameras may be unscaled.
         config: Settings.
+        checkpoint: Where the state of the descents goes, and from where they are taken up; None keeps none.
 
     Raises:
         InputDataError: If a body has neither masks nor a shape, or photos have no cameras.
     """
     config = config or SplatConfig()
     started = time.perf_counter()
-    stage = _open(capture, config)
+    stage = _open(capture, config, checkpoint)
+    corrections = _correct_photos(stage) if stage.train and (config.exposure or config.refine_poses) else None
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
     for index, body in enumerate(capture.manifest.bodies):
@@ -129,19 +140,64 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult
         if world is not None:
             placed.append(world)
     scene = _fit_background(stage, placed) if stage.train else None
-    sheet = None
+    pictures: dict[str, bytes] = {}
     if stage.train:
-        stage.record["held_out"], sheet = _held_out(stage, placed, scene)
+        exposed, moved = (corrections is not None and bool(found) for found in _found(corrections))
+        held_out = look(stage.test, placed, scene, stage.spread, exposure=exposed, poses=moved)
+        stage.record["held_out"] = held_out.figures
+        if held_out.sheet is not None:
+            pictures["held_out.png"] = held_out.sheet
+        if config.turntable:
+            up = upward(stage.train, stage.ground and stage.ground.normal)
+            pictures["turntable.mp4"] = turntable(stage.train, placed, scene, up)
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     splats = None if scene is None else scene.to_numpy()
-    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), sheet)
+    cameras = _refined_cameras(stage) if corrections is not None and corrections.motions else None
+    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), pictures, cameras)
 
 
-def _open(capture: Capture, config: SplatConfig) -> _Stage:
+def _found(corrections: Corrections | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    return ({}, {}) if corrections is None else (corrections.gains, corrections.motions)
+
+
+def _correct_photos(stage: _Stage) -> Corrections:
+    """Bring the photos to one exposure, and their cameras to where they were, as far as the settings ask for it."""
+    config = stage.config
+    started = time.perf_counter()
+    poses = config.refine_poses
+    # Exposure is the same all over a photo: without poses, small photos and few steps tell it.
+    views = stage.train if poses else [_smaller(view) for view in stage.train]
+    count = config.max_scene_spheres if poses else config.max_scene_spheres // 4
+    start = _background_seeds(stage, views, count, None)
+    steps = stage.steps(_POSE_STEPS if poses else _EXPOSURE_STEPS)
+    corrections = learn_corrections(
+        views, start, stage.spread, steps, config.seed, exposure=config.exposure, poses=poses
+    )
+    stage.train = [corrections.corrected(view) for view in stage.train]
+    seconds = {"seconds": round(time.perf_counter() - started, 2)}
+    stage.record["photo_corrections"] = corrections.record() | seconds
+    return corrections
+
+
+def _smaller(view: View) -> View:
+    """Return a photo at half its size; masks and maps are left behind, but for what is needed to leave bodies out."""
+    width, height = (side // 2 for side in view.size)
+    image = functional.adaptive_avg_pool2d(view.image.permute(2, 0, 1), (height, width)).permute(1, 2, 0)
+    cover = None if view.cover is None else functional.adaptive_avg_pool2d(view.cover, (height, width))
+    K = view.K * view.K.new_tensor([width / view.size[0], height / view.size[1], 1.0])[:, None]
+    return replace(view, image=image, cover=cover, K=K, depth=None, normals=None, features=None)
+
+
+def _refined_cameras(stage: _Stage) -> CamerasFile:
+    assert stage.capture.cameras is not None
+    return posed(stage.capture.cameras, {view.name: view.camera.T_world_cam for view in stage.train})
+
+
+def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) -> _Stage:
     device = resolve_device(config.device)
     ground = capture.manifest.world.ground
     names = capture.photos()
-    stage = _Stage(capture, config, device, ground, [], [])
+    stage = _Stage(capture, config, device, checkpoint, ground, [], [])
     if not names:
         return stage
     if capture.cameras is None:
@@ -226,6 +282,8 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
 def _hull(stage: _Stage, index: int, body: Body) -> Volume:
     silhouettes = [view.silhouette(index) for view in stage.train]
     hull = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
+    if any(view.depth_map is not None for view in stage.train):
+        return hull  # depth maps have carved it where photos would have to be compared
     solid, refinement = refine(
         hull, [view for view in stage.train if view.labels is not None], index, stage.config.seed
     )
@@ -234,53 +292,94 @@ def _hull(stage: _Stage, index: int, body: Body) -> Volume:
 
 
 def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Spheres:
-    """Fit a body's visual spheres: silhouettes first, then colours with the geometry fixed."""
+    """Fit a body's visual spheres: geometry first, then colours (or both together)."""
     config, device = stage.config, stage.device
     started = time.perf_counter()
     centers, scales, surface_count = body_seeds(solid, config.max_body_spheres, config.radius_factor, config.seed)
     spheres = to_spheres(centers, scales, 0.95, device)
     windows = body_windows(stage.train, index)
-    geometry = Trainable(spheres, Rates(means=0.05, log_scales=0.02, logits=0.03))
+    record: dict[str, Any] = {"spheres": len(spheres), "surface_spheres": surface_count}
+    geometry = Rates(means=0.05, log_scales=0.02, logits=0.03)
+    if not config.joint:
+        spheres, losses = _fit_geometry(stage, index, body, solid, spheres, windows, geometry)
+        record["geometry_loss"] = _thinned(losses)
+        share = _GEOMETRY_SHARE
+        geometry = Rates(share * geometry.means, share * geometry.log_scales, geometry.logits)
+    spheres = replace(spheres, colors=mean_colors(spheres, windows, index))
+    appearance = Trainable(spheres, replace(geometry, colors=0.02))
     losses = descend(
-        geometry, windows, silhouette_loss(index), stage.steps(0.25), config.seed, f"{body.name}: shape", 0.002
+        appearance,
+        windows,
+        body_loss(index),
+        stage.steps(0.75 if config.joint else 0.5),
+        config.seed,
+        f"{body.name}: colours",
+        0.002,
+        slot=stage.slot(f"{body.name} colours"),
     )
-    spheres = _detached(geometry.spheres())
-    spheres = Spheres(spheres.means, spheres.scales, spheres.opacities, mean_colors(spheres, windows, index))
-    appearance = Trainable(spheres, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.02))
-    losses_appearance = descend(
-        appearance, windows, body_loss(index), stage.steps(0.5), config.seed, f"{body.name}: colours", 0.002
+    record |= {"appearance_loss": _thinned(losses), "seconds": round(time.perf_counter() - started, 2)}
+    stage.record[body.name] = stage.record.get(body.name, {}) | record
+    return _detached(appearance.spheres())
+
+
+def _fit_geometry(
+    stage: _Stage, index: int, body: Body, solid: Volume, start: Spheres, windows: Sequence[View], rates: Rates
+) -> tuple[Spheres, list[float]]:
+    """Fit centres, scales and opacities to silhouettes and to what geometry maps there are."""
+    with_features = [view for view in windows if view.features is not None]
+    codes = start.means.new_zeros(len(start), 0)
+    if with_features:
+        as_pictures = [replace(view, image=view.features) for view in with_features]
+        codes = mean_colors(start, as_pictures, index)
+    geometry = Trainable(replace(start, colors=codes), replace(rates, colors=0.02 if with_features else 0.0))
+    losses = descend(
+        geometry,
+        windows,
+        geometry_loss(index, solid.size(), stage.config.radius_factor),
+        stage.steps(0.25),
+        stage.config.seed,
+        f"{body.name}: shape",
+        0.002,
+        slot=stage.slot(f"{body.name} shape"),
     )
-    spheres = _detached(appearance.spheres())
-    stage.record[body.name] = stage.record.get(body.name, {}) | {
-        "spheres": len(spheres),
-        "surface_spheres": surface_count,
-        "silhouette_loss": _thinned(losses),
-        "appearance_loss": _thinned(losses_appearance),
-        "seconds": round(time.perf_counter() - started, 2),
-    }
-    return spheres
+    return _detached(geometry.spheres()), losses
+
+
+def _background_seeds(stage: _Stage, views: Sequence[View], count: int, bodies: Spheres | None) -> Spheres:
+    """Return spheres where the background begins: on the ground, on SfM points or depth maps, and far away."""
+    path = stage.capture.root / POINTS_NAME
+    points = read_points(path)[0] if path.is_file() else points_of_depth(views, _DEPTH_POINTS, stage.config.seed)
+    if points is None and stage.ground is None:
+        text = f"No {POINTS_NAME} and no ground: the background starts from random points."
+        if text not in stage.warnings:
+            stage.warnings.append(text)
+    centers, scales = scene_seeds(views, stage.ground, points, count, stage.config.seed)
+    if len(scales) == 0:
+        raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")
+    spheres = to_spheres(centers, scales, 0.9 if stage.config.spheres is None else 0.5, stage.device)
+    colors = mean_colors(behind(bodies, spheres), views)
+    return replace(spheres, colors=colors if bodies is None else colors[len(bodies) :])
 
 
 def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     config = stage.config
     started = time.perf_counter()
-    path = stage.capture.root / POINTS_NAME
-    points = read_points(path)[0] if path.is_file() else None
-    if points is None and stage.ground is None:
-        stage.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
     count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))
-    centers, scales = scene_seeds(stage.train, stage.ground, points, count, config.seed)
-    if len(scales) == 0:
-        raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")
-    spheres = to_spheres(centers, scales, 0.9 if config.spheres is None else 0.5, stage.device)
     standing = Spheres.joined(bodies) if bodies else None
-    spheres = Spheres(
-        spheres.means, spheres.scales, spheres.opacities, _background_colors(stage.train, standing, spheres)
-    )
+    spheres = _background_seeds(stage, stage.train, count, standing)
     if config.spheres is not None:
         return _adapted(stage, standing, spheres, config.spheres, started)
     trainable = Trainable(spheres, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
-    losses = descend(trainable, stage.train, scene_loss(standing), stage.steps(0.75), config.seed, "background", 0.001)
+    losses = descend(
+        trainable,
+        stage.train,
+        scene_loss(standing),
+        stage.steps(0.75),
+        config.seed,
+        "background",
+        0.001,
+        slot=stage.slot("background"),
+    )
     stage.record["scene"] = {
         "spheres": len(spheres),
         "loss": _thinned(losses),
@@ -292,20 +391,17 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
 def _adapted(stage: _Stage, bodies: Spheres | None, start: Spheres, budget: int, started: float) -> Spheres:
     """Fit a background whose spheres multiply up to the budget."""
     config = stage.config
-
-    def picture(spheres: Spheres, view: View) -> Tensor:
-        return render_view(behind(bodies, spheres), view).features[0]
-
     spheres, history = fit_adaptively(
         start,
         stage.train,
-        picture,
+        scene_loss(bodies),
         budget=budget,
         degree=config.sh_degree,
         iterations=config.adaptive_iterations,
-        spread=_spread(stage.train),
+        spread=stage.spread,
         seed=config.seed,
         what="background",
+        slot=stage.slot("background"),
     )
     stage.record["scene"] = {
         "spheres": len(spheres),
@@ -314,56 +410,6 @@ def _adapted(stage: _Stage, bodies: Spheres | None, start: Spheres, budget: int,
         "seconds": round(time.perf_counter() - started, 2),
     }
     return spheres
-
-
-def _spread(views: Sequence[View]) -> float:
-    """Return the greatest distance of a camera from the cameras' mean [m], as a scale of the scene."""
-    centers = np.stack([view.camera.center for view in views])
-    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-
-
-def _background_colors(views: Sequence[View], bodies: Spheres | None, spheres: Spheres) -> Tensor:
-    """Return the background's mean colours, with the bodies standing before it."""
-    return mean_colors(behind(bodies, spheres), views)[0 if bodies is None else len(bodies) :]
-
-
-@torch.no_grad()
-def _held_out(stage: _Stage, bodies: list[Spheres], scene: Spheres | None) -> tuple[dict[str, Any], bytes | None]:
-    """Return PSNR, SSIM and mask IoU on the photos that the fit did not see, and a contact sheet of them."""
-    parts = [*bodies, *([] if scene is None else [scene])]
-    everything = Spheres.joined(parts)
-    shown = sum(len(part) for part in bodies)
-    label = torch.zeros(len(everything), 1, device=everything.means.device)
-    label[:shown] = 1.0
-    whole, similar, inside, overlap = [], [], [], []
-    pictures: list[NDArray[np.uint8]] = []
-    for view in stage.test:
-        seen = everything.seen_from(camera_center(view.viewmat))
-        colored = Spheres(seen.means, seen.scales, seen.opacities, torch.cat([seen.colors, label], 1))
-        features = render_view(colored, view).features[0]
-        picture = features[..., :3].clamp(0, 1)
-        pictures.append(_bytes(picture))
-        whole.append(psnr(picture, view.image))
-        similar.append(float(ssim_map(picture, view.image).mean()))
-        if view.cover is not None and bodies:
-            true, mine = view.cover.sum(0) > 0.5, features[..., 3] > 0.5
-            if true.any():
-                inside.append(psnr(picture, view.image, true))
-                overlap.append(float((true & mine).sum() / (true | mine).sum()))
-    sheet = small_png(compared([_bytes(view.image) for view in stage.test], pictures), 3_000_000) if pictures else None
-    figures = {
-        "photos": [view.name for view in stage.test],
-        "psnr_db": _mean(whole),
-        "ssim": _mean(similar),
-        "psnr_object_db": _mean(inside),
-        "mask_iou": _mean(overlap),
-        "psnr_db_by_photo": [round(value, 3) for value in whole],
-    }
-    return figures, sheet
-
-
-def _bytes(picture: Tensor) -> NDArray[np.uint8]:
-    return (picture * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def _collision_record(spheres: CollisionSpheres) -> dict[str, float]:
@@ -376,10 +422,6 @@ def _collision_record(spheres: CollisionSpheres) -> dict[str, float]:
 
 def _detached(spheres: Spheres) -> Spheres:
     return Spheres(spheres.means.detach(), spheres.scales.detach(), spheres.opacities.detach(), spheres.colors.detach())
-
-
-def _mean(values: list[float]) -> float | None:
-    return round(float(np.mean(values)), 4) if values else None
 
 
 def _thinned(losses: list[float], count: int = 50) -> list[float]:

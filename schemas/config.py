@@ -38,6 +38,14 @@ class SplatConfig(FileModel):
     """Steps of the background's fit where there is a budget."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
+    joint: bool = False
+    """Fit geometry and colours of bodies together, not geometry first."""
+    exposure: bool = True
+    """Bring the photos to one exposure and white balance first."""
+    refine_poses: bool = False
+    """Refine the poses of the photos' cameras first; the model then holds them in `cameras.json`."""
+    turntable: bool = True
+    """Write a film around what was fitted, `turntable.mp4`."""
     max_collision_spheres: Annotated[int, Field(ge=8)] = 128
     image_size: Annotated[int, Field(ge=32)] = 320
     """Photos are reduced to this longer side [px] for fitting."""

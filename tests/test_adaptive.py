@@ -11,10 +11,10 @@ from cgwm.datasets.cameras import Camera
 from cgwm.datasets.ply import Splats, read_splats, write_splats
 from cgwm.pipeline.labels import LabelRenderer
 from cgwm.pipeline.splats.adaptive import DEAD, Population, fit_adaptively, shared_among
-from cgwm.pipeline.splats.fit import psnr, render_view
 from cgwm.pipeline.splats.harmonics import harmonics
+from cgwm.pipeline.splats.losses import psnr, scene_loss
 from cgwm.pipeline.splats.spheres import Spheres
-from cgwm.pipeline.splats.views import View
+from cgwm.pipeline.splats.views import View, render_view
 from small_model import small_model
 
 
@@ -60,16 +60,12 @@ def _view(spheres, angle, higher=None):
     return View(blank.name, picture, None, *tensors, camera, None, blank.grey)
 
 
-def _picture(spheres, view):
-    return render_view(spheres, view).features[0]
-
-
 def test_a_fit_keeps_to_its_budget_improves_and_repeats():
     truth = _spheres()
     views = [_view(truth, angle) for angle in np.linspace(0, 5.5, 8)]
     few = Spheres(*(getattr(_spheres(60, 5), key) for key in ("means", "scales", "opacities", "colors")))
     settings = {"budget": 90, "degree": 1, "iterations": 400, "spread": 1.6, "seed": 0, "what": "test"}
-    fitted, history = fit_adaptively(few, views, _picture, **settings)
+    fitted, history = fit_adaptively(few, views, scene_loss(None), **settings)
     assert len(few) < len(fitted) <= 90
     assert history[-1].spheres == len(fitted)
     assert torch.isfinite(fitted.means).all()
@@ -78,7 +74,7 @@ def test_a_fit_keeps_to_its_budget_improves_and_repeats():
         for one in (few, fitted)
     )
     assert after > before + 5
-    again, _ = fit_adaptively(few, views, _picture, **settings)
+    again, _ = fit_adaptively(few, views, scene_loss(None), **settings)
     assert torch.equal(again.means, fitted.means)
 
 

@@ -15,7 +15,14 @@ from cgwm.schemas import InputDataError, SplatConfig
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
 RADIUS, PLACE = 0.05, np.array([0.01, -0.02, 0.05])
 CONFIG = SplatConfig(
-    iterations=40, max_body_spheres=200, max_scene_spheres=400, max_collision_spheres=60, image_size=96, device="cpu"
+    iterations=40,
+    max_body_spheres=200,
+    max_scene_spheres=400,
+    max_collision_spheres=60,
+    image_size=96,
+    device="cpu",
+    exposure=False,
+    turntable=False,
 )
 
 
@@ -104,7 +111,7 @@ def test_the_fit_shows_photos_that_it_did_not_see(capture, result):
 
 
 def test_the_contact_sheet_shows_photos_renders_and_errors(result):
-    sheet = cv2.imdecode(np.frombuffer(result.held_out, np.uint8), cv2.IMREAD_COLOR)
+    sheet = cv2.imdecode(np.frombuffer(result.pictures["held_out.png"], np.uint8), cv2.IMREAD_COLOR)
     count = len(result.record["held_out"]["photos"])
     width, gutter = 264, 4
     assert sheet.shape == (3 * 198 + 2 * gutter, count * (width + gutter) - gutter, 3)

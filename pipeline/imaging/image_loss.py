@@ -18,9 +18,9 @@ from torch import Tensor
 from ...datasets.models import Model
 from ...schemas import InputDataError
 from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
-from ..splats.fit import camera_center
 from ..splats.render import MIN_ALPHA, render
 from ..splats.spheres import Spheres
+from ..splats.views import camera_center
 from .footage import Footage, Video
 from .windows import Window, window_of
 

@@ -8,16 +8,17 @@ budget. A sphere that splits keeps the picture as it was, by its opacities exact
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor
 
 from ...datasets.ply import SH_C0
 from ...datasets.progress import progress
-from .fit import photometric, psnr
+from ..checkpoint import Slot, State
 from .harmonics import term_count
+from .losses import Loss, psnr_of
 from .spheres import Spheres
 from .views import View
 
@@ -80,6 +81,21 @@ class Population:
         return Spheres(
             value["means"], value["log_scales"].exp(), torch.sigmoid(value["logits"]), value["colors"], higher
         )
+
+    def state(self) -> State:
+        """Return all that the spheres and Adam are made of, for a checkpoint."""
+        return {
+            "values": {name: value.detach() for name, value in self._values.items()},
+            "adam": {name: adam.state_dict() for name, adam in self._adam.items()},
+        }
+
+    def restore(self, state: State) -> None:
+        """Take up what `state` returned; the number of spheres may differ from the start's."""
+        for name, value in state["values"].items():
+            self._values[name] = value.requires_grad_()
+            if name in self._adam:
+                self._adam[name].param_groups[0]["params"] = [self._values[name]]
+                self._adam[name].load_state_dict(state["adam"][name])
 
     def step(self, share: float, generator: torch.Generator) -> None:
         """Move by the gradients, and by noise; `share` of the fit is over."""
@@ -171,7 +187,7 @@ def _binomial(n: Tensor, k: int) -> Tensor:
 def fit_adaptively(
     start: Spheres,
     views: Sequence[View],
-    picture: Callable[[Spheres, View], Tensor],
+    loss: Loss,
     *,
     budget: int,
     degree: int,
@@ -179,49 +195,91 @@ def fit_adaptively(
     spread: float,
     seed: int,
     what: str,
+    slot: Slot | None = None,
 ) -> tuple[Spheres, list[Progress]]:
     """Fit spheres to photos, one photo an iteration.
 
     Args:
         start: The spheres at the beginning, at most the budget.
         views: The photos; each round goes through all of them in a new order.
-        picture: Renders the spheres as a view sees them (H, W, 3), with whatever stands before them.
+        loss: The loss of one view, with whatever stands before the spheres.
         budget: Most spheres.
         degree: Of the harmonics of the colours.
         iterations: Number of steps.
         spread: Greatest distance of a camera from their mean [m].
         seed: Seed.
         what: Name of the stage, for the progress bar.
+        slot: Where checkpoints go, and from where an interrupted fit is taken up.
 
     Returns:
         The spheres, and how it went, every `REFINED_EVERY` iterations.
     """
-    population = Population(start, degree, spread)
-    shuffle = torch.Generator().manual_seed(seed)
-    noise = torch.Generator(start.means.device).manual_seed(seed)
-    history: list[Progress] = []
-    order: list[int] = []
-    losses: list[Tensor] = []
-    bar = progress(range(iterations), what)
+    run = _Run(Population(start, degree, spread), seed, start.means.device)
+    first = run.restore(slot)
+    bar = progress(range(first, iterations), what, total=iterations, initial=first)
     for iteration in bar:
-        if not order:
-            order = torch.randperm(len(views), generator=shuffle).tolist()
-        view = views[order.pop()]
-        spheres = population.spheres()
-        seen = picture(spheres, view)
-        value = photometric(seen, view.image)
+        view = views[run.next_photo(len(views))]
+        spheres = run.population.spheres()
+        value, wrong = loss(spheres, view, run.shuffle)
         value = value + OPACITY_WEIGHT * spheres.opacities.mean() + SCALE_WEIGHT * spheres.scales.mean() / spread
         value.backward()
-        losses.append(value.detach())
-        population.step(iteration / iterations, noise)
+        run.losses.append(value.detach())
+        run.population.step(iteration / iterations, run.noise)
         if iteration % REFINED_EVERY == 0 or iteration == iterations - 1:
-            mean = float(torch.stack(losses).mean())
-            history.append(Progress(iteration, len(population), mean, psnr(seen.detach(), view.image)))
-            losses = []
-            bar.set_postfix_str(f"{len(population)} spheres, loss {mean:.4f}, {history[-1].psnr_db:.1f} dB")
+            run.note(iteration, wrong)
+            bar.set_postfix_str(run.told())
             if REFINED_FROM * iterations <= iteration < REFINED_UNTIL * iterations:
-                population.refine(budget, noise)
-    fitted = population.spheres()
+                run.population.refine(budget, run.noise)
+            if slot is not None and slot.due():
+                slot.write(run.state(iteration + 1))
+    fitted = run.population.spheres()
     higher = None if fitted.harmonics is None else fitted.harmonics.detach()
     plain = (fitted.means, fitted.scales, fitted.opacities, fitted.colors)
-    return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher), history
+    return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher), run.history
+
+
+class _Run:
+    """What a fit carries from one iteration to the next."""
+
+    def __init__(self, population: Population, seed: int, device: torch.device) -> None:
+        self.population = population
+        self.shuffle = torch.Generator().manual_seed(seed)
+        self.noise = torch.Generator(device).manual_seed(seed)
+        self.order: list[int] = []
+        self.losses: list[Tensor] = []
+        self.history: list[Progress] = []
+
+    def next_photo(self, count: int) -> int:
+        self.order = self.order or torch.randperm(count, generator=self.shuffle).tolist()
+        return self.order.pop()
+
+    def note(self, iteration: int, wrong: Tensor) -> None:
+        mean = float(torch.stack(self.losses).mean())
+        self.history.append(Progress(iteration, len(self.population), mean, psnr_of(wrong)))
+        self.losses = []
+
+    def told(self) -> str:
+        last = self.history[-1]
+        return f"{last.spheres} spheres, loss {last.loss:.4f}, {last.psnr_db:.1f} dB"
+
+    def state(self, done: int) -> State:
+        return {
+            "done": done,
+            "population": self.population.state(),
+            "shuffle": self.shuffle.get_state(),
+            "noise": self.noise.get_state(),
+            "order": self.order,
+            "history": [asdict(entry) for entry in self.history],
+        }
+
+    def restore(self, slot: Slot | None) -> int:
+        """Take up the last checkpoint; return how many iterations are done."""
+        state = slot.read(self.noise.device) if slot is not None else None
+        if state is None:
+            return 0
+        self.population.restore(state["population"])
+        self.shuffle.set_state(state["shuffle"].cpu())
+        self.noise.set_state(state["noise"].cpu())
+        self.order = state["order"]
+        self.history = [Progress(**entry) for entry in state["history"]]
+        return state["done"]

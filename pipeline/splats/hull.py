@@ -25,6 +25,8 @@ _BORDER_SMOOTHING_PX = 0.7
 _BORDER_BIAS_PX = 0.5
 _TIP_DIRECTIONS = 500
 _MIN_VIEWS = 3
+_AGREEING = 3
+"""So many depth maps have to see a point before their surface, for it to be empty."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +37,13 @@ class Silhouette:
         mask: Whether each pixel shows the body, shape (H, W).
         K: Camera matrix [px], shape (3, 3); the centre of the top-left pixel is (0.5, 0.5); no distortion.
         T_cam_world: World to camera, OpenCV axes, shape (4, 4).
+        depth_m: Depth along the optical axis [m], 0 where unknown, shape (H, W); None without a depth map.
     """
 
     mask: NDArray[np.bool_]
     K: Array
     T_cam_world: Array
+    depth_m: NDArray[np.float32] | None = None
 
     def pixel_at(self, point: Array) -> float:
         """Return the width of a pixel [m] at the depth of a point, world frame, shape (3,)."""
@@ -48,7 +52,7 @@ class Silhouette:
 
 
 def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = "body") -> Volume:
-    """Return the visual hull of a body, in the world frame.
+    """Return the visual hull of a body, in the world frame, carved further by depth maps where views have them.
 
     Views whose mask is empty are left out; what lies beyond a picture's border is unknown there and not carved.
 
@@ -153,6 +157,7 @@ def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], 
     """Return about the distance from the hull's surface at points (n, 3) [m], positive inside, shape (n,)."""
     result = np.full(points.shape[0], np.inf)
     seen = np.zeros(points.shape[0], dtype=np.int32)
+    behind = np.full((_AGREEING, points.shape[0]), np.inf)  # the least of the depths behind a depth map's surface [m]
     for view, field in zip(views, fields, strict=True):
         local = points @ view.T_cam_world[:3, :3].T + view.T_cam_world[:3, 3]
         depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
@@ -163,8 +168,16 @@ def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], 
         metres = signed * depth[visible] / np.sqrt(view.K[0, 0] * view.K[1, 1])
         result[visible] = np.minimum(result[visible], metres)
         seen[visible] += 1
+        if view.depth_m is not None:
+            rows, columns = v[visible].astype(int), u[visible].astype(int)
+            surface = view.depth_m[rows, columns]
+            known = (surface > 0) & view.mask[rows, columns]
+            below = np.where(known, depth[visible] - surface, np.inf)
+            behind[:, visible] = np.sort(np.concatenate([behind[:, visible], below[None]]), axis=0)[:_AGREEING]
     far = np.abs(result[np.isfinite(result)]).max(initial=1.0)
     result = np.where(seen >= min(_MIN_VIEWS, len(views)), result, -far)
+    # What lies before the surface that a depth map shows is empty; a few maps must agree, for each has noise.
+    result = np.minimum(result, behind[-1])
     if ground is not None:
         result = np.minimum(result, points @ np.array(ground.normal) - ground.offset_m)
     return result

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ...schemas import Ground
 from .directions import fibonacci_directions
 from .spheres import Spheres
-from .views import View
+from .views import View, focus_of
 from .volume import Array, Volume, grid_points
 
 _SURFACE_SHARE = 0.9
@@ -151,17 +151,28 @@ def _on_bodies(points: Array, views: Sequence[View]) -> Array:
 
 def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Array:
     """Return points in a ball around where the cameras look, (count, 3): a start where nothing else is known."""
-    system, right = np.zeros((3, 3)), np.zeros(3)
-    for view in views:
-        axis = view.camera.T_world_cam[:3, 2]
-        across = np.eye(3) - np.outer(axis, axis)
-        system += across
-        right += across @ view.camera.center
-    focus = np.linalg.lstsq(system, right, rcond=None)[0]
+    focus = focus_of(views)
     radius = float(np.median([np.linalg.norm(view.camera.center - focus) for view in views]))
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return focus + 1.5 * radius * rng.random((count, 1)) ** (1 / 3) * directions
+
+
+def points_of_depth(views: Sequence[View], count: int, seed: int) -> Array | None:
+    """Return points of the surfaces that the photos' depth maps show, world frame, (n, 3), or None without any."""
+    rng = np.random.default_rng(seed)
+    known = [view for view in views if view.depth is not None]
+    parts = []
+    for view in known:
+        depth = view.depth.cpu().numpy()  # type: ignore[union-attr]
+        v, u = np.nonzero(depth)
+        chosen = rng.permutation(len(u))[: 1 + count // len(known)]
+        v, u = v[chosen], u[chosen]
+        K, z = view.K.double().cpu().numpy(), depth[v, u].astype(float)
+        local = np.stack([z * (u + 0.5 - K[0, 2]) / K[0, 0], z * (v + 0.5 - K[1, 2]) / K[1, 1], z], 1)
+        pose = view.camera.T_world_cam
+        parts.append(local @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(parts) if parts else None
 
 
 @dataclass(frozen=True)

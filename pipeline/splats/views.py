@@ -1,9 +1,9 @@
-"""Photos as the fit sees them: undistorted, reduced, with soft masks and pinhole cameras."""
+"""Photos as the fit sees them: undistorted, reduced, with soft masks, geometry maps and pinhole cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,11 +13,16 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...datasets.capture import Capture
+from ...datasets.geometry_maps import GeometryMaps
 from ...datasets.progress import progress
+from ...schemas import InputDataError
 from .hull import Silhouette
+from .render import RenderOutput, render
+from .spheres import Spheres
 from .volume import Array
 
 _FINE_SIZE = 800
+_MARGIN_PX = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +38,10 @@ class View:
         camera: The camera at the photo's own size, without distortion.
         labels: Mask at the photo's own size, without distortion, or None.
         grey: Grey values in [0, 1], longer side at most 800 px, on the CPU, shape (h, w).
+        depth: Depth along the optical axis [m], 0 where unknown, shape (H, W); None without a map.
+        normals: Outward unit normals, camera axes, zero where unknown, shape (H, W, 3); None without a map.
+        features: Feature map, each channel scaled to [0, 1] over all photos, shape (H, W, F); None without one.
+        depth_map: Depth at the photo's own size, without distortion, or None.
     """
 
     name: str
@@ -43,6 +52,10 @@ class View:
     camera: Camera
     labels: NDArray[np.uint8] | None
     grey: Tensor
+    depth: Tensor | None = None
+    normals: Tensor | None = None
+    features: Tensor | None = None
+    depth_map: NDArray[np.float32] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -53,7 +66,7 @@ class View:
         """Return the mask of a body (its place in the manifest), at the photo's own size."""
         if self.labels is None:
             return None
-        return Silhouette(self.labels == body + 1, self.camera.K, self.camera.T_cam_world)
+        return Silhouette(self.labels == body + 1, self.camera.K, self.camera.T_cam_world, self.depth_map)
 
     def crop(self, left: int, top: int, width: int, height: int) -> View:
         """Return a window of the view [px]; its camera's principal point is moved."""
@@ -61,22 +74,29 @@ class View:
         K[0, 2] -= left
         K[1, 2] -= top
         rows, columns = slice(top, top + height), slice(left, left + width)
+        maps = {
+            name: None if value is None else value[rows, columns]
+            for name, value in (("depth", self.depth), ("normals", self.normals), ("features", self.features))
+        }
         cover = None if self.cover is None else self.cover[:, rows, columns]
-        return View(self.name, self.image[rows, columns], cover, K, self.viewmat, self.camera, self.labels, self.grey)
+        return replace(self, image=self.image[rows, columns], cover=cover, K=K, **maps)
 
 
 def load_views(capture: Capture, names: Sequence[str], image_size: int, device: torch.device) -> list[View]:
-    """Read photos and masks, take the distortion out, and reduce them to a longer side of `image_size` [px]."""
+    """Read photos, masks and maps, take the distortion out, and reduce them to a longer side of `image_size` [px]."""
     bodies = len(capture.manifest.bodies)
     views = []
     for name in progress(names, "reading photos"):
-        image, camera = capture.photo_camera(name).undistorted(capture.photo(name))
+        original = capture.photo_camera(name)
+        image, camera = original.undistorted(capture.photo(name))
         mask = capture.photo_mask(name)
-        labels = None if mask is None else capture.photo_camera(name).undistorted(mask, labels=True)[0]
+        labels = None if mask is None else original.undistorted(mask, labels=True)[0]
         scale = min(1.0, image_size / max(camera.width, camera.height))
         width, height = round(scale * camera.width), round(scale * camera.height)
         small = camera.resized(width, height)
         cover = None if labels is None else _cover(labels, bodies, width, height)
+        maps = _undistorted_maps(capture.photo_maps(name), original)
+        depth, normals, features = _reduced_maps(maps, width, height)
         views.append(
             View(
                 name,
@@ -87,9 +107,119 @@ def load_views(capture: Capture, names: Sequence[str], image_size: int, device: 
                 camera,
                 labels,
                 _grey(image),
+                None if depth is None else _tensor(depth, device),
+                None if normals is None else _tensor(normals, device),
+                None if features is None else _tensor(features, device),
+                maps.depth_m,
             )
         )
-    return views
+    return _with_features_scaled(views)
+
+
+def render_view(spheres: Spheres, view: View, background: Tensor | None = None) -> RenderOutput:
+    """Render spheres (world frame) as a view sees them."""
+    width, height = view.size
+    spheres = spheres.seen_from(camera_center(view.viewmat))
+    return render(
+        spheres.means,
+        spheres.scales,
+        spheres.opacities,
+        spheres.colors,
+        view.viewmat[None],
+        view.K[None],
+        width,
+        height,
+        background,
+    )
+
+
+def camera_center(viewmat: Tensor) -> Tensor:
+    """Return the centre of a camera, world frame, from T_cam_world (4, 4)."""
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+
+def body_windows(views: Sequence[View], body: int) -> list[View]:
+    """Return the views' windows around a body's mask; views that do not show it are left out."""
+    windows = []
+    for view in views:
+        if view.cover is None or not bool((view.cover[body] > 0.5).any()):
+            continue
+        rows, columns = (view.cover[body] > 0.5).nonzero(as_tuple=True)
+        width, height = view.size
+        left, top = max(int(columns.min()) - _MARGIN_PX, 0), max(int(rows.min()) - _MARGIN_PX, 0)
+        right, bottom = min(int(columns.max()) + _MARGIN_PX, width - 1), min(int(rows.max()) + _MARGIN_PX, height - 1)
+        windows.append(view.crop(left, top, right - left + 1, bottom - top + 1))
+    return windows
+
+
+def focus_of(views: Sequence[View]) -> Array:
+    """Return the point that the cameras' axes pass nearest to, world frame [m], (3,)."""
+    axes = np.stack([view.camera.T_world_cam[:3, 2] for view in views])
+    across = np.eye(3) - np.einsum("ni,nj->nij", axes, axes)
+    centers = np.stack([view.camera.center for view in views])
+    return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
+
+
+def spread_of(views: Sequence[View]) -> float:
+    """Return the greatest distance of a camera from the cameras' mean, and a tenth, as a scale of the scene [m]."""
+    centers = np.stack([view.camera.center for view in views])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+
+
+def _undistorted_maps(maps: GeometryMaps, camera: Camera) -> GeometryMaps:
+    """Take the distortion out of the maps; unknown depths and normals must not be mixed into known ones."""
+
+    def straight(values: NDArray[np.float32] | None, nearest: bool) -> NDArray[np.float32] | None:
+        if values is None:
+            return None
+        at_size = camera.resized(values.shape[1], values.shape[0])
+        if values.ndim == 2:
+            return at_size.undistorted(values, nearest)[0]
+        # OpenCV takes no more than four channels at once
+        channels = [values[..., k] for k in range(values.shape[2])]
+        return np.stack([at_size.undistorted(np.ascontiguousarray(one), nearest)[0] for one in channels], -1)
+
+    return GeometryMaps(straight(maps.depth_m, True), straight(maps.normals_cam, True), straight(maps.features, False))
+
+
+def _reduced_maps(maps: GeometryMaps, width: int, height: int) -> list[NDArray[np.float32] | None]:
+    """Return depth, normals and features at the fit's size.
+
+    Depth and normals are those of the pixel in the middle: a mean over a border would lie on neither side of it.
+    """
+    size = (width, height)
+    nearest = [
+        None if values is None else cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
+        for values in (maps.depth_m, maps.normals_cam)
+    ]
+    features = None
+    if maps.features is not None:
+        channels = [maps.features[..., k] for k in range(maps.features.shape[2])]
+        smaller = width < maps.features.shape[1]
+        how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+        features = np.stack([cv2.resize(np.ascontiguousarray(one), size, interpolation=how) for one in channels], -1)
+    return [*nearest, features]
+
+
+def _with_features_scaled(views: list[View]) -> list[View]:
+    """Bring each channel of the feature maps to [0, 1], by its range over all photos.
+
+    Raises:
+        InputDataError: If the photos' features have different numbers of channels.
+    """
+    maps = {view.name: view.features for view in views if view.features is not None}
+    if not maps:
+        return views
+    widths = {name: value.shape[-1] for name, value in maps.items()}
+    if len(set(widths.values())) > 1:
+        name, other = sorted(widths, key=lambda name: widths[name])[:: len(widths) - 1][:2]
+        raise InputDataError(
+            f"features/: {widths[name]} channels for {name}, {widths[other]} for {other}.", "the same number for all."
+        )
+    low = torch.stack([value.amin((0, 1)) for value in maps.values()]).amin(0)
+    high = torch.stack([value.amax((0, 1)) for value in maps.values()]).amax(0)
+    span = (high - low).clamp_min(1e-12)
+    return [replace(v, features=None if v.features is None else (v.features - low) / span) for v in views]
 
 
 def _grey(image: NDArray[np.uint8]) -> Tensor:

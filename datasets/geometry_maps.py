@@ -1,0 +1,122 @@
+"""Geometry maps beside the photos: depth, normals and features, where something measured or computed them.
+
+    depth/<photo>.npy      float, (H, W): depth along the optical axis [m]; 0 or not finite where unknown
+    depth/<photo>.png      16 bits, one channel: the same in millimetres
+    normals/<photo>.npy    float, (H, W, 3): outward unit normals in camera axes (OpenCV); zero where unknown
+    normals/<photo>.png    8 bits, RGB: 127.5 (n + 1)
+    features/<photo>.npy   float, (h, w, F), any size and number of channels: what a point looks like to a network
+
+Names are the photos' own without their suffix. Maps belong to the photo as it is, with its camera's distortion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import InputDataError
+from .files import files_under
+
+KINDS = {"depth": (".npy", ".png"), "normals": (".npy", ".png"), "features": (".npy",)}
+"""Folder of each kind of map, and the suffixes that are read there."""
+_MILLIMETRE_M = 1e-3
+_LEAST_NORMAL = 0.5
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryMaps:
+    """What is known about a photo's pixels besides their colours; None where there is no such map.
+
+    Attributes:
+        depth_m: Depth along the optical axis [m], 0 where unknown, shape (H, W).
+        normals_cam: Outward unit normals, camera axes (OpenCV), zero where unknown, shape (H, W, 3).
+        features: Shape (h, w, F).
+    """
+
+    depth_m: Map | None = None
+    normals_cam: Map | None = None
+    features: Map | None = None
+
+
+def map_names(root: Path, kind: str) -> list[str]:
+    """Return the maps of a kind in a capture, relative to their folder, sorted."""
+    return [name for name in files_under(root / kind) if Path(name).suffix.lower() in KINDS[kind]]
+
+
+def read_maps(root: Path, photo: str) -> GeometryMaps:
+    """Return the maps of a photo.
+
+    Raises:
+        InputDataError: If a file cannot be read, or its shape or type is wrong.
+    """
+    depth, normals, features = (_read(root, kind, photo) for kind in KINDS)
+    return GeometryMaps(depth, normals, features)
+
+
+def _read(root: Path, kind: str, photo: str) -> Map | None:
+    for suffix in KINDS[kind]:
+        path = root / kind / Path(photo).with_suffix(suffix)
+        if path.is_file():
+            return read_map(path, kind)
+    return None
+
+
+def read_map(path: Path, kind: str) -> Map:
+    """Return one map, float32, as `GeometryMaps` has it.
+
+    Raises:
+        InputDataError: If it cannot be read, or its shape or type is wrong.
+    """
+    return {"depth": _depth, "normals": _normals, "features": _features}[kind](path)
+
+
+def _depth(path: Path) -> Map:
+    if path.suffix.lower() == ".png":
+        values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        if values is None or values.ndim != 2 or values.dtype != np.uint16:
+            raise InputDataError(f"{path}: no image of one channel with 16 bits.", "16-bit PNG, millimetres; or .npy.")
+        depth = values.astype(np.float32) * _MILLIMETRE_M
+    else:
+        depth = _array(path, (2,), "(H, W) [m]")
+    if (depth[np.isfinite(depth)] < 0).any():
+        raise InputDataError(f"{path}: a depth below 0.", "metres along the optical axis; 0 where unknown.")
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+
+
+def _normals(path: Path) -> Map:
+    if path.suffix.lower() == ".png":
+        values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        if values is None or values.ndim != 3 or values.shape[2] != 3 or values.dtype != np.uint8:
+            raise InputDataError(f"{path}: no RGB image with 8 bits.", "8-bit PNG, 127.5 (n + 1); or .npy.")
+        normals = values[..., ::-1].astype(np.float32) / 127.5 - 1
+    else:
+        normals = _array(path, (3,), "(H, W, 3)")
+        if normals.shape[2] != 3:
+            raise InputDataError(f"{path}: the shape is {normals.shape}.", "(H, W, 3).")
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    known = np.isfinite(length) & (length > _LEAST_NORMAL)
+    return np.where(known, normals / np.where(known, length, 1), 0).astype(np.float32)
+
+
+def _features(path: Path) -> Map:
+    features = _array(path, (3,), "(h, w, F)")
+    if not np.isfinite(features).all():
+        raise InputDataError(f"{path}: values that are not finite.", "finite numbers.")
+    return features
+
+
+def _array(path: Path, dimensions: tuple[int, ...], wanted: str) -> Map:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        fault = f"{path}: no readable array ({type(error).__name__})."
+        raise InputDataError(fault, f"a .npy file, {wanted}.") from None
+    if not isinstance(array, np.ndarray) or array.ndim not in dimensions or array.dtype.kind != "f" or not array.size:
+        shape = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
+        raise InputDataError(f"{path}: {shape}.", f"floating-point numbers, {wanted}.")
+    return array.astype(np.float32)

@@ -1,0 +1,183 @@
+"""Checkpoints of a fit: what an interrupted one takes up again with `--resume`.
+
+They lie in a directory beside the model that is being made, `MODEL.checkpoint`, one file for each descent. A file
+appears when it is complete, so that a fit that is killed at any moment leaves the last complete one. Everything that
+a descent draws from or moves is in it, generators included: a resumed fit gives the spheres that it would have given.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datasets.atomic import new_file
+from ..schemas import InputDataError, UsageError
+
+State = dict[str, Any]
+"""Tensors, numbers, text, and lists and dictionaries of them."""
+Array = NDArray[Any]
+
+_KEY = "made_of.json"
+
+
+class Checkpoint:
+    """The checkpoints of one fit.
+
+    Nothing is written before the fit has run for `every_s`: a short one leaves no trace.
+
+    Args:
+        path: The directory; it is made with the first checkpoint.
+        made_of: What the fit is made of (settings, inputs), by name, as text. A checkpoint of anything else is refused.
+        every_s: Least time between two checkpoints [s].
+    """
+
+    def __init__(self, path: Path, made_of: Mapping[str, str], every_s: float = 15.0) -> None:
+        self.path = path
+        self._made_of = dict(made_of)
+        self._every_s = every_s
+        self._last = time.monotonic()
+
+    @staticmethod
+    def beside(out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool) -> Checkpoint:
+        """Return the checkpoints of the fit that writes the model `out`; what lies there is kept where it resumes.
+
+        Raises:
+            UsageError: If what lies there holds no checkpoints, if it does and neither `resume` nor `overwrite` is
+                given, or what is to be resumed was made of something else.
+        """
+        checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
+        path = checkpoint.path
+        if not path.exists():
+            return checkpoint
+        if not (path / _KEY).is_file():
+            raise UsageError(
+                f"{path} is in the way: checkpoints go there, and it holds none.",
+                todo="move it, or choose another --out.",
+            )
+        if resume:
+            checkpoint._refuse_others()
+        elif overwrite:
+            checkpoint.remove()
+        else:
+            raise UsageError(
+                f"{path} holds a fit of {out} that was interrupted.",
+                todo="pass --resume to go on with it, or --overwrite to begin again.",
+            )
+        return checkpoint
+
+    def slot(self, name: str) -> Slot:
+        """Return the place of one descent's state."""
+        return Slot(self, name)
+
+    def remove(self) -> None:
+        """Remove all checkpoints: the model is complete."""
+        if (self.path / _KEY).is_file():
+            shutil.rmtree(self.path)
+
+    def due(self) -> bool:
+        """Tell whether the last checkpoint is old enough for another."""
+        return time.monotonic() - self._last >= self._every_s
+
+    def write(self, name: str, state: State) -> None:
+        """Write a state, complete or not at all."""
+        if not (self.path / _KEY).is_file():
+            self.path.mkdir(parents=True, exist_ok=True)
+            with new_file(self.path / _KEY, overwrite=True) as path:
+                path.write_text(json.dumps(self._made_of, indent=1) + "\n", encoding="utf-8")
+        with new_file(self.path / _file_name(name), overwrite=True) as path:
+            arrays: list[Array] = []
+            frame = json.dumps(_taken_apart(state, arrays))
+            with path.open("wb") as stream:  # an open file: savez would put another suffix after the name
+                np.savez(stream, frame=np.array(frame), **{str(k): array for k, array in enumerate(arrays)})
+        self._last = time.monotonic()
+
+    def read(self, name: str, device: torch.device) -> State | None:
+        """Return a state, its tensors on a device, or None where there is none.
+
+        Raises:
+            InputDataError: If the file cannot be read.
+        """
+        path = self.path / _file_name(name)
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                return _put_together(json.loads(str(stored["frame"])), stored, device)
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise InputDataError(
+                f"{path}: the checkpoint cannot be read ({type(error).__name__}).",
+                todo="remove the file, or pass --overwrite to begin the fit again.",
+            ) from None
+
+    def _refuse_others(self) -> None:
+        try:
+            found = json.loads((self.path / _KEY).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            found = {}
+        names = sorted(name for name in {*found, *self._made_of} if found.get(name) != self._made_of.get(name))
+        if names:
+            raise UsageError(
+                f"{self.path} was made with other {', '.join(names)}.",
+                "the same command, on the same capture, with --resume.",
+                "pass what was passed before, or --overwrite to begin again.",
+            )
+
+
+class Slot:
+    """The place of one descent's state in a checkpoint."""
+
+    def __init__(self, checkpoint: Checkpoint, name: str) -> None:
+        self._checkpoint, self._name = checkpoint, name
+
+    def read(self, device: torch.device) -> State | None:
+        """Return the state that was written last, or None."""
+        return self._checkpoint.read(self._name, device)
+
+    def due(self) -> bool:
+        """Tell whether it is time to write."""
+        return self._checkpoint.due()
+
+    def write(self, state: State) -> None:
+        """Write the state."""
+        self._checkpoint.write(self._name, state)
+
+
+def _file_name(name: str) -> str:
+    """Return a file name for a descent: its name where that is plain, told apart from others by a hash."""
+    plain = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
+    return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}.npz"
+
+
+def _taken_apart(value: Any, arrays: list[Array]) -> Any:
+    """Return a state as JSON writes it, with tensors by their place among the arrays, to which they are added."""
+    if isinstance(value, Tensor):
+        arrays.append(value.detach().cpu().numpy())
+        return {"tensor": len(arrays) - 1}
+    if isinstance(value, dict):  # as pairs, for the keys of Adam's state are numbers
+        return {"dict": [[key, _taken_apart(entry, arrays)] for key, entry in value.items()]}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__: [_taken_apart(entry, arrays) for entry in value]}
+    return value
+
+
+def _put_together(value: Any, arrays: Mapping[str, Array], device: torch.device) -> Any:
+    if not isinstance(value, dict):
+        return value
+    ((kind, content),) = value.items()
+    if kind == "tensor":
+        return torch.from_numpy(arrays[str(content)]).to(device)
+    if kind == "dict":
+        return {key: _put_together(entry, arrays, device) for key, entry in content}
+    entries = [_put_together(entry, arrays, device) for entry in content]
+    return tuple(entries) if kind == "tuple" else entries

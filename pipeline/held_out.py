@@ -1,0 +1,104 @@
+"""Photos that the fit did not see: figures, and a contact sheet of photo, render and error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .reporting.pictures import compared, small_png
+from .splats.losses import psnr, ssim_map
+from .splats.photos import correct_one
+from .splats.spheres import Spheres
+from .splats.views import View, camera_center, render_view
+
+_SHEET_BYTES = 3_000_000
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Quality on photos that the fit did not see.
+
+    Attributes:
+        figures: Means over the photos, for fit.json: `psnr_db` and `ssim` of the whole picture, `psnr_object_db` and
+            `mask_iou` where masks show a body; where photos were corrected, `psnr_right_half_db`, that of the right
+            half of each picture, and `psnr_right_half_corrected_db`, with exposure and pose found on its left half.
+        sheet: Contact sheet, PNG, or None without photos.
+    """
+
+    figures: dict[str, Any]
+    sheet: bytes | None
+
+
+@torch.no_grad()
+def look(
+    views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, spread: float, *, exposure: bool, poses: bool
+) -> HeldOut:
+    """Compare photos with what the spheres show.
+
+    Args:
+        views: The photos.
+        bodies: Visual spheres of the bodies, world frame.
+        scene: The background, or None.
+        spread: Size of the cameras' arrangement [m].
+        exposure: Whether the photos that were fitted were brought to one exposure.
+        poses: Whether their cameras were moved.
+    """
+    everything = Spheres.joined([*bodies, *([] if scene is None else [scene])])
+    label = torch.zeros(len(everything), 1, device=everything.means.device)
+    label[: sum(len(part) for part in bodies)] = 1.0
+    whole, similar, inside, overlap, halves = [], [], [], [], []
+    pictures: list[NDArray[np.uint8]] = []
+    for view in views:
+        seen = everything.seen_from(camera_center(view.viewmat))
+        colored = Spheres(seen.means, seen.scales, seen.opacities, torch.cat([seen.colors, label], 1))
+        features = render_view(colored, view).features[0]
+        picture = features[..., :3].clamp(0, 1)
+        pictures.append(_bytes(picture))
+        whole.append(psnr(picture, view.image))
+        similar.append(float(ssim_map(picture, view.image).mean()))
+        if view.cover is not None and bodies:
+            true, mine = view.cover.sum(0) > 0.5, features[..., 3] > 0.5
+            if true.any():
+                inside.append(psnr(picture, view.image, true))
+                overlap.append(float((true & mine).sum() / (true | mine).sum()))
+        if exposure or poses:
+            right = slice(view.image.shape[1] // 2, None)
+            shown = _corrected(everything, view, spread, exposure, poses)
+            halves.append((psnr(picture[:, right], view.image[:, right]), psnr(shown[:, right], view.image[:, right])))
+    sheet = None
+    if pictures:
+        sheet = small_png(compared([_bytes(view.image) for view in views], pictures), _SHEET_BYTES)
+    figures = {
+        "photos": [view.name for view in views],
+        "psnr_db": _mean(whole),
+        "ssim": _mean(similar),
+        "psnr_object_db": _mean(inside),
+        "mask_iou": _mean(overlap),
+        "psnr_db_by_photo": [round(value, 3) for value in whole],
+    }
+    if halves:
+        before, after = zip(*halves, strict=True)
+        figures |= {"psnr_right_half_db": _mean(before), "psnr_right_half_corrected_db": _mean(after)}
+    return HeldOut(figures, sheet)
+
+
+def _corrected(spheres: Spheres, view: View, spread: float, exposure: bool, poses: bool) -> Tensor:
+    """Return the render of a photo in its own exposure and from its own pose, both found on its left half."""
+    with torch.enable_grad():
+        found = correct_one(spheres, view, spread, exposure=exposure, poses=poses)
+    picture = render_view(spheres, found.corrected(view)).features[0]
+    return (picture * found.gains.get(view.name, 1.0)).clamp(0, 1)
+
+
+def _bytes(picture: Tensor) -> NDArray[np.uint8]:
+    return (picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def _mean(values: list[float]) -> float | None:
+    return round(float(np.mean(values)), 4) if values else None
