@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .reporting.pictures import compared, small_png
+from .splats.exposures import least_squares_gain
 from .splats.losses import psnr, ssim_map
-from .splats.photos import correct_one
+from .splats.poses import find_motion, moved
 from .splats.spheres import Spheres
 from .splats.views import View, camera_center, render_view
 
@@ -90,10 +91,13 @@ def look(
 
 def _corrected(spheres: Spheres, view: View, spread: float, exposure: bool, poses: bool) -> Tensor:
     """Return the render of a photo in its own exposure and from its own pose, both found on its left half."""
-    with torch.enable_grad():
-        found = correct_one(spheres, view, spread, exposure=exposure, poses=poses)
-    picture = render_view(spheres, found.corrected(view)).features[0]
-    return (picture * found.gains.get(view.name, 1.0)).clamp(0, 1)
+    left = torch.zeros_like(view.image[..., 0])
+    left[:, : left.shape[1] // 2] = 1.0
+    if poses:
+        with torch.enable_grad():
+            view = moved(view, find_motion(spheres, view, left, spread))
+    picture = render_view(spheres, view).features[0]
+    return (picture * least_squares_gain(picture, view.image, left) if exposure else picture).clamp(0, 1)
 
 
 def _bytes(picture: Tensor) -> NDArray[np.uint8]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn import functional
 
 from ..datasets.cameras import posed
 from ..datasets.capture import Capture
@@ -23,10 +23,11 @@ from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
 from .splats.collision import CollisionSpheres, distil, shape_to_spheres
 from .splats.colors import mean_colors
+from .splats.exposures import Exposures
 from .splats.fit import Rates, Trainable, descend
 from .splats.hull import carve
 from .splats.losses import behind, body_loss, geometry_loss, scene_loss
-from .splats.photos import Corrections, learn_corrections
+from .splats.poses import learn_motions, motion_record, moved_for_good
 from .splats.seeds import body_seeds, points_of_depth, scene_seeds, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
@@ -41,8 +42,8 @@ _START_SHARE = 0.3
 _DEPTH_POINTS = 20_000
 _GEOMETRY_SHARE = 0.5
 """How fast geometry still moves while colours are fitted, of how fast it moved before; 0 is the published form."""
-_EXPOSURE_STEPS, _POSE_STEPS = 0.4, 2.0
-"""Steps that learn the photos' corrections, in units of the setting `iterations`."""
+_POSE_STEPS = 2.0
+"""Steps that refine the cameras' poses, in units of the setting `iterations`."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,11 @@ class _Stage:
     record: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
+    @cached_property
+    def exposures(self) -> Exposures:
+        """What is known of the photos' exposures so far."""
+        return Exposures(self.train, self.config.exposure)
+
     @property
     def spread(self) -> float:
         """Size of the cameras' arrangement [m]."""
@@ -132,7 +138,8 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     config = config or SplatConfig()
     started = time.perf_counter()
     stage = _open(capture, config, checkpoint)
-    corrections = _correct_photos(stage) if stage.train and (config.exposure or config.refine_poses) else None
+    if stage.train and config.refine_poses:
+        _refine_poses(stage)
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
     for index, body in enumerate(capture.manifest.bodies):
@@ -142,8 +149,10 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     scene = _fit_background(stage, placed) if stage.train else None
     pictures: dict[str, bytes] = {}
     if stage.train:
-        exposed, moved = (corrections is not None and bool(found) for found in _found(corrections))
-        held_out = look(stage.test, placed, scene, stage.spread, exposure=exposed, poses=moved)
+        settings = {"exposure": config.exposure, "poses": config.refine_poses}
+        held_out = look(stage.test, placed, scene, stage.spread, **settings)
+        if config.exposure:
+            stage.record["exposure_gain_rgb"] = stage.exposures.record()
         stage.record["held_out"] = held_out.figures
         if held_out.sheet is not None:
             pictures["held_out.png"] = held_out.sheet
@@ -152,40 +161,18 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
             pictures["turntable.mp4"] = turntable(stage.train, placed, scene, up)
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     splats = None if scene is None else scene.to_numpy()
-    cameras = _refined_cameras(stage) if corrections is not None and corrections.motions else None
+    cameras = _refined_cameras(stage) if stage.train and config.refine_poses else None
     return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), pictures, cameras)
 
 
-def _found(corrections: Corrections | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    return ({}, {}) if corrections is None else (corrections.gains, corrections.motions)
-
-
-def _correct_photos(stage: _Stage) -> Corrections:
-    """Bring the photos to one exposure, and their cameras to where they were, as far as the settings ask for it."""
-    config = stage.config
+def _refine_poses(stage: _Stage) -> None:
+    """Move the cameras to where the photos say that they were."""
     started = time.perf_counter()
-    poses = config.refine_poses
-    # Exposure is the same all over a photo: without poses, small photos and few steps tell it.
-    views = stage.train if poses else [_smaller(view) for view in stage.train]
-    count = config.max_scene_spheres if poses else config.max_scene_spheres // 4
-    start = _background_seeds(stage, views, count, None)
-    steps = stage.steps(_POSE_STEPS if poses else _EXPOSURE_STEPS)
-    corrections = learn_corrections(
-        views, start, stage.spread, steps, config.seed, exposure=config.exposure, poses=poses
-    )
-    stage.train = [corrections.corrected(view) for view in stage.train]
-    seconds = {"seconds": round(time.perf_counter() - started, 2)}
-    stage.record["photo_corrections"] = corrections.record() | seconds
-    return corrections
-
-
-def _smaller(view: View) -> View:
-    """Return a photo at half its size; masks and maps are left behind, but for what is needed to leave bodies out."""
-    width, height = (side // 2 for side in view.size)
-    image = functional.adaptive_avg_pool2d(view.image.permute(2, 0, 1), (height, width)).permute(1, 2, 0)
-    cover = None if view.cover is None else functional.adaptive_avg_pool2d(view.cover, (height, width))
-    K = view.K * view.K.new_tensor([width / view.size[0], height / view.size[1], 1.0])[:, None]
-    return replace(view, image=image, cover=cover, K=K, depth=None, normals=None, features=None)
+    start = _background_seeds(stage, stage.config.max_scene_spheres, None)
+    steps = stage.steps(_POSE_STEPS)
+    motions = learn_motions(stage.train, start, stage.exposures, stage.spread, steps, stage.config.seed)
+    stage.train = [moved_for_good(view, motions[view.name]) for view in stage.train]
+    stage.record["camera_poses"] = motion_record(motions) | {"seconds": round(time.perf_counter() - started, 2)}
 
 
 def _refined_cameras(stage: _Stage) -> CamerasFile:
@@ -305,16 +292,18 @@ def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Sphere
         record["geometry_loss"] = _thinned(losses)
         share = _GEOMETRY_SHARE
         geometry = Rates(share * geometry.means, share * geometry.log_scales, geometry.logits)
-    spheres = replace(spheres, colors=mean_colors(spheres, windows, index))
+    even = [stage.exposures.even(window) for window in windows]
+    spheres = replace(spheres, colors=mean_colors(spheres, even, index))
     appearance = Trainable(spheres, replace(geometry, colors=0.02))
     losses = descend(
         appearance,
         windows,
-        body_loss(index),
+        body_loss(index, stage.exposures),
         stage.steps(0.75 if config.joint else 0.5),
         config.seed,
         f"{body.name}: colours",
         0.002,
+        exposures=stage.exposures,
         slot=stage.slot(f"{body.name} colours"),
     )
     record |= {"appearance_loss": _thinned(losses), "seconds": round(time.perf_counter() - started, 2)}
@@ -345,19 +334,19 @@ def _fit_geometry(
     return _detached(geometry.spheres()), losses
 
 
-def _background_seeds(stage: _Stage, views: Sequence[View], count: int, bodies: Spheres | None) -> Spheres:
+def _background_seeds(stage: _Stage, count: int, bodies: Spheres | None) -> Spheres:
     """Return spheres where the background begins: on the ground, on SfM points or depth maps, and far away."""
     path = stage.capture.root / POINTS_NAME
-    points = read_points(path)[0] if path.is_file() else points_of_depth(views, _DEPTH_POINTS, stage.config.seed)
+    points = read_points(path)[0] if path.is_file() else points_of_depth(stage.train, _DEPTH_POINTS, stage.config.seed)
     if points is None and stage.ground is None:
         text = f"No {POINTS_NAME} and no ground: the background starts from random points."
         if text not in stage.warnings:
             stage.warnings.append(text)
-    centers, scales = scene_seeds(views, stage.ground, points, count, stage.config.seed)
+    centers, scales = scene_seeds(stage.train, stage.ground, points, count, stage.config.seed)
     if len(scales) == 0:
         raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")
     spheres = to_spheres(centers, scales, 0.9 if stage.config.spheres is None else 0.5, stage.device)
-    colors = mean_colors(behind(bodies, spheres), views)
+    colors = mean_colors(behind(bodies, spheres), [stage.exposures.even(view) for view in stage.train])
     return replace(spheres, colors=colors if bodies is None else colors[len(bodies) :])
 
 
@@ -366,18 +355,19 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     started = time.perf_counter()
     count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))
     standing = Spheres.joined(bodies) if bodies else None
-    spheres = _background_seeds(stage, stage.train, count, standing)
+    spheres = _background_seeds(stage, count, standing)
     if config.spheres is not None:
         return _adapted(stage, standing, spheres, config.spheres, started)
     trainable = Trainable(spheres, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
     losses = descend(
         trainable,
         stage.train,
-        scene_loss(standing),
+        scene_loss(standing, stage.exposures),
         stage.steps(0.75),
         config.seed,
         "background",
         0.001,
+        exposures=stage.exposures,
         slot=stage.slot("background"),
     )
     stage.record["scene"] = {
@@ -394,13 +384,14 @@ def _adapted(stage: _Stage, bodies: Spheres | None, start: Spheres, budget: int,
     spheres, history = fit_adaptively(
         start,
         stage.train,
-        scene_loss(bodies),
+        scene_loss(bodies, stage.exposures),
         budget=budget,
         degree=config.sh_degree,
         iterations=config.adaptive_iterations,
         spread=stage.spread,
         seed=config.seed,
         what="background",
+        exposures=stage.exposures,
         slot=stage.slot("background"),
     )
     stage.record["scene"] = {

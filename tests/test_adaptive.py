@@ -11,6 +11,7 @@ from cgwm.datasets.cameras import Camera
 from cgwm.datasets.ply import Splats, read_splats, write_splats
 from cgwm.pipeline.labels import LabelRenderer
 from cgwm.pipeline.splats.adaptive import DEAD, Population, fit_adaptively, shared_among
+from cgwm.pipeline.splats.exposures import Exposures
 from cgwm.pipeline.splats.harmonics import harmonics
 from cgwm.pipeline.splats.losses import psnr, scene_loss
 from cgwm.pipeline.splats.spheres import Spheres
@@ -65,7 +66,8 @@ def test_a_fit_keeps_to_its_budget_improves_and_repeats():
     views = [_view(truth, angle) for angle in np.linspace(0, 5.5, 8)]
     few = Spheres(*(getattr(_spheres(60, 5), key) for key in ("means", "scales", "opacities", "colors")))
     settings = {"budget": 90, "degree": 1, "iterations": 400, "spread": 1.6, "seed": 0, "what": "test"}
-    fitted, history = fit_adaptively(few, views, scene_loss(None), **settings)
+    exposures = Exposures(views, False)
+    fitted, history = fit_adaptively(few, views, scene_loss(None, exposures), exposures=exposures, **settings)
     assert len(few) < len(fitted) <= 90
     assert history[-1].spheres == len(fitted)
     assert torch.isfinite(fitted.means).all()
@@ -74,7 +76,7 @@ def test_a_fit_keeps_to_its_budget_improves_and_repeats():
         for one in (few, fitted)
     )
     assert after > before + 5
-    again, _ = fit_adaptively(few, views, scene_loss(None), **settings)
+    again, _ = fit_adaptively(few, views, scene_loss(None, exposures), exposures=exposures, **settings)
     assert torch.equal(again.means, fitted.means)
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from ...datasets.ply import SH_C0
 from ...datasets.progress import progress
 from ..checkpoint import Slot, State
+from .exposures import Exposures
 from .harmonics import term_count
 from .losses import Loss, psnr_of
 from .spheres import Spheres
@@ -195,6 +196,7 @@ def fit_adaptively(
     spread: float,
     seed: int,
     what: str,
+    exposures: Exposures,
     slot: Slot | None = None,
 ) -> tuple[Spheres, list[Progress]]:
     """Fit spheres to photos, one photo an iteration.
@@ -209,12 +211,13 @@ def fit_adaptively(
         spread: Greatest distance of a camera from their mean [m].
         seed: Seed.
         what: Name of the stage, for the progress bar.
+        exposures: What the loss learns of the photos' exposures, to be kept in checkpoints.
         slot: Where checkpoints go, and from where an interrupted fit is taken up.
 
     Returns:
         The spheres, and how it went, every `REFINED_EVERY` iterations.
     """
-    run = _Run(Population(start, degree, spread), seed, start.means.device)
+    run = _Run(Population(start, degree, spread), exposures, seed, start.means.device)
     first = run.restore(slot)
     bar = progress(range(first, iterations), what, total=iterations, initial=first)
     for iteration in bar:
@@ -241,8 +244,8 @@ def fit_adaptively(
 class _Run:
     """What a fit carries from one iteration to the next."""
 
-    def __init__(self, population: Population, seed: int, device: torch.device) -> None:
-        self.population = population
+    def __init__(self, population: Population, exposures: Exposures, seed: int, device: torch.device) -> None:
+        self.population, self.exposures = population, exposures
         self.shuffle = torch.Generator().manual_seed(seed)
         self.noise = torch.Generator(device).manual_seed(seed)
         self.order: list[int] = []
@@ -266,6 +269,7 @@ class _Run:
         return {
             "done": done,
             "population": self.population.state(),
+            "exposures": self.exposures.state(),
             "shuffle": self.shuffle.get_state(),
             "noise": self.noise.get_state(),
             "order": self.order,
@@ -278,6 +282,7 @@ class _Run:
         if state is None:
             return 0
         self.population.restore(state["population"])
+        self.exposures.restore(state["exposures"])
         self.shuffle.set_state(state["shuffle"].cpu())
         self.noise.set_state(state["noise"].cpu())
         self.order = state["order"]

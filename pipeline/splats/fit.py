@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...datasets.progress import progress
 from ..checkpoint import Slot, State
+from .exposures import Exposures
 from .losses import Loss, psnr_of
 from .spheres import Spheres
 from .views import View
@@ -96,6 +97,7 @@ def descend(
     what: str,
     drift_weight: float = 0.0,
     beside: Sequence[dict[str, Any]] = (),
+    exposures: Exposures | None = None,
     slot: Slot | None = None,
 ) -> list[float]:
     """Run Adam, one view an iteration, with step sizes that fall to a tenth.
@@ -109,6 +111,7 @@ def descend(
         what: Name of the stage, for the progress bar.
         drift_weight: Weight of `Trainable.drift`.
         beside: Groups of further parameters on which the loss depends, as Adam takes them.
+        exposures: What the loss learns of the photos' exposures, to be kept in checkpoints.
         slot: Where checkpoints go, and from where an interrupted descent is taken up; not together with `beside`.
 
     Returns:
@@ -126,6 +129,8 @@ def descend(
         decay.load_state_dict(state["decay"])
         generator.set_state(state["generator"].cpu())
         losses, order = list(state["losses"].unbind()), state["order"]
+        if exposures is not None:
+            exposures.restore(state["exposures"])
     bar = progress(range(len(losses), iterations), what, total=iterations, initial=len(losses))
     for iteration in bar:
         if not order:
@@ -149,6 +154,7 @@ def descend(
                     "generator": generator.get_state(),
                     "losses": torch.stack(losses),
                     "order": order,
+                    "exposures": None if exposures is None else exposures.state(),
                 }
             )
     return torch.stack(losses).tolist()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from .exposures import Exposures
 from .spheres import Spheres
 from .views import View, render_view
 
@@ -20,7 +21,8 @@ DSSIM_WEIGHT = 0.2
 """Share of D-SSIM in the photometric loss, as in 3D Gaussian splatting (arXiv 2308.04079, equation 7)."""
 DEPTH_WEIGHT, NORMAL_WEIGHT, FEATURE_WEIGHT = 1.0, 0.02, 0.1
 """Of the geometry maps beside the silhouette; depth in units of the body's size."""
-_FARTHEST = 0.1  # depth errors beyond this, in units of the size, count as this: they are outliers or other surfaces
+_OUTLYING = 0.05
+"""A depth error of this, in units of the body's size, is large."""
 _SSIM_WINDOW = 7
 _NORMAL_WINDOW = 5
 
@@ -95,8 +97,11 @@ def geometry_loss(body: int, size_m: float, radius_factor: float) -> Loss:
 
 
 def depth_error(depth: Tensor, target: Tensor, chosen: Tensor, unit: Tensor | float) -> Tensor:
-    """Return the mean over all pixels (H, W) of the chosen depth errors in a unit [m], outliers cut."""
-    error = ((depth - target).abs() / unit).clamp_max(_FARTHEST)
+    """Return the mean over all pixels (H, W) of the chosen depth errors in a unit [m].
+
+    Large errors count by their logarithm: they are outliers, or another surface that shows at a border.
+    """
+    error = _OUTLYING * ((depth - target).abs() / (unit * _OUTLYING)).log1p()
     return (error * (chosen & (target > 0))).mean()
 
 
@@ -122,21 +127,23 @@ def _front(spheres: Spheres, view: View, radius_factor: float) -> Tensor:
     return spheres.means @ view.viewmat[2, :3] + view.viewmat[2, 3] - radius_factor * spheres.scales
 
 
-def body_loss(body: int) -> Loss:
+def body_loss(body: int, exposures: Exposures) -> Loss:
     """Return the loss of a body's appearance before a random background, which alpha has to hide or to show."""
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         background = torch.rand(3, generator=generator).to(view.image)
-        output = render_view(spheres, view, background)
+        output = render_view(spheres, view)
         cover = cover_of(view)
         mine = cover[body][..., None]
+        exposures.follow(view, output.features[0].detach(), cover[body] > 0.95)
+        picture = exposures.gain(view) * output.features[0] + (1 - output.alpha[0])[..., None] * background
         others = (cover.sum(0) - cover[body])[..., None]
         # Mixed pixels of the border show both; what the body's share of them looks like is not known.
-        target = torch.where(mine > 0.95, view.image, mine * output.features[0].detach() + (1 - mine) * background)
+        target = torch.where(mine > 0.95, view.image, mine * picture.detach() + (1 - mine) * background)
         sure = (1 - others[..., 0]) * ((mine[..., 0] > 0.95) | (mine[..., 0] < 0.05))
         edge = ((output.alpha[0] - mine[..., 0]).abs() * (1 - others[..., 0])).mean()
-        wrong = ((output.features[0] - target).detach().square().mean(-1) * sure).sum() / sure.sum().clamp_min(1.0)
-        return photometric(output.features[0], target, sure) + 0.5 * edge, wrong
+        wrong = ((picture - target).detach().square().mean(-1) * sure).sum() / sure.sum().clamp_min(1.0)
+        return photometric(picture, target, sure) + 0.5 * edge, wrong
 
     return loss
 
@@ -146,12 +153,13 @@ def behind(bodies: Spheres | None, spheres: Spheres) -> Spheres:
     return spheres if bodies is None else Spheres.joined([bodies, spheres])
 
 
-def scene_loss(bodies: Spheres | None) -> Loss:
+def scene_loss(bodies: Spheres | None, exposures: Exposures) -> Loss:
     """Return the loss of the background, with the bodies standing in it as they are; depth counts where it is known."""
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         output = render_view(behind(bodies, spheres), view)
-        picture = output.features[0]
+        exposures.follow(view, output.features[0].detach(), output.alpha[0].detach() > 0.5)
+        picture = exposures.gain(view) * output.features[0]
         value = photometric(picture, view.image)
         if view.depth is not None:
             seen = output.alpha[0].detach() > 0.5
@@ -161,9 +169,9 @@ def scene_loss(bodies: Spheres | None) -> Loss:
     return loss
 
 
-def scene_weight(view: View) -> Tensor | None:
-    """Return how much each pixel shows of what is no body, (H, W), or None without a mask."""
-    return None if view.cover is None else 1 - view.cover.sum(0)
+def scene_weight(view: View) -> Tensor:
+    """Return how much each pixel shows of what is no body, (H, W); 1 without a mask."""
+    return torch.ones_like(view.image[..., 0]) if view.cover is None else 1 - view.cover.sum(0)
 
 
 def cover_of(view: View) -> Tensor:

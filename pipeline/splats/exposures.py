@@ -1,0 +1,77 @@
+"""Exposure and white balance of the photos, learned while spheres are fitted to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..checkpoint import State
+from .views import View
+
+_FOLLOWING = 0.3
+"""Share of the way to the least-squares gain that a photo's gain takes each time the photo is looked at."""
+_LEAST, _MOST = 0.1, 10.0
+
+
+class Exposures:
+    """A gain of each colour channel for each photo: photo = gain * what the spheres show.
+
+    The best gain for spheres as they are is a least-squares factor, so no descent is needed: whenever a photo is
+    looked at, its gain goes a part of the way there. The geometric mean of the gains stays 1, for photos do not tell
+    a bright scene from a long exposure.
+
+    Args:
+        views: The photos.
+        learned: Whether gains follow the photos; otherwise all stay 1.
+    """
+
+    def __init__(self, views: Sequence[View], learned: bool) -> None:
+        self.learned = learned
+        self._place = {view.name: k for k, view in enumerate(views)}
+        self._log_gains = views[0].image.new_zeros(len(views), 3)
+
+    def gain(self, view: View) -> Tensor:
+        """Return a photo's brightness by channel relative to the mean photo, (3,)."""
+        return self._log_gains[self._place[view.name]].exp()
+
+    def follow(self, view: View, picture: Tensor, weight: Tensor) -> None:
+        """Look at a photo once more.
+
+        Args:
+            view: The photo, or a window of it.
+            picture: What the spheres show of it at gain 1, shape (H, W, 3).
+            weight: How much each pixel counts, shape (H, W).
+        """
+        if not self.learned:
+            return
+        row = self._place[view.name]
+        self._log_gains[row].lerp_(least_squares_gain(picture, view.image, weight).log(), _FOLLOWING)
+        self._log_gains -= self._log_gains.mean(0)
+
+    def even(self, view: View) -> View:
+        """Return a photo brought to the mean exposure."""
+        return replace(view, image=view.image / self.gain(view)) if self.learned else view
+
+    def record(self) -> dict[str, list[float]]:
+        """Return the gains by photo, for fit.json."""
+        gains = self._log_gains.exp().tolist()
+        return {name: [round(value, 4) for value in gains[row]] for name, row in self._place.items()}
+
+    def state(self) -> State:
+        """Return the gains, for a checkpoint."""
+        return {"log_gains": self._log_gains}
+
+    def restore(self, state: State) -> None:
+        """Take up what `state` returned."""
+        self._log_gains = state["log_gains"]
+
+
+@torch.no_grad()
+def least_squares_gain(picture: Tensor, photo: Tensor, weight: Tensor) -> Tensor:
+    """Return the factor of each channel that brings a picture (H, W, 3) nearest to a photo, weighted by pixel, (3,)."""
+    weighted = picture * weight[..., None]
+    square = (weighted * picture).sum((0, 1))
+    return torch.where(square > 0, (weighted * photo).sum((0, 1)) / square.clamp_min(1e-12), 1.0).clamp(_LEAST, _MOST)
