@@ -6,8 +6,9 @@ import os
 
 import pytest
 import torch
+from cgwm.pipeline.splats.rays import pixel_rays
 from cgwm.pipeline.splats.render import render
-from test_render import scene
+from test_render import BARREL, PINCUSHION, SKEWED, scene, twin, wide_scene
 
 CUDA = torch.cuda.is_available()
 if not CUDA:
@@ -22,12 +23,12 @@ NEEDS_GPU = pytest.mark.skipif(not (CUDA and cuda.available()), reason="needs a 
 KERNELS = ["triton", pytest.param("cuda", marks=NEEDS_GPU)]
 
 
-def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3):
+def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3, size=SIZE, distortion=None):
     """Return outputs and gradients (outputs, gradients) of the torch renderer in double, and of the kernels."""
     generator = torch.Generator().manual_seed(seed)
     means, scales, opacities, features, viewmats, Ks = arguments
     features = torch.rand(len(means), channels, generator=generator, dtype=torch.float64)
-    weights = torch.randn(len(Ks), SIZE[1], SIZE[0], channels + 2, generator=generator, dtype=torch.float64)
+    weights = torch.randn(len(Ks), size[1], size[0], channels + 2, generator=generator, dtype=torch.float64)
     results = []
     for exact in (True, False):
         leaves = [means, scales, opacities, features, viewmats]
@@ -35,12 +36,13 @@ def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3):
             leaves = [leaf.float().to(DEVICE) for leaf in leaves]
         leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
         if exact:
-            seen = render(*leaves, Ks, *SIZE, min_alpha=min_alpha, min_transmittance=0.0, median=True)
+            seen = render(*leaves, Ks, *size, None, distortion, min_alpha=min_alpha, min_transmittance=0.0, median=True)
             assert seen.median_depth is not None
             outputs = (seen.features, seen.alpha, seen.depth * seen.alpha, seen.median_depth)
         else:
-            raster = Raster(*SIZE, min_alpha, 0.0, kernels=kernels)
-            outputs = rasterize(*leaves, Ks.float().to(DEVICE), raster)[:4]
+            raster = Raster(*size, min_alpha, 0.0, kernels=kernels)
+            single = None if distortion is None else distortion.float().to(DEVICE)
+            outputs = rasterize(*leaves, Ks.float().to(DEVICE), raster, single)[:4]
         loss = (torch.cat([outputs[0], *(o[..., None] for o in outputs[1:3])], -1) * weights.to(outputs[0])).sum()
         gradients = torch.autograd.grad(loss, leaves)
         results.append([[value.detach().double().cpu() for value in values] for values in (outputs, gradients)])
@@ -60,6 +62,66 @@ def assert_equal(results, pixels_off=0):
 @pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
 def test_values_and_gradients_equal_the_torch_renderer(kernels, min_alpha):
     assert_equal(both(scene(24), kernels, min_alpha))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+def test_strong_distortion_equals_the_torch_renderer(kernels, min_alpha):
+    """What lies far outside of a barrel's picture, the distortion would fold back into it."""
+    size = (37, 20)  # six tiles, of which four are cut
+    arguments, distortion = wide_scene(20, *size)
+    assert_equal(both(arguments, kernels, min_alpha, size=size, distortion=distortion), pixels_off=2)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_four_coefficients_for_all_cameras(kernels):
+    assert_equal(both(scene(12), kernels, distortion=torch.tensor(SKEWED[:4], dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_strong_distortion_equals_the_twin(kernels):
+    (*leaves, Ks), distortion = wide_scene(24, *SIZE)
+    results = []
+    for exact in (True, False):
+        tensors = [leaf if exact else leaf.float().to(DEVICE) for leaf in leaves]
+        tensors = [tensor.detach().clone().requires_grad_() for tensor in tensors]
+        if exact:
+            image, alpha, _ = twin(*tensors, Ks, *SIZE, distortion=distortion)
+        else:
+            raster = Raster(*SIZE, 0.0, 0.0, kernels=kernels)
+            image, alpha = rasterize(*tensors, Ks.float().to(DEVICE), raster, distortion.float().to(DEVICE))[:2]
+        gradients = torch.autograd.grad(image.square().sum() + alpha.sum(), tensors)
+        results.append([[v.detach().double().cpu() for v in values] for values in ((image, alpha), gradients)])
+    assert_equal(results)
+
+
+def test_no_distortion_is_a_pinhole():
+    arguments = [value.float().to(DEVICE) for value in scene(24)]
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels="triton")
+    plain, traced = (rasterize(*arguments, raster, none) for none in (None, torch.zeros(5, device=DEVICE)))
+    for one, other in zip(plain[:4], traced[:4], strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("coefficients", [BARREL, PINCUSHION, SKEWED])
+def test_distortion_loses_no_sphere(coefficients):
+    """Small spheres on the rays of some pixels: these see them, and no others do."""
+    width, height = 37, 20
+    arguments, _ = wide_scene(1, width, height)
+    K = arguments[-1][[0 if coefficients == BARREL else 1]]
+    distortion = torch.tensor([coefficients], dtype=torch.float64)
+    chosen = torch.arange(width * height)[::5]
+    pixels = torch.stack([chosen % width, chosen // width], -1) + 0.5
+    rays = pixel_rays(pixels.double(), K, distortion)[0]
+    count = len(rays)
+    single = (rays, torch.full((count,), 1e-4), torch.full((count,), 0.9), torch.ones(count, 1))
+    tensors = [value.float().to(DEVICE) for value in (*single, torch.eye(4)[None], K)]
+    raster = Raster(width, height, 1 / 255, 0.0, kernels="triton")
+    _, alpha, _, _, pairs = rasterize(*tensors, raster, distortion.float().to(DEVICE))
+    expected = torch.zeros(width * height)
+    expected[chosen] = 0.9
+    torch.testing.assert_close(alpha.cpu().reshape(-1), expected, atol=1e-3, rtol=0)
+    assert int(pairs) < 1.2 * count  # the bounds of the tiles are tight
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
@@ -149,3 +211,15 @@ def test_large_scenes_equal_the_torch_renderer(size):
     single = [value.float().to(DEVICE) for value in (means, scales, opacities, features, viewmats, Ks)]
     output = render(*single, width, height, min_transmittance=0.0)
     assert (output.features.double().cpu() - exact.features).norm() < 1e-3 * exact.features.norm()
+
+
+@NEEDS_GPU
+def test_distorted_cameras_take_the_kernels_and_equal_the_torch_renderer():
+    (*leaves, Ks), distortion = wide_scene(3000, 320, 240)
+    leaves[1] = 0.3 * leaves[1]
+    exact = render(*leaves, Ks, 320, 240, None, distortion, min_transmittance=0.0)
+    single = [value.float().to(DEVICE) for value in (*leaves, Ks)]
+    output = render(*single, 320, 240, None, distortion.float().to(DEVICE), min_transmittance=0.0)
+    assert output.pairs is not None
+    assert (output.features.double().cpu() - exact.features).norm() < 1e-3 * exact.features.norm()
+    assert (output.alpha.double().cpu() - exact.alpha).norm() < 1e-3 * exact.alpha.norm()

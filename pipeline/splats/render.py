@@ -70,8 +70,9 @@ def render(
     """Render spheres into C cameras.
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn where its centre
-    lies in front of the camera by more than its scale. float32 tensors on CUDA go through the kernels of `rasterize`,
-    everything else (cameras with distortion, systems without Triton) through plain torch; both give the same pictures.
+    lies in front of the camera by more than its scale; one whose place is not finite is not drawn. float32 tensors on
+    CUDA go through the kernels of `rasterize`, everything else (and systems without Triton) through plain torch; both
+    give the same pictures.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
@@ -93,11 +94,13 @@ def render(
     Returns:
         Features, alpha and depth.
     """
-    if means.is_cuda and means.dtype == torch.float32 and distortion is None and _has_triton():
+    if means.is_cuda and means.dtype == torch.float32 and _has_triton():
         from .rasterize import Raster, rasterize  # imports Triton
 
         raster = Raster(width, height, min_alpha, min_transmittance, capacity)
-        values, alpha, depth, middle, pairs = rasterize(means, scales, opacities, features, viewmats, Ks, raster)
+        values, alpha, depth, middle, pairs = rasterize(
+            means, scales, opacities, features, viewmats, Ks, raster, distortion
+        )
         return replace(_finished(values, alpha, depth, background, middle if median else None), pairs=pairs)
     camera_count = viewmats.shape[0]
     local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
