@@ -36,6 +36,7 @@ from .splats.fit import (
     ssim_map,
 )
 from .splats.hull import carve
+from .splats.overlap import require_body_in_masks, require_points_in_view
 from .splats.seeds import body_seeds, scene_seeds, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
@@ -44,6 +45,7 @@ from .splats.views import View, load_views
 from .splats.volume import Array, MassProperties, Volume, grid_points
 
 _MIN_PHOTOS = 3
+_FEW_IN_VIEW = 0.5
 _START_SHARE = 0.3
 """Of a budget: spheres of the background at the beginning."""
 
@@ -117,7 +119,8 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult
         config: Settings.
 
     Raises:
-        InputDataError: If a body has neither masks nor a shape, or photos have no cameras.
+        InputDataError: If a body has neither masks nor a shape, photos have no cameras, or points and shapes lie where
+            no photo shows them.
     """
     config = config or SplatConfig()
     started = time.perf_counter()
@@ -192,6 +195,7 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
         solid = _hull(stage, index, body)
     elif masked:
         solid = _moved(shape_volume(body.shape, stage.capture.root, stage.config.radius_factor), T_world_body)
+        require_body_in_masks(solid.surface, masked, index, body.name)
     elif stage.train:
         stage.warnings.append(
             f"body '{body.name}': no mask shows it, so that it has a shape for contact and no looks; masks/ with label "
@@ -266,6 +270,10 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     started = time.perf_counter()
     path = stage.capture.root / POINTS_NAME
     points = read_points(path)[0] if path.is_file() else None
+    if points is not None:
+        share = require_points_in_view(points, stage.train, str(path))
+        if share < _FEW_IN_VIEW:
+            stage.warnings.append(f"Only {share:.0%} of the points of {POINTS_NAME} lie in view of any photo.")
     if points is None and stage.ground is None:
         stage.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
     count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...datasets.ply import SH_C0
 from ...datasets.progress import progress
-from .fit import photometric, psnr
+from .fit import photometric, psnr, require_finite
 from .harmonics import term_count
 from .spheres import Spheres
 from .views import View
@@ -195,6 +195,9 @@ def fit_adaptively(
 
     Returns:
         The spheres, and how it went, every `REFINED_EVERY` iterations.
+
+    Raises:
+        NotConvergedError: If the loss or a sphere is no longer finite.
     """
     population = Population(start, degree, spread)
     shuffle = torch.Generator().manual_seed(seed)
@@ -216,12 +219,14 @@ def fit_adaptively(
         population.step(iteration / iterations, noise)
         if iteration % REFINED_EVERY == 0 or iteration == iterations - 1:
             mean = float(torch.stack(losses).mean())
+            require_finite(mean, what, f"{iteration + 1} of {iterations}")
             history.append(Progress(iteration, len(population), mean, psnr(seen.detach(), view.image)))
             losses = []
             bar.set_postfix_str(f"{len(population)} spheres, loss {mean:.4f}, {history[-1].psnr_db:.1f} dB")
             if REFINED_FROM * iterations <= iteration < REFINED_UNTIL * iterations:
                 population.refine(budget, noise)
     fitted = population.spheres()
+    require_finite(float((fitted.means.sum() + fitted.colors.sum()).detach()), what, f"{iterations} of {iterations}")
     higher = None if fitted.harmonics is None else fitted.harmonics.detach()
     plain = (fitted.means, fitted.scales, fitted.opacities, fitted.colors)
     return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher), history

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ...datasets.progress import progress
+from ...schemas import NotConvergedError
 from .render import RenderOutput, render
 from .spheres import Spheres
 from .views import View
@@ -119,13 +121,16 @@ def descend(
 
     Returns:
         The loss by iteration.
+
+    Raises:
+        NotConvergedError: If the loss or what moves is no longer finite.
     """
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(trainable.groups, eps=1e-12)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(iterations, 1)))
     losses: list[float] = []
     order: list[int] = []
-    for _ in progress(range(iterations), what):
+    for step in progress(range(iterations), what):
         if not order:
             order = torch.randperm(len(views), generator=generator).tolist()
         value = loss(trainable.spheres(), views[order.pop()], generator)
@@ -136,7 +141,23 @@ def descend(
         optimiser.step()
         decay.step()
         losses.append(value.item())
+        require_finite(losses[-1], what, f"{step + 1} of {iterations}")
+    for group in trainable.groups:
+        require_finite(float(group["params"][0].detach().sum()), what, f"{iterations} of {iterations}")
     return losses
+
+
+def require_finite(value: float, what: str, step: str) -> None:
+    """Check a loss, or a sum of what moves, at a step of a fit.
+
+    Raises:
+        NotConvergedError: If it is not finite.
+    """
+    if not math.isfinite(value):
+        raise NotConvergedError(
+            f"The fit of '{what}' diverged by step {step}: its loss or its spheres are not finite.",
+            todo="check that cameras and photos belong together ('cgwm validate CAPTURE'), or try another --seed.",
+        )
 
 
 def photometric(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
