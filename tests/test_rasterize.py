@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 
 import pytest
 import torch
 from cgwm.pipeline.splats.rays import pixel_rays
 from cgwm.pipeline.splats.render import render
-from test_render import BARREL, PINCUSHION, SKEWED, scene, twin, wide_scene
+from test_render import BARREL, PINCUSHION, SKEWED, rotation, scene, twin, wide_scene
 
 CUDA = torch.cuda.is_available()
 if not CUDA:
@@ -176,6 +177,89 @@ def test_a_capacity_changes_nothing_while_it_suffices(kernels):
     roomy = rasterize(*arguments, Raster(*SIZE, 1 / 255, 1e-4, capacity=2 * int(counted[4]), kernels=kernels))
     for one, other in zip(counted, roomy, strict=True):
         torch.testing.assert_close(one, other, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("lens", [None, BARREL])
+def test_a_sphere_whose_place_is_not_finite_is_not_drawn(kernels, value, lens):
+    means, *others = [tensor.float().to(DEVICE) for tensor in scene(12)]
+    distortion = None if lens is None else torch.tensor(lens, device=DEVICE)
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels=kernels)
+    *spheres, viewmats, Ks = others
+    without = rasterize(means[3:], *(v[3:] for v in spheres), viewmats, Ks, raster, distortion)
+    means[0, 0] = means[1, 1] = means[2, 2] = value
+    means.requires_grad_()
+    output = rasterize(means, *others, raster, distortion)
+    for one, other in zip(output, without, strict=True):
+        torch.testing.assert_close(one.detach(), other, atol=1e-6, rtol=0)
+    (gradient,) = torch.autograd.grad(output[0].sum(), means)
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_a_pixel_under_many_spheres(kernels):
+    count = 10_000 if CUDA else 1_000
+    means = torch.zeros(count, 3)
+    means[:, 2] = torch.linspace(1, 2, count)
+    features = torch.rand(count, 1, generator=torch.Generator().manual_seed(0))
+    opacity = 100 / count / 2
+    K = torch.tensor([[[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]]])
+    spheres = (means, torch.full((count,), 0.1), torch.full((count,), opacity), features)
+    tensors = [tensor.to(DEVICE) for tensor in (*spheres, torch.eye(4)[None], K)]
+    picture, alpha, _, _, pairs = rasterize(*tensors, Raster(1, 1, opacity / 2, 0.0, kernels=kernels))
+    weights = opacity * (1 - opacity) ** torch.arange(count, dtype=torch.float64)
+    assert int(pairs) == count
+    assert float(picture) == pytest.approx(float((weights * features[:, 0]).sum()), rel=1e-4)
+    assert float(alpha) == pytest.approx(float(weights.sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_order_motion_and_batch_do_not_matter(kernels):
+    """Spheres in another order, spheres and cameras moved together, cameras one by one: the same pictures."""
+    means, *rest, viewmats, Ks = scene(16, cameras=3)
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels=kernels)
+
+    def pictures(*tensors):
+        return rasterize(*(tensor.float().to(DEVICE) for tensor in tensors), raster)[:4]
+
+    reference = pictures(means, *rest, viewmats, Ks)
+    p = torch.randperm(len(means), generator=torch.Generator().manual_seed(5))
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3], T[:3, 3] = rotation(), torch.tensor([0.1, -0.05, 0.07])
+    moved = means @ T[:3, :3].T + T[:3, 3]
+    loop = [pictures(means, *rest, viewmats[[k]], Ks[[k]]) for k in range(3)]
+    others = [
+        pictures(means[p], *(value[p] for value in rest), viewmats, Ks),
+        pictures(moved, *rest, viewmats @ torch.linalg.inv(T), Ks),
+        tuple(torch.cat(parts) for parts in zip(*loop, strict=True)),
+    ]
+    for other in others:
+        for one, two in zip(reference, other, strict=True):
+            assert int(((one - two).abs() > 1e-4).sum()) <= 2  # an alpha may cross the threshold, a depth the median
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_gradients_equal_finite_differences(kernels):
+    """The derivative along random directions, by central differences of the double-precision twin's picture."""
+    *leaves, Ks = scene(6, cameras=1)
+    weights = torch.randn(1, SIZE[1], SIZE[0], 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    single = [leaf.float().to(DEVICE).requires_grad_() for leaf in leaves]
+    picture = rasterize(*single, Ks.float().to(DEVICE), Raster(*SIZE, 0.0, 0.0, kernels=kernels))[0]
+    gradients = torch.autograd.grad((picture * weights.to(picture)).sum(), single)
+    for place, gradient in enumerate(gradients):
+        direction = torch.randn(
+            leaves[place].shape, generator=torch.Generator().manual_seed(place), dtype=torch.float64
+        )
+        if place == 4:
+            direction[:, 3] = 0  # a camera's last row is 0, 0, 0, 1
+        sides = []
+        for sign in (1e-5, -1e-5):
+            values = list(leaves)
+            values[place] = leaves[place] + sign * direction
+            sides.append((twin(*values, Ks, *SIZE)[0] * weights).sum())
+        numeric = float((sides[0] - sides[1]) / 2e-5)
+        assert float((gradient.double().cpu() * direction).sum()) == pytest.approx(numeric, rel=2e-3, abs=1e-3)
 
 
 @NEEDS_GPU

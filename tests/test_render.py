@@ -190,11 +190,41 @@ def test_gradients_equal_finite_differences():
     torch.autograd.gradcheck(image, leaves, atol=1e-6)
 
 
-def test_alpha_lies_in_the_unit_interval_and_an_opaque_sphere_hides_what_is_behind():
+def test_alpha_lies_in_the_unit_interval():
     means, scales, _, features, viewmats, Ks = scene()
     output = render(means, 4 * scales, torch.ones_like(scales), features, viewmats, Ks, 25, 19)
     assert output.alpha.min() >= 0
     assert output.alpha.max() <= 1
+
+
+def test_a_sphere_of_opacity_1_hides_what_is_behind_up_to_a_hundredth():
+    means = torch.tensor([[0.0, 0, 1], [0, 0, 2]], dtype=torch.float64)
+    K = torch.tensor([[[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]]], dtype=torch.float64)
+    view, scales = torch.eye(4, dtype=torch.float64)[None], torch.full((2,), 0.1, dtype=torch.float64)
+    colors, ones = torch.eye(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+    output = render(means, scales, ones, colors, view, K, 1, 1, median=True, **EXACT)
+    expected = torch.tensor([0.99, 0.01 * 0.99], dtype=torch.float64)
+    torch.testing.assert_close(output.features[0, 0, 0], expected)
+    torch.testing.assert_close(output.depth[0, 0, 0], (expected * means[:, 2]).sum() / expected.sum())
+    assert float(output.median_depth) == 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+def test_a_sphere_whose_place_is_not_finite_is_not_drawn(value, min_alpha):
+    means, *others = scene()
+    for axis in range(3):
+        spoilt = means.clone()
+        spoilt[[4, 11], axis] = value
+        kept = torch.ones(len(means), dtype=torch.bool)
+        kept[[4, 11]] = False
+        spoilt.requires_grad_()
+        output = render(spoilt, *others, 25, 19, min_alpha=min_alpha)
+        *spheres, viewmats, Ks = others
+        without = render(means[kept], *(v[kept] for v in spheres), viewmats, Ks, 25, 19, min_alpha=min_alpha)
+        torch.testing.assert_close(output.features, without.features, atol=1e-12, rtol=0)
+        (gradient,) = torch.autograd.grad(output.features.sum(), spoilt)
+        assert torch.isfinite(gradient[kept]).all()
 
 
 def test_many_spheres_over_one_pixel():
@@ -272,6 +302,18 @@ def test_distorted_rays_project_where_opencv_says():
 def test_nothing_to_see():
     means, scales, opacities, features, viewmats, Ks = scene()
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    one = render(
+        means[:1] - viewmats.new_tensor([0, 0, 9.0]),
+        scales[:1],
+        opacities[:1],
+        features[:1],
+        viewmats[:1],
+        Ks[:1],
+        25,
+        19,
+        background,
+    )
+    assert torch.equal(one.features, background.expand(1, 19, 25, 3))
     empty = render(means[:0], scales[:0], opacities[:0], features[:0], viewmats, Ks, 25, 19, background)
     assert torch.equal(empty.features, background.expand(2, 19, 25, 3))
     behind = render(means + viewmats.new_tensor([0, 0, -9.0]), scales, opacities, features, viewmats[:1], Ks[:1], 9, 9)
