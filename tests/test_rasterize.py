@@ -126,6 +126,11 @@ def test_distortion_loses_no_sphere(coefficients):
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
+def test_more_cameras_than_are_summed_together(kernels):
+    assert_equal(both(scene(6, cameras=18), kernels, size=(7, 5)))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
 @pytest.mark.parametrize("channels", [1, 9])
 def test_any_number_of_channels(kernels, channels):
     assert_equal(both(scene(12), kernels, channels=channels))

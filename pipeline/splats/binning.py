@@ -1,4 +1,4 @@
-"""Triton kernels that find which spheres each tile composites: projection, and pairs of tiles and spheres.
+"""Triton kernels that find which spheres each tile composites: projection, its derivative, pairs with tiles.
 
 What a sphere can reach is a rectangle: of pixels for a pinhole camera, of x and y on the plane z = 1 for one that
 distorts. The latter is compared with the bounds of the tiles' own rays: no point is sent through the distortion, which
@@ -193,3 +193,70 @@ def emit(
         tl.store(rows + place, row.to(tl.int32), mask=kept)
         place += active.to(tl.int32)
         j += 1
+
+
+@triton.jit
+def _summed(gradients, column, n, inside, CAMERAS, N, WIDE: tl.constexpr, GROUP: tl.constexpr):
+    """Return one column of the rows of gradients (C, N, WIDE), summed over cameras."""
+    total = tl.zeros(n.shape, tl.float32)
+    camera = tl.arange(0, GROUP)
+    first = 0
+    while first < CAMERAS:
+        place = ((first + camera)[:, None].to(tl.int64) * N + n[None, :]) * WIDE + column
+        valid = (first + camera < CAMERAS)[:, None] & inside[None, :]
+        total += tl.sum(tl.load(gradients + place, mask=valid, other=0.0), 0)
+        first += GROUP
+    return total
+
+
+@triton.jit
+def project_backward(
+    gradients, viewmats, scales, opacities, by_means, by_scales, by_opacities, by_features, CAMERAS, N,
+    F: tl.constexpr, WIDE: tl.constexpr, PER_CAMERA: tl.constexpr, GROUP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Turn derivatives by centres in camera frames, k, log opacities and features into those by what was given.
+
+    Reads the rows (C, N, WIDE) of `kernels.composite_backward`, GROUP cameras at a time. Writes by_means (N, 3), or
+    (C, N, 3) where they differ by camera; by_scales (N,); by_opacities (N,); by_features (N, F).
+    """
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = n < N
+    camera = tl.arange(0, GROUP)
+    sum_x, sum_y, sum_z = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    first = 0
+    while first < CAMERAS:
+        there = first + camera < CAMERAS
+        valid = there[:, None] & inside[None, :]
+        row = (first + camera)[:, None].to(tl.int64) * N + n[None, :]
+        x = tl.load(gradients + row * WIDE, mask=valid, other=0.0)
+        y = tl.load(gradients + row * WIDE + 1, mask=valid, other=0.0)
+        z = tl.load(gradients + row * WIDE + 2, mask=valid, other=0.0)
+        view = viewmats + (first + camera) * 16
+        xx, xy, xz = tl.load(view, there, 0.0), tl.load(view + 1, there, 0.0), tl.load(view + 2, there, 0.0)
+        yx, yy, yz = tl.load(view + 4, there, 0.0), tl.load(view + 5, there, 0.0), tl.load(view + 6, there, 0.0)
+        zx, zy, zz = tl.load(view + 8, there, 0.0), tl.load(view + 9, there, 0.0), tl.load(view + 10, there, 0.0)
+        by_x = xx[:, None] * x + yx[:, None] * y + zx[:, None] * z
+        by_y = xy[:, None] * x + yy[:, None] * y + zy[:, None] * z
+        by_z = xz[:, None] * x + yz[:, None] * y + zz[:, None] * z
+        if PER_CAMERA:
+            tl.store(by_means + row * 3, by_x, mask=valid)
+            tl.store(by_means + row * 3 + 1, by_y, mask=valid)
+            tl.store(by_means + row * 3 + 2, by_z, mask=valid)
+        else:
+            sum_x += tl.sum(by_x, 0)
+            sum_y += tl.sum(by_y, 0)
+            sum_z += tl.sum(by_z, 0)
+        first += GROUP
+    if not PER_CAMERA:
+        tl.store(by_means + n * 3, sum_x, mask=inside)
+        tl.store(by_means + n * 3 + 1, sum_y, mask=inside)
+        tl.store(by_means + n * 3 + 2, sum_z, mask=inside)
+    s = tl.load(scales + n, mask=inside, other=1.0)
+    opacity = tl.load(opacities + n, mask=inside, other=1.0)
+    by_k = _summed(gradients, 3, n, inside, CAMERAS, N, WIDE, GROUP)
+    by_log = _summed(gradients, 4, n, inside, CAMERAS, N, WIDE, GROUP)
+    tl.store(by_scales + n, by_k / (s * s * s), mask=inside)
+    tl.store(by_opacities + n, tl.where(opacity > 1e-12, by_log / opacity, 0.0), mask=inside)
+    for f in range(F):
+        by_feature = _summed(gradients, 5 + f, n, inside, CAMERAS, N, WIDE, GROUP)
+        tl.store(by_features + n * F + f, by_feature, mask=inside)

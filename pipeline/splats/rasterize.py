@@ -130,7 +130,7 @@ class _Rasterize(torch.autograd.Function):
         distortion: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         means, scales, opacities, features, viewmats, Ks = (
-            value.detach().contiguous() for value in (means, scales, opacities, features, viewmats, Ks)
+            value.contiguous() for value in (means, scales, opacities, features, viewmats, Ks)
         )
         rays = _Rays() if distortion is None else _trace(Ks, distortion, raster)
         lists = _bin(means, scales, opacities, viewmats, Ks, rays, raster)
@@ -173,19 +173,21 @@ class _Rasterize(torch.autograd.Function):
                 *lists[:2], features, *lists[3:5], Ks, rays, *pictures, *numbers, *raster.thresholds,
                 F=channels, CHANNELS=_filled(channels), WIDE=rows.shape[2], TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
             )  # fmt: skip
-        by_centre, summed = rows[..., :3], rows[..., 3:].sum(0)
-        grad_means = by_centre @ viewmats[:, :3, :3]
-        if means.dim() == 2:
-            grad_means = grad_means.sum(0)
-        grad_scales = summed[:, 0] / scales**3
+        by_sphere = [torch.empty_like(value) for value in (means, scales, opacities, features)]
+        group = min(16, _filled(cameras))
+        block = max(32, 256 // group)
+        if count:
+            binning.project_backward[(-(-count // block),)](
+                rows, viewmats, scales, opacities, *by_sphere, cameras, count,
+                F=channels, WIDE=rows.shape[2], PER_CAMERA=means.dim() == 3, GROUP=group, BLOCK=block,
+            )  # fmt: skip
         grad_viewmats = None
         if ctx.needs_input_grad[4]:
+            by_centre = rows[..., :3]
             grad_viewmats = torch.zeros_like(viewmats)
             grad_viewmats[:, :3, :3] = by_centre.transpose(1, 2) @ means
             grad_viewmats[:, :3, 3] = by_centre.sum(1)
-        grad_opacities = torch.where(opacities > 1e-12, summed[:, 1] / opacities.clamp_min(1e-12), 0.0)
-        grad_features = summed[:, 2 : 2 + channels]
-        return grad_means, grad_scales, grad_opacities, grad_features, grad_viewmats, None, None, None
+        return *by_sphere, grad_viewmats, None, None, None
 
 
 def _filled(channels: int) -> int:
@@ -222,13 +224,14 @@ def _bin(
         PER_CAMERA=means.dim() == 3, HAS_LEAST=raster.min_alpha > 0, TILE=TILE, BLOCK=binning.PROJECT_BLOCK,
     )  # fmt: skip
     order = torch.argsort(distances)
-    ends = counts[order].cumsum(0, dtype=torch.int32)
+    ends = counts.gather(0, order).cumsum(0, dtype=torch.int32)
     pairs = ends[-1] if total else torch.zeros((), device=device, dtype=torch.int32)
     capacity = int(pairs) if raster.capacity is None else raster.capacity
     key_type = torch.int16 if tiles < 2**15 else torch.int32
-    # what no pair fills sorts behind all tiles
-    keys = torch.full((capacity,), torch.iinfo(key_type).max, device=device, dtype=key_type)
-    rows = torch.zeros(capacity, device=device, dtype=torch.int32)
+    keys = torch.empty(capacity, device=device, dtype=key_type)
+    rows = torch.empty(capacity, device=device, dtype=torch.int32)
+    if raster.capacity is not None:
+        keys.fill_(torch.iinfo(key_type).max)  # what no pair fills sorts behind all tiles
     if total:
         binning.emit[(-(-total // binning.EMIT_BLOCK),)](
             order, ends, spans, *rays[1:], keys, rows, total, count, capacity, raster.columns, raster.rows,
@@ -236,4 +239,4 @@ def _bin(
         )  # fmt: skip
     keys, place = torch.sort(keys, stable=True)
     starts = torch.searchsorted(keys, torch.arange(tiles + 1, device=device, dtype=key_type), out_int32=True)
-    return _Lists(centres, log_opacities, spans, rows[place], starts, pairs)
+    return _Lists(centres, log_opacities, spans, rows.gather(0, place), starts, pairs)

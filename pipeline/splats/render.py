@@ -35,7 +35,7 @@ class RenderOutput:
     Attributes:
         features: Composited features with the background behind them, shape (C, H, W, F).
         alpha: Opacity of all spheres together in [0, 1), shape (C, H, W).
-        depth: Expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen.
+        weighted_depth: Depths along the optical axis [m], each times what its sphere adds to alpha, shape (C, H, W).
         median_depth: Depth of the sphere behind which less than half of the light gets through [m], shape (C, H, W);
             0 where more does. It has no derivative. None where it was not asked for.
         pairs: From the kernels of `rasterize`: how many pairs of tiles and spheres there are, to compare with the
@@ -44,9 +44,15 @@ class RenderOutput:
 
     features: Tensor
     alpha: Tensor
-    depth: Tensor
+    weighted_depth: Tensor
     median_depth: Tensor | None = None
     pairs: Tensor | None = None
+
+    @property
+    def depth(self) -> Tensor:
+        """Return the expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen."""
+        seen = self.alpha > 0
+        return torch.where(seen, self.weighted_depth / torch.where(seen, self.alpha, 1.0), 0.0)
 
 
 def render(
@@ -141,9 +147,7 @@ def _finished(
     if background is not None:
         behind = background.expand(colours.shape[0], -1)[:, None, None, :]
         colours = colours + (1 - alpha)[..., None] * behind
-    seen = alpha > 0
-    depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1.0), 0.0)
-    return RenderOutput(colours, alpha, depth, median_depth)
+    return RenderOutput(colours, alpha, weighted_depth, median_depth)
 
 
 def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
