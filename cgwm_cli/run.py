@@ -105,7 +105,9 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror}."
-    if isinstance(error, MemoryError):
+    from ..pipeline.memory import ran_out_of_memory
+
+    if ran_out_of_memory(error):
         return "The memory did not suffice.\nNext: close other programs, or work on less at a time."
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("cgwm"):
         return f"The package '{error.name}' is not installed.\nNext: run 'cgwm doctor', which prints the pip line."

@@ -64,8 +64,12 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
     images: dict[str, PosedImage] = {}
     try:
         for number, model, width, height, params in (_cameras_bin if binary else _cameras_txt)(camera_path):
+            if not all(map(math.isfinite, params)):
+                raise InputDataError(f"{camera_path}: camera {number} has parameters that are not finite: {params}.")
             cameras[f"camera{number}"] = _intrinsics(camera_path, number, model, width, height, params)
         for name, camera, quat_wxyz, translation in (_images_bin if binary else _images_txt)(image_path):
+            if not all(map(math.isfinite, (*quat_wxyz, *translation))) or not any(quat_wxyz):
+                raise InputDataError(f"{image_path}: image '{name}' has a pose that is not finite, or no rotation.")
             pose = _world_from_camera(np.array(quat_wxyz), np.array(translation))
             images[name.removeprefix("images/")] = PosedImage(camera=f"camera{camera}", T_world_cam=pose)
         scale = Scale(kind="metric" if metric else "unscaled", source="COLMAP model")
@@ -140,8 +144,6 @@ def _images_txt(path: Path) -> Iterator[ImageRecord]:
         if line.strip():
             _, *pose, camera, name = line.split(maxsplit=9)
             values = tuple(map(float, pose))
-            if not all(map(math.isfinite, values)):
-                raise ValueError(f"image '{name}' has a pose that is not finite")
             yield name.strip(), int(camera), values[:4], values[4:]
 
 

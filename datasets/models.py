@@ -45,6 +45,11 @@ class Model:
         """Return the entry of a body in `model.json`."""
         return next(body for body in self.file.bodies if body.name == name)
 
+    @property
+    def visual_count(self) -> int:
+        """Return the number of spheres that are rendered."""
+        return sum(map(len, self.body_splats.values())) + (0 if self.scene is None else len(self.scene))
+
 
 def read_model(path: Path | str) -> Model:
     """Read a model directory.

@@ -24,6 +24,7 @@ from ..datasets.tracks import Track
 from ..schemas import EpisodeErrors, ErrorSummary, EvalResult, InputDataError
 from .estimation.noise import estimate_noise
 from .image_errors import VideoComparison, VideoErrors, renderable, usable_cameras
+from .memory import enough_memory
 from .physics.world import World
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, Episode, EpisodePrediction, predict
 
@@ -65,11 +66,15 @@ def evaluate(model: Path, target: Path, split: str = "test", warmup_s: float = 0
         InputDataError: If the target has nothing to compare with, or other bodies than the model.
         UsageError: If there is no such split.
         NotConvergedError: If a rollout of the model diverges.
+        NotEnoughMemoryError: If the frames cannot be rendered in the memory that there is.
     """
     loaded = read_model(model)
     if kind_of(target) == "dataset":
         return evaluate_dataset(loaded, target, split, warmup_s).result
-    return evaluate_model(loaded, Capture.open(target, splits=(split,)), split, warmup_s, device).result
+    capture = Capture.open(target, splits=(split,))
+    tried = f"{loaded.visual_count} spheres, frames of the videos at their own size"
+    with enough_memory(tried, _device(device), "a model of fewer spheres (cgwm fit --spheres), smaller videos"):
+        return evaluate_model(loaded, capture, split, warmup_s, device).result
 
 
 def evaluate_model(

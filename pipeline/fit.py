@@ -32,10 +32,11 @@ from ..schemas import (
     SplatConfig,
 )
 from .checkpoint import Checkpoint
+from .memory import enough_memory
 from .phys_geo import PhysicsFit, fit_physics, track_episodes
 from .physics.world import World, symmetric
 from .sfm.points import POINTS_NAME
-from .sg_gs import SgGsResult, fit_scene
+from .sg_gs import SgGsResult, fit_scene, resolve_device
 
 Stage = Literal["all", "sg-gs", "phys-geo"]
 
@@ -75,6 +76,7 @@ def fit(
         UsageError: If `out` exists, or the split does not.
         InputDataError: If the capture lacks what the stage needs.
         NotConvergedError: If the fit diverges; nothing is written then.
+        NotEnoughMemoryError: If the memory does not suffice.
     """
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
     refuse_existing(out, overwrite)
@@ -82,9 +84,11 @@ def fit(
     started = time.perf_counter()
     config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
     checkpoint = Checkpoint.beside(Path(out), _made_of(opened, splat_config), resume, overwrite)
-    model = _start(opened, stage, parent, splat_config, checkpoint)
+    with enough_memory(*_needs(splat_config)):
+        model = _start(opened, stage, parent, splat_config, checkpoint)
     if stage == "phys-geo" or (stage == "all" and _has_motion(opened, split)):
-        model = _with_physics(model, opened, split, phys_config)
+        with enough_memory(*_needs(phys_config)):
+            model = _with_physics(model, opened, split, phys_config)
     provenance = Provenance(
         capture=opened.root.resolve().name,
         input_sha256=_input_hashes(opened, split),
@@ -100,6 +104,18 @@ def fit(
     written = write_model(out, replace(model, file=file, fit=fit_file), overwrite)
     checkpoint.remove()
     return written.file
+
+
+def _needs(config: SplatConfig | PhysConfig) -> tuple[str, str, str]:
+    """Return what takes a stage's memory, the device, and what would take less."""
+    device = resolve_device(config.device).type
+    if isinstance(config, SplatConfig):
+        scene = config.max_scene_spheres if config.spheres is None else config.spheres
+        tried = f"{scene} spheres of the background, {config.max_body_spheres} a body, photos at {config.image_size} px"
+        less = "--spheres N" if config.spheres is not None else "--set sg-gs.max_scene_spheres=N"
+        return tried, device, f"fewer spheres ({less}), smaller photos (--set sg-gs.image_size=N)"
+    population = "a population of 24 to 96" if config.population is None else f"a population of {config.population}"
+    return f"{population}, supervised by {config.supervise}", device, "--set phys-geo.population=N with a smaller N"
 
 
 def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:

@@ -27,6 +27,7 @@ from .splats.exposures import Exposures
 from .splats.fit import Rates, Trainable, descend
 from .splats.hull import carve
 from .splats.losses import behind, body_loss, geometry_loss, scene_loss
+from .splats.overlap import require_body_in_masks, require_points_in_view
 from .splats.poses import learn_motions, motion_record, moved_for_good
 from .splats.seeds import body_seeds, points_of_depth, scene_seeds, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
@@ -37,6 +38,7 @@ from .splats.volume import Array, MassProperties, Volume, grid_points
 from .turntable import turntable, upward
 
 _MIN_PHOTOS = 3
+_FEW_IN_VIEW = 0.5
 _START_SHARE = 0.3
 """Of a budget: spheres of the background at the beginning."""
 _DEPTH_POINTS = 20_000
@@ -108,6 +110,21 @@ class _Stage:
         """What is known of the photos' exposures so far."""
         return Exposures(self.train, self.config.exposure)
 
+    @cached_property
+    def points(self) -> Array | None:
+        """Points of the scene, world frame, (n, 3): from structure from motion, or from depth maps; or None."""
+        path = self.capture.root / POINTS_NAME
+        if not path.is_file():
+            found = points_of_depth(self.train, _DEPTH_POINTS, self.config.seed)
+            if found is None and self.ground is None:
+                self.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
+            return found
+        found = read_points(path)[0]
+        share = require_points_in_view(found, self.train, str(path))
+        if share < _FEW_IN_VIEW:
+            self.warnings.append(f"Only {share:.0%} of the points of {POINTS_NAME} lie in view of any photo.")
+        return found
+
     @property
     def spread(self) -> float:
         """Size of the cameras' arrangement [m]."""
@@ -133,7 +150,8 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
         checkpoint: Where the state of the descents goes, and from where they are taken up; None keeps none.
 
     Raises:
-        InputDataError: If a body has neither masks nor a shape, or photos have no cameras.
+        InputDataError: If a body has neither masks nor a shape, photos have no cameras, or points and shapes lie where
+            no photo shows them.
     """
     config = config or SplatConfig()
     started = time.perf_counter()
@@ -235,6 +253,7 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
         solid = _hull(stage, index, body)
     elif masked:
         solid = _moved(shape_volume(body.shape, stage.capture.root, stage.config.radius_factor), T_world_body)
+        require_body_in_masks(solid.surface, masked, index, body.name)
     elif stage.train:
         stage.warnings.append(
             f"body '{body.name}': no mask shows it, so that it has a shape for contact and no looks; masks/ with label "
@@ -336,13 +355,7 @@ def _fit_geometry(
 
 def _background_seeds(stage: _Stage, count: int, bodies: Spheres | None) -> Spheres:
     """Return spheres where the background begins: on the ground, on SfM points or depth maps, and far away."""
-    path = stage.capture.root / POINTS_NAME
-    points = read_points(path)[0] if path.is_file() else points_of_depth(stage.train, _DEPTH_POINTS, stage.config.seed)
-    if points is None and stage.ground is None:
-        text = f"No {POINTS_NAME} and no ground: the background starts from random points."
-        if text not in stage.warnings:
-            stage.warnings.append(text)
-    centers, scales = scene_seeds(stage.train, stage.ground, points, count, stage.config.seed)
+    centers, scales = scene_seeds(stage.train, stage.ground, stage.points, count, stage.config.seed)
     if len(scales) == 0:
         raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")
     spheres = to_spheres(centers, scales, 0.9 if stage.config.spheres is None else 0.5, stage.device)

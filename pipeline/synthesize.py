@@ -36,6 +36,7 @@ from ..schemas import (
     UsageError,
 )
 from .labels import LabelRenderer
+from .memory import enough_memory
 from .physics.rollout import ContactRecord, simulate
 from .physics.world import State, World
 from .posterior import draw_parameters, not_varied
@@ -80,10 +81,19 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
         NotConvergedError: If a simulation diverges.
+        NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """
     began = time.perf_counter()
     with _one_thread():
         job = _prepare(model, config)
+    tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
+    with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
+        return _written(job, model, out, config, overwrite, began)
+
+
+def _written(
+    job: _Job, model: Path, out: Path, config: SynthesizeConfig, overwrite: bool, began: float
+) -> DatasetSummary:
     indices = shard_indices(config)
     notes = _notes(job)
     manifest = _manifest(model, job, notes)

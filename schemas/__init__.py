@@ -44,7 +44,15 @@ from .demo import (
     SplatCheck,
 )
 from .doctor import DoctorReport, Missing, PackageState
-from .errors import CgwmError, CheckFailedError, InputDataError, NotConvergedError, UsageError, did_you_mean
+from .errors import (
+    CgwmError,
+    CheckFailedError,
+    InputDataError,
+    NotConvergedError,
+    NotEnoughMemoryError,
+    UsageError,
+    did_you_mean,
+)
 from .imports import ImportResult
 from .model import (
     MODEL_FORMAT,
@@ -115,6 +123,7 @@ __all__ = [
     "Missing",
     "ModelFile",
     "NotConvergedError",
+    "NotEnoughMemoryError",
     "PackageState",
     "PairFigures",
     "Parameter",

@@ -46,6 +46,10 @@ class NotConvergedError(CgwmError):
     """A fit, a calibration or a simulation failed to reach a usable result (exit code 1)."""
 
 
+class NotEnoughMemoryError(CgwmError):
+    """What was asked for needs more memory than there is (exit code 1)."""
+
+
 class CheckFailedError(CgwmError):
     """A check found faults (exit code 1)."""
 

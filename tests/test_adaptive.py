@@ -12,10 +12,12 @@ from cgwm.datasets.ply import Splats, read_splats, write_splats
 from cgwm.pipeline.labels import LabelRenderer
 from cgwm.pipeline.splats.adaptive import DEAD, Population, fit_adaptively, shared_among
 from cgwm.pipeline.splats.exposures import Exposures
+from cgwm.pipeline.splats.fit import Rates, Trainable, descend
 from cgwm.pipeline.splats.harmonics import harmonics
 from cgwm.pipeline.splats.losses import psnr, scene_loss
 from cgwm.pipeline.splats.spheres import Spheres
 from cgwm.pipeline.splats.views import View, render_view
+from cgwm.schemas import NotConvergedError
 from small_model import small_model
 
 
@@ -117,3 +119,38 @@ def test_what_turns_has_one_colour_from_all_sides():
     higher = torch.zeros(5, 3, 3)
     with pytest.raises(ValueError, match="turned"):
         Spheres(spheres.means, spheres.scales, spheres.opacities, spheres.colors, higher).moved(torch.eye(4))
+
+
+@pytest.mark.parametrize("bad", ["loss", "gradient"])
+def test_a_fit_that_diverges_ends_at_its_step(bad):
+    truth = _spheres()
+    views = [_view(truth, 0.0)]
+    steps = iter(range(100))
+
+    def loss(spheres, view, generator):
+        value, wrong = scene_loss(None, Exposures(views, False))(spheres, view, generator)
+        if next(steps) < 4:
+            return value, wrong
+        # the square root of 0 has a finite value, and no finite derivative
+        value = value * math.nan if bad == "loss" else value + (0 * spheres.means).square().sum().sqrt()
+        return value, wrong
+
+    trainable = Trainable(truth, Rates(means=0.01))
+    with pytest.raises(NotConvergedError, match=r"'background' diverged by step \d+ of 6") as caught:
+        descend(trainable, views, loss, 6, 0, "background", 0.002)
+    step = int(str(caught.value).split("step ")[1].split(" of")[0])
+    assert step == (5 if bad == "loss" else 6)
+
+
+def test_an_adaptive_fit_that_diverges_ends_at_its_step():
+    truth = _spheres()
+    view = _view(truth, 0.0)
+
+    def loss(spheres, view, generator):
+        value, wrong = scene_loss(None, exposures)(spheres, view, generator)
+        return value * math.inf, wrong
+
+    exposures = Exposures([view], False)
+    options = {"budget": 400, "degree": 0, "iterations": 3, "spread": 1.0, "seed": 0, "what": "background"}
+    with pytest.raises(NotConvergedError, match="'background' diverged by step 1 of 3"):
+        fit_adaptively(truth, [view], loss, exposures=exposures, **options)

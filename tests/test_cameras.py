@@ -183,6 +183,17 @@ def test_colmap_faults(tmp_path: Path) -> None:
     path.write_text("7 PINHOLE 320 240 1 1\n")
     with pytest.raises(InputDataError, match="not a COLMAP model that can be read"):
         read_cameras(tmp_path)
+    write_colmap_text(tmp_path / "n", camera())
+    images = tmp_path / "n" / "sparse" / "0" / "images.txt"
+    images.write_text("3 1 0 0 0 nan 0 0 7 sub/a.png\n\n")
+    with pytest.raises(InputDataError) as caught:
+        read_cameras(tmp_path / "n")
+    assert str(caught.value) == f"{images}: image 'sub/a.png' has a pose that is not finite, or no rotation."
+    cameras = images.with_name("cameras.txt")
+    cameras.write_text("7 PINHOLE 320 240 inf 1 1 1\n")
+    with pytest.raises(InputDataError) as caught:
+        read_cameras(tmp_path / "n")
+    assert str(caught.value) == f"{cameras}: camera 7 has parameters that are not finite: (inf, 1.0, 1.0, 1.0)."
     write_colmap_binary(tmp_path / "b", camera())
     images = tmp_path / "b" / "colmap" / "images.bin"
     images.write_bytes(images.read_bytes()[:-70])
@@ -260,6 +271,19 @@ def test_transforms_faults(tmp_path: Path, change: dict[str, Any], expected: str
     with pytest.raises(InputDataError) as caught:
         read_cameras(tmp_path)
     assert str(caught.value).splitlines()[0] == f"{path}: {expected}"
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity"])
+def test_a_pose_that_is_not_finite_is_told_with_its_place(tmp_path: Path, value: str) -> None:
+    write_cgwm(tmp_path, camera())
+    path = tmp_path / "cameras.json"
+    data = json.loads(path.read_text())
+    data["images"]["sub/a.png"]["T_world_cam"][1][3] = float(value.lower().replace("infinity", "inf"))
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputDataError) as caught:
+        read_cameras(tmp_path)
+    found = str(caught.value)
+    assert found.startswith(f"{path}") and "T_world_cam" in found and "finite" in found
 
 
 def test_pose_with_a_scale_or_a_mirror_is_refused(tmp_path: Path) -> None:

@@ -278,6 +278,11 @@ def test_a_wrong_shard(run: Run, stage: Callable[..., None], shard: str) -> None
         (CheckFailedError("3 faults."), 1, "3 faults.\n"),
         (InputDataError("a.csv, line 3: NaN.", "numbers."), 2, "a.csv, line 3: NaN.\nAllowed: numbers.\n"),
         (KeyboardInterrupt(), 130, "Interrupted; nothing was left under the output's name.\n"),
+        (
+            RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."),
+            1,
+            "The memory did not suffice.\nNext: close other programs, or work on less at a time.\n",
+        ),
         (OSError(28, "No space left on device", "out/x"), 1, "out/x: No space left on device.\n"),
         (
             ModuleNotFoundError("No module named 'mujoco'", name="mujoco"),

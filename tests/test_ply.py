@@ -47,10 +47,39 @@ def test_layout_is_that_of_inria(tmp_path: Path) -> None:
 
 
 def test_padding_to_degree_three(tmp_path: Path) -> None:
+    """The 62 properties of INRIA's files, in their order (scene/gaussian_model.py, construct_list_of_attributes)."""
     write_splats(tmp_path / "a.ply", splats(), sh_degree=3)
     text = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].decode()
-    assert text.count("f_rest_") == 45 and "f_rest_44" in text
+    expected = [*"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split(), *(f"f_rest_{k}" for k in range(45)), "opacity"]
+    expected += "scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    assert [line.split()[1:] for line in text.splitlines() if line.startswith("property")] == [
+        ["float", name] for name in expected
+    ]
     np.testing.assert_allclose(read_splats(tmp_path / "a.ply").means, splats().means, rtol=1e-6)
+
+
+def test_anisotropic_gaussians_of_others_are_refused_with_their_number(tmp_path: Path) -> None:
+    """A file as 3DGS itself writes it: no comments, 62 properties, three different scales and any rotation."""
+    rng = np.random.default_rng(0)
+    names = [*"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split(), *(f"f_rest_{k}" for k in range(45)), "opacity"]
+    names += "scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    rows = rng.normal(size=(30, len(names))).astype("<f4")
+    rows[:4, 55:58] = -3.0
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 30", *(f"property float {n}" for n in names)]
+    path = tmp_path / "point_cloud.ply"
+    path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes())
+    with pytest.raises(InputDataError) as caught:
+        read_splats(path)
+    assert str(caught.value) == (
+        f"{path}: 26 of 30 splats are no spheres.\nAllowed: three scales that are equal within 1 %.\n"
+        "Next: leave the shape out, so that cgwm fit makes spheres from the photos."
+    )
+    rows[:, 55:58] = rows[:, 55:56]
+    path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes())
+    read = read_splats(path, harmonics=True)
+    np.testing.assert_allclose(read.scales, np.exp(rows[:, 55].astype(float)), rtol=1e-6)
+    assert read.harmonics is not None
+    np.testing.assert_allclose(read.harmonics[:, 2, 1], rows[:, 9 + 15 + 2], rtol=1e-6)
 
 
 def test_full_and_empty_opacity_stay_finite(tmp_path: Path) -> None:

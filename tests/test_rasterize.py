@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 
 import pytest
 import torch
+from cgwm.pipeline.splats.rays import pixel_rays
 from cgwm.pipeline.splats.render import render
-from test_render import scene
+from test_render import BARREL, PINCUSHION, SKEWED, rotation, scene, twin, wide_scene
 
 CUDA = torch.cuda.is_available()
 if not CUDA:
@@ -22,12 +24,12 @@ NEEDS_GPU = pytest.mark.skipif(not (CUDA and cuda.available()), reason="needs a 
 KERNELS = ["triton", pytest.param("cuda", marks=NEEDS_GPU)]
 
 
-def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3):
+def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3, size=SIZE, distortion=None):
     """Return outputs and gradients (outputs, gradients) of the torch renderer in double, and of the kernels."""
     generator = torch.Generator().manual_seed(seed)
     means, scales, opacities, features, viewmats, Ks = arguments
     features = torch.rand(len(means), channels, generator=generator, dtype=torch.float64)
-    weights = torch.randn(len(Ks), SIZE[1], SIZE[0], channels + 2, generator=generator, dtype=torch.float64)
+    weights = torch.randn(len(Ks), size[1], size[0], channels + 2, generator=generator, dtype=torch.float64)
     results = []
     for exact in (True, False):
         leaves = [means, scales, opacities, features, viewmats]
@@ -35,12 +37,13 @@ def both(arguments, kernels, min_alpha=1 / 255, channels=3, seed=3):
             leaves = [leaf.float().to(DEVICE) for leaf in leaves]
         leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
         if exact:
-            seen = render(*leaves, Ks, *SIZE, min_alpha=min_alpha, min_transmittance=0.0, median=True)
+            seen = render(*leaves, Ks, *size, None, distortion, min_alpha=min_alpha, min_transmittance=0.0, median=True)
             assert seen.median_depth is not None
             outputs = (seen.features, seen.alpha, seen.depth * seen.alpha, seen.median_depth)
         else:
-            raster = Raster(*SIZE, min_alpha, 0.0, kernels=kernels)
-            outputs = rasterize(*leaves, Ks.float().to(DEVICE), raster)[:4]
+            raster = Raster(*size, min_alpha, 0.0, kernels=kernels)
+            single = None if distortion is None else distortion.float().to(DEVICE)
+            outputs = rasterize(*leaves, Ks.float().to(DEVICE), raster, single)[:4]
         loss = (torch.cat([outputs[0], *(o[..., None] for o in outputs[1:3])], -1) * weights.to(outputs[0])).sum()
         gradients = torch.autograd.grad(loss, leaves)
         results.append([[value.detach().double().cpu() for value in values] for values in (outputs, gradients)])
@@ -60,6 +63,71 @@ def assert_equal(results, pixels_off=0):
 @pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
 def test_values_and_gradients_equal_the_torch_renderer(kernels, min_alpha):
     assert_equal(both(scene(24), kernels, min_alpha))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+def test_strong_distortion_equals_the_torch_renderer(kernels, min_alpha):
+    """What lies far outside of a barrel's picture, the distortion would fold back into it."""
+    size = (37, 20)  # six tiles, of which four are cut
+    arguments, distortion = wide_scene(20, *size)
+    assert_equal(both(arguments, kernels, min_alpha, size=size, distortion=distortion), pixels_off=2)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_four_coefficients_for_all_cameras(kernels):
+    assert_equal(both(scene(12), kernels, distortion=torch.tensor(SKEWED[:4], dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_strong_distortion_equals_the_twin(kernels):
+    (*leaves, Ks), distortion = wide_scene(24, *SIZE)
+    results = []
+    for exact in (True, False):
+        tensors = [leaf if exact else leaf.float().to(DEVICE) for leaf in leaves]
+        tensors = [tensor.detach().clone().requires_grad_() for tensor in tensors]
+        if exact:
+            image, alpha, _ = twin(*tensors, Ks, *SIZE, distortion=distortion)
+        else:
+            raster = Raster(*SIZE, 0.0, 0.0, kernels=kernels)
+            image, alpha = rasterize(*tensors, Ks.float().to(DEVICE), raster, distortion.float().to(DEVICE))[:2]
+        gradients = torch.autograd.grad(image.square().sum() + alpha.sum(), tensors)
+        results.append([[v.detach().double().cpu() for v in values] for values in ((image, alpha), gradients)])
+    assert_equal(results)
+
+
+def test_no_distortion_is_a_pinhole():
+    arguments = [value.float().to(DEVICE) for value in scene(24)]
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels="triton")
+    plain, traced = (rasterize(*arguments, raster, none) for none in (None, torch.zeros(5, device=DEVICE)))
+    for one, other in zip(plain[:4], traced[:4], strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("coefficients", [BARREL, PINCUSHION, SKEWED])
+def test_distortion_loses_no_sphere(coefficients):
+    """Small spheres on the rays of some pixels: these see them, and no others do."""
+    width, height = 37, 20
+    arguments, _ = wide_scene(1, width, height)
+    K = arguments[-1][[0 if coefficients == BARREL else 1]]
+    distortion = torch.tensor([coefficients], dtype=torch.float64)
+    chosen = torch.arange(width * height)[::5]
+    pixels = torch.stack([chosen % width, chosen // width], -1) + 0.5
+    rays = pixel_rays(pixels.double(), K, distortion)[0]
+    count = len(rays)
+    single = (rays, torch.full((count,), 1e-4), torch.full((count,), 0.9), torch.ones(count, 1))
+    tensors = [value.float().to(DEVICE) for value in (*single, torch.eye(4)[None], K)]
+    raster = Raster(width, height, 1 / 255, 0.0, kernels="triton")
+    _, alpha, _, _, pairs = rasterize(*tensors, raster, distortion.float().to(DEVICE))
+    expected = torch.zeros(width * height)
+    expected[chosen] = 0.9
+    torch.testing.assert_close(alpha.cpu().reshape(-1), expected, atol=1e-3, rtol=0)
+    assert int(pairs) < 1.2 * count  # the bounds of the tiles are tight
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_more_cameras_than_are_summed_together(kernels):
+    assert_equal(both(scene(6, cameras=18), kernels, size=(7, 5)))
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
@@ -116,6 +184,90 @@ def test_a_capacity_changes_nothing_while_it_suffices(kernels):
         torch.testing.assert_close(one, other, atol=0, rtol=0)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value")  # from the interpreter's numpy
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("lens", [None, BARREL])
+def test_a_sphere_whose_place_is_not_finite_is_not_drawn(kernels, value, lens):
+    means, *others = [tensor.float().to(DEVICE) for tensor in scene(12)]
+    distortion = None if lens is None else torch.tensor(lens, device=DEVICE)
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels=kernels)
+    *spheres, viewmats, Ks = others
+    without = rasterize(means[3:], *(v[3:] for v in spheres), viewmats, Ks, raster, distortion)
+    means[0, 0] = means[1, 1] = means[2, 2] = value
+    means.requires_grad_()
+    output = rasterize(means, *others, raster, distortion)
+    for one, other in zip(output, without, strict=True):
+        torch.testing.assert_close(one.detach(), other, atol=1e-6, rtol=0)
+    (gradient,) = torch.autograd.grad(output[0].sum(), means)
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_a_pixel_under_many_spheres(kernels):
+    count = 10_000 if CUDA else 320
+    means = torch.zeros(count, 3)
+    means[:, 2] = torch.linspace(1, 2, count)
+    features = torch.rand(count, 1, generator=torch.Generator().manual_seed(0))
+    opacity = 100 / count / 2
+    K = torch.tensor([[[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]]])
+    spheres = (means, torch.full((count,), 0.1), torch.full((count,), opacity), features)
+    tensors = [tensor.to(DEVICE) for tensor in (*spheres, torch.eye(4)[None], K)]
+    picture, alpha, _, _, pairs = rasterize(*tensors, Raster(1, 1, opacity / 2, 0.0, kernels=kernels))
+    weights = opacity * (1 - opacity) ** torch.arange(count, dtype=torch.float64)
+    assert int(pairs) == count
+    assert float(picture) == pytest.approx(float((weights * features[:, 0]).sum()), rel=1e-4)
+    assert float(alpha) == pytest.approx(float(weights.sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_order_motion_and_batch_do_not_matter(kernels):
+    """Spheres in another order, spheres and cameras moved together, cameras one by one: the same pictures."""
+    means, *rest, viewmats, Ks = scene(16, cameras=3)
+    raster = Raster(*SIZE, 1 / 255, 0.0, kernels=kernels)
+
+    def pictures(*tensors):
+        return rasterize(*(tensor.float().to(DEVICE) for tensor in tensors), raster)[:4]
+
+    reference = pictures(means, *rest, viewmats, Ks)
+    p = torch.randperm(len(means), generator=torch.Generator().manual_seed(5))
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3], T[:3, 3] = rotation(), torch.tensor([0.1, -0.05, 0.07])
+    moved = means @ T[:3, :3].T + T[:3, 3]
+    loop = [pictures(means, *rest, viewmats[[k]], Ks[[k]]) for k in range(3)]
+    others = [
+        pictures(means[p], *(value[p] for value in rest), viewmats, Ks),
+        pictures(moved, *rest, viewmats @ torch.linalg.inv(T), Ks),
+        tuple(torch.cat(parts) for parts in zip(*loop, strict=True)),
+    ]
+    for other in others:
+        for one, two in zip(reference, other, strict=True):
+            assert int(((one - two).abs() > 1e-4).sum()) <= 2  # an alpha may cross the threshold, a depth the median
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_gradients_equal_finite_differences(kernels):
+    """The derivative along random directions, by central differences of the double-precision twin's picture."""
+    *leaves, Ks = scene(6, cameras=1)
+    weights = torch.randn(1, SIZE[1], SIZE[0], 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    single = [leaf.float().to(DEVICE).requires_grad_() for leaf in leaves]
+    picture = rasterize(*single, Ks.float().to(DEVICE), Raster(*SIZE, 0.0, 0.0, kernels=kernels))[0]
+    gradients = torch.autograd.grad((picture * weights.to(picture)).sum(), single)
+    for place, gradient in enumerate(gradients):
+        direction = torch.randn(
+            leaves[place].shape, generator=torch.Generator().manual_seed(place), dtype=torch.float64
+        )
+        if place == 4:
+            direction[:, 3] = 0  # a camera's last row is 0, 0, 0, 1
+        sides = []
+        for sign in (1e-5, -1e-5):
+            values = list(leaves)
+            values[place] = leaves[place] + sign * direction
+            sides.append((twin(*values, Ks, *SIZE)[0] * weights).sum())
+        numeric = float((sides[0] - sides[1]) / 2e-5)
+        assert float((gradient.double().cpu() * direction).sum()) == pytest.approx(numeric, rel=2e-3, abs=1e-3)
+
+
 @NEEDS_GPU
 def test_a_cuda_graph_captures_a_step():
     arguments = [value.float().to(DEVICE) for value in scene(300)]
@@ -149,3 +301,15 @@ def test_large_scenes_equal_the_torch_renderer(size):
     single = [value.float().to(DEVICE) for value in (means, scales, opacities, features, viewmats, Ks)]
     output = render(*single, width, height, min_transmittance=0.0)
     assert (output.features.double().cpu() - exact.features).norm() < 1e-3 * exact.features.norm()
+
+
+@NEEDS_GPU
+def test_distorted_cameras_take_the_kernels_and_equal_the_torch_renderer():
+    (*leaves, Ks), distortion = wide_scene(3000, 320, 240)
+    leaves[1] = 0.3 * leaves[1]
+    exact = render(*leaves, Ks, 320, 240, None, distortion, min_transmittance=0.0)
+    single = [value.float().to(DEVICE) for value in (*leaves, Ks)]
+    output = render(*single, 320, 240, None, distortion.float().to(DEVICE), min_transmittance=0.0)
+    assert output.pairs is not None
+    assert (output.features.double().cpu() - exact.features).norm() < 1e-3 * exact.features.norm()
+    assert (output.alpha.double().cpu() - exact.alpha).norm() < 1e-3 * exact.alpha.norm()

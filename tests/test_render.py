@@ -2,22 +2,29 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from cgwm.datasets.cameras import distort
 from cgwm.pipeline.splats.render import render
 
 EXACT = {"min_alpha": 0.0, "min_transmittance": 0.0}
 
 
-def twin(means, scales, opacities, features, viewmats, Ks, width, height, background=None):
+BARREL, PINCUSHION, SKEWED = [-0.25, 0.0, 0.0, 0.0, 0.0], [0.3, 0.1, 0.0, 0.0, 0.02], [-0.1, 0.05, 0.04, -0.06, 0.0]
+
+
+def twin(means, scales, opacities, features, viewmats, Ks, width, height, background=None, distortion=None):
     """Render by one loop over all spheres for all pixels, without tiles, thresholds or hand-written derivatives."""
     images, alphas, depths = [], [], []
     u, v = torch.meshgrid(
         torch.arange(width, dtype=means.dtype) + 0.5, torch.arange(height, dtype=means.dtype) + 0.5, indexing="xy"
     )
-    for view, K in zip(viewmats, Ks, strict=True):
+    for camera, (view, K) in enumerate(zip(viewmats, Ks, strict=True)):
         local = means @ view[:3, :3].T + view[:3, 3]
         rays = torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)], -1).to(means)
+        if distortion is not None:
+            rays[..., :2] = undistorted(rays[..., :2], distortion[camera].tolist())
         rays = rays / rays.norm(dim=-1, keepdim=True)
         left = torch.ones(height, width, dtype=means.dtype)
         image = torch.zeros(height, width, features.shape[1], dtype=means.dtype)
@@ -37,6 +44,31 @@ def twin(means, scales, opacities, features, viewmats, Ks, width, height, backgr
         alphas.append(1 - left)
         depths.append(depth / (1 - left))
     return torch.stack(images), torch.stack(alphas), torch.stack(depths)
+
+
+def undistorted(points, coefficients):
+    """Undo OpenCV's distortion by walking to it in small steps, from none to all of it (Davidenko's method)."""
+    steps, start = 50, points.reshape(-1, 2).double().numpy()
+    found = start.copy()
+    for step in [*range(steps), *[steps] * 6]:
+        partial = step / steps * np.asarray(coefficients)
+        jacobian = np.stack(
+            [(distort(found + h, partial) - distort(found - h, partial)) / 2e-6 for h in 1e-6 * np.eye(2)], -1
+        )
+        found -= np.linalg.solve(jacobian, (distort(found, partial) - start)[..., None])[..., 0]
+    return torch.from_numpy(found).to(points).reshape(points.shape)
+
+
+def wide_scene(count=40, width=25, height=19):
+    """Spheres all around two cameras that see as much as their strong distortions allow."""
+    means, scales, opacities, features, viewmats, Ks = scene(count)
+    means = 4 * means
+    Ks = torch.zeros_like(Ks)
+    Ks[:, 2, 2] = 1
+    for K, reach in zip(Ks, (0.72, 1.3), strict=True):
+        K[0, 0] = K[1, 1] = math.hypot(width, height) / 2 / reach
+        K[0, 2], K[1, 2] = width / 2 + 0.3, height / 2 - 0.2
+    return [means, scales, opacities, features, viewmats, Ks], torch.tensor([BARREL, PINCUSHION], dtype=torch.float64)
 
 
 def scene(count=40, dtype=torch.float64, seed=0, cameras=2):
@@ -105,6 +137,47 @@ def test_gradients_equal_the_twin():
         torch.testing.assert_close(mine, other, atol=1e-8, rtol=1e-7)
 
 
+@pytest.mark.parametrize("coefficients", [BARREL, PINCUSHION, SKEWED])
+def test_distorted_rays_are_those_that_the_distortion_sends_there(coefficients):
+    from cgwm.pipeline.splats.rays import pixel_rays
+
+    _, _, _, _, _, Ks = wide_scene(1)[0]
+    K = Ks[0 if coefficients == BARREL else 1]
+    u, v = torch.meshgrid(torch.arange(25.0) + 0.5, torch.arange(19.0) + 0.5, indexing="xy")
+    pixels = torch.stack([u, v], -1).double().reshape(-1, 2)
+    rays = pixel_rays(pixels, K[None], torch.tensor([coefficients], dtype=torch.float64))[0]
+    back = torch.from_numpy(distort((rays[:, :2] / rays[:, 2:]).numpy(), np.array(coefficients)))
+    torch.testing.assert_close(back @ K[:2, :2].T + K[:2, 2], pixels, atol=1e-9, rtol=0)
+    expected = undistorted((pixels - K[:2, 2]) @ torch.linalg.inv(K[:2, :2]).T, coefficients)
+    torch.testing.assert_close(rays[:, :2] / rays[:, 2:], expected, atol=1e-8, rtol=0)  # and no other root
+
+
+def test_strong_distortion_equals_the_twin():
+    (*leaves, Ks), distortion = wide_scene()
+    weights = torch.rand(2, 19, 25, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    gradients, images = [], []
+    for function in (
+        lambda *a: render(*a, 25, 19, distortion=distortion, **EXACT),
+        lambda *a: twin(*a, 25, 19, distortion=distortion),
+    ):
+        leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
+        output = function(*leaves, Ks)
+        image, alpha, depth = output if isinstance(output, tuple) else (output.features, output.alpha, output.depth)
+        images.append(torch.cat([image, alpha[..., None], depth[..., None]], -1))
+        gradients.append(torch.autograd.grad((images[-1] * weights).sum(), leaves))
+    torch.testing.assert_close(*images, atol=1e-7, rtol=1e-7)
+    for mine, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(mine, other, atol=1e-6, rtol=1e-6)
+
+
+def test_culling_loses_nothing_under_strong_distortion():
+    arguments, distortion = wide_scene(200, 61, 47)
+    least = 1e-3
+    culled = render(*arguments, 61, 47, distortion=distortion, min_alpha=least, min_transmittance=0.0, tile_size=8)
+    whole = render(*arguments, 61, 47, distortion=distortion, min_alpha=least, min_transmittance=0.0, tile_size=64)
+    torch.testing.assert_close(culled.features, whole.features, atol=1e-9, rtol=0)
+
+
 def test_gradients_equal_finite_differences():
     *leaves, Ks = scene(count=5, cameras=1)
     for leaf in leaves:
@@ -117,11 +190,41 @@ def test_gradients_equal_finite_differences():
     torch.autograd.gradcheck(image, leaves, atol=1e-6)
 
 
-def test_alpha_lies_in_the_unit_interval_and_an_opaque_sphere_hides_what_is_behind():
+def test_alpha_lies_in_the_unit_interval():
     means, scales, _, features, viewmats, Ks = scene()
     output = render(means, 4 * scales, torch.ones_like(scales), features, viewmats, Ks, 25, 19)
     assert output.alpha.min() >= 0
     assert output.alpha.max() <= 1
+
+
+def test_a_sphere_of_opacity_1_hides_what_is_behind_up_to_a_hundredth():
+    means = torch.tensor([[0.0, 0, 1], [0, 0, 2]], dtype=torch.float64)
+    K = torch.tensor([[[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]]], dtype=torch.float64)
+    view, scales = torch.eye(4, dtype=torch.float64)[None], torch.full((2,), 0.1, dtype=torch.float64)
+    colors, ones = torch.eye(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+    output = render(means, scales, ones, colors, view, K, 1, 1, median=True, **EXACT)
+    expected = torch.tensor([0.99, 0.01 * 0.99], dtype=torch.float64)
+    torch.testing.assert_close(output.features[0, 0, 0], expected)
+    torch.testing.assert_close(output.depth[0, 0, 0], (expected * means[:, 2]).sum() / expected.sum())
+    assert float(output.median_depth) == 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+def test_a_sphere_whose_place_is_not_finite_is_not_drawn(value, min_alpha):
+    means, *others = scene()
+    for axis in range(3):
+        spoilt = means.clone()
+        spoilt[[4, 11], axis] = value
+        kept = torch.ones(len(means), dtype=torch.bool)
+        kept[[4, 11]] = False
+        spoilt.requires_grad_()
+        output = render(spoilt, *others, 25, 19, min_alpha=min_alpha)
+        *spheres, viewmats, Ks = others
+        without = render(means[kept], *(v[kept] for v in spheres), viewmats, Ks, 25, 19, min_alpha=min_alpha)
+        torch.testing.assert_close(output.features, without.features, atol=1e-12, rtol=0)
+        (gradient,) = torch.autograd.grad(output.features.sum(), spoilt)
+        assert torch.isfinite(gradient[kept]).all()
 
 
 def test_many_spheres_over_one_pixel():
@@ -199,6 +302,18 @@ def test_distorted_rays_project_where_opencv_says():
 def test_nothing_to_see():
     means, scales, opacities, features, viewmats, Ks = scene()
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    one = render(
+        means[:1] - viewmats.new_tensor([0, 0, 9.0]),
+        scales[:1],
+        opacities[:1],
+        features[:1],
+        viewmats[:1],
+        Ks[:1],
+        25,
+        19,
+        background,
+    )
+    assert torch.equal(one.features, background.expand(1, 19, 25, 3))
     empty = render(means[:0], scales[:0], opacities[:0], features[:0], viewmats, Ks, 25, 19, background)
     assert torch.equal(empty.features, background.expand(2, 19, 25, 3))
     behind = render(means + viewmats.new_tensor([0, 0, -9.0]), scales, opacities, features, viewmats[:1], Ks[:1], 9, 9)

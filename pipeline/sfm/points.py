@@ -44,7 +44,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
         Positions, world frame, float64 (point, 3), in the unit of `cameras.json`, and sRGB colours, uint8 (point, 3).
 
     Raises:
-        InputDataError: If it is another kind of file, or truncated.
+        InputDataError: If it is another kind of file, truncated, or holds a point that is not finite.
     """
     data = path.read_bytes()
     header, found, body = data.partition(b"end_header\n")
@@ -60,4 +60,9 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
             todo="run 'cgwm calibrate --overwrite'.",
         )
     table = np.frombuffer(body, _VERTEX)
+    bad = int(np.count_nonzero(~np.isfinite(table["xyz"]).all(1)))
+    if bad:
+        raise InputDataError(
+            f"{path}: {bad} of {len(table)} points are not finite.", todo="run 'cgwm calibrate --overwrite'."
+        )
     return table["xyz"].astype(np.float64), table["rgb"].astype(np.uint8)

@@ -18,6 +18,7 @@ from ...datasets.ply import SH_C0
 from ...datasets.progress import progress
 from ..checkpoint import Slot, State
 from .exposures import Exposures
+from .fit import require_finite
 from .harmonics import term_count
 from .losses import Loss, psnr_of
 from .spheres import Spheres
@@ -216,6 +217,9 @@ def fit_adaptively(
 
     Returns:
         The spheres, and how it went, every `REFINED_EVERY` iterations.
+
+    Raises:
+        NotConvergedError: If the loss or a sphere is no longer finite.
     """
     run = _Run(Population(start, degree, spread), exposures, seed, start.means.device)
     first = run.restore(slot)
@@ -229,6 +233,7 @@ def fit_adaptively(
         run.losses.append(value.detach())
         run.population.step(iteration / iterations, run.noise)
         if iteration % REFINED_EVERY == 0 or iteration == iterations - 1:
+            require_finite(run.losses, iteration, iterations, what)
             run.note(iteration, wrong)
             bar.set_postfix_str(run.told())
             if REFINED_FROM * iterations <= iteration < REFINED_UNTIL * iterations:
@@ -236,6 +241,8 @@ def fit_adaptively(
             if slot is not None and slot.due():
                 slot.write(run.state(iteration + 1))
     fitted = run.population.spheres()
+    sums = [values.detach().sum() for values in (fitted.means, fitted.scales, fitted.colors)]
+    require_finite(sums, iterations - 1, iterations, what)
     higher = None if fitted.harmonics is None else fitted.harmonics.detach()
     plain = (fitted.means, fitted.scales, fitted.opacities, fitted.colors)
     return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher), run.history

@@ -25,49 +25,91 @@ SOURCE = r"""
 #define WARPS 4
 #define FULL 0xffffffffu
 
+struct View {
+    const float* Ks;
+    const float2* rays;  // x, y on the plane z = 1 of every pixel; only with RAYS, where cameras distort
+    int columns, tile_rows, width, height;
+};
+
+struct Lists {
+    const float4* centres;
+    const float* log_opacities;
+    const float4* spans;
+    const float* features;
+    const int* rows;
+    int N;
+};
+
 struct Pixel {
     float x, y, dx, dy, inverse;
     int target;
     bool shown;
 };
 
-struct Patch {  // the 8 x 8 pixels of a warp
-    float x0, y0, left, top;
-    int camera;
+struct Patch {  // the 8 x 8 pixels of a warp: the ray at its middle, and its bounds in the unit of the spans
+    float x0, y0, low_x, low_y, high_x, high_y;
 };
 
-__device__ Patch patch_of(const float* Ks, int columns, int tile_rows, int& tile) {
-    int warp = threadIdx.x >> 5, tiles = columns * tile_rows;
-    tile = blockIdx.x;
-    Patch patch;
-    patch.camera = tile / tiles;
-    int within = tile - patch.camera * tiles;
-    patch.left = (within % columns) * 16 + (warp & 1) * 8;
-    patch.top = (within / columns) * 16 + (warp >> 1) * 8;
-    const float* K = Ks + patch.camera * 9;
-    patch.x0 = (patch.left + 4.0f - K[2]) / K[0];
-    patch.y0 = (patch.top + 4.0f - K[5]) / K[4];
-    return patch;
+__device__ __forceinline__ float2 ray_at(const View& view, int camera, float u, float v) {
+    int column = min((int)u, view.width - 1), row = min((int)v, view.height - 1);
+    return view.rays[(camera * view.height + row) * view.width + column];
 }
 
-__device__ Pixel pixel_of(const Patch& patch, const float* Ks, int half, int width, int height) {
-    int lane = threadIdx.x & 31;
-    const float* K = Ks + patch.camera * 9;
-    float u = patch.left + (lane & 7), v = patch.top + (lane >> 3) + 4 * half;
-    Pixel pixel;
-    pixel.x = (u + 0.5f - K[2]) / K[0];
-    pixel.y = (v + 0.5f - K[5]) / K[4];
-    pixel.dx = (u + 0.5f - patch.left - 4.0f) / K[0];
-    pixel.dy = (v + 0.5f - patch.top - 4.0f) / K[4];
-    pixel.inverse = 1.0f / (1.0f + pixel.x * pixel.x + pixel.y * pixel.y);
-    pixel.shown = u < width && v < height;
-    pixel.target = (patch.camera * height + (int)v) * width + (int)u;
-    return pixel;
+// Sets the patch of a warp and the two pixels of each lane, and returns the tile.
+__device__ __forceinline__ int look(const View& view, Patch& patch, Pixel* pixels) {
+    int warp = threadIdx.x >> 5, lane = threadIdx.x & 31, tile = blockIdx.x, tiles = view.columns * view.tile_rows;
+    int camera = tile / tiles, within = tile - camera * tiles;
+    float left = (within % view.columns) * 16 + (warp & 1) * 8, top = (within / view.columns) * 16 + (warp >> 1) * 8;
+#if RAYS
+    float2 middle = ray_at(view, camera, left + 4.0f, top + 4.0f);
+    patch.x0 = middle.x;
+    patch.y0 = middle.y;
+#else
+    const float* K = view.Ks + camera * 9;
+    patch.x0 = (left + 4.0f - K[2]) / K[0];
+    patch.y0 = (top + 4.0f - K[5]) / K[4];
+    patch.low_x = left + 0.5f;
+    patch.low_y = top + 0.5f;
+    patch.high_x = left + 7.5f;
+    patch.high_y = top + 7.5f;
+#endif
+#pragma unroll
+    for (int h = 0; h < 2; h++) {
+        float u = left + (lane & 7), v = top + (lane >> 3) + 4 * h;
+        Pixel& pixel = pixels[h];
+#if RAYS
+        float2 ray = ray_at(view, camera, u, v);
+        pixel.x = ray.x;
+        pixel.y = ray.y;
+        pixel.dx = ray.x - middle.x;
+        pixel.dy = ray.y - middle.y;
+#else
+        pixel.x = (u + 0.5f - K[2]) / K[0];
+        pixel.y = (v + 0.5f - K[5]) / K[4];
+        pixel.dx = (u + 0.5f - left - 4.0f) / K[0];
+        pixel.dy = (v + 0.5f - top - 4.0f) / K[4];
+#endif
+        pixel.inverse = 1.0f / (1.0f + pixel.x * pixel.x + pixel.y * pixel.y);
+        pixel.shown = u < view.width && v < view.height;
+        pixel.target = (camera * view.height + (int)v) * view.width + (int)u;
+    }
+#if RAYS
+    patch.low_x = fminf(pixels[0].x, pixels[1].x);
+    patch.low_y = fminf(pixels[0].y, pixels[1].y);
+    patch.high_x = fmaxf(pixels[0].x, pixels[1].x);
+    patch.high_y = fmaxf(pixels[0].y, pixels[1].y);
+    for (int apart = 16; apart > 0; apart >>= 1) {
+        patch.low_x = fminf(patch.low_x, __shfl_xor_sync(FULL, patch.low_x, apart));
+        patch.low_y = fminf(patch.low_y, __shfl_xor_sync(FULL, patch.low_y, apart));
+        patch.high_x = fmaxf(patch.high_x, __shfl_xor_sync(FULL, patch.high_x, apart));
+        patch.high_y = fmaxf(patch.high_y, __shfl_xor_sync(FULL, patch.high_y, apart));
+    }
+#endif
+    return tile;
 }
 
 __device__ bool reaches(const float4& span, const Patch& patch) {
-    return span.x <= patch.left + 7.5f && span.z >= patch.left + 0.5f && span.y <= patch.top + 7.5f &&
-           span.w >= patch.top + 0.5f;
+    return span.x <= patch.high_x && span.z >= patch.low_x && span.y <= patch.high_y && span.w >= patch.low_y;
 }
 
 // The squared distance from a centre to the ray (x0 + dx, y0 + dy, 1), times 1 + x^2 + y^2, is quadratic in (dx, dy):
@@ -90,19 +132,58 @@ __device__ float alpha_at(const float4& low, const float4& high, const Pixel& pi
     return exp2f(square * pixel.inverse + low.w);
 }
 
+template <int CHANNELS>
+struct Staged {  // up to 32 spheres that reach a patch
+    float4 lows[32], highs[32];
+    float colors[32][CHANNELS];
+};
+
+struct Sources {  // where they come from, which only the derivative needs
+    float4 points[32];
+    int places[32];
+};
+
+// Puts those of the next 32 spheres of a tile that reach the patch into shared memory, and returns how many they are.
+template <int CHANNELS>
+__device__ __forceinline__ int stage(const Lists& lists, const Patch& patch, int first, int end, int channel,
+                                     Staged<CHANNELS>& staged, Sources* sources) {
+    int lane = threadIdx.x & 31;
+    int row = first + lane < end ? lists.rows[first + lane] : 0;
+    bool hit = first + lane < end && reaches(lists.spans[row], patch);
+    unsigned mask = __ballot_sync(FULL, hit);
+    if (hit) {
+        int slot = __popc(mask & ((1u << lane) - 1)), sphere = row % lists.N;
+        float4 point = lists.centres[row], low, high;
+        expand(point, patch, low, high);
+        low.w = lists.log_opacities[sphere] * LOG2E;
+        staged.lows[slot] = low;
+        staged.highs[slot] = high;
+        if (sources != nullptr) {
+            sources->points[slot] = point;
+            sources->places[slot] = row;
+        }
+#pragma unroll
+        for (int c = 0; c < CHANNELS; c++) staged.colors[slot][c] = lists.features[sphere * F + channel + c];
+    }
+    __syncwarp();
+    return __popc(mask);
+}
+
 extern "C" __global__ void __launch_bounds__(128) composite_forward(
     const float4* centres, const float* log_opacities, const float4* spans, const float* features, const int* rows,
-    const int* starts, const float* Ks, float* out, float* out_left, float* out_depth, float* out_median,
-    int N, int columns, int tile_rows, int width, int height, float min_alpha, float min_transmittance) {
-    __shared__ float4 lows[WARPS][32], highs[WARPS][32];
-    __shared__ float colors[WARPS][32][COUNT];
-    int warp = threadIdx.x >> 5, lane = threadIdx.x & 31, tile;
-    Patch patch = patch_of(Ks, columns, tile_rows, tile);
+    const int* starts, const float* Ks, const float2* rays, float* out, float* out_left, float* out_depth,
+    float* out_median, int N, int columns, int tile_rows, int width, int height, float min_alpha,
+    float min_transmittance) {
+    __shared__ Staged<COUNT> shared[WARPS];
+    Staged<COUNT>& staged = shared[threadIdx.x >> 5];
+    Lists lists = {centres, log_opacities, spans, features, rows, N};
+    View view = {Ks, rays, columns, tile_rows, width, height};
+    Patch patch;
     Pixel pixels[2];
+    int tile = look(view, patch, pixels);
     float left[2], depth[2] = {0, 0}, median[2] = {0, 0}, sums[2][COUNT];
 #pragma unroll
     for (int h = 0; h < 2; h++) {
-        pixels[h] = pixel_of(patch, Ks, h, width, height);
         left[h] = pixels[h].shown ? 1.0f : 0.0f;
 #pragma unroll
         for (int c = 0; c < COUNT; c++) sums[h][c] = 0;
@@ -110,23 +191,9 @@ extern "C" __global__ void __launch_bounds__(128) composite_forward(
     int end = starts[tile + 1];
     for (int first = starts[tile]; first < end; first += 32) {
         if (__all_sync(FULL, fmaxf(left[0], left[1]) <= min_transmittance)) break;
-        int row = first + lane < end ? rows[first + lane] : 0;
-        bool hit = first + lane < end && reaches(spans[row], patch);
-        unsigned mask = __ballot_sync(FULL, hit);
-        if (hit) {
-            int slot = __popc(mask & ((1u << lane) - 1)), sphere = row % N;
-            float4 low, high;
-            expand(centres[row], patch, low, high);
-            low.w = log_opacities[sphere] * LOG2E;
-            lows[warp][slot] = low;
-            highs[warp][slot] = high;
-#pragma unroll
-            for (int c = 0; c < COUNT; c++) colors[warp][slot][c] = features[sphere * F + FIRST + c];
-        }
-        __syncwarp();
-        int count = __popc(mask);
+        int count = stage(lists, patch, first, end, FIRST, staged, nullptr);
         for (int j = 0; j < count; j++) {
-            float4 low = lows[warp][j], high = highs[warp][j];
+            float4 low = staged.lows[j], high = staged.highs[j];
 #pragma unroll
             for (int h = 0; h < 2; h++) {
                 float raw = alpha_at(low, high, pixels[h]);
@@ -138,7 +205,7 @@ extern "C" __global__ void __launch_bounds__(128) composite_forward(
                     }
                     left[h] = after;
 #pragma unroll
-                    for (int c = 0; c < COUNT; c++) sums[h][c] += weight * colors[warp][j][c];
+                    for (int c = 0; c < COUNT; c++) sums[h][c] += weight * staged.colors[j][c];
                 }
             }
         }
@@ -179,19 +246,22 @@ __device__ float transposed_sum(float* values, int lane) {
 
 extern "C" __global__ void __launch_bounds__(128) composite_backward(
     const float4* centres, const float* log_opacities, const float4* spans, const float* features, const int* rows,
-    const int* starts, const float* Ks, const float* out, const float* out_left, const float* out_depth,
-    const float* grad_out, const float* grad_alpha, const float* grad_depth, float* gradients,
+    const int* starts, const float* Ks, const float2* rays, const float* out, const float* out_left,
+    const float* out_depth, const float* grad_out, const float* grad_alpha, const float* grad_depth, float* gradients,
     int N, int columns, int tile_rows, int width, int height, float min_alpha, float min_transmittance) {
-    __shared__ float4 lows[WARPS][32], highs[WARPS][32], points[WARPS][32];
-    __shared__ float colors[WARPS][32][F];
-    __shared__ int places[WARPS][32];
-    int warp = threadIdx.x >> 5, lane = threadIdx.x & 31, tile;
-    Patch patch = patch_of(Ks, columns, tile_rows, tile);
+    __shared__ Staged<F> shared[WARPS];
+    __shared__ Sources shared_sources[WARPS];
+    int warp = threadIdx.x >> 5, lane = threadIdx.x & 31;
+    Staged<F>& staged = shared[warp];
+    Sources& sources = shared_sources[warp];
+    Lists lists = {centres, log_opacities, spans, features, rows, N};
+    View view = {Ks, rays, columns, tile_rows, width, height};
+    Patch patch;
     Pixel pixels[2];
+    int tile = look(view, patch, pixels);
     float left[2], rest[2], by_depth[2], by_color[2][F];
 #pragma unroll
     for (int h = 0; h < 2; h++) {
-        pixels[h] = pixel_of(patch, Ks, h, width, height);
         bool shown = pixels[h].shown;
         int target = pixels[h].target;
         left[h] = shown ? 1.0f : 0.0f;
@@ -207,28 +277,12 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
     int end = starts[tile + 1];
     for (int first = starts[tile]; first < end; first += 32) {
         if (__all_sync(FULL, fmaxf(left[0], left[1]) <= min_transmittance)) break;
-        int row = first + lane < end ? rows[first + lane] : 0;
-        bool hit = first + lane < end && reaches(spans[row], patch);
-        unsigned mask = __ballot_sync(FULL, hit);
-        if (hit) {
-            int slot = __popc(mask & ((1u << lane) - 1)), sphere = row % N;
-            float4 point = centres[row], low, high;
-            expand(point, patch, low, high);
-            low.w = log_opacities[sphere] * LOG2E;
-            lows[warp][slot] = low;
-            highs[warp][slot] = high;
-            points[warp][slot] = point;
-            places[warp][slot] = row;
-#pragma unroll
-            for (int c = 0; c < F; c++) colors[warp][slot][c] = features[sphere * F + c];
-        }
-        __syncwarp();
-        int count = __popc(mask);
+        int count = stage(lists, patch, first, end, 0, staged, &sources);
         for (int j = 0; j < count; j++) {
-            float4 low = lows[warp][j], high = highs[warp][j];
+            float4 low = staged.lows[j], high = staged.highs[j];
             float raw[2] = {alpha_at(low, high, pixels[0]), alpha_at(low, high, pixels[1])};
             if (!__any_sync(FULL, fmaxf(raw[0], raw[1]) >= min_alpha)) continue;
-            float4 point = points[warp][j];
+            float4 point = sources.points[j];
             float values[GROUPS * VALUES];
 #pragma unroll
             for (int i = 0; i < GROUPS * VALUES; i++) values[i] = 0;
@@ -240,7 +294,7 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
                 float along = point.z * by_depth[h];
 #pragma unroll
                 for (int c = 0; c < F; c++) {
-                    along += colors[warp][j][c] * by_color[h][c];
+                    along += staged.colors[j][c] * by_color[h][c];
                     values[5 + c] += weight * by_color[h][c];
                 }
                 rest[h] -= weight * along;
@@ -255,7 +309,7 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
                 values[3] += grad * (a * a + b * b + c * c) * at.inverse;
                 values[4] += grad;
             }
-            float* target = gradients + (long long)places[warp][j] * (GROUPS * VALUES);
+            float* target = gradients + (long long)sources.places[j] * (GROUPS * VALUES);
 #pragma unroll
             for (int g = 0; g < GROUPS; g++) {
                 float sum = transposed_sum(values + g * VALUES, lane);
@@ -288,11 +342,11 @@ def gradient_width(channels: int) -> int:
 
 
 @cache
-def _kernel(name: str, device: int, channels: int, first: int) -> Any:
+def _kernel(name: str, device: int, channels: int, first: int, rays: bool) -> Any:
     core = _core()
     core.Device(device).set_current()
     major, minor = torch.cuda.get_device_capability(device)
-    defines = {"F": channels, "FIRST": first, "COUNT": min(CHANNELS, channels - first)}
+    defines = {"F": channels, "FIRST": first, "COUNT": min(CHANNELS, channels - first), "RAYS": int(rays)}
     source = "".join(f"#define {key} {value}\n" for key, value in defines.items()) + SOURCE
     options = core.ProgramOptions(std="c++17", arch=f"sm_{major}{minor}")
     return core.Program(source, "c++", options).compile("cubin").get_kernel(name)
@@ -309,20 +363,21 @@ def _stream(handle: int) -> Any:
 
 
 def launch(
-    name: str, blocks: int, tensors: tuple[Tensor, ...], numbers: tuple[int | float, ...], first: int = 0
+    name: str, blocks: int, tensors: tuple[Tensor | None, ...], numbers: tuple[int | float, ...], first: int = 0
 ) -> None:
     """Launch a kernel of `SOURCE` on torch's current stream.
 
     Args:
         name: The kernel.
         blocks: One for each tile of 16 x 16 pixels.
-        tensors: Its pointers, in order, contiguous; the fourth are the features (N, F).
+        tensors: Its pointers, in order, contiguous; the fourth are the features (N, F), the eighth the rays or None.
         numbers: Its int32 and float32 arguments, in order.
         first: First channel of the forward kernel.
     """
     features = tensors[3]
-    kernel = _kernel(name, features.device.index or 0, features.shape[1], first)
+    assert features is not None
+    kernel = _kernel(name, features.device.index or 0, features.shape[1], first, tensors[7] is not None)
     words = [np.int32(number) if isinstance(number, int) else np.float32(number) for number in numbers]
-    pointers = [tensor.data_ptr() for tensor in tensors]
+    pointers = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
     stream = _stream(torch.cuda.current_stream(features.device).cuda_stream)
     _core().launch(stream, _config(blocks), kernel, *pointers, *words)

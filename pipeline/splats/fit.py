@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from ...datasets.progress import progress
+from ...schemas import NotConvergedError
 from ..checkpoint import Slot, State
 from .exposures import Exposures
 from .losses import Loss, psnr_of
 from .spheres import Spheres
 from .views import View
 
-_SHOWN_EVERY = 20
+_LOOKED_EVERY = 20
 _MAX_OPACITY = 0.995
 
 
@@ -116,6 +117,9 @@ def descend(
 
     Returns:
         The loss by iteration.
+
+    Raises:
+        NotConvergedError: If the loss or what moves is no longer finite.
     """
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam([*trainable.groups, *beside], eps=1e-12)
@@ -143,9 +147,12 @@ def descend(
         optimiser.step()
         decay.step()
         losses.append(value.detach())
-        if iteration % _SHOWN_EVERY == 0 and not bar.disable:
+        last = iteration == iterations - 1
+        if iteration % _LOOKED_EVERY == 0 or last:  # not oftener: on a GPU a look waits for it
+            require_finite(losses, iteration, iterations, what)
             bar.set_postfix_str(f"{len(trainable.shift)} spheres, loss {float(value):.4f}, {psnr_of(wrong):.1f} dB")
         if slot is not None and slot.due():
+            require_finite(losses, iteration, iterations, what)
             slot.write(
                 {
                     "spheres": trainable.state(),
@@ -157,4 +164,20 @@ def descend(
                     "exposures": None if exposures is None else exposures.state(),
                 }
             )
+    require_finite([group["params"][0].detach().sum() for group in trainable.groups], iterations - 1, iterations, what)
     return torch.stack(losses).tolist()
+
+
+def require_finite(values: Sequence[Tensor], iteration: int, iterations: int, what: str) -> None:
+    """Check losses of successive iterations, the last of which is `iteration`; or sums of what moves, at its end.
+
+    Raises:
+        NotConvergedError: If one is not finite.
+    """
+    wrong = (~torch.isfinite(torch.stack(list(values)))).nonzero()
+    if len(wrong):
+        step = min(iteration + 1, max(1, iteration + 2 - len(values) + int(wrong[0])))
+        raise NotConvergedError(
+            f"The fit of '{what}' diverged by step {step} of {iterations}: its loss or its spheres are not finite.",
+            todo="check that cameras and photos belong together ('cgwm validate CAPTURE'), or try another --seed.",
+        )

@@ -16,7 +16,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from . import cuda, kernels
+from . import binning, cuda, kernels
+from .rays import LEAST_DETERMINANT, UNDISTORT_STEPS
 
 TILE = 16
 """Side of a tile [px]."""
@@ -72,7 +73,7 @@ class Raster:
 class _Lists(NamedTuple):
     """Which spheres each tile composites, nearest first.
 
-    centres (C, N, 4), log_opacities (N,), spans (C * N, 4): as `kernels.project` writes them; rows (M,): camera * N +
+    centres (C, N, 4), log_opacities (N,), spans (C * N, 4): as `binning.project` writes them; rows (M,): camera * N +
     sphere; starts (tiles + 1,): where each tile's rows begin; pairs (): how many rows all tiles need.
     """
 
@@ -84,14 +85,35 @@ class _Lists(NamedTuple):
     pairs: Tensor
 
 
+class _Rays(NamedTuple):
+    """The rays of cameras that distort, as `kernels.trace` writes them; every field None for pinholes.
+
+    rays (C, H, W, 2); tiles, columns and rows (C, ..., 4): bounds of the rays in each tile, and in each column and row
+    of tiles.
+    """
+
+    rays: Tensor | None = None
+    tiles: Tensor | None = None
+    columns: Tensor | None = None
+    rows: Tensor | None = None
+
+
 def rasterize(
-    means: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, viewmats: Tensor, Ks: Tensor, raster: Raster
+    means: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    raster: Raster,
+    distortion: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return features (C, H, W, F), alpha (C, H, W), depth times alpha, median depth, and the number of pairs ().
 
     Shapes as `render.render` has them; all float32 on one CUDA device. The last two have no derivative.
     """
-    return _Rasterize.apply(means, scales, opacities, features, viewmats, Ks, raster)  # type: ignore[return-value]
+    arguments = (means, scales, opacities, features, viewmats, Ks, raster, distortion)
+    return _Rasterize.apply(*arguments)  # type: ignore[return-value]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -105,11 +127,13 @@ class _Rasterize(torch.autograd.Function):
         viewmats: Tensor,
         Ks: Tensor,
         raster: Raster,
+        distortion: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         means, scales, opacities, features, viewmats, Ks = (
-            value.detach().contiguous() for value in (means, scales, opacities, features, viewmats, Ks)
+            value.contiguous() for value in (means, scales, opacities, features, viewmats, Ks)
         )
-        lists = _bin(means, scales, opacities, viewmats, Ks, raster)
+        rays = _Rays() if distortion is None else _trace(Ks, distortion, raster)
+        lists = _bin(means, scales, opacities, viewmats, Ks, rays, raster)
         cameras, channels = viewmats.shape[0], features.shape[1]
         shape = (cameras, raster.height, raster.width)
         out = features.new_empty(*shape, channels)
@@ -117,22 +141,23 @@ class _Rasterize(torch.autograd.Function):
         tiles = cameras * raster.columns * raster.rows
         numbers = (scales.shape[0], raster.columns, raster.rows, raster.width, raster.height)
         if raster.compiled:
-            tensors = (*lists[:3], features, *lists[3:5], Ks, out, left, depth, median)
+            tensors = (*lists[:3], features, *lists[3:5], Ks, rays.rays, out, left, depth, median)
             for first in range(0, channels, cuda.CHANNELS):
                 cuda.launch("composite_forward", tiles, tensors, (*numbers, *raster.thresholds), first)
         else:
             kernels.composite_forward[(tiles,)](
-                *lists[:2], features, *lists[3:5], Ks, out, left, depth, median, *numbers, *raster.thresholds,
+                *lists[:2], features, *lists[3:5], Ks, rays.rays, out, left, depth, median,
+                *numbers, *raster.thresholds,
                 F=channels, CHANNELS=_filled(channels), TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
             )  # fmt: skip
-        ctx.save_for_backward(means, scales, opacities, features, viewmats, Ks, out, left, depth, *lists)
+        ctx.save_for_backward(means, scales, opacities, features, viewmats, Ks, rays.rays, out, left, depth, *lists)
         ctx.raster = raster
         ctx.mark_non_differentiable(median, lists.pairs)
         return out, 1 - left, depth, median, lists.pairs
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        means, scales, opacities, features, viewmats, Ks, out, left, depth, *parts = ctx.saved_tensors
+        means, scales, opacities, features, viewmats, Ks, rays, out, left, depth, *parts = ctx.saved_tensors
         lists, raster = _Lists(*parts), ctx.raster
         grad_out, grad_alpha, grad_depth = (gradient.contiguous() for gradient in gradients[:3])
         count, channels, cameras = scales.shape[0], features.shape[1], viewmats.shape[0]
@@ -141,26 +166,28 @@ class _Rasterize(torch.autograd.Function):
         rows = torch.zeros(cameras, count, cuda.gradient_width(channels), device=means.device)
         pictures = (out, left, depth, grad_out, grad_alpha, grad_depth, rows)
         if raster.compiled:
-            tensors = (*lists[:3], features, *lists[3:5], Ks, *pictures)
+            tensors = (*lists[:3], features, *lists[3:5], Ks, rays, *pictures)
             cuda.launch("composite_backward", tiles, tensors, (*numbers, *raster.thresholds))
         else:
             kernels.composite_backward[(tiles,)](
-                *lists[:2], features, *lists[3:5], Ks, *pictures, *numbers, *raster.thresholds,
+                *lists[:2], features, *lists[3:5], Ks, rays, *pictures, *numbers, *raster.thresholds,
                 F=channels, CHANNELS=_filled(channels), WIDE=rows.shape[2], TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
             )  # fmt: skip
-        by_centre, summed = rows[..., :3], rows[..., 3:].sum(0)
-        grad_means = by_centre @ viewmats[:, :3, :3]
-        if means.dim() == 2:
-            grad_means = grad_means.sum(0)
-        grad_scales = summed[:, 0] / scales**3
+        by_sphere = [torch.empty_like(value) for value in (means, scales, opacities, features)]
+        group = min(16, _filled(cameras))
+        block = max(32, 256 // group)
+        if count:
+            binning.project_backward[(-(-count // block),)](
+                rows, viewmats, scales, opacities, *by_sphere, cameras, count,
+                F=channels, WIDE=rows.shape[2], PER_CAMERA=means.dim() == 3, GROUP=group, BLOCK=block,
+            )  # fmt: skip
         grad_viewmats = None
         if ctx.needs_input_grad[4]:
+            by_centre = rows[..., :3]
             grad_viewmats = torch.zeros_like(viewmats)
             grad_viewmats[:, :3, :3] = by_centre.transpose(1, 2) @ means
             grad_viewmats[:, :3, 3] = by_centre.sum(1)
-        grad_opacities = torch.where(opacities > 1e-12, summed[:, 1] / opacities.clamp_min(1e-12), 0.0)
-        grad_features = summed[:, 2 : 2 + channels]
-        return grad_means, grad_scales, grad_opacities, grad_features, grad_viewmats, None, None
+        return *by_sphere, grad_viewmats, None, None, None
 
 
 def _filled(channels: int) -> int:
@@ -168,7 +195,21 @@ def _filled(channels: int) -> int:
     return 1 << (channels - 1).bit_length()
 
 
-def _bin(means: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, raster: Raster) -> _Lists:
+def _trace(Ks: Tensor, distortion: Tensor, raster: Raster) -> _Rays:
+    cameras = Ks.shape[0]
+    distortion = distortion.detach().to(Ks).expand(cameras, -1).contiguous()
+    rays = Ks.new_empty(cameras, raster.height, raster.width, 2)
+    bounds = Ks.new_empty(cameras, raster.rows, raster.columns, 4)
+    kernels.trace[(cameras * raster.columns * raster.rows,)](
+        Ks, distortion, rays, bounds, raster.columns, raster.rows, raster.width, raster.height,
+        TERMS=distortion.shape[1], STEPS=UNDISTORT_STEPS, LEAST=LEAST_DETERMINANT, TILE=TILE, num_warps=_WARPS,
+    )  # fmt: skip
+    return _Rays(rays, bounds, bounds.amin(1), bounds.amin(2))
+
+
+def _bin(
+    means: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, rays: _Rays, raster: Raster
+) -> _Lists:
     cameras, count = viewmats.shape[0], scales.shape[0]
     total, tiles = cameras * count, cameras * raster.columns * raster.rows
     device = means.device
@@ -177,24 +218,25 @@ def _bin(means: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks:
     distances = torch.empty(total, device=device)
     spans = torch.empty(total, 4, device=device)
     counts = torch.empty(total, device=device, dtype=torch.int32)
-    kernels.project[(cameras, max(1, -(-count // kernels.PROJECT_BLOCK)))](
-        means, scales, opacities, viewmats, Ks, centres, log_opacities, distances, spans, counts,
+    binning.project[(cameras, max(1, -(-count // binning.PROJECT_BLOCK)))](
+        means, scales, opacities, viewmats, Ks, *rays[1:], centres, log_opacities, distances, spans, counts,
         count, raster.width, raster.height, raster.columns, raster.rows, raster.min_alpha,
-        PER_CAMERA=means.dim() == 3, HAS_LEAST=raster.min_alpha > 0, TILE=TILE, BLOCK=kernels.PROJECT_BLOCK,
+        PER_CAMERA=means.dim() == 3, HAS_LEAST=raster.min_alpha > 0, TILE=TILE, BLOCK=binning.PROJECT_BLOCK,
     )  # fmt: skip
     order = torch.argsort(distances)
-    ends = counts[order].cumsum(0, dtype=torch.int32)
+    ends = counts.gather(0, order).cumsum(0, dtype=torch.int32)
     pairs = ends[-1] if total else torch.zeros((), device=device, dtype=torch.int32)
     capacity = int(pairs) if raster.capacity is None else raster.capacity
     key_type = torch.int16 if tiles < 2**15 else torch.int32
-    # what no pair fills sorts behind all tiles
-    keys = torch.full((capacity,), torch.iinfo(key_type).max, device=device, dtype=key_type)
-    rows = torch.zeros(capacity, device=device, dtype=torch.int32)
+    keys = torch.empty(capacity, device=device, dtype=key_type)
+    rows = torch.empty(capacity, device=device, dtype=torch.int32)
+    if raster.capacity is not None:
+        keys.fill_(torch.iinfo(key_type).max)  # what no pair fills sorts behind all tiles
     if total:
-        kernels.emit[(-(-total // kernels.EMIT_BLOCK),)](
-            order, ends, spans, keys, rows, total, count, capacity, raster.columns, raster.rows,
-            TILE=TILE, BLOCK=kernels.EMIT_BLOCK,
+        binning.emit[(-(-total // binning.EMIT_BLOCK),)](
+            order, ends, spans, *rays[1:], keys, rows, total, count, capacity, raster.columns, raster.rows,
+            TILE=TILE, BLOCK=binning.EMIT_BLOCK,
         )  # fmt: skip
     keys, place = torch.sort(keys, stable=True)
     starts = torch.searchsorted(keys, torch.arange(tiles + 1, device=device, dtype=key_type), out_int32=True)
-    return _Lists(centres, log_opacities, spans, rows[place], starts, pairs)
+    return _Lists(centres, log_opacities, spans, rows.gather(0, place), starts, pairs)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_UNDISTORT_STEPS = 20
+UNDISTORT_STEPS = 10
+"""Newton's method doubles the digits with each."""
+LEAST_DETERMINANT = 1e-3
+"""Of the distortion's Jacobian: where it folds there is no ray, and a step must not leave for infinity."""
 
 
 def pixel_rays(pixels: Tensor, Ks: Tensor, distortion: Tensor | None = None) -> Tensor:
@@ -23,21 +26,31 @@ def pixel_rays(pixels: Tensor, Ks: Tensor, distortion: Tensor | None = None) -> 
     focal = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], 1)[:, None]
     points = (flat - Ks[:, None, :2, 2]) / focal
     if distortion is not None:
-        points = _undistort(points, distortion)
+        points = undistort(points, distortion)
     rays = torch.cat([points, torch.ones_like(points[..., :1])], -1)
     return torch.nn.functional.normalize(rays, dim=-1).reshape(Ks.shape[0], *pixels.shape[:-1], 3)
 
 
-def _undistort(distorted: Tensor, distortion: Tensor) -> Tensor:
-    """Invert OpenCV's distortion by fixed-point iteration; points (C, n, 2) on the plane z = 1."""
+def undistort(distorted: Tensor, distortion: Tensor) -> Tensor:
+    """Invert OpenCV's distortion by Newton's method; points (C, n, 2) on the plane z = 1.
+
+    From the distorted point it goes straight to the nearer root, whether the lens is a barrel or a pincushion
+    (derived: along a radius the distortion is concave or convex, and the start lies on the side where tangents help).
+    """
     k1, k2, p1, p2 = (distortion[:, None, index] for index in range(4))
     k3 = distortion[:, None, 4] if distortion.shape[1] > 4 else torch.zeros_like(k1)
-    points = distorted
-    for _ in range(_UNDISTORT_STEPS):
-        x, y = points.unbind(-1)
+    u, v = distorted.unbind(-1)
+    x, y = u, v
+    for _ in range(UNDISTORT_STEPS):
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        points = (distorted - torch.stack([dx, dy], -1)) / radial[..., None]
-    return points
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        off_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - u
+        off_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - v
+        xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+        xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
+        yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+        determinant = (xx * yy - xy * xy).clamp_min(LEAST_DETERMINANT)
+        x = x - (yy * off_x - xy * off_y) / determinant
+        y = y - (xx * off_y - xy * off_x) / determinant
+    return torch.stack([x, y], -1)

@@ -35,7 +35,7 @@ class RenderOutput:
     Attributes:
         features: Composited features with the background behind them, shape (C, H, W, F).
         alpha: Opacity of all spheres together in [0, 1), shape (C, H, W).
-        depth: Expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen.
+        weighted_depth: Depths along the optical axis [m], each times what its sphere adds to alpha, shape (C, H, W).
         median_depth: Depth of the sphere behind which less than half of the light gets through [m], shape (C, H, W);
             0 where more does. It has no derivative. None where it was not asked for.
         pairs: From the kernels of `rasterize`: how many pairs of tiles and spheres there are, to compare with the
@@ -44,9 +44,15 @@ class RenderOutput:
 
     features: Tensor
     alpha: Tensor
-    depth: Tensor
+    weighted_depth: Tensor
     median_depth: Tensor | None = None
     pairs: Tensor | None = None
+
+    @property
+    def depth(self) -> Tensor:
+        """Return the expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen."""
+        seen = self.alpha > 0
+        return torch.where(seen, self.weighted_depth / torch.where(seen, self.alpha, 1.0), 0.0)
 
 
 def render(
@@ -70,8 +76,9 @@ def render(
     """Render spheres into C cameras.
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn where its centre
-    lies in front of the camera by more than its scale. float32 tensors on CUDA go through the kernels of `rasterize`,
-    everything else (cameras with distortion, systems without Triton) through plain torch; both give the same pictures.
+    lies in front of the camera by more than its scale; one whose place is not finite is not drawn. float32 tensors on
+    CUDA go through the kernels of `rasterize`, everything else (and systems without Triton) through plain torch; both
+    give the same pictures.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
@@ -93,11 +100,13 @@ def render(
     Returns:
         Features, alpha and depth.
     """
-    if means.is_cuda and means.dtype == torch.float32 and distortion is None and _has_triton():
+    if means.is_cuda and means.dtype == torch.float32 and _has_triton():
         from .rasterize import Raster, rasterize  # imports Triton
 
         raster = Raster(width, height, min_alpha, min_transmittance, capacity)
-        values, alpha, depth, middle, pairs = rasterize(means, scales, opacities, features, viewmats, Ks, raster)
+        values, alpha, depth, middle, pairs = rasterize(
+            means, scales, opacities, features, viewmats, Ks, raster, distortion
+        )
         return replace(_finished(values, alpha, depth, background, middle if median else None), pairs=pairs)
     camera_count = viewmats.shape[0]
     local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
@@ -138,9 +147,7 @@ def _finished(
     if background is not None:
         behind = background.expand(colours.shape[0], -1)[:, None, None, :]
         colours = colours + (1 - alpha)[..., None] * behind
-    seen = alpha > 0
-    depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1.0), 0.0)
-    return RenderOutput(colours, alpha, depth, median_depth)
+    return RenderOutput(colours, alpha, weighted_depth, median_depth)
 
 
 def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:

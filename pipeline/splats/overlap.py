@@ -1,0 +1,72 @@
+"""Whether photos show what they are said to show: a wrong convention or scale of the cameras would fit nonsense."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...schemas import InputDataError
+from .views import View
+from .volume import Array
+
+LEAST_SHARE = 0.05
+"""Of points in view of some photo: fewer are no overlap."""
+LEAST_COVERED = 0.1
+"""Of what photos see of a shape, inside of its masks: less than this, others before it would have to hide it nearly."""
+_HINT = (
+    "compare the conventions: poses camera to world with OpenCV axes (x right, y down, z forward), and one unit of "
+    "length for all; 'cgwm validate' reprojects what it can."
+)
+
+
+def require_points_in_view(points: Array, views: Sequence[View], what: str) -> float:
+    """Return the share of points (n, 3), world frame, that some photo has in its picture.
+
+    Raises:
+        InputDataError: If it is less than `LEAST_SHARE`.
+    """
+    share = float(np.mean(np.any([_in_picture(points, view)[0] for view in views], 0))) if len(points) else 1.0
+    if share < LEAST_SHARE:
+        raise InputDataError(
+            f"{what}: {share:.0%} of its {len(points)} points lie in view of any of the {len(views)} photos.",
+            f"at least {LEAST_SHARE:.0%}.",
+            _HINT,
+        )
+    return share
+
+
+def require_body_in_masks(surface: Array, views: Sequence[View], body: int, name: str) -> None:
+    """Check that a body's shape, where it is said to be, is where the masks show it.
+
+    Args:
+        surface: Points of its surface, world frame, shape (n, 3).
+        views: Photos with masks that show it.
+        body: Its place in the manifest.
+        name: Its name.
+
+    Raises:
+        InputDataError: If less than `LEAST_COVERED` of what the photos have of it in view lies inside its masks.
+    """
+    seen, covered = 0, 0
+    for view in views:
+        inside, column, row = _in_picture(surface, view)
+        seen += np.count_nonzero(inside)
+        if view.labels is not None:
+            covered += np.count_nonzero(inside & (view.labels[row, column] == body + 1))
+    if covered < LEAST_COVERED * seen or seen == 0:
+        raise InputDataError(
+            f"body '{name}': {seen / (len(surface) * len(views)):.0%} of the surface of its shape lies in view of the "
+            f"{len(views)} photos whose masks show it, and {covered / max(seen, 1):.0%} of that inside those masks.",
+            f"at least {LEAST_COVERED:.0%}.",
+            f"correct photo_pose, the body's pose while the photos were taken; and {_HINT}",
+        )
+
+
+def _in_picture(points: Array, view: View) -> tuple[Array, Array, Array]:
+    """Return which points a photo has in its picture (n,), and their columns and rows [px], inside of it."""
+    camera = view.camera
+    pixel, depth = camera.project(points)
+    inside = (depth > 0) & (pixel >= 0).all(1) & (pixel < [camera.width, camera.height]).all(1)
+    place = np.where(inside[:, None], pixel, 0).astype(int)
+    return inside, place[:, 0], place[:, 1]
