@@ -1,6 +1,7 @@
 """Held-out quality on real photos (`fox`, 540x960, every 8th held out) against gsplat's MCMC strategy, in one run.
 
-python benchmarks/fox.py [--spheres 100000] [--iterations 7000] [--peer gsplat|none] [--photos FOLDER]
+python benchmarks/fox.py [--spheres 100000] [--iterations 7000] [--peer gsplat|none] [--exposure on|off]
+    [--refine-poses] [--photos FOLDER]
 
 Both get spheres (one scale for all axes), the same budget, harmonics of degree 3, photos and iterations, and both start
 at random: gsplat's peer from the points from which its examples start, in the cameras' volume. Needs a CUDA device.
@@ -37,18 +38,26 @@ def capture_of(photos: Path, folder: Path) -> Capture:
     return Capture.open(folder)
 
 
-def ours(capture: Capture, spheres: int, iterations: int, device: str) -> dict[str, Any]:
+def ours(capture: Capture, spheres: int, iterations: int, device: str, **settings: bool) -> dict[str, Any]:
     """Return the figures of the stage sg-gs."""
     config = SplatConfig(
-        spheres=spheres, adaptive_iterations=iterations, image_size=SIZE, test_every=EVERY, device=device
+        spheres=spheres,
+        adaptive_iterations=iterations,
+        image_size=SIZE,
+        test_every=EVERY,
+        device=device,
+        turntable=False,
+        **settings,
     )
     record = fit_scene(capture, config).record
     held_out, scene = record["held_out"], record["scene"]
     return {
         "method": "cgwm",
+        **settings,
         "spheres": scene["spheres"],
         "psnr_db": held_out["psnr_db"],
         "ssim": held_out["ssim"],
+        **{name: held_out[name] for name in ("psnr_right_half_db", "psnr_right_half_corrected_db") if name in held_out},
         "seconds": scene["seconds"],
     }
 
@@ -142,6 +151,8 @@ def main() -> int:
     parser.add_argument("--peer", choices=("gsplat", "none"), default="gsplat")
     parser.add_argument("--photos", type=Path, default=None)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--exposure", choices=("on", "off"), default="on", help="whether photos get a gain each")
+    parser.add_argument("--refine-poses", action="store_true")
     options = parser.parse_args()
     data = shared_data()
     photos = options.photos or (data / "fox" if data else None)
@@ -150,7 +161,8 @@ def main() -> int:
         return 2
     with tempfile.TemporaryDirectory() as folder:
         capture = capture_of(photos, Path(folder) / "fox")
-        mine = ours(capture, options.spheres, options.iterations, options.device)
+        corrections = {"exposure": options.exposure == "on", "refine_poses": options.refine_poses}
+        mine = ours(capture, options.spheres, options.iterations, options.device, **corrections)
         print(json.dumps(mine), flush=True)
         if options.peer == "gsplat":
             print(json.dumps(peer(capture, options.spheres, options.iterations)), flush=True)

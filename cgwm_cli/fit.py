@@ -37,6 +37,9 @@ def fit(
     joint: Annotated[
         bool | None, typer.Option("--joint", help="Fit geometry and colours of bodies together, not geometry first.")
     ] = None,
+    exposure: Annotated[
+        bool | None, typer.Option("--exposure", help="Learn exposure and white balance of every photo.")
+    ] = None,
     refine_poses: Annotated[
         bool | None, typer.Option("--refine-poses", help="Refine the poses of the photos' cameras first.")
     ] = None,
@@ -57,7 +60,7 @@ def fit(
         from .settings import StageSettings
 
         settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
-        looks = {"spheres": spheres, "joint": joint, "refine_poses": refine_poses}
+        looks = {"spheres": spheres, "joint": joint, "exposure": exposure, "refine_poses": refine_poses}
         splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
         emit(

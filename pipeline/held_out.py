@@ -27,8 +27,9 @@ class HeldOut:
 
     Attributes:
         figures: Means over the photos, for fit.json: `psnr_db` and `ssim` of the whole picture, `psnr_object_db` and
-            `mask_iou` where masks show a body; where photos were corrected, `psnr_right_half_db`, that of the right
-            half of each picture, and `psnr_right_half_corrected_db`, with exposure and pose found on its left half.
+            `mask_iou` where masks show a body; `psnr_right_half_db`, that of the right half of each picture, and
+            `psnr_right_half_corrected_db`, with the photo's exposure (and its pose, where poses were refined) found on
+            its left half: what differs from photo to photo is not the scene's fault.
         sheet: Contact sheet, PNG, or None without photos.
     """
 
@@ -37,9 +38,7 @@ class HeldOut:
 
 
 @torch.no_grad()
-def look(
-    views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, spread: float, *, exposure: bool, poses: bool
-) -> HeldOut:
+def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, spread: float, *, poses: bool) -> HeldOut:
     """Compare photos with what the spheres show.
 
     Args:
@@ -47,8 +46,7 @@ def look(
         bodies: Visual spheres of the bodies, world frame.
         scene: The background, or None.
         spread: Size of the cameras' arrangement [m].
-        exposure: Whether the photos that were fitted were brought to one exposure.
-        poses: Whether their cameras were moved.
+        poses: Whether the cameras of the photos that were fitted were moved.
     """
     everything = Spheres.joined([*bodies, *([] if scene is None else [scene])])
     label = torch.zeros(len(everything), 1, device=everything.means.device)
@@ -68,10 +66,9 @@ def look(
             if true.any():
                 inside.append(psnr(picture, view.image, true))
                 overlap.append(float((true & mine).sum() / (true | mine).sum()))
-        if exposure or poses:
-            right = slice(view.image.shape[1] // 2, None)
-            shown = _corrected(everything, view, spread, exposure, poses)
-            halves.append((psnr(picture[:, right], view.image[:, right]), psnr(shown[:, right], view.image[:, right])))
+        right = slice(view.image.shape[1] // 2, None)
+        shown = _corrected(everything, view, spread, poses)
+        halves.append((psnr(picture[:, right], view.image[:, right]), psnr(shown[:, right], view.image[:, right])))
     sheet = None
     if pictures:
         sheet = small_png(compared([_bytes(view.image) for view in views], pictures), _SHEET_BYTES)
@@ -89,15 +86,15 @@ def look(
     return HeldOut(figures, sheet)
 
 
-def _corrected(spheres: Spheres, view: View, spread: float, exposure: bool, poses: bool) -> Tensor:
-    """Return the render of a photo in its own exposure and from its own pose, both found on its left half."""
+def _corrected(spheres: Spheres, view: View, spread: float, poses: bool) -> Tensor:
+    """Return the render of a photo in its own exposure (and from its own pose), both found on its left half."""
     left = torch.zeros_like(view.image[..., 0])
     left[:, : left.shape[1] // 2] = 1.0
     if poses:
         with torch.enable_grad():
             view = moved(view, find_motion(spheres, view, left, spread))
     picture = render_view(spheres, view).features[0]
-    return (picture * least_squares_gain(picture, view.image, left) if exposure else picture).clamp(0, 1)
+    return (picture * least_squares_gain(picture, view.image, left)).clamp(0, 1)
 
 
 def _bytes(picture: Tensor) -> NDArray[np.uint8]:

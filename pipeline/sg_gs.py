@@ -18,7 +18,7 @@ from ..datasets.capture import Capture
 from ..datasets.ply import Splats
 from ..schemas import Body, CamerasFile, Ground, InputDataError, Pose, SplatConfig, UsageError
 from .checkpoint import Checkpoint, Slot
-from .held_out import look
+from .held_out import HeldOut, look
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
 from .splats.collision import CollisionSpheres, distil, shape_to_spheres
@@ -28,7 +28,7 @@ from .splats.fit import Rates, Trainable, descend
 from .splats.hull import carve
 from .splats.losses import behind, body_loss, geometry_loss, scene_loss
 from .splats.overlap import require_body_in_masks, require_points_in_view
-from .splats.poses import learn_motions, motion_record, moved_for_good
+from .splats.poses import Motions, motion_record, moved_for_good
 from .splats.seeds import body_seeds, points_of_depth, scene_seeds, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
@@ -44,8 +44,10 @@ _START_SHARE = 0.3
 _DEPTH_POINTS = 20_000
 _GEOMETRY_SHARE = 0.5
 """How fast geometry still moves while colours are fitted, of how fast it moved before; 0 is the published form."""
+_UNEVEN_DB = 1.0
+"""Photos that gain so much from an exposure each were not taken at one."""
 _POSE_STEPS = 2.0
-"""Steps that refine the cameras' poses, in units of the setting `iterations`."""
+"""Steps that refine the cameras' poses without a budget of spheres, in units of the setting `iterations`."""
 
 
 @dataclass(frozen=True)
@@ -167,11 +169,11 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     scene = _fit_background(stage, placed) if stage.train else None
     pictures: dict[str, bytes] = {}
     if stage.train:
-        settings = {"exposure": config.exposure, "poses": config.refine_poses}
-        held_out = look(stage.test, placed, scene, stage.spread, **settings)
+        held_out = look(stage.test, placed, scene, stage.spread, poses=config.refine_poses)
         if config.exposure:
             stage.record["exposure_gain_rgb"] = stage.exposures.record()
         stage.record["held_out"] = held_out.figures
+        stage.warnings += _uneven(held_out, config)
         if held_out.sheet is not None:
             pictures["held_out.png"] = held_out.sheet
         if config.turntable:
@@ -184,13 +186,24 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
 
 
 def _refine_poses(stage: _Stage) -> None:
-    """Move the cameras to where the photos say that they were."""
+    """Move the cameras to where the photos say that they were, by a fit of the background that is then thrown away."""
     started = time.perf_counter()
-    start = _background_seeds(stage, stage.config.max_scene_spheres, None)
-    steps = stage.steps(_POSE_STEPS)
-    motions = learn_motions(stage.train, start, stage.exposures, stage.spread, steps, stage.config.seed)
-    stage.train = [moved_for_good(view, motions[view.name]) for view in stage.train]
-    stage.record["camera_poses"] = motion_record(motions) | {"seconds": round(time.perf_counter() - started, 2)}
+    motions = Motions(stage.train, stage.spread)
+    _background_spheres(stage, None, "camera poses", motions)
+    found = motions.found(stage.train)
+    stage.train = [moved_for_good(view, found[view.name]) for view in stage.train]
+    stage.record["camera_poses"] = motion_record(found) | {"seconds": round(time.perf_counter() - started, 2)}
+
+
+def _uneven(held_out: HeldOut, config: SplatConfig) -> list[str]:
+    """Return a warning where photos differ in exposure and the fit took them as they are."""
+    before, after = (held_out.figures[f"psnr_right_half_{name}db"] for name in ("", "corrected_"))
+    if config.exposure or before is None or after - before < _UNEVEN_DB:
+        return []
+    return [
+        f"Photos that the fit did not see agree {after - before:.1f} dB better when each has its own exposure: "
+        "fit again with --exposure."
+    ]
 
 
 def _refined_cameras(stage: _Stage) -> CamerasFile:
@@ -364,56 +377,43 @@ def _background_seeds(stage: _Stage, count: int, bodies: Spheres | None) -> Sphe
 
 
 def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
-    config = stage.config
     started = time.perf_counter()
-    count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))
     standing = Spheres.joined(bodies) if bodies else None
-    spheres = _background_seeds(stage, count, standing)
-    if config.spheres is not None:
-        return _adapted(stage, standing, spheres, config.spheres, started)
-    trainable = Trainable(spheres, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
-    losses = descend(
-        trainable,
-        stage.train,
-        scene_loss(standing, stage.exposures),
-        stage.steps(0.75),
-        config.seed,
-        "background",
-        0.001,
-        exposures=stage.exposures,
-        slot=stage.slot("background"),
-    )
-    stage.record["scene"] = {
-        "spheres": len(spheres),
-        "loss": _thinned(losses),
-        "seconds": round(time.perf_counter() - started, 2),
-    }
-    return _detached(trainable.spheres())
+    spheres, record = _background_spheres(stage, standing, "background", None)
+    seconds = round(time.perf_counter() - started, 2)
+    stage.record["scene"] = {"spheres": len(spheres), **record, "seconds": seconds}
+    return spheres
 
 
-def _adapted(stage: _Stage, bodies: Spheres | None, start: Spheres, budget: int, started: float) -> Spheres:
-    """Fit a background whose spheres multiply up to the budget."""
+def _background_spheres(
+    stage: _Stage, bodies: Spheres | None, what: str, motions: Motions | None
+) -> tuple[Spheres, dict[str, Any]]:
+    """Fit the spheres of the background, of which there are ever more where there is a budget; return how it went."""
     config = stage.config
+    loss = scene_loss(bodies, stage.exposures, motions)
+    slot = stage.slot(what)
+    if config.spheres is None:
+        start = _background_seeds(stage, config.max_scene_spheres, bodies)
+        trainable = Trainable(start, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
+        steps = stage.steps(0.75 if motions is None else _POSE_STEPS)
+        losses = descend(trainable, stage.train, loss, steps, config.seed, what, 0.001, stage.exposures, motions, slot)
+        return _detached(trainable.spheres()), {"loss": _thinned(losses)}
+    start = _background_seeds(stage, max(16, int(_START_SHARE * config.spheres)), bodies)
     spheres, history = fit_adaptively(
         start,
         stage.train,
-        scene_loss(bodies, stage.exposures),
-        budget=budget,
+        loss,
+        budget=config.spheres,
         degree=config.sh_degree,
         iterations=config.adaptive_iterations,
         spread=stage.spread,
         seed=config.seed,
-        what="background",
+        what=what,
         exposures=stage.exposures,
-        slot=stage.slot("background"),
+        motions=motions,
+        slot=slot,
     )
-    stage.record["scene"] = {
-        "spheres": len(spheres),
-        "sh_degree": config.sh_degree,
-        "history": [asdict(entry) for entry in history],
-        "seconds": round(time.perf_counter() - started, 2),
-    }
-    return spheres
+    return spheres, {"sh_degree": config.sh_degree, "history": [asdict(entry) for entry in history]}
 
 
 def _collision_record(spheres: CollisionSpheres) -> dict[str, float]:

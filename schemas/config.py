@@ -40,8 +40,8 @@ class SplatConfig(FileModel):
     """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
     joint: bool = False
     """Fit geometry and colours of bodies together, not geometry first."""
-    exposure: bool = True
-    """Bring the photos to one exposure and white balance first."""
+    exposure: bool = False
+    """Learn a gain of each colour channel for every photo: for photos whose exposure or white balance varies."""
     refine_poses: bool = False
     """Refine the poses of the photos' cameras first; the model then holds them in `cameras.json`."""
     turntable: bool = True

@@ -14,7 +14,7 @@ from cgwm.pipeline.splats.exposures import Exposures
 from cgwm.pipeline.splats.fit import Rates, Trainable, descend
 from cgwm.pipeline.splats.hull import Silhouette, carve
 from cgwm.pipeline.splats.losses import geometry_loss, normals_of, scene_loss
-from cgwm.pipeline.splats.poses import learn_motions, motion_record, moved_for_good
+from cgwm.pipeline.splats.poses import Motions, motion_record, moved_for_good
 from cgwm.pipeline.splats.spheres import Spheres
 from cgwm.pipeline.splats.views import load_views, render_view, spread_of
 from test_sg_gs import PLACE, make_capture, world
@@ -79,7 +79,10 @@ def test_camera_poses_are_refined_without_moving_the_world(views, truth):
     bare = [replace(view, cover=None) for view in views]  # all of the picture counts
     twists = [(*rng.normal(0, 0.006, 3), *rng.normal(0, 0.001, 3)) for _ in views]
     off = [_turned(view, twist) for view, twist in zip(bare, twists, strict=True)]
-    found = learn_motions(off, truth, Exposures(off, True), spread_of(views), 400, 0)
+    exposures, motions = Exposures(off, True), Motions(off, spread_of(views))
+    trainable = Trainable(truth, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
+    descend(trainable, off, scene_loss(None, exposures, motions), 400, 0, "test", 0.001, exposures, motions)
+    found = motions.found(off)
     moved = [moved_for_good(view, found[view.name]) for view in off]
     before, after = _disagreement(off, bare), _disagreement(moved, bare)
     assert before > 0.5  # pixels, at the body
@@ -109,9 +112,8 @@ def test_held_out_photos_are_corrected_by_their_left_half_alone(views, truth):
     darker = replace(views[0], image=views[0].image * 0.8)
     broken = darker.image.clone()
     broken[:, darker.size[0] // 2 :] = 0.123
-    settings = {"exposure": True, "poses": False}
     figures, other = (
-        look([one], [], truth, spread_of(views), **settings).figures for one in (darker, replace(darker, image=broken))
+        look([one], [], truth, spread_of(views), poses=False).figures for one in (darker, replace(darker, image=broken))
     )
     assert figures["psnr_right_half_db"] < 25
     assert figures["psnr_right_half_corrected_db"] > 60
@@ -121,7 +123,7 @@ def test_held_out_photos_are_corrected_by_their_left_half_alone(views, truth):
 def test_a_held_out_photo_finds_its_pose(views, truth):
     twist = (0.004, -0.003, 0.002, 0.001, 0.0, 0.001)
     off = _turned(replace(views[0], cover=None), twist)
-    figures = look([off], [], truth, spread_of(views), exposure=False, poses=True).figures
+    figures = look([off], [], truth, spread_of(views), poses=True).figures
     assert figures["psnr_right_half_corrected_db"] > figures["psnr_right_half_db"] + 5
 
 

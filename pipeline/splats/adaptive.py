@@ -21,6 +21,7 @@ from .exposures import Exposures
 from .fit import require_finite
 from .harmonics import term_count
 from .losses import Loss, psnr_of
+from .poses import Motions
 from .spheres import Spheres
 from .views import View
 
@@ -198,6 +199,7 @@ def fit_adaptively(
     seed: int,
     what: str,
     exposures: Exposures,
+    motions: Motions | None = None,
     slot: Slot | None = None,
 ) -> tuple[Spheres, list[Progress]]:
     """Fit spheres to photos, one photo an iteration.
@@ -213,6 +215,7 @@ def fit_adaptively(
         seed: Seed.
         what: Name of the stage, for the progress bar.
         exposures: What the loss learns of the photos' exposures, to be kept in checkpoints.
+        motions: What it learns of the cameras' poses.
         slot: Where checkpoints go, and from where an interrupted fit is taken up.
 
     Returns:
@@ -221,7 +224,7 @@ def fit_adaptively(
     Raises:
         NotConvergedError: If the loss or a sphere is no longer finite.
     """
-    run = _Run(Population(start, degree, spread), exposures, seed, start.means.device)
+    run = _Run(Population(start, degree, spread), exposures, motions, seed)
     first = run.restore(slot)
     bar = progress(range(first, iterations), what, total=iterations, initial=first)
     for iteration in bar:
@@ -232,6 +235,8 @@ def fit_adaptively(
         value.backward()
         run.losses.append(value.detach())
         run.population.step(iteration / iterations, run.noise)
+        if motions is not None:
+            motions.step(iteration / iterations)
         if iteration % REFINED_EVERY == 0 or iteration == iterations - 1:
             require_finite(run.losses, iteration, iterations, what)
             run.note(iteration, wrong)
@@ -251,10 +256,10 @@ def fit_adaptively(
 class _Run:
     """What a fit carries from one iteration to the next."""
 
-    def __init__(self, population: Population, exposures: Exposures, seed: int, device: torch.device) -> None:
-        self.population, self.exposures = population, exposures
+    def __init__(self, population: Population, exposures: Exposures, motions: Motions | None, seed: int) -> None:
+        self.population, self.exposures, self.motions = population, exposures, motions
         self.shuffle = torch.Generator().manual_seed(seed)
-        self.noise = torch.Generator(device).manual_seed(seed)
+        self.noise = torch.Generator(population.spheres().means.device).manual_seed(seed)
         self.order: list[int] = []
         self.losses: list[Tensor] = []
         self.history: list[Progress] = []
@@ -277,6 +282,7 @@ class _Run:
             "done": done,
             "population": self.population.state(),
             "exposures": self.exposures.state(),
+            "motions": None if self.motions is None else self.motions.state(),
             "shuffle": self.shuffle.get_state(),
             "noise": self.noise.get_state(),
             "order": self.order,
@@ -290,6 +296,8 @@ class _Run:
             return 0
         self.population.restore(state["population"])
         self.exposures.restore(state["exposures"])
+        if self.motions is not None:
+            self.motions.restore(state["motions"])
         self.shuffle.set_state(state["shuffle"].cpu())
         self.noise.set_state(state["noise"].cpu())
         self.order = state["order"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from ...schemas import NotConvergedError
 from ..checkpoint import Slot, State
 from .exposures import Exposures
 from .losses import Loss, psnr_of
+from .poses import Motions
 from .spheres import Spheres
 from .views import View
 
@@ -97,8 +97,8 @@ def descend(
     seed: int,
     what: str,
     drift_weight: float = 0.0,
-    beside: Sequence[dict[str, Any]] = (),
     exposures: Exposures | None = None,
+    motions: Motions | None = None,
     slot: Slot | None = None,
 ) -> list[float]:
     """Run Adam, one view an iteration, with step sizes that fall to a tenth.
@@ -111,9 +111,9 @@ def descend(
         seed: Seed.
         what: Name of the stage, for the progress bar.
         drift_weight: Weight of `Trainable.drift`.
-        beside: Groups of further parameters on which the loss depends, as Adam takes them.
         exposures: What the loss learns of the photos' exposures, to be kept in checkpoints.
-        slot: Where checkpoints go, and from where an interrupted descent is taken up; not together with `beside`.
+        motions: What it learns of the cameras' poses.
+        slot: Where checkpoints go, and from where an interrupted descent is taken up.
 
     Returns:
         The loss by iteration.
@@ -122,7 +122,7 @@ def descend(
         NotConvergedError: If the loss or what moves is no longer finite.
     """
     generator = torch.Generator().manual_seed(seed)
-    optimiser = torch.optim.Adam([*trainable.groups, *beside], eps=1e-12)
+    optimiser = torch.optim.Adam(trainable.groups, eps=1e-12)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(iterations, 1)))
     losses: list[Tensor] = []
     order: list[int] = []
@@ -133,8 +133,9 @@ def descend(
         decay.load_state_dict(state["decay"])
         generator.set_state(state["generator"].cpu())
         losses, order = list(state["losses"].unbind()), state["order"]
-        if exposures is not None:
-            exposures.restore(state["exposures"])
+        for carried, name in ((exposures, "exposures"), (motions, "motions")):
+            if carried is not None:
+                carried.restore(state[name])
     bar = progress(range(len(losses), iterations), what, total=iterations, initial=len(losses))
     for iteration in bar:
         if not order:
@@ -146,11 +147,15 @@ def descend(
         value.backward()
         optimiser.step()
         decay.step()
+        if motions is not None:
+            motions.step(iteration / iterations)
         losses.append(value.detach())
-        last = iteration == iterations - 1
-        if iteration % _LOOKED_EVERY == 0 or last:  # not oftener: on a GPU a look waits for it
+        # not oftener, for on a GPU a look waits until it is ready
+        if iteration % _LOOKED_EVERY == 0 or iteration == iterations - 1:
             require_finite(losses, iteration, iterations, what)
-            bar.set_postfix_str(f"{len(trainable.shift)} spheres, loss {float(value):.4f}, {psnr_of(wrong):.1f} dB")
+            bar.set_postfix_str(
+                f"{len(trainable.shift)} spheres, loss {float(losses[-1]):.4f}, {psnr_of(wrong):.1f} dB"
+            )
         if slot is not None and slot.due():
             require_finite(losses, iteration, iterations, what)
             slot.write(
@@ -162,6 +167,7 @@ def descend(
                     "losses": torch.stack(losses),
                     "order": order,
                     "exposures": None if exposures is None else exposures.state(),
+                    "motions": None if motions is None else motions.state(),
                 }
             )
     require_finite([group["params"][0].detach().sum() for group in trainable.groups], iterations - 1, iterations, what)

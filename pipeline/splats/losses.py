@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,6 +13,9 @@ from torch.nn import functional
 from .exposures import Exposures
 from .spheres import Spheres
 from .views import View, render_view
+
+if TYPE_CHECKING:
+    from .poses import Motions
 
 Loss = Callable[[Spheres, View, torch.Generator], tuple[Tensor, Tensor]]
 """The loss of one view [1], given a generator for whatever is random in it, and the mean square error of what was
@@ -153,14 +157,24 @@ def behind(bodies: Spheres | None, spheres: Spheres) -> Spheres:
     return spheres if bodies is None else Spheres.joined([bodies, spheres])
 
 
-def scene_loss(bodies: Spheres | None, exposures: Exposures) -> Loss:
-    """Return the loss of the background, with the bodies standing in it as they are; depth counts where it is known."""
+def scene_loss(bodies: Spheres | None, exposures: Exposures, motions: Motions | None = None) -> Loss:
+    """Return the loss of the background, with the bodies standing in it as they are; depth counts where it is known.
+
+    Args:
+        bodies: Visual spheres of the bodies, world frame, or None. Without them, pixels that masks give to bodies do
+            not count.
+        exposures: Gains of the photos, learned along.
+        motions: Motions of the cameras, where they are to be learned along.
+    """
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        view = view if motions is None else motions.moved(view)
         output = render_view(behind(bodies, spheres), view)
         exposures.follow(view, output.features[0].detach(), output.alpha[0].detach() > 0.5)
         picture = exposures.gain(view) * output.features[0]
-        value = photometric(picture, view.image)
+        value = photometric(picture, view.image, None if bodies is not None else scene_weight(view))
+        if motions is not None:
+            value = value + motions.prior(view)
         if view.depth is not None:
             seen = output.alpha[0].detach() > 0.5
             value = value + DEPTH_WEIGHT * depth_error(output.depth[0], view.depth, seen, view.depth.clamp_min(1e-6))

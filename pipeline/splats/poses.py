@@ -10,48 +10,70 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .exposures import Exposures, least_squares_gain
-from .fit import Rates, Trainable, descend
-from .losses import photometric, scene_weight
+from ..checkpoint import State
+from .exposures import least_squares_gain
+from .losses import photometric
 from .spheres import Spheres
 from .views import View, render_view
 
-_RATE = 1e-3
+RATE, LAST_RATE = 1e-3, 1e-4
+"""Adam's step size at the beginning and at the end; of angles [rad], of movements in units of the cameras' spread."""
+WAITING = 0.1
+"""Share of a fit during which the cameras stay, for there is nothing yet to stand right before."""
 _SPREAD = 0.02
-"""Standard deviation that the prior gives an angle [rad], or a movement of a camera in units of the cameras' spread."""
+"""Standard deviation that the prior gives an angle [rad], or a movement in units of the cameras' spread."""
 _PRIOR = 1e-4
-_SINGLE_STEPS = 60
+_SINGLE_RATE, _SINGLE_STEPS = 1e-3, 60
 
 
-def learn_motions(
-    views: Sequence[View], start: Spheres, exposures: Exposures, spread: float, iterations: int, seed: int
-) -> dict[str, Tensor]:
-    """Fit spheres to photos together with small motions of the cameras; return new camera frame from old one, (4, 4).
-
-    The spheres are thrown away. The cameras as a whole stand where they stood: photos alone do not tell.
+class Motions:
+    """A small motion of the camera for each photo, learned while spheres are fitted.
 
     Args:
-        views: The photos; pixels of bodies are left out where masks show them.
-        start: Spheres of the background.
-        exposures: Gains of the photos, learned along.
+        views: The photos.
         spread: Size of the cameras' arrangement [m], the unit of their movements.
-        iterations: Steps.
-        seed: Seed.
     """
-    twists = {view.name: view.image.new_zeros(6, requires_grad=True) for view in views}
 
-    def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        twist, weight = twists[view.name], scene_weight(view)
-        picture = render_view(spheres, moved(view, _motion(twist, spread))).features[0]
-        exposures.follow(view, picture.detach(), weight)
-        picture = exposures.gain(view) * picture
-        return _loss(picture, view, weight, twist), (picture - view.image).detach().square().mean()
+    def __init__(self, views: Sequence[View], spread: float) -> None:
+        self._spread = spread
+        self._twists = {view.name: view.image.new_zeros(6, requires_grad=True) for view in views}
+        self._adam = torch.optim.Adam(list(self._twists.values()), RATE)
 
-    trainable = Trainable(start, Rates(means=0.02, log_scales=0.01, logits=0.03, colors=0.015))
-    beside = [{"params": list(twists.values()), "lr": _RATE}]
-    descend(trainable, views, loss, iterations, seed, "camera poses", 0.001, beside)
-    with torch.no_grad():
-        return _anchored(views, {view.name: _motion(twists[view.name], spread) for view in views})
+    def moved(self, view: View) -> View:
+        """Return a photo as its camera stands now, connected to what is learned; its `camera` stays."""
+        return replace(view, viewmat=_motion(self._twists[view.name], self._spread) @ view.viewmat)
+
+    def prior(self, view: View) -> Tensor:
+        """Return the penalty of a photo's motion, ()."""
+        return _prior(self._twists[view.name])
+
+    def step(self, share: float) -> None:
+        """Move the cameras whose photos were looked at; `share` of the fit is over."""
+        self._adam.param_groups[0]["lr"] = 0.0 if share < WAITING else RATE * (LAST_RATE / RATE) ** share
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+    @torch.no_grad()
+    def found(self, views: Sequence[View]) -> dict[str, Tensor]:
+        """Return new camera frame from old one (4, 4) by photo; the cameras as a whole stand where they stood.
+
+        Photos alone do not tell a motion of all cameras from one of the world.
+        """
+        return _anchored(views, {view.name: _motion(self._twists[view.name], self._spread) for view in views})
+
+    def state(self) -> State:
+        """Return the motions, for a checkpoint."""
+        return {
+            "twists": {name: twist.detach() for name, twist in self._twists.items()},
+            "adam": self._adam.state_dict(),
+        }
+
+    @torch.no_grad()
+    def restore(self, state: State) -> None:
+        """Take up what `state` returned."""
+        for name, twist in self._twists.items():
+            twist.copy_(state["twists"][name])
+        self._adam.load_state_dict(state["adam"])
 
 
 def find_motion(spheres: Spheres, view: View, weight: Tensor, spread: float) -> Tensor:
@@ -64,13 +86,15 @@ def find_motion(spheres: Spheres, view: View, weight: Tensor, spread: float) -> 
         spread: Size of the cameras' arrangement [m].
     """
     twist = view.image.new_zeros(6, requires_grad=True)
-    optimiser = torch.optim.Adam([twist], _RATE)
+    optimiser = torch.optim.Adam([twist], _SINGLE_RATE)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimiser, (LAST_RATE / _SINGLE_RATE) ** (1 / _SINGLE_STEPS))
     for _ in range(_SINGLE_STEPS):
         picture = render_view(spheres, moved(view, _motion(twist, spread))).features[0]
         picture = picture * least_squares_gain(picture.detach(), view.image, weight)
         optimiser.zero_grad()
-        _loss(picture, view, weight, twist).backward()
+        (photometric(picture, view.image, weight) + _prior(twist)).backward()
         optimiser.step()
+        decay.step()
     return _motion(twist.detach(), spread)
 
 
@@ -95,8 +119,8 @@ def motion_record(motions: Mapping[str, Tensor]) -> dict[str, Any]:
     }
 
 
-def _loss(picture: Tensor, view: View, weight: Tensor, twist: Tensor) -> Tensor:
-    return photometric(picture, view.image, weight) + _PRIOR * (twist / _SPREAD).square().sum()
+def _prior(twist: Tensor) -> Tensor:
+    return _PRIOR * (twist / _SPREAD).square().sum()
 
 
 def _motion(twist: Tensor, spread: float) -> Tensor:
