@@ -34,6 +34,10 @@ def fit(
         int | None,
         typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres that go where needed."),
     ] = None,
+    collision: Annotated[
+        Literal["distilled", "visual"] | None,
+        typer.Option("--collision", show_default="distilled", help="What collides: a small set, or what is seen."),
+    ] = None,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -50,7 +54,9 @@ def fit(
         from .settings import StageSettings
 
         settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
-        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, spheres=spheres)
+        splats = settings.configure(
+            "sg-gs", SplatConfig, seed=seed, device=device, spheres=spheres, collision=collision
+        )
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
         emit(work(capture, out, stage, parent, split, splats, physics, overwrite), lambda model: _summary(model, out))
 

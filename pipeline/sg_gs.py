@@ -19,7 +19,7 @@ from ..schemas import Body, Ground, InputDataError, Pose, SplatConfig, UsageErro
 from .reporting.pictures import compared, small_png
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
-from .splats.collision import CollisionSpheres, distil, shape_to_spheres
+from .splats.collision import distil, shape_to_spheres
 from .splats.fit import (
     Rates,
     Trainable,
@@ -36,10 +36,11 @@ from .splats.fit import (
     ssim_map,
 )
 from .splats.hull import carve
-from .splats.seeds import body_seeds, scene_seeds, to_spheres
+from .splats.seeds import body_seeds, scene_seeds, shows_bodies, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
 from .splats.stereo import refine
+from .splats.surface import Union
 from .splats.views import View, load_views
 from .splats.volume import Array, MassProperties, Volume, grid_points
 
@@ -122,6 +123,12 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult
     config = config or SplatConfig()
     started = time.perf_counter()
     stage = _open(capture, config)
+    if config.collision == "visual" and not stage.train:
+        raise UsageError(
+            "--collision visual: no photos, so that there are no visual spheres to collide.",
+            "distilled (the default): spheres made from the shapes in capture.toml.",
+            "leave the option out, or add photos and masks.",
+        )
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
     for index, body in enumerate(capture.manifest.bodies):
@@ -213,12 +220,16 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
         spheres = distil(local, stage.config.max_collision_spheres, seed=stage.config.seed)
         collision, distance = spheres.splats(stage.config.radius_factor), spheres.distance_m
         mass_properties = _turned(solid.mass_properties(), T_body_world)
-        stage.record[body.name]["collision"] = _collision_record(spheres)
+        stage.record[body.name]["collision"] = {"support_error_m": spheres.support_error_m}
     visual = None
     if world is not None and solid is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
         nearest = KDTree(solid.surface).query(world.means.cpu().numpy())[1]
         visual = replace(visual, normals=solid.normals[nearest] @ T_body_world[:3, :3].T)
+        if stage.config.collision == "visual":
+            collision = visual
+            distance = float(_union(visual, stage.config).distance(_moved(solid, T_body_world).surface).max())
+        _record_collision(stage, body.name, collision, visual, distance)
     pose = body.photo_pose or _pose(T_world_body)
     return BodyResult(visual, collision, distance, pose, mass_properties), world
 
@@ -267,7 +278,8 @@ def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     path = stage.capture.root / POINTS_NAME
     points = read_points(path)[0] if path.is_file() else None
     if points is None and stage.ground is None:
-        stage.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
+        where = "lies on a shell far away" if shows_bodies(stage.train) else "starts from random points"
+        stage.warnings.append(f"No {POINTS_NAME} and no ground: the background {where}.")
     count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))
     centers, scales = scene_seeds(stage.train, stage.ground, points, count, config.seed)
     if len(scales) == 0:
@@ -366,12 +378,17 @@ def _bytes(picture: Tensor) -> NDArray[np.uint8]:
     return (picture * 255).round().to(torch.uint8).cpu().numpy()
 
 
-def _collision_record(spheres: CollisionSpheres) -> dict[str, float]:
-    return {
-        "spheres": len(spheres.radii),
-        "surface_distance_m": spheres.distance_m,
-        "support_error_m": spheres.support_error_m,
-    }
+def _record_collision(stage: _Stage, name: str, collision: Splats, visual: Splats, distance: float) -> None:
+    """Record how far what collides is from the solid, and from what is seen."""
+    record: dict[str, Any] = {"set": stage.config.collision, "spheres": len(collision), "surface_distance_m": distance}
+    if collision is not visual:
+        there, back = _union(collision, stage.config).gaps(_union(visual, stage.config))
+        record |= {"to_visual": asdict(there), "from_visual": asdict(back)}
+    stage.record[name]["collision"] = stage.record[name].get("collision", {}) | record
+
+
+def _union(splats: Splats, config: SplatConfig) -> Union:
+    return Union.of(np.asarray(splats.means), config.radius_factor * np.asarray(splats.scales))
 
 
 def _detached(spheres: Spheres) -> Spheres:

@@ -38,7 +38,10 @@ class SplatConfig(FileModel):
     """Steps of the background's fit where there is a budget."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
-    max_collision_spheres: Annotated[int, Field(ge=8)] = 128
+    collision: Literal["distilled", "visual"] = "distilled"
+    """What collides: a small set of spheres distilled from a body's solid, or its visual spheres themselves."""
+    max_collision_spheres: Annotated[int, Field(ge=8)] = 200
+    """Most spheres of a distilled set; fewer where their surface is within 0.2 % of the solid's size on average."""
     image_size: Annotated[int, Field(ge=32)] = 320
     """Photos are reduced to this longer side [px] for fitting."""
     test_every: Annotated[int, Field(ge=2)] = 8
