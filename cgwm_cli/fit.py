@@ -44,6 +44,10 @@ def fit(
         bool | None, typer.Option("--refine-poses", help="Refine the poses of the photos' cameras first.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a fit of MODEL that was interrupted.")] = False,
+    collision: Annotated[
+        Literal["distilled", "visual"] | None,
+        typer.Option("--collision", show_default="distilled", help="What collides: a small set, or what is seen."),
+    ] = None,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -60,7 +64,13 @@ def fit(
         from .settings import StageSettings
 
         settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
-        looks = {"spheres": spheres, "joint": joint, "exposure": exposure, "refine_poses": refine_poses}
+        looks = {
+            "spheres": spheres,
+            "joint": joint,
+            "exposure": exposure,
+            "refine_poses": refine_poses,
+            "collision": collision,
+        }
         splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
         emit(

@@ -88,12 +88,16 @@ def learn_appearance(model: Model, capture: Capture, exposures: dict[str, Exposu
         return model
     ratio, now, photo = (np.concatenate([row[k] for row in rows]) for k in range(3))
     light = fit_light(ratio, now, photo, SIDES_PER_FRAME * len(rows))
-    splats = dict(model.body_splats)
+    splats, collision = dict(model.body_splats), dict(model.collision)
     for index, body in enumerate(model.file.bodies):
         mine = [frame for frame in frames if frame.body == index]
         if mine:
             splats[body.name] = _colored(model, index, mine, light, seen[body.name])
-    return replace(model, file=model.file.model_copy(update={"light": light}), body_splats=splats)
+            # where the visual spheres collide, they stay one set
+            if model.collision.get(body.name) is model.body_splats[body.name]:
+                collision[body.name] = splats[body.name]
+    file = model.file.model_copy(update={"light": light})
+    return replace(model, file=file, body_splats=splats, collision=collision)
 
 
 def fit_light(ratio: Array, normals_now: Array, normals_photo: Array, independent: float) -> Light:

@@ -21,7 +21,7 @@ from .checkpoint import Checkpoint, Slot
 from .held_out import HeldOut, look
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
-from .splats.collision import CollisionSpheres, distil, shape_to_spheres
+from .splats.collision import distil, shape_to_spheres
 from .splats.colors import mean_colors
 from .splats.exposures import Exposures
 from .splats.fit import Rates, Trainable, descend
@@ -29,10 +29,11 @@ from .splats.hull import carve
 from .splats.losses import behind, body_loss, geometry_loss, scene_loss
 from .splats.overlap import require_body_in_masks, require_points_in_view
 from .splats.poses import Motions, motion_record, moved_for_good
-from .splats.seeds import body_seeds, points_of_depth, scene_seeds, to_spheres
+from .splats.seeds import body_seeds, points_of_depth, scene_seeds, shows_bodies, to_spheres
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
 from .splats.stereo import refine
+from .splats.surface import Union
 from .splats.views import View, body_windows, load_views, spread_of
 from .splats.volume import Array, MassProperties, Volume, grid_points
 from .turntable import turntable, upward
@@ -42,8 +43,6 @@ _FEW_IN_VIEW = 0.5
 _START_SHARE = 0.3
 """Of a budget: spheres of the background at the beginning."""
 _DEPTH_POINTS = 20_000
-_GEOMETRY_SHARE = 0.5
-"""How fast geometry still moves while colours are fitted, of how fast it moved before; 0 is the published form."""
 _UNEVEN_DB = 1.0
 """Photos that gain so much from an exposure each were not taken at one."""
 _POSE_STEPS = 2.0
@@ -119,7 +118,8 @@ class _Stage:
         if not path.is_file():
             found = points_of_depth(self.train, _DEPTH_POINTS, self.config.seed)
             if found is None and self.ground is None:
-                self.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
+                where = "lies on a shell far away" if shows_bodies(self.train) else "starts from random points"
+                self.warnings.append(f"No {POINTS_NAME} and no ground: the background {where}.")
             return found
         found = read_points(path)[0]
         share = require_points_in_view(found, self.train, str(path))
@@ -158,6 +158,12 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     config = config or SplatConfig()
     started = time.perf_counter()
     stage = _open(capture, config, checkpoint)
+    if config.collision == "visual" and not stage.train:
+        raise UsageError(
+            "--collision visual: no photos, so that there are no visual spheres to collide.",
+            "distilled (the default): spheres made from the shapes in capture.toml.",
+            "leave the option out, or add photos and masks.",
+        )
     if stage.train and config.refine_poses:
         _refine_poses(stage)
     results: dict[str, BodyResult] = {}
@@ -288,12 +294,16 @@ def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Sphere
         spheres = distil(local, stage.config.max_collision_spheres, seed=stage.config.seed)
         collision, distance = spheres.splats(stage.config.radius_factor), spheres.distance_m
         mass_properties = _turned(solid.mass_properties(), T_body_world)
-        stage.record[body.name]["collision"] = _collision_record(spheres)
+        stage.record[body.name]["collision"] = {"support_error_m": spheres.support_error_m}
     visual = None
     if world is not None and solid is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
         nearest = KDTree(solid.surface).query(world.means.cpu().numpy())[1]
         visual = replace(visual, normals=solid.normals[nearest] @ T_body_world[:3, :3].T)
+        if stage.config.collision == "visual":
+            collision = visual
+            distance = float(_union(visual, stage.config).distance(_moved(solid, T_body_world).surface).max())
+        _record_collision(stage, body.name, collision, visual, distance)
     pose = body.photo_pose or _pose(T_world_body)
     return BodyResult(visual, collision, distance, pose, mass_properties), world
 
@@ -322,8 +332,8 @@ def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Sphere
     if not config.joint:
         spheres, losses = _fit_geometry(stage, index, body, solid, spheres, windows, geometry)
         record["geometry_loss"] = _thinned(losses)
-        share = _GEOMETRY_SHARE
-        geometry = Rates(share * geometry.means, share * geometry.log_scales, geometry.logits)
+        rate = config.geometry_rate
+        geometry = Rates(rate * geometry.means, rate * geometry.log_scales, geometry.logits)
     even = [stage.exposures.even(window) for window in windows]
     spheres = replace(spheres, colors=mean_colors(spheres, even, index))
     appearance = Trainable(spheres, replace(geometry, colors=0.02))
@@ -416,12 +426,17 @@ def _background_spheres(
     return spheres, {"sh_degree": config.sh_degree, "history": [asdict(entry) for entry in history]}
 
 
-def _collision_record(spheres: CollisionSpheres) -> dict[str, float]:
-    return {
-        "spheres": len(spheres.radii),
-        "surface_distance_m": spheres.distance_m,
-        "support_error_m": spheres.support_error_m,
-    }
+def _record_collision(stage: _Stage, name: str, collision: Splats, visual: Splats, distance: float) -> None:
+    """Record how far what collides is from the solid, and from what is seen."""
+    record: dict[str, Any] = {"set": stage.config.collision, "spheres": len(collision), "surface_distance_m": distance}
+    if collision is not visual:
+        there, back = _union(collision, stage.config).gaps(_union(visual, stage.config))
+        record |= {"to_visual": asdict(there), "from_visual": asdict(back)}
+    stage.record[name]["collision"] = stage.record[name].get("collision", {}) | record
+
+
+def _union(splats: Splats, config: SplatConfig) -> Union:
+    return Union.of(np.asarray(splats.means), config.radius_factor * np.asarray(splats.scales))
 
 
 def _detached(spheres: Spheres) -> Spheres:

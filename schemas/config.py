@@ -40,13 +40,19 @@ class SplatConfig(FileModel):
     """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
     joint: bool = False
     """Fit geometry and colours of bodies together, not geometry first."""
+    geometry_rate: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """How fast a body's geometry still moves while its colours are fitted, of how fast it moved before; 0 leaves it as
+    the silhouettes and maps had it, the published form."""
     exposure: bool = False
     """Learn a gain of each colour channel for every photo: for photos whose exposure or white balance varies."""
     refine_poses: bool = False
     """Refine the poses of the photos' cameras first; the model then holds them in `cameras.json`."""
     turntable: bool = True
     """Write a film around what was fitted, `turntable.mp4`."""
-    max_collision_spheres: Annotated[int, Field(ge=8)] = 128
+    collision: Literal["distilled", "visual"] = "distilled"
+    """What collides: a small set of spheres distilled from a body's solid, or its visual spheres themselves."""
+    max_collision_spheres: Annotated[int, Field(ge=8)] = 200
+    """Most spheres of a distilled set; fewer where their surface is within 0.2 % of the solid's size on average."""
     image_size: Annotated[int, Field(ge=32)] = 320
     """Photos are reduced to this longer side [px] for fitting."""
     test_every: Annotated[int, Field(ge=2)] = 8

@@ -8,26 +8,31 @@ finds a body there.
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from ...datasets.ply import Splats, read_splats
 from ...schemas import InputDataError, Shape
 from .directions import fibonacci_directions
 from .mesh import mesh_volume, read_mesh
+from .surface import union_distance
 from .volume import Array, Volume, crossings, grid_points
 
 DIRECTIONS = 1500
 """Number of directions in which the support function is held."""
 _SUPPORT_TOLERANCE = 1e-3  # of the solid's size
-_SURFACE_TOLERANCE = 2e-3
+_MEAN_TOLERANCE, _MOST_TOLERANCE = 2e-3, 7.5e-3
+"""Mean and largest gap, in units of the solid's size, below which no more spheres are added."""
 _SMALLEST_RADIUS = 2e-3
 _SUPPORT_SHARE = 0.7
 _FILL_SHARE = 0.08
-_SAMPLES = 6000
+_SAMPLES = 4000
 _CORNER_RADIUS_M = 2.5e-4
 
 
@@ -136,7 +141,7 @@ def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = N
         _add_support(chosen, solid, int(_SUPPORT_SHARE * (budget - fill)), _SUPPORT_TOLERANCE * size)
     samples = np.random.default_rng(seed).permutation(solid.surface.shape[0])[:_SAMPLES]
     points, normals = solid.surface[samples], solid.normals[samples]
-    _add_cover(chosen, solid, points, normals, max_spheres - fill, _SURFACE_TOLERANCE * size)
+    _add_cover(chosen, solid, points, normals, max_spheres - fill)
     if isinstance(solid, Volume):
         _add_fill(chosen, solid, max_spheres)
     centers, radii = chosen.arrays()
@@ -156,14 +161,6 @@ def support_of_spheres(centers: Array, radii: Array, directions: Array | None = 
     """Return max n . c + r over spheres [m], for each direction, shape (D,)."""
     directions = fibonacci_directions(DIRECTIONS) if directions is None else directions
     return (directions @ centers.T + radii).max(1)
-
-
-def union_distance(centers: Array, radii: Array, points: Array) -> Array:
-    """Return min |p - c| - r over spheres at points (n, 3) [m]: the exact distance outside of their union."""
-    result = np.full(points.shape[0], np.inf)
-    for center, radius in zip(centers, radii, strict=True):
-        np.minimum(result, np.linalg.norm(points - center, axis=1) - radius, out=result)
-    return result
 
 
 class _Chosen:
@@ -200,15 +197,46 @@ def _add_support(chosen: _Chosen, solid: Solid, limit: int, tolerance: float) ->
         lack = np.minimum(lack, (points * directions).sum(1) - (directions @ center + radii[worst]))
 
 
-def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, limit: int, tolerance: float) -> None:
-    """Add spheres that touch the surface from inside at the point that is farthest from all spheres so far."""
+def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, limit: int) -> None:
+    """Add spheres that touch the surface from inside until its points are near to one, on average and each.
+
+    The gap of a point is its distance from all spheres so far. First each sphere is the one that lessens the sum of the
+    gaps most; what it lessens it by can only fall while others are added (the sum is submodular), so a candidate is
+    weighed anew only when its old worth is the greatest. Then each is the one that comes nearest to the worst point.
+    """
     radii = _inscribed_radii(solid, points, normals)
-    gap = union_distance(*chosen.arrays(), points)
-    while chosen.count < limit and gap.max() > tolerance:
+    centers = points - radii[:, None] * normals
+    # at a notch or a tip even the smallest sphere may stick out
+    inside = solid.at(centers) + radii <= 2 * solid.tolerance
+    radii, centers = radii[inside], centers[inside]
+    gap = np.maximum(union_distance(*chosen.arrays(), points), 0.0).astype(np.float32)
+    gap = np.minimum(gap, np.float32(solid.size()))
+    reach = _gaps(centers, radii, points)
+    queue = [(-float(np.maximum(gap - row, 0).sum()), index) for index, row in enumerate(reach)]
+    heapq.heapify(queue)
+    while chosen.count < limit and queue and gap.mean() > _MEAN_TOLERANCE * solid.size():
+        _, index = heapq.heappop(queue)
+        worth = float(np.maximum(gap - reach[index], 0).sum())
+        if queue and worth < -queue[0][0]:
+            heapq.heappush(queue, (-worth, index))
+            continue
+        chosen.add(centers[index], float(radii[index]))
+        gap = np.minimum(gap, reach[index])
+    while chosen.count < limit and gap.max() > _MOST_TOLERANCE * solid.size():
         worst = int(np.argmax(gap))
-        center = points[worst] - radii[worst] * normals[worst]
-        chosen.add(center, float(radii[worst]))
-        gap = np.minimum(gap, np.linalg.norm(points - center, axis=1) - radii[worst])
+        index = int(np.argmin(reach[:, worst]))
+        if reach[index, worst] >= gap[worst]:
+            break
+        chosen.add(centers[index], float(radii[index]))
+        gap = np.minimum(gap, reach[index])
+
+
+def _gaps(centers: Array, radii: Array, points: Array) -> NDArray[np.float32]:
+    """Return how far each sphere leaves each point outside [m], shape (spheres, points)."""
+    result = np.empty((len(radii), len(points)), np.float32)
+    for rows in np.array_split(np.arange(len(radii)), max(1, len(radii) // 500)):
+        result[rows] = np.maximum(cdist(centers[rows], points) - radii[rows, None], 0)
+    return result
 
 
 def _add_fill(chosen: _Chosen, solid: Volume, limit: int) -> None:

@@ -97,8 +97,9 @@ def scene_seeds(
     """Return spheres for what is not a body: ground, SfM points, and a shell far away.
 
     Ground that the photos show is covered by cells, small where its picture has detail; elsewhere SfM points stand for
-    the surfaces, or random points where there is neither. Rays that meet nothing end on a shell, which is closed, so
-    that no view looks out of the world.
+    the surfaces. Where there is neither, random points do, but not around a body that masks show: whatever stands
+    before one camera would hide the body from its neighbours. Rays that meet nothing end on a shell, which is closed,
+    so that no view looks out of the world.
 
     Args:
         views: The photos; pixels of bodies are left out.
@@ -118,7 +119,7 @@ def scene_seeds(
     rest = max_spheres - shell_budget
     parts: list[tuple[Array, Array]] = []
     standing = points = None if points is None else points[~_on_bodies(points, views)]
-    if points is None and ground is None:
+    if points is None and ground is None and not shows_bodies(views):
         standing = _random_points(views, rest, rng)
     elif points is not None and ground is not None:
         standing = points[points @ np.array(ground.normal) - ground.offset_m > 0.02 * spread]
@@ -131,6 +132,11 @@ def scene_seeds(
         sample = sample.chosen(~hits)
     parts.append(_shell(sample, cameras, points, shell_budget))
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def shows_bodies(views: Sequence[View]) -> bool:
+    """Tell whether a mask shows a body."""
+    return any(view.cover is not None and bool((view.cover > 0.5).any()) for view in views)
 
 
 def _on_bodies(points: Array, views: Sequence[View]) -> Array:
