@@ -10,8 +10,8 @@ from .atomic import new_directory
 from .kinds import refuse_other_kind
 from .ply import Splats, read_splats, write_splats
 
-HELD_OUT = "held_out.png"
-"""Name of the contact sheet in a model's directory."""
+HELD_OUT, SEPARATION = "held_out.png", "separation.png"
+"""Names of the contact sheets in a model's directory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class Model:
         scene: Background spheres, world frame, or None.
         fit: `fit.json`.
         held_out: `held_out.png`: photos that the fit did not see, its renders of them, and the error; or None.
+        separation: `separation.png`: what was taken for bodies without masks; or None.
     """
 
     root: Path | None
@@ -36,6 +37,7 @@ class Model:
     scene: Splats | None = None
     fit: FitFile = field(default_factory=FitFile)
     held_out: bytes | None = None
+    separation: bytes | None = None
 
     def body(self, name: str) -> BodyModel:
         """Return the entry of a body in `model.json`."""
@@ -60,8 +62,10 @@ def read_model(path: Path | str) -> Model:
             collision[body.name] = read_splats(_inside(root, body.collision))
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
-    held_out = (root / HELD_OUT).read_bytes() if (root / HELD_OUT).is_file() else None
-    return Model(root, file, body_splats, collision, scene, fit, held_out)
+    held_out, separation = (
+        (root / name).read_bytes() if (root / name).is_file() else None for name in (HELD_OUT, SEPARATION)
+    )
+    return Model(root, file, body_splats, collision, scene, fit, held_out, separation)
 
 
 def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
@@ -86,8 +90,9 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
             write_splats(directory / name, splats, "body")
         if model.scene is not None:
             write_splats(directory / "scene.ply", model.scene, "world")
-        if model.held_out is not None:
-            (directory / HELD_OUT).write_bytes(model.held_out)
+        for name, picture in ((HELD_OUT, model.held_out), (SEPARATION, model.separation)):
+            if picture is not None:
+                (directory / name).write_bytes(picture)
         (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
         (directory / "model.json").write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)

@@ -162,6 +162,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
         scene.scene,
         FitFile(stages={"sg-gs": scene.record}),
         scene.held_out,
+        scene.separation,
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..datasets.capture import Capture
 from ..datasets.ply import Splats
 from ..schemas import Body, Ground, InputDataError, Pose, SplatConfig, UsageError
-from .reporting.pictures import compared, small_png
+from .reporting.pictures import compared, separated, small_png
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
 from .splats.collision import CollisionSpheres, distil, shape_to_spheres
@@ -37,6 +37,7 @@ from .splats.fit import (
 )
 from .splats.hull import carve
 from .splats.seeds import body_seeds, scene_seeds, to_spheres
+from .splats.separation import separate
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
 from .splats.stereo import refine
@@ -78,6 +79,7 @@ class SgGsResult:
         record: Losses, timings and held-out figures, for fit.json.
         warnings: What the user should know.
         held_out: Contact sheet of the photos that the fit did not see, PNG, or None where it saw all.
+        separation: Contact sheet of what was taken for bodies without masks, PNG, or None where there were none.
     """
 
     bodies: dict[str, BodyResult]
@@ -86,6 +88,7 @@ class SgGsResult:
     record: dict[str, Any]
     warnings: tuple[str, ...] = ()
     held_out: bytes | None = None
+    separation: bytes | None = None
 
 
 @dataclass
@@ -108,20 +111,21 @@ class _Stage:
 def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult:
     """Fit spheres to the photos of a capture.
 
-    Bodies need masks or a shape. With masks, a body's solid is its visual hull (or its shape); its spheres are fitted
-    geometry first, to the silhouettes, then appearance. Everything else becomes the background. Without photos, bodies
-    get colliding spheres from their shapes and no visual ones.
+    Bodies need masks or a shape, or else a box or the ground to be separated by. With masks, a body's solid is its
+    visual hull (or its shape); its spheres are fitted geometry first, to the silhouettes, then appearance. Everything
+    else becomes the background. Without photos, bodies get colliding spheres from their shapes and no visual ones.
 
     Args:
         capture: The capture, calibrated where it has photos; the cameras may be unscaled.
         config: Settings.
 
     Raises:
-        InputDataError: If a body has neither masks nor a shape, or photos have no cameras.
+        InputDataError: If a body has none of these, or photos have no cameras.
     """
     config = config or SplatConfig()
     started = time.perf_counter()
     stage = _open(capture, config)
+    separation = _separated(stage)
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
     for index, body in enumerate(capture.manifest.bodies):
@@ -134,7 +138,7 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None) -> SgGsResult
         stage.record["held_out"], sheet = _held_out(stage, placed, scene)
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     splats = None if scene is None else scene.to_numpy()
-    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), sheet)
+    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), sheet, separation)
 
 
 def _open(capture: Capture, config: SplatConfig) -> _Stage:
@@ -175,6 +179,23 @@ def resolve_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: no CUDA device was found.", "auto, cpu, cuda.", "run 'cgwm doctor'.")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _separated(stage: _Stage) -> bytes | None:
+    """Give the photos masks of bodies that have none; return a picture of them."""
+    found = separate(stage.capture, stage.train, stage.test, stage.ground, _sparse_points(stage), stage.config.seed)
+    if found is None:
+        return None
+    stage.train, stage.test = found.train, found.test
+    stage.record["separation"] = found.record
+    stage.warnings += found.warnings
+    masks = [(view.cover > 0.5).any(0).cpu().numpy() for view in found.train if view.cover is not None]
+    return small_png(separated([_bytes(view.image) for view in found.train], masks), 3_000_000)
+
+
+def _sparse_points(stage: _Stage) -> Array | None:
+    path = stage.capture.root / POINTS_NAME
+    return read_points(path)[0] if path.is_file() else None
 
 
 def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Spheres | None]:
@@ -264,8 +285,7 @@ def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Sphere
 def _fit_background(stage: _Stage, bodies: list[Spheres]) -> Spheres:
     config = stage.config
     started = time.perf_counter()
-    path = stage.capture.root / POINTS_NAME
-    points = read_points(path)[0] if path.is_file() else None
+    points = _sparse_points(stage)
     if points is None and stage.ground is None:
         stage.warnings.append(f"No {POINTS_NAME} and no ground: the background starts from random points.")
     count = config.max_scene_spheres if config.spheres is None else max(16, int(_START_SHARE * config.spheres))

@@ -149,19 +149,24 @@ def _on_bodies(points: Array, views: Sequence[View]) -> Array:
     return inside > 0.6 * np.maximum(seen, 1)
 
 
-def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Array:
-    """Return points in a ball around where the cameras look, (count, 3): a start where nothing else is known."""
+def focus(views: Sequence[View]) -> Array:
+    """Return the point that the cameras' axes pass nearest to, world frame [m], shape (3,)."""
     system, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         axis = view.camera.T_world_cam[:3, 2]
         across = np.eye(3) - np.outer(axis, axis)
         system += across
         right += across @ view.camera.center
-    focus = np.linalg.lstsq(system, right, rcond=None)[0]
-    radius = float(np.median([np.linalg.norm(view.camera.center - focus) for view in views]))
+    return np.linalg.lstsq(system, right, rcond=None)[0]
+
+
+def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Array:
+    """Return points in a ball around where the cameras look, (count, 3): a start where nothing else is known."""
+    middle = focus(views)
+    radius = float(np.median([np.linalg.norm(view.camera.center - middle) for view in views]))
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return focus + 1.5 * radius * rng.random((count, 1)) ** (1 / 3) * directions
+    return middle + 1.5 * radius * rng.random((count, 1)) ** (1 / 3) * directions
 
 
 @dataclass(frozen=True)

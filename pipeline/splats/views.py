@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -90,6 +90,18 @@ def load_views(capture: Capture, names: Sequence[str], image_size: int, device: 
             )
         )
     return views
+
+
+def with_labels(view: View, labels: NDArray[np.uint8], bodies: int) -> View:
+    """Return a view with other labels (h, w), of any size of the same shape; they are brought to the photo's own."""
+    width, height = view.camera.width, view.camera.height
+    if labels.shape != (height, width):
+        own = np.zeros((height, width), np.uint8)
+        for k in range(bodies):
+            share = (labels == k + 1).astype(np.float32)
+            own[cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5] = k + 1
+        labels = own
+    return replace(view, labels=labels, cover=_tensor(_cover(labels, bodies, *view.size), view.image.device))
 
 
 def _grey(image: NDArray[np.uint8]) -> Tensor:
