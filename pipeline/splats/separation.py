@@ -170,7 +170,8 @@ def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Gro
 def _remarks(name: str, entry: BodyRecord) -> list[str]:
     where = "in its box" if entry.method == "box" else "on the ground"
     remarks = [
-        f"body '{name}' has no masks: it was separated by what is {where}; separation.png shows what was taken for it."
+        f"body '{name}' has no masks: it was separated by what is {where}. separation.png shows what was taken for it, and the "
+        "held-out figures within the mask rest on that."
     ]
     if entry.method == "ground" and entry.clusters > 1:
         remarks.append(
@@ -351,7 +352,7 @@ class _Scene:
 
     @torch.no_grad()
     def _in_view(self, spheres: Spheres, clusters: Sequence[NDArray[np.int64]]) -> list[float]:
-        """Return how much of the photos each cluster fills, where no mask names something else; the middle counts most."""
+        """Return how many pixels without a label each cluster fills; those in the middle of a photo count most."""
         label = torch.zeros(len(spheres), len(clusters))
         for k, members in enumerate(clusters):
             label[members, k] = 1.0
