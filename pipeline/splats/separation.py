@@ -170,8 +170,8 @@ def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Gro
 def _remarks(name: str, entry: BodyRecord) -> list[str]:
     where = "in its box" if entry.method == "box" else "on the ground"
     remarks = [
-        f"body '{name}' has no masks: it was separated by what is {where}. separation.png shows what was taken for it, and the "
-        "held-out figures within the mask rest on that."
+        f"body '{name}' has no masks: it was separated by what is {where}. separation.png shows what was taken for "
+        "it, and the held-out figures within the mask rest on that."
     ]
     if entry.method == "ground" and entry.clusters > 1:
         remarks.append(
