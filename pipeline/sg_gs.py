@@ -183,7 +183,7 @@ def resolve_device(name: str) -> torch.device:
 
 def _separated(stage: _Stage) -> bytes | None:
     """Give the photos masks of bodies that have none; return a picture of them."""
-    found = separate(stage.capture, stage.train, stage.test, stage.ground, _sparse_points(stage), stage.config.seed)
+    found = separate(stage.capture, stage.train, stage.test, stage.ground, _sparse_points(stage), stage.config)
     if found is None:
         return None
     stage.train, stage.test = found.train, found.test

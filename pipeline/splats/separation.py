@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ...datasets.capture import Capture
-from ...schemas import Body, Ground, InputDataError
+from ...schemas import Body, Ground, InputDataError, SplatConfig
 from .fit import Rates, Trainable, descend, mean_colors, render_view, scene_loss
 from .outlines import Blob, outline
 from .seeds import focus, scene_seeds, to_spheres
@@ -31,8 +31,9 @@ from .views import View
 from .volume import Array
 
 _SIZE = 160
-"""Longer side of the photos that the spheres are fitted to [px]."""
-_ITERATIONS = 300
+"""Most pixels of the longer side of the photos that the spheres are fitted to."""
+_ROUGH, _FINE = 0.4, 0.75
+"""Shares of the iterations: looking for a body on the ground, and fitting what is in a box."""
 _GRID_SPHERES, _OTHER_SPHERES = 2000, 1500
 _START_OPACITY = 0.1
 _OPACITY_WEIGHT = 0.002
@@ -43,12 +44,14 @@ _SOLID = 0.15
 """A sphere of the grid that has become more opaque than this is part of something."""
 _REACH = 1.8
 """Two spheres touch when their distance is less than this many times the sum of their scales."""
-_SEARCHED = 0.45
+_SEARCHED = 0.6
 """Radius of the space in which bodies are looked for, in units of the cameras' distance from where they look."""
 _MARGIN = 1.2
 """Width of the space about a cluster in which it is fitted again, in units of the first grid's spacing."""
 _FAINT = 0.15
 """What fills less than this share of the largest cluster's pixels is dust."""
+_LEAST = 5e-4
+"""Least mean share of a photo that a body fills."""
 _CENTRAL = 0.35
 """Pixels count less the farther they are from a photo's middle: standard deviation in units of its longer side."""
 _POOR = 0.9
@@ -95,7 +98,7 @@ def separate(
     test: Sequence[View],
     ground: Ground | None,
     points: Array | None,
-    seed: int,
+    config: SplatConfig,
 ) -> Separation | None:
     """Find the bodies that have neither masks nor a shape, or a box and no masks, and give the photos masks of them.
 
@@ -105,7 +108,7 @@ def separate(
         test: The photos that are held out.
         ground: The ground, where there is one and its place among the photos is known.
         points: Sparse points of the calibration, world frame, (n, 3), or None.
-        seed: Seed.
+        config: Settings of the stage.
 
     Returns:
         The photos with masks, or None where no body needs that, or there are no photos.
@@ -119,7 +122,7 @@ def separate(
         return None
     _refuse_the_unknowable(capture, [bodies[index] for index in wanted], ground)
     small = [_small(view) for view in train]
-    scene = _Scene(capture, small, ground, points, seed)
+    scene = _Scene(capture, small, ground, points, config)
     boxes = {index: _box(bodies[index]) for index in wanted if bodies[index].photo_box is not None}
     regions, counts = dict(boxes), {}
     for index in wanted:
@@ -218,13 +221,14 @@ class _Scene:
         views: The photos, small.
         ground: The ground, or None.
         points: Sparse points, world frame, (n, 3), or None.
-        seed: Seed.
+        config: Settings of the stage.
     """
 
     def __init__(
-        self, capture: Capture, views: Sequence[View], ground: Ground | None, points: Array | None, seed: int
+        self, capture: Capture, views: Sequence[View], ground: Ground | None, points: Array | None, config: SplatConfig
     ) -> None:
-        self._root, self._views, self._ground, self._points, self._seed = capture.root, views, ground, points, seed
+        self._root, self._views, self._ground, self._points = capture.root, views, ground, points
+        self._config = config
         self._up = np.array([0.0, 0.0, 1.0]) if ground is None else np.array(ground.normal)
 
     def standing(self, body: Body, taken: Sequence[_Region]) -> tuple[_Region, int]:
@@ -241,27 +245,32 @@ class _Scene:
         reach = _SEARCHED * float(np.median([np.linalg.norm(view.camera.center - middle) for view in self._views]))
         axes = _upright(self._up)
         space = _Region(axes, axes @ middle - reach, axes @ middle + reach)
-        spheres, count, pitch = self._fitted([space], f"{body.name}: looking for it", _ITERATIONS // 2)
-        clusters = self._clusters(spheres, count, pitch)
-        kept = []
-        for members in clusters:
-            local = spheres.means[members].numpy() @ axes.T
-            # What reaches the sides of the space goes on outside, or belongs to what lies behind it.
-            inside = (local.min(0)[:2] > space.low[:2] + pitch).all() and (local.max(0) < space.high - pitch).all()
-            own = not any(region.contains(local.mean(0, keepdims=True) @ axes)[0] for region in taken)
-            if inside and own:
-                kept.append((members, local))
-        weights = self._in_view(spheres, [members for members, _ in kept])
-        if not kept or max(weights) <= 0:
+        spheres, count, pitch = self._fitted([space], _ROUGH, f"{body.name}: looking for it")
+        clusters = [
+            members
+            for members in self._clusters(spheres, count, pitch)
+            if not any(region.contains(spheres.means[members].numpy().mean(0, keepdims=True))[0] for region in taken)
+        ]
+        weights = self._in_view(spheres, clusters)
+        most = max(weights, default=0.0)
+        if most < _LEAST:
             raise InputDataError(
                 f"{self._root}: body '{body.name}' has neither masks nor a shape, and nothing that stands on the "
                 f"ground was found within {reach:.2g} m of where the cameras look.",
                 "a thing that stands free on the ground, seen from all around.",
                 "give the body a photo_box in capture.toml, or masks/.",
             )
-        local = kept[int(np.argmax(weights))][1]
-        region = _Region(axes, local.min(0) - _MARGIN * pitch, local.max(0) + _MARGIN * pitch)
-        return region, sum(weight > _FAINT * max(weights) for weight in weights)
+        local = spheres.means[clusters[weights.index(most)]].numpy() @ axes.T
+        low, high = local.min(0), local.max(0)
+        if (low[:2] < space.low[:2] + 0.5 * pitch).any() or (high > space.high - 0.5 * pitch).any():
+            raise InputDataError(
+                f"{self._root}: body '{body.name}' has neither masks nor a shape, and what is most in view above the "
+                f"ground reaches farther than {reach:.2g} m from where the cameras look: it is no single body.",
+                "a thing that stands free on the ground, seen from all around.",
+                "give the body a photo_box in capture.toml, or masks/.",
+            )
+        region = _Region(axes, low - _MARGIN * pitch, high + _MARGIN * pitch)
+        return region, sum(weight > _FAINT * most for weight in weights)
 
     def contents(self, regions: dict[str, _Region]) -> tuple[Spheres, float, list[tuple[NDArray[np.int64], int]]]:
         """Fit what is in the regions of bodies by a fine grid.
@@ -273,33 +282,38 @@ class _Scene:
         Raises:
             InputDataError: If a region is empty.
         """
-        spheres, count, pitch = self._fitted(list(regions.values()), "bodies: separating")
+        for name, region in regions.items():
+            if self._volume(region) <= 0:
+                raise self._empty(name, region)
+        spheres, count, pitch = self._fitted(list(regions.values()), _FINE, "bodies: separating")
         found = []
         for name, region in regions.items():
             inside = region.contains(spheres.means.numpy())
             clusters = [members[inside[members]] for members in self._clusters(spheres, count, pitch)]
             clusters = [members for members in clusters if len(members)]
             weights = self._in_view(spheres, clusters)
-            if not clusters or max(weights) <= 0:
-                raise InputDataError(
-                    f"{self._root}: nothing was found in the box of body '{name}', "
-                    f"{np.round(region.low, 3).tolist()} to {np.round(region.high, 3).tolist()}.",
-                    "a box in the world frame that holds the body where it stands in the photos.",
-                    "correct photo_box in capture.toml; 'cgwm validate' shows the cameras' frame.",
-                )
+            if max(weights, default=0.0) < _LEAST:
+                raise self._empty(name, region)
             near = [members for members, w in zip(clusters, weights, strict=True) if w > _FAINT * max(weights)]
             found.append((np.concatenate(near), len(near)))
         return spheres, pitch, found
 
-    def _fitted(
-        self, regions: Sequence[_Region], what: str, iterations: int = _ITERATIONS
-    ) -> tuple[Spheres, int, float]:
+    def _empty(self, name: str, region: _Region) -> InputDataError:
+        return InputDataError(
+            f"{self._root}: the photos show nothing solid where body '{name}' is looked for, "
+            f"from {np.round(region.low, 3).tolist()} to {np.round(region.high, 3).tolist()}.",
+            "a box, in the frame and unit of cameras.json, that holds the body and reaches above the ground.",
+            "correct photo_box in capture.toml, or add masks/.",
+        )
+
+    def _fitted(self, regions: Sequence[_Region], share: float, what: str) -> tuple[Spheres, int, float]:
         """Fit the scene; return the spheres, how many of the first are the grid's, and its spacing [m]."""
-        rng = np.random.default_rng(self._seed)
+        seed, steps = self._config.seed, max(1, round(share * self._config.iterations))
+        rng = np.random.default_rng(seed)
         volume = sum(self._volume(region) for region in regions)
-        pitch = (max(volume, 1e-12) / _GRID_SPHERES) ** (1 / 3)
+        pitch = (volume / _GRID_SPHERES) ** (1 / 3)
         seeds = np.concatenate([self._grid(region, pitch, rng) for region in regions])
-        centers, scales = scene_seeds(self._views, self._ground, self._points, _OTHER_SPHERES, self._seed)
+        centers, scales = scene_seeds(self._views, self._ground, self._points, _OTHER_SPHERES, seed)
         device = self._views[0].image.device
         grid = to_spheres(seeds, np.full(len(seeds), _SCALE * pitch), _START_OPACITY, device)
         start = Spheres.joined([grid, to_spheres(centers, scales, 0.9, device)])
@@ -308,9 +322,10 @@ class _Scene:
         photometric = scene_loss(None)
 
         def loss(spheres: Spheres, view: View, generator: torch.Generator) -> Tensor:
-            return photometric(spheres, view, generator) + _OPACITY_WEIGHT * spheres.opacities[: len(seeds)].mean()
+            faint = spheres.opacities[: len(seeds)].sum() / _GRID_SPHERES
+            return photometric(spheres, view, generator) + _OPACITY_WEIGHT * faint
 
-        descend(trainable, self._views, loss, iterations, self._seed, what)
+        descend(trainable, self._views, loss, steps, seed, what)
         fitted = trainable.spheres()
         parts = (fitted.means, fitted.scales, fitted.opacities, fitted.colors)
         return Spheres(*(part.detach().cpu() for part in parts)), len(seeds), pitch
@@ -352,21 +367,28 @@ class _Scene:
 
     @torch.no_grad()
     def _in_view(self, spheres: Spheres, clusters: Sequence[NDArray[np.int64]]) -> list[float]:
-        """Return how many pixels without a label each cluster fills; those in the middle of a photo count most."""
+        """Return how many pixels without a label each cluster fills; those in the middle of a photo count most.
+
+        As a mean share of a photo.
+        """
+        if not clusters:
+            return []
         label = torch.zeros(len(spheres), len(clusters))
         for k, members in enumerate(clusters):
             label[members, k] = 1.0
         labelled = replace(spheres, colors=label)
         total = torch.zeros(len(clusters))
+        pixels = 0.0
         for view in self._views:
             width, height = view.size
             v, u = torch.meshgrid(torch.arange(height) - height / 2, torch.arange(width) - width / 2, indexing="ij")
             central = torch.exp(-0.5 * (u**2 + v**2) / (_CENTRAL * max(width, height)) ** 2)
+            pixels += float(central.sum())
             if view.cover is not None:
                 central = central * (1 - view.cover.sum(0).cpu())
             seen = render_view(labelled, replace(view, viewmat=view.viewmat.cpu(), K=view.K.cpu())).features[0]
             total += (seen * central[..., None]).sum((0, 1))
-        return total.tolist()
+        return (total / pixels).tolist()
 
 
 def _upright(up: Array) -> Array:
