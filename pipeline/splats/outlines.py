@@ -8,6 +8,7 @@ photo, it starts a second cut in a narrow band.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -97,16 +98,17 @@ def outline(
     shares, agreements = [], []
     for k, blob in enumerate(blobs):
         near = spheres.means.numpy()[blob.members]
-        excluded = [
-            np.any([picture.given > 0, _beyond(blob, picture), *(b.inside for b in own[:k] + own[k + 1 :])], axis=0)
+        hidden = [
+            np.any([picture.given > 0, *(band.inside for band in own[:k] + own[k + 1 :])], axis=0)
             for picture, own in zip(pictures, bands, strict=True)
         ]
+        excluded = [other | _beyond(blob, picture) for picture, other in zip(pictures, hidden, strict=True)]
         cuts = list(zip(pictures, bands, excluded, strict=True))
         first = [_cut(picture.image, own[k].without(other)) for picture, own, other in cuts[fitted]]
-        solid = _Solid.left_by(pictures[fitted], first, near, pitch, ground)
+        solid = _Solid.left_by(pictures[fitted], first, hidden[fitted], near, pitch, ground)
         masks = [_cut(picture.image, solid.band(picture.camera).without(other)) for picture, _, other in cuts]
-        left = _Solid.left_by(pictures[fitted], masks[fitted], near, pitch, ground)
-        agreements.append(_agreement(left, pictures[fitted], masks[fitted]))
+        left = _Solid.left_by(pictures[fitted], masks[fitted], hidden[fitted], near, pitch, ground)
+        agreements.append(_agreement(left, pictures[fitted], masks[fitted], hidden[fitted]))
         shares.append(float(np.mean([mask.mean() for mask in masks[fitted]])))
         for known, mask in zip(labels, masks, strict=True):
             known[mask & (known == 0)] = blob.index + 1
@@ -252,11 +254,16 @@ class _Solid:
 
     @staticmethod
     def left_by(
-        pictures: Sequence[_Picture], masks: Sequence[Mask], near: Array, margin: float, ground: Ground | None
+        pictures: Sequence[_Picture],
+        masks: Sequence[Mask],
+        hidden: Sequence[Mask],
+        near: Array,
+        margin: float,
+        ground: Ground | None,
     ) -> _Solid:
         """Carve a grid about points that are near the body, (n, 3), and a margin [m], down to the ground.
 
-        Unlike `hull.carve` it lets a few masks be outvoted.
+        Unlike `hull.carve` it lets a few masks be outvoted, and does not carve where another body may hide this one.
         """
         low, high = near.min(0) - 1.5 * margin, near.max(0) + 1.5 * margin
         if ground is not None:
@@ -266,10 +273,10 @@ class _Solid:
         shape = tuple(int(n) for n in np.ceil((high - low) / pitch).astype(int) + 1)
         points = grid_points(shape, low, pitch)
         distances = np.full((len(pictures), len(points)), np.inf, np.float32)
-        for row, picture, mask in zip(distances, pictures, masks, strict=True):
+        for row, picture, mask, other in zip(distances, pictures, masks, hidden, strict=True):
             if mask.any():
-                _look_up(row, points, mask, picture.camera)
-        rank = int(_OUTVOTED * len(pictures))
+                _look_up(row, points, mask, other, picture.camera)
+        rank = min(math.ceil(_OUTVOTED * len(pictures)), len(pictures) - 1)
         field = np.partition(distances, rank, axis=0)[rank].astype(float)
         field[np.isfinite(distances).sum(0) < _MIN_VIEWS] = -pitch
         if ground is not None:
@@ -293,11 +300,12 @@ class _Solid:
         return _Band.about(mask, mask, width)
 
 
-def _look_up(row: Array, points: Array, mask: Mask, camera: Camera) -> None:
-    """Write into `row` (n,) how far inside a mask points (n, 3) lie [m], where the photo shows them."""
+def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera) -> None:
+    """Write into `row` (n,) how far inside a mask points (n, 3) lie [m], where the photo may show them."""
     signed = signed_distance_px(mask)
     pixel, depth = camera.project(points)
     seen = (depth > 0) & (pixel > 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
+    seen[seen] = ~hidden[tuple(pixel[seen].astype(int).T[::-1])]
     u, v = pixel[seen].T - 0.5
     row[seen] = map_coordinates(signed, [v, u], order=1, mode="nearest") * depth[seen] / camera.K[0, 0]
 
@@ -312,11 +320,11 @@ def _largest_part(field: Array, pitch: float) -> Array:
     return np.where(parts == int(np.argmax(sizes)), field, np.minimum(field, -1e-3 * pitch))
 
 
-def _agreement(solid: _Solid, pictures: Sequence[_Picture], masks: Sequence[Mask]) -> float:
+def _agreement(solid: _Solid, pictures: Sequence[_Picture], masks: Sequence[Mask], hidden: Sequence[Mask]) -> float:
     """Return the mean IoU of masks and of the solid in the same photos; photos that show neither do not count."""
     values = []
-    for picture, mask in zip(pictures, masks, strict=True):
-        seen = solid.seen_by(picture.camera)
+    for picture, mask, other in zip(pictures, masks, hidden, strict=True):
+        seen = solid.seen_by(picture.camera) & ~other
         if (seen | mask).any():
             values.append(float((seen & mask).sum() / (seen | mask).sum()))
     return float(np.mean(values)) if values else 0.0

@@ -35,6 +35,7 @@ _SIZE = 160
 _ROUGH, _FINE = 0.4, 0.75
 """Shares of the iterations: looking for a body on the ground, and fitting what is in a box."""
 _GRID_SPHERES, _OTHER_SPHERES = 2000, 1500
+"""At most; fewer where the settings allow a body or a background fewer."""
 _START_OPACITY = 0.1
 _OPACITY_WEIGHT = 0.002
 """Weight of the mean opacity of the grid's spheres: what no photo needs fades away."""
@@ -137,6 +138,8 @@ def separate(
     record: dict[str, dict[str, Any]] = {}
     warnings: list[str] = []
     for index, (_, count), share, agreement in zip(wanted, parts, outlined.shares, outlined.agreements, strict=True):
+        if share < _LEAST:
+            raise scene.empty(bodies[index].name, regions[index])
         entry = BodyRecord(
             "box" if index in boxes else "ground", counts.get(index, count), round(share, 4), round(agreement, 4)
         )
@@ -284,7 +287,7 @@ class _Scene:
         """
         for name, region in regions.items():
             if self._volume(region) <= 0:
-                raise self._empty(name, region)
+                raise self.empty(name, region)
         spheres, count, pitch = self._fitted(list(regions.values()), _FINE, "bodies: separating")
         found = []
         for name, region in regions.items():
@@ -293,12 +296,13 @@ class _Scene:
             clusters = [members for members in clusters if len(members)]
             weights = self._in_view(spheres, clusters)
             if max(weights, default=0.0) < _LEAST:
-                raise self._empty(name, region)
+                raise self.empty(name, region)
             near = [members for members, w in zip(clusters, weights, strict=True) if w > _FAINT * max(weights)]
             found.append((np.concatenate(near), len(near)))
         return spheres, pitch, found
 
-    def _empty(self, name: str, region: _Region) -> InputDataError:
+    def empty(self, name: str, region: _Region) -> InputDataError:
+        """Return the error that nothing was found in a region."""
         return InputDataError(
             f"{self._root}: the photos show nothing solid where body '{name}' is looked for, "
             f"from {np.round(region.low, 3).tolist()} to {np.round(region.high, 3).tolist()}.",
@@ -310,10 +314,12 @@ class _Scene:
         """Fit the scene; return the spheres, how many of the first are the grid's, and its spacing [m]."""
         seed, steps = self._config.seed, max(1, round(share * self._config.iterations))
         rng = np.random.default_rng(seed)
+        count = min(_GRID_SPHERES, self._config.max_body_spheres)
         volume = sum(self._volume(region) for region in regions)
-        pitch = (volume / _GRID_SPHERES) ** (1 / 3)
+        pitch = (volume / count) ** (1 / 3)
         seeds = np.concatenate([self._grid(region, pitch, rng) for region in regions])
-        centers, scales = scene_seeds(self._views, self._ground, self._points, _OTHER_SPHERES, seed)
+        others = min(_OTHER_SPHERES, self._config.max_scene_spheres)
+        centers, scales = scene_seeds(self._views, self._ground, self._points, others, seed)
         device = self._views[0].image.device
         grid = to_spheres(seeds, np.full(len(seeds), _SCALE * pitch), _START_OPACITY, device)
         start = Spheres.joined([grid, to_spheres(centers, scales, 0.9, device)])
@@ -322,7 +328,7 @@ class _Scene:
         photometric = scene_loss(None)
 
         def loss(spheres: Spheres, view: View, generator: torch.Generator) -> Tensor:
-            faint = spheres.opacities[: len(seeds)].sum() / _GRID_SPHERES
+            faint = spheres.opacities[: len(seeds)].sum() / count
             return photometric(spheres, view, generator) + _OPACITY_WEIGHT * faint
 
         descend(trainable, self._views, loss, steps, seed, what)
