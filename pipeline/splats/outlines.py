@@ -238,7 +238,7 @@ def _cut(image: NDArray[np.uint8], band: _Band) -> Mask:
     if not outer.any() or outer.all():  # GrabCut needs colours of both
         return band.start & ~band.outside
     cv2.setRNGSeed(0)
-    cv2.grabCut(part, state, None, np.zeros((1, 65)), np.zeros((1, 65)), _CUTS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(part, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), _CUTS, cv2.GC_INIT_WITH_MASK)
     inner = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.float32)
     mask = np.zeros(band.start.shape, bool)
     mask[window] = cv2.resize(inner, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5

@@ -208,7 +208,7 @@ class _Region:
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (n, 3) lie inside."""
         local = points @ self.axes.T
-        return ((local >= self.low) & (local <= self.high)).all(1)
+        return np.asarray(((local >= self.low) & (local <= self.high)).all(1))
 
 
 def _box(body: Body) -> _Region:
