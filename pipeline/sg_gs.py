@@ -19,6 +19,7 @@ from ..datasets.ply import Splats
 from ..schemas import Body, CamerasFile, Ground, InputDataError, Pose, SplatConfig, UsageError
 from .checkpoint import Checkpoint, Slot
 from .held_out import HeldOut, look
+from .reporting.pictures import separated, small_png
 from .sfm.points import POINTS_NAME, read_points
 from .splats.adaptive import fit_adaptively
 from .splats.collision import distil, shape_to_spheres
@@ -30,6 +31,7 @@ from .splats.losses import behind, body_loss, geometry_loss, scene_loss
 from .splats.overlap import require_body_in_masks, require_points_in_view
 from .splats.poses import Motions, motion_record, moved_for_good
 from .splats.seeds import body_seeds, points_of_depth, scene_seeds, shows_bodies, to_spheres
+from .splats.separation import separate
 from .splats.shapes import shape_mass_properties, shape_volume
 from .splats.spheres import Spheres
 from .splats.stereo import refine
@@ -43,6 +45,7 @@ _FEW_IN_VIEW = 0.5
 _START_SHARE = 0.3
 """Of a budget: spheres of the background at the beginning."""
 _DEPTH_POINTS = 20_000
+_SHEET_BYTES = 3_000_000
 _UNEVEN_DB = 1.0
 """Photos that gain so much from an exposure each were not taken at one."""
 _POSE_STEPS = 2.0
@@ -116,11 +119,7 @@ class _Stage:
         """Points of the scene, world frame, (n, 3): from structure from motion, or from depth maps; or None."""
         path = self.capture.root / POINTS_NAME
         if not path.is_file():
-            found = points_of_depth(self.train, _DEPTH_POINTS, self.config.seed)
-            if found is None and self.ground is None:
-                where = "lies on a shell far away" if shows_bodies(self.train) else "starts from random points"
-                self.warnings.append(f"No {POINTS_NAME} and no ground: the background {where}.")
-            return found
+            return points_of_depth(self.train, _DEPTH_POINTS, self.config.seed)
         found = read_points(path)[0]
         share = require_points_in_view(found, self.train, str(path))
         if share < _FEW_IN_VIEW:
@@ -142,9 +141,10 @@ class _Stage:
 def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: Checkpoint | None = None) -> SgGsResult:
     """Fit spheres to the photos of a capture.
 
-    Bodies need masks or a shape. With masks, a body's solid is its visual hull (or its shape); its spheres are fitted
-    geometry first, to silhouettes and geometry maps, then appearance. Everything else becomes the background. Without
-    photos, bodies get colliding spheres from their shapes and no visual ones.
+    Bodies need masks or a shape, or else a box or the ground to be separated by. With masks, a body's solid is its
+    visual hull (or its shape); its spheres are fitted geometry first, to silhouettes and geometry maps, then
+    appearance. Everything else becomes the background. Without photos, bodies get colliding spheres from their shapes
+    and no visual ones.
 
     Args:
         capture: The capture, calibrated where it has photos; the cameras may be unscaled.
@@ -152,7 +152,7 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
         checkpoint: Where the state of the descents goes, and from where they are taken up; None keeps none.
 
     Raises:
-        InputDataError: If a body has neither masks nor a shape, photos have no cameras, or points and shapes lie where
+        InputDataError: If a body has none of these, photos have no cameras, or points and shapes lie where
             no photo shows them.
     """
     config = config or SplatConfig()
@@ -166,6 +166,7 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
         )
     if stage.train and config.refine_poses:
         _refine_poses(stage)
+    pictures = _separated(stage)
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
     for index, body in enumerate(capture.manifest.bodies):
@@ -173,7 +174,6 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
         if world is not None:
             placed.append(world)
     scene = _fit_background(stage, placed) if stage.train else None
-    pictures: dict[str, bytes] = {}
     if stage.train:
         held_out = look(stage.test, placed, scene, stage.spread, poses=config.refine_poses)
         if config.exposure:
@@ -255,6 +255,19 @@ def resolve_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: no CUDA device was found.", "auto, cpu, cuda.", "run 'cgwm doctor'.")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _separated(stage: _Stage) -> dict[str, bytes]:
+    """Give the photos masks of bodies that have none; return a picture of them, by its file's name."""
+    found = separate(stage.capture, stage.train, stage.test, stage.ground, stage.points, stage.config)
+    if found is None:
+        return {}
+    stage.train, stage.test = found.train, found.test
+    stage.record["separation"] = found.record
+    stage.warnings += found.warnings
+    masks = [(view.cover > 0.5).any(0).cpu().numpy() for view in found.train if view.cover is not None]
+    photos = [(view.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy() for view in found.train]
+    return {"separation.png": small_png(separated(photos, masks), _SHEET_BYTES)}
 
 
 def _fit_body(stage: _Stage, index: int, body: Body) -> tuple[BodyResult, Spheres | None]:
@@ -378,6 +391,10 @@ def _fit_geometry(
 
 def _background_seeds(stage: _Stage, count: int, bodies: Spheres | None) -> Spheres:
     """Return spheres where the background begins: on the ground, on SfM points or depth maps, and far away."""
+    if stage.points is None and stage.ground is None:
+        where = "lies on a shell far away" if shows_bodies(stage.train) else "starts from random points"
+        warning = f"No {POINTS_NAME} and no ground: the background {where}."
+        stage.warnings += [warning] if warning not in stage.warnings else []
     centers, scales = scene_seeds(stage.train, stage.ground, stage.points, count, stage.config.seed)
     if len(scales) == 0:
         raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")

@@ -119,6 +119,23 @@ class Shape(FileModel):
         return self
 
 
+class PhotoBox(FileModel):
+    """A box along the world's axes that holds a body, and nothing else than some ground, in the photos.
+
+    In the unit of the cameras: metres, unless they are unscaled.
+    """
+
+    min_m: Vector3
+    max_m: Vector3
+
+    @model_validator(mode="after")
+    def _ordered(self) -> PhotoBox:
+        for axis, low, high in zip("xyz", self.min_m, self.max_m, strict=True):
+            if not low < high:
+                raise ValueError(f"min_m must be below max_m in {axis}; found {low:g} and {high:g}")
+        return self
+
+
 class Body(FileModel):
     """A rigid body."""
 
@@ -135,6 +152,8 @@ class Body(FileModel):
     """Left out: from the photos (stage SG-GS)."""
     photo_pose: Pose | None = None
     """T_world_body while the photos were taken; default identity (see `Capture`)."""
+    photo_box: PhotoBox | None = None
+    """Where the body is in photos without masks; left out: found on the ground (stage SG-GS)."""
 
     @field_validator("inertia_kg_m2")
     @classmethod

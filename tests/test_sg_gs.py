@@ -35,8 +35,8 @@ def looking_at(position, target):
     return T
 
 
-def world():
-    """A ball of spheres with a colour that changes over it, on a ground of squares."""
+def world(beside=None):
+    """A ball of spheres with a colour that changes over it, on a ground of squares; or two, so far apart [m]."""
     rng = np.random.default_rng(0)
     directions = fibonacci_directions(600)
     ball = PLACE + 0.92 * RADIUS * directions
@@ -48,19 +48,25 @@ def world():
     )
     means = torch.tensor(np.concatenate([ball, ground]), dtype=torch.float32)
     scales = torch.cat([torch.full((600,), 0.004), torch.full((len(ground),), 0.012)])
-    label = torch.cat([torch.ones(600), torch.zeros(len(ground))])[:, None]
+    label = torch.zeros(len(means), 2)
+    label[:600, 0] = 1.0
     colors = torch.tensor(np.concatenate([ball_colors, ground_colors]), dtype=torch.float32)
-    return means, scales, torch.full_like(scales, 0.95), torch.cat([colors, label], 1)
+    features = torch.cat([colors, label], 1)
+    if beside is not None:
+        other = torch.cat([1 - colors[:600], label[:600].flip(1)], 1)
+        means = torch.cat([means, means[:600] + torch.tensor(beside, dtype=torch.float32)])
+        scales, features = torch.cat([scales, scales[:600]]), torch.cat([features, other])
+    return means, scales, torch.full_like(scales, 0.95), features
 
 
-def make_capture(root, masks=True, shape=""):
+def make_capture(root, shape="", beside=None):
     views = fibonacci_directions(24)[:11]
     poses = [looking_at(PLACE + 0.3 * view, PLACE) for view in views]
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     viewmats = torch.tensor(np.linalg.inv(np.stack(poses)), dtype=torch.float32)
     Ks = torch.tensor(K, dtype=torch.float32).expand(len(poses), 3, 3)
-    background = torch.tensor([0.6, 0.7, 0.8, 0.0])
-    pictures = render(*world(), viewmats, Ks, WIDTH, HEIGHT, background).features.numpy()
+    background = torch.tensor([0.6, 0.7, 0.8, 0.0, 0.0])
+    pictures = render(*world(beside), viewmats, Ks, WIDTH, HEIGHT, background).features.numpy()
     (root / "images").mkdir(parents=True)
     (root / "masks").mkdir()
     cameras = {
@@ -74,8 +80,7 @@ def make_capture(root, masks=True, shape=""):
     for number, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
         name = f"{number:03d}.png"
         cv2.imwrite(str(root / "images" / name), (255 * picture[..., 2::-1]).round().astype(np.uint8))
-        if masks:
-            cv2.imwrite(str(root / "masks" / name), (picture[..., 3] > 0.5).astype(np.uint8))
+        cv2.imwrite(str(root / "masks" / name), ((picture[..., 3:] > 0.5) @ [1, 2]).astype(np.uint8))
         cameras["images"][name] = {"camera": "c", "T_world_cam": pose.tolist()}
     (root / "cameras.json").write_text(json.dumps(cameras))
     write_manifest(root, shape)
@@ -165,10 +170,10 @@ def test_a_body_without_photos_has_the_spheres_of_its_shape(tmp_path):
     assert len(ball.collision) <= CONFIG.max_collision_spheres
 
 
-def test_a_body_with_neither_masks_nor_shape_is_refused(tmp_path):
-    capture = make_capture(tmp_path / "bare", masks=False)
+def test_a_body_with_neither_photos_nor_shape_is_refused(tmp_path):
+    write_manifest(tmp_path / "bare", "")
     with pytest.raises(InputDataError, match="body 'ball' has neither a shape nor masks"):
-        fit_scene(capture, CONFIG)
+        fit_scene(Capture.open(tmp_path / "bare", check=False), CONFIG)
 
 
 def test_photos_without_cameras_are_refused(tmp_path):

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 TILE_WIDTH = 264
 """Width of a frame in a report [px]; on a page of 1100 px six stand side by side."""
 _ASPECT = 4 / 3
 _MARGIN = 0.2
+_COLUMNS = 4
 _OUTLINE = (255, 214, 10)
 _LABEL_COLORS = np.array([[32, 36, 44], [240, 165, 40], [70, 160, 220], [120, 200, 120], [220, 110, 150]], np.uint8)
 
@@ -127,6 +129,27 @@ def compared(photos: Sequence[Image], renders: Sequence[Image], wanted: int = 8,
         for row, picture in zip(rows, (photos[k], renders[k], np.asarray(colors, np.uint8)), strict=True):
             row.append(_fitted(picture, size))
     return contact_sheet([np.stack(row) for row in rows])
+
+
+def separated(photos: Sequence[Image], masks: Sequence[Mask], wanted: int = 12, width: int = TILE_WIDTH) -> Image:
+    """Return a contact sheet of up to `wanted` photos, four a row: bodies as they are and outlined, the rest dimmed.
+
+    Args:
+        photos: uint8 RGB, each (H, W, 3); sizes may differ.
+        masks: Whether each pixel shows a body, (H, W).
+        wanted: Most photos.
+        width: Of a tile [px]; its height is that of the first photo at this width.
+    """
+    chosen = evenly(len(photos), wanted)
+    size = (width, round(width * photos[chosen[0]].shape[0] / photos[chosen[0]].shape[1]))
+    found: list[Image] = []
+    for k in chosen:
+        picture = np.where(masks[k][..., None], photos[k], photos[k] // 3)
+        _outline(picture, masks[k].astype(np.uint8))
+        found.append(_fitted(picture, size))
+    columns = min(_COLUMNS, len(found))
+    found += [np.full_like(found[0], 255)] * (-len(found) % columns)
+    return contact_sheet([np.stack(found[k : k + columns]) for k in range(0, len(found), columns)])
 
 
 def depth_colors(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> Image:

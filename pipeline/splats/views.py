@@ -222,6 +222,18 @@ def _with_features_scaled(views: list[View]) -> list[View]:
     return [replace(v, features=None if v.features is None else (v.features - low) / span) for v in views]
 
 
+def with_labels(view: View, labels: NDArray[np.uint8], bodies: int) -> View:
+    """Return a view with other labels (h, w), of any size of the same shape; they are brought to the photo's own."""
+    width, height = view.camera.width, view.camera.height
+    if labels.shape != (height, width):
+        own = np.zeros((height, width), np.uint8)
+        for k in range(bodies):
+            share = (labels == k + 1).astype(np.float32)
+            own[cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5] = k + 1
+        labels = own
+    return replace(view, labels=labels, cover=_tensor(_cover(labels, bodies, *view.size), view.image.device))
+
+
 def _grey(image: NDArray[np.uint8]) -> Tensor:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
     scale = min(1.0, _FINE_SIZE / max(grey.shape))

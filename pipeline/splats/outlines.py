@@ -1,0 +1,361 @@
+"""Borders of bodies in photos, from where they roughly are in space.
+
+Each photo is cut into body and background by GrabCut (Rother, Kolmogorov, Blake 2004: colour models of both, and a
+minimal cut along the edges), first in a wide band about the spheres that stand for the body. The masks together leave a
+solid, more exact than each of them: what one photo took for the body and the others did not is gone. Seen by each
+photo, it starts a second cut in a narrow band.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import label, map_coordinates
+
+from ...datasets.cameras import Camera
+from ...datasets.capture import Capture
+from ...schemas import Ground
+from .hull import signed_distance_px
+from .render import render
+from .spheres import Spheres
+from .views import View, with_labels
+from .volume import Array, crossings, grid_points
+
+Mask = NDArray[np.bool_]
+
+_SIZE = 800
+"""Photos are reduced to this longer side [px]; masks are brought back to the photos' own."""
+_RENDERED = 240
+_WINDOW_PX = 400
+"""A cut is made at no more than this size of the body's window [px]."""
+_SURROUNDINGS = 0.25
+"""Width of the background about the band that the colour model of the background learns from, of the band's size."""
+_CUTS = 4
+_NARROW = 3.0
+"""Half width of the second band, in units of the solid's grid."""
+_GRID = 72
+_OUTVOTED = 0.05
+"""Share of the photos that may find a point outside the body and be wrong."""
+_MIN_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Blob:
+    """Where a body roughly is.
+
+    Attributes:
+        index: The body's place in the manifest.
+        members: Which spheres are part of it, shape (n,).
+        corners: Of a box that holds all of it, world frame [m], shape (8, 3), or None.
+    """
+
+    index: int
+    members: NDArray[np.int64]
+    corners: Array | None
+
+
+@dataclass(frozen=True)
+class Outlined:
+    """The photos with masks, and of each body its mean share of the pixels and the agreement of its masks."""
+
+    train: list[View]
+    test: list[View]
+    shares: list[float]
+    agreements: list[float]
+
+
+def outline(
+    capture: Capture,
+    train: Sequence[View],
+    test: Sequence[View],
+    spheres: Spheres,
+    pitch: float,
+    blobs: Sequence[Blob],
+    ground: Ground | None,
+) -> Outlined:
+    """Give photos masks of bodies; labels that they have stay.
+
+    Args:
+        capture: Where the photos are.
+        train: The photos that tell the bodies' solids.
+        test: Others.
+        spheres: The whole scene, world frame.
+        pitch: How exactly they show where a body ends [m].
+        blobs: The bodies.
+        ground: The ground, on which they stand and which they do not enter, or None.
+    """
+    views = [*train, *test]
+    pictures = [_Picture.read(capture, view) for view in views]
+    fitted = slice(len(train))
+    bands = [_wide_bands(picture, spheres, pitch, blobs, ground) for picture in pictures]
+    labels = [picture.given.copy() for picture in pictures]
+    shares, agreements = [], []
+    for k, blob in enumerate(blobs):
+        near = spheres.means.numpy()[blob.members]
+        hidden = [
+            np.any([picture.given > 0, *(band.inside for band in own[:k] + own[k + 1 :])], axis=0)
+            for picture, own in zip(pictures, bands, strict=True)
+        ]
+        excluded = [other | _beyond(blob, picture) for picture, other in zip(pictures, hidden, strict=True)]
+        cuts = list(zip(pictures, bands, excluded, strict=True))
+        first = [_cut(picture.image, own[k].without(other)) for picture, own, other in cuts[fitted]]
+        solid = _Solid.left_by(pictures[fitted], first, hidden[fitted], near, pitch, ground)
+        masks = [_cut(picture.image, solid.band(picture.camera).without(other)) for picture, _, other in cuts]
+        left = _Solid.left_by(pictures[fitted], masks[fitted], hidden[fitted], near, pitch, ground)
+        agreements.append(_agreement(left, pictures[fitted], masks[fitted], hidden[fitted]))
+        shares.append(float(np.mean([mask.mean() for mask in masks[fitted]])))
+        for known, mask in zip(labels, masks, strict=True):
+            known[mask & (known == 0)] = blob.index + 1
+    bodies = len(capture.manifest.bodies)
+    found = [with_labels(view, known, bodies) for view, known in zip(views, labels, strict=True)]
+    return Outlined(found[fitted], found[len(train) :], shares, agreements)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A photo without distortion, uint8 RGB (H, W, 3), its camera, and the labels that it came with (H, W)."""
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    given: NDArray[np.uint8]
+
+    @staticmethod
+    def read(capture: Capture, view: View) -> _Picture:
+        image, camera = capture.photo_camera(view.name).undistorted(capture.photo(view.name))
+        scale = min(1.0, _SIZE / max(camera.width, camera.height))
+        width, height = round(scale * camera.width), round(scale * camera.height)
+        if scale < 1:
+            image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        given = np.zeros((height, width), np.uint8)
+        if view.labels is not None:
+            given = np.asarray(cv2.resize(view.labels, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+        return _Picture(image, camera.resized(width, height), given)
+
+
+@dataclass(frozen=True)
+class _Band:
+    """What is known of a mask: pixels surely inside, surely outside, and where to begin between the two, (H, W)."""
+
+    inside: Mask
+    outside: Mask
+    start: Mask
+
+    def without(self, other: Mask) -> _Band:
+        """Return the band with other pixels that are surely outside."""
+        return _Band(self.inside & ~other, self.outside | other, self.start & ~other)
+
+    @staticmethod
+    def about(start: Mask, core: Mask, width_px: float) -> _Band:
+        """Return a band that reaches so far out from `start`, and so far into `core`."""
+        return _Band(_eroded(core, width_px), ~_dilated(start, width_px), start)
+
+
+def _wide_bands(
+    picture: _Picture, spheres: Spheres, pitch: float, blobs: Sequence[Blob], ground: Ground | None
+) -> list[_Band]:
+    """Return a band about each body as the spheres show it, down to the ground: its lowest part is none of theirs."""
+    seen = _rendered(picture.camera, spheres, blobs)
+    bands = []
+    for k, blob in enumerate(blobs):
+        core = seen[..., k] > 0.5
+        start, width = core, 0.0
+        points = spheres.means.numpy()[blob.members]
+        metre = _pixels_per_metre(picture.camera, points)
+        if metre is not None:
+            width = pitch * metre
+            if ground is not None:
+                columns = _marked(picture.camera, _columns(points, pitch, ground))
+                start = core | _eroded(_dilated(columns, 0.7 * width), 0.7 * width)
+        bands.append(_Band.about(start, core, width))
+    return bands
+
+
+@torch.no_grad()
+def _rendered(camera: Camera, spheres: Spheres, blobs: Sequence[Blob]) -> Array:
+    """Return how much of each body the spheres show in each pixel, in [0, 1], (H, W, bodies)."""
+    scale = min(1.0, _RENDERED / max(camera.width, camera.height))
+    small = camera.resized(round(scale * camera.width), round(scale * camera.height))
+    label = torch.zeros(len(spheres), len(blobs))
+    for k, blob in enumerate(blobs):
+        label[blob.members, k] = 1.0
+    pose = torch.as_tensor(small.T_cam_world[None], dtype=torch.float32)
+    K = torch.as_tensor(small.K[None], dtype=torch.float32)
+    parts = (spheres.means, spheres.scales, spheres.opacities, label, pose, K)
+    seen = render(*parts, small.width, small.height).features[0].numpy()
+    large = cv2.resize(seen, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large, np.float32).reshape(camera.height, camera.width, len(blobs))
+
+
+def _columns(points: Array, pitch: float, ground: Ground) -> Array:
+    """Return points under given ones (n, 3), down to the ground, half a pitch apart."""
+    normal = np.array(ground.normal)
+    heights = np.maximum(points @ normal - ground.offset_m, 0)
+    steps = np.arange(0, heights.max() + 0.5 * pitch, 0.5 * pitch)
+    down = np.minimum(steps[None], heights[:, None])
+    return (points[:, None] - down[..., None] * normal).reshape(-1, 3)
+
+
+def _beyond(blob: Blob, picture: _Picture) -> Mask:
+    """Return the pixels in which nothing of the body's box can lie."""
+    shape = picture.given.shape
+    if blob.corners is None:
+        return np.zeros(shape, bool)
+    pixel, depth = picture.camera.project(blob.corners)
+    if (depth <= 0).any():  # the camera is in the box, or close beside it
+        return np.zeros(shape, bool)
+    within = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(within, cv2.convexHull(np.round(pixel).astype(np.int32)), 1)
+    return within == 0
+
+
+def _cut(image: NDArray[np.uint8], band: _Band) -> Mask:
+    """Return the body's mask within a band, by GrabCut in a window about it."""
+    rows, columns = np.nonzero(~band.outside)
+    if len(rows) == 0 or not band.start.any():
+        return np.zeros(band.start.shape, bool)
+    more = 4 + int(_SURROUNDINGS * max(np.ptp(rows), np.ptp(columns)))
+    window = (
+        slice(max(rows.min() - more, 0), rows.max() + more + 1),
+        slice(max(columns.min() - more, 0), columns.max() + more + 1),
+    )
+    state = np.where(band.start, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    state[band.outside], state[band.inside & ~band.outside] = cv2.GC_BGD, cv2.GC_FGD
+    part, state = image[window], state[window]
+    height, width = state.shape
+    scale = min(1.0, _WINDOW_PX / max(height, width))
+    if scale < 1:
+        size = max(1, round(scale * width)), max(1, round(scale * height))
+        part = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+        state = cv2.resize(state, size, interpolation=cv2.INTER_NEAREST)
+    part, state = np.ascontiguousarray(part), np.ascontiguousarray(state)
+    outer = (state == cv2.GC_BGD) | (state == cv2.GC_PR_BGD)
+    if not outer.any() or outer.all():  # GrabCut needs colours of both
+        return band.start & ~band.outside
+    cv2.setRNGSeed(0)
+    cv2.grabCut(part, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), _CUTS, cv2.GC_INIT_WITH_MASK)
+    inner = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.float32)
+    mask = np.zeros(band.start.shape, bool)
+    mask[window] = cv2.resize(inner, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    return mask
+
+
+@dataclass(frozen=True)
+class _Solid:
+    """What several masks leave of space: points on its surface, world frame [m], (n, 3), and their spacing [m]."""
+
+    surface: Array
+    pitch: float
+
+    @staticmethod
+    def left_by(
+        pictures: Sequence[_Picture],
+        masks: Sequence[Mask],
+        hidden: Sequence[Mask],
+        near: Array,
+        margin: float,
+        ground: Ground | None,
+    ) -> _Solid:
+        """Carve a grid about points that are near the body, (n, 3), and a margin [m], down to the ground.
+
+        Unlike `hull.carve` it lets a few masks be outvoted, and does not carve where another body may hide this one.
+        """
+        low, high = near.min(0) - 1.5 * margin, near.max(0) + 1.5 * margin
+        if ground is not None:
+            feet = near - (near @ np.array(ground.normal) - ground.offset_m)[:, None] * np.array(ground.normal)
+            low, high = np.minimum(low, feet.min(0)), np.maximum(high, feet.max(0))
+        pitch = float((high - low).max()) / (_GRID - 1)
+        shape = tuple(int(n) for n in np.ceil((high - low) / pitch).astype(int) + 1)
+        points = grid_points(shape, low, pitch)
+        distances = np.full((len(pictures), len(points)), np.inf, np.float32)
+        for row, picture, mask, other in zip(distances, pictures, masks, hidden, strict=True):
+            if mask.any():
+                _look_up(row, points, mask, other, picture.camera)
+        rank = min(math.ceil(_OUTVOTED * len(pictures)), len(pictures) - 1)
+        field = np.partition(distances, rank, axis=0)[rank].astype(float)
+        field[np.isfinite(distances).sum(0) < _MIN_VIEWS] = -pitch
+        if ground is not None:
+            field = np.minimum(field, points @ np.array(ground.normal) - ground.offset_m + 1e-3 * pitch)
+        field = _largest_part(np.pad(field.reshape(shape), 1, constant_values=-pitch), pitch)
+        return _Solid(crossings(field, low - pitch, pitch), pitch)
+
+    def seen_by(self, camera: Camera) -> Mask:
+        """Return the solid's mask in a photo."""
+        metre = _pixels_per_metre(camera, self.surface)
+        if metre is None:
+            return np.zeros((camera.height, camera.width), bool)
+        # The points lie on the surface: discs that close the gaps between them are taken off again at the border.
+        radius = 0.9 * self.pitch * metre + 0.5
+        return _eroded(_dilated(_marked(camera, self.surface), radius), radius)
+
+    def band(self, camera: Camera) -> _Band:
+        """Return a narrow band about the solid's border in a photo."""
+        mask = self.seen_by(camera)
+        width = _NARROW * self.pitch * (_pixels_per_metre(camera, self.surface) or 0.0)
+        return _Band.about(mask, mask, width)
+
+
+def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera) -> None:
+    """Write into `row` (n,) how far inside a mask points (n, 3) lie [m], where the photo may show them."""
+    signed = signed_distance_px(mask)
+    pixel, depth = camera.project(points)
+    seen = (depth > 0) & (pixel > 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
+    seen[seen] = ~hidden[tuple(pixel[seen].astype(int).T[::-1])]
+    u, v = pixel[seen].T - 0.5
+    row[seen] = map_coordinates(signed, [v, u], order=1, mode="nearest") * depth[seen] / camera.K[0, 0]
+
+
+def _largest_part(field: Array, pitch: float) -> Array:
+    """Return a field (X, Y, Z) that is positive in its largest connected part alone."""
+    parts, count = label(field > 0)  # type: ignore[misc]
+    if count == 0:
+        return field
+    sizes = np.bincount(parts.reshape(-1))
+    sizes[0] = 0
+    return np.where(parts == int(np.argmax(sizes)), field, np.minimum(field, -1e-3 * pitch))
+
+
+def _agreement(solid: _Solid, pictures: Sequence[_Picture], masks: Sequence[Mask], hidden: Sequence[Mask]) -> float:
+    """Return the mean IoU of masks and of the solid in the same photos; photos that show neither do not count."""
+    values = []
+    for picture, mask, other in zip(pictures, masks, hidden, strict=True):
+        seen = solid.seen_by(picture.camera) & ~other
+        if (seen | mask).any():
+            values.append(float((seen & mask).sum() / (seen | mask).sum()))
+    return float(np.mean(values)) if values else 0.0
+
+
+def _pixels_per_metre(camera: Camera, points: Array) -> float | None:
+    """Return the size of a metre [px] at the depth of points (n, 3), or None if they are not before the camera."""
+    depth = points @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
+    middle = float(np.median(depth)) if len(depth) else 0.0
+    return camera.K[0, 0] / middle if middle > 0 else None
+
+
+def _marked(camera: Camera, points: Array) -> Mask:
+    """Return the pixels in which points (n, 3) lie."""
+    pixel, depth = camera.project(points)
+    column, row = np.floor(np.nan_to_num(pixel, nan=-1.0)).clip(-1, 1e6).astype(int).T
+    seen = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[row[seen], column[seen]] = True
+    return mask
+
+
+def _dilated(mask: Mask, radius_px: float) -> Mask:
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), _disc(radius_px))) > 0
+
+
+def _eroded(mask: Mask, radius_px: float) -> Mask:
+    # What lies beyond the picture is unknown: the border of a body that leaves it is not eroded there.
+    return np.asarray(cv2.erode(mask.astype(np.uint8), _disc(radius_px), borderValue=1)) > 0
+
+
+def _disc(radius_px: float) -> NDArray[np.uint8]:
+    side = 2 * max(0, round(radius_px)) + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
