@@ -98,8 +98,8 @@ def scene_seeds(
 
     Ground that the photos show is covered by cells, small where its picture has detail; elsewhere SfM points stand for
     the surfaces. Where there is neither, random points do, but not around a body that masks show: whatever stands
-    before one camera would hide the body from its neighbours. Rays that meet nothing end on a shell, which is closed, so
-    that no view looks out of the world.
+    before one camera would hide the body from its neighbours. Rays that meet nothing end on a shell, which is closed,
+    so that no view looks out of the world.
 
     Args:
         views: The photos; pixels of bodies are left out.
