@@ -8,7 +8,7 @@ eighth is held out. Distances are between the true surface, all of it (the insid
 union of the colliding spheres, both ways, over area, in per cent of the diagonal of the mesh's bounding box. From the
 spheres to the mesh they are to the nearest of a million points on it, which overstates them by at most 0.15 mm.
 `built-in` is the L-block of the built-in scenes' seed 2; the others are YCB scans, mug and drill the test, the rest
-(banana, mustard_bottle, rubiks_cube) those with which settings were chosen.
+(banana, mustard_bottle, rubiks_cube) those with which settings were chosen. The bar of the PSNR is for `built-in`.
 """
 
 from __future__ import annotations
@@ -102,8 +102,9 @@ def verdict(name: str, row: dict[str, Any]) -> list[bool]:
     bars = [
         ("surface error", row["surface_error_per_cent"], f"< {surface} %", row["surface_error_per_cent"] < surface),
         ("spheres", row["collision_spheres"], f"<= {MOST_SPHERES}", row["collision_spheres"] <= MOST_SPHERES),
-        ("PSNR in the mask", row["psnr_object_db"], f">= {PSNR_DB} dB", row["psnr_object_db"] >= PSNR_DB),
     ]
+    if name == "built-in":
+        bars += [("PSNR in the mask", row["psnr_object_db"], f">= {PSNR_DB} dB", row["psnr_object_db"] >= PSNR_DB)]
     for what, value, bar, met in bars:
         print(f"{name}: {what} {value} ({bar}): {'met' if met else 'MISSED'}")
     return [met for *_, met in bars]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -185,7 +186,7 @@ def _chunks(drawn: NDArray[np.int64], shape: NDArray[np.int64]) -> list[NDArray[
     return parts
 
 
-def _weights(corners: Array, x: Array, y: Array) -> Array:
+def _weights(corners: Array, x: NDArray[Any], y: NDArray[Any]) -> Array:
     """Return barycentric coordinates in the image (..., 3) of points in triangles with corners (..., 3, 2)."""
     a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
     area = (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ def test_points_behind_every_camera(tmp_path: Path) -> None:
 
 
 def test_points_of_which_few_are_in_view_are_told(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path / "capture", shape=BALL, masks=False)
+    capture = make_capture(tmp_path / "capture", shape=BALL)
+    shutil.rmtree(capture.root / "masks")
     write(capture, np.concatenate([points(60), points(140) + np.array([100.0, 0, 0])]))
     result = fit_scene(capture, QUICK)
     assert "Only 30% of the points of sparse_points.ply lie in view of any photo." in result.warnings

@@ -209,12 +209,12 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
     # at a notch or a tip even the smallest sphere may stick out
     inside = solid.at(centers) + radii <= 2 * solid.tolerance
     radii, centers = radii[inside], centers[inside]
-    gap = np.maximum(union_distance(*chosen.arrays(), points), 0.0).astype(np.float32)
-    gap = np.minimum(gap, np.float32(solid.size()))
+    size = solid.size()
+    gap = np.clip(union_distance(*chosen.arrays(), points), 0.0, size).astype(np.float32)
     reach = _gaps(centers, radii, points)
     queue = [(-float(np.maximum(gap - row, 0).sum()), index) for index, row in enumerate(reach)]
     heapq.heapify(queue)
-    while chosen.count < limit and queue and gap.mean() > _MEAN_TOLERANCE * solid.size():
+    while chosen.count < limit and queue and gap.mean() > _MEAN_TOLERANCE * size:
         _, index = heapq.heappop(queue)
         worth = float(np.maximum(gap - reach[index], 0).sum())
         if queue and worth < -queue[0][0]:
@@ -222,7 +222,7 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
             continue
         chosen.add(centers[index], float(radii[index]))
         gap = np.minimum(gap, reach[index])
-    while chosen.count < limit and gap.max() > _MOST_TOLERANCE * solid.size():
+    while chosen.count < limit and gap.max() > _MOST_TOLERANCE * size:
         worst = int(np.argmax(gap))
         index = int(np.argmin(reach[:, worst]))
         if reach[index, worst] >= gap[worst]:
@@ -260,11 +260,19 @@ def _inscribed_radii(solid: Solid, points: Array, normals: Array) -> Array:
     """
     size = solid.size()
     steps = size * np.geomspace(_SMALLEST_RADIUS, 0.5, 40)
+
+    def fits(radius: Array) -> NDArray[np.bool_]:
+        return -solid.at(points - radius[:, None] * normals) >= radius - solid.tolerance
+
     radii = np.full(points.shape[0], steps[0])
     for step in steps[1:]:
-        fits = -solid.at(points - step * normals) >= step - solid.tolerance
-        radii[fits] = step
-    return radii
+        radii[fits(np.full(len(points), step))] = step
+    low, high = radii, radii * steps[1] / steps[0]
+    for _ in range(5):
+        middle = 0.5 * (low + high)
+        good = fits(middle)
+        low, high = np.where(good, middle, low), np.where(good, high, middle)
+    return low
 
 
 @dataclass(frozen=True)
