@@ -1,7 +1,7 @@
 """Bodies whose surface is known: held-out pictures, and how far the colliding spheres are from the true surface.
 
     python benchmarks/known_mesh.py [--objects built-in,mug,power_drill] [--views 48] [--size 400] [--spheres 16000]
-        [--joint] [--geometry-rate 0.5] [--collision-spheres N]
+        [--joint] [--geometry-rate 0.5] [--collision-spheres N] [--depth-noise-mm 1]
 
 Clean photos from all around of a mesh that floats before one colour (mesh_photos.py), with its masks and cameras; every
 eighth is held out. Distances are between the true surface, all of it (the inside of a mug too), and the surface of the
@@ -42,11 +42,13 @@ _POINTS, _QUERIES = 1_000_000, 40_000
 Array = NDArray[np.float64]
 
 
-def measure(painted: Painted, views: int, size: int, config: SplatConfig) -> dict[str, Any]:
+def measure(
+    painted: Painted, views: int, size: int, config: SplatConfig, depth_noise_m: float | None
+) -> dict[str, Any]:
     """Photograph, fit and compare one object."""
     with tempfile.TemporaryDirectory() as folder:
         capture, out = Path(folder) / "capture", Path(folder) / "model"
-        write_capture(capture, painted, views, size)
+        write_capture(capture, painted, views, size, depth_noise_m)
         started, cpu = time.perf_counter(), time.process_time()
         fit(capture, out, "sg-gs", splat_config=config)
         seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
@@ -122,7 +124,9 @@ def main() -> int:
     )
     parser.add_argument("--joint", action="store_true", help="fit geometry and colours together")
     parser.add_argument("--geometry-rate", type=float, default=0.5, help="of geometry while colours are fitted")
+    parser.add_argument("--depth-noise-mm", type=float, help="give depth maps with so much noise")
     words = parser.parse_args()
+    noise_m = None if words.depth_noise_mm is None else 1e-3 * words.depth_noise_mm
     config = SplatConfig(image_size=words.size, max_body_spheres=words.spheres, max_scene_spheres=500)
     config = config.model_copy(update={"joint": words.joint, "geometry_rate": words.geometry_rate, "turntable": False})
     if words.collision_spheres is not None:
@@ -142,7 +146,8 @@ def main() -> int:
             key = f"{name}, {words.views} views, {words.size} px, {config.max_body_spheres} visual spheres, "
             key += f"at most {config.max_collision_spheres} colliding"
             key += ", joint" if words.joint else f", geometry at {config.geometry_rate:g}"
-            row = store.result(key, lambda painted=painted: measure(painted, words.views, words.size, config))
+            key += "" if noise_m is None else f", depth maps with {words.depth_noise_mm:g} mm of noise"
+            row = store.result(key, lambda painted=painted: measure(painted, words.views, words.size, config, noise_m))
             met += verdict(name, row)
     print(f"{sum(met)} of {len(met)} bars met")
     return 0 if all(met) else 1

@@ -104,13 +104,26 @@ def cameras_around(mesh: Mesh, count: int, size: int) -> dict[str, Camera]:
     }
 
 
-def write_capture(root: Path, painted: Painted, views: int, size: int) -> None:
-    """Write a capture of one body, `object`, whose frame in the photos is the mesh's."""
+def write_capture(root: Path, painted: Painted, views: int, size: int, depth_noise_m: float | None = None) -> None:
+    """Write a capture of one body, `object`, whose frame in the photos is the mesh's.
+
+    Args:
+        root: The directory to make.
+        painted: The body.
+        views: Number of photos.
+        size: Their sides [px].
+        depth_noise_m: Standard deviation of the noise of depth maps [m]; None writes no depth maps.
+    """
+    rng = np.random.default_rng(0)
     cameras = cameras_around(painted.mesh, views, size)
     (root / "images").mkdir(parents=True)
     (root / "masks").mkdir()
     for name, camera in cameras.items():
-        image, mask = draw(painted, camera)
+        image, mask, depth = draw(painted, camera)
+        if depth_noise_m is not None:
+            (root / "depth").mkdir(exist_ok=True)
+            noisy = np.where(depth > 0, depth + depth_noise_m * rng.normal(size=depth.shape), 0)
+            np.save(root / "depth" / name.replace(".png", ".npy"), noisy.astype(np.float32))
         write_image(root / "images" / name, image)
         write_image(root / "masks" / name, mask)
     file = CamerasFile(
@@ -126,8 +139,8 @@ def write_capture(root: Path, painted: Painted, views: int, size: int) -> None:
     (root / "capture.toml").write_text(manifest, encoding="utf-8")
 
 
-def draw(painted: Painted, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return a photo (H, W, 3) and its mask (H, W): 1 where most of a pixel shows the mesh."""
+def draw(painted: Painted, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
+    """Return a photo (H, W, 3), its mask (H, W): 1 where most of a pixel shows the mesh, and the depth [m] (H, W)."""
     width, height = SAMPLES * camera.width, SAMPLES * camera.height
     pixel, depth = camera.resized(width, height).project(painted.mesh.vertices)
     face, weight, place = _visible(pixel, depth, painted.mesh.faces, width, height)
@@ -135,10 +148,13 @@ def draw(painted: Painted, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[n
     fine[place] = painted.color(face, weight)
     covered = np.zeros(height * width, np.float32)
     covered[place] = 1
+    depths = np.zeros(height * width)
+    depths[place] = (weight * depth[painted.mesh.faces[face]]).sum(1)
     shape = (camera.height, SAMPLES, camera.width, SAMPLES)
     image = fine.reshape(*shape, 3).mean((1, 3))
     cover = covered.reshape(shape).mean((1, 3))
-    return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8), (cover > 0.5).astype(np.uint8)
+    middle = depths.reshape(height, width)[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
+    return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8), (cover > 0.5).astype(np.uint8), middle
 
 
 def _visible(

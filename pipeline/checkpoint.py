@@ -99,7 +99,8 @@ class Checkpoint:
             arrays: list[Array] = []
             frame = json.dumps(_taken_apart(state, arrays))
             with path.open("wb") as stream:  # an open file: savez would put another suffix after the name
-                np.savez(stream, frame=np.array(frame), **{str(k): array for k, array in enumerate(arrays)})
+                named = {"frame": np.array(frame)} | {str(k): array for k, array in enumerate(arrays)}
+                np.savez(stream, allow_pickle=False, **named)
         self._last = time.monotonic()
 
     def read(self, name: str, device: torch.device) -> State | None:

@@ -80,9 +80,8 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         "mask_iou": _mean(overlap),
         "psnr_db_by_photo": [round(value, 3) for value in whole],
     }
-    if halves:
-        before, after = zip(*halves, strict=True)
-        figures |= {"psnr_right_half_db": _mean(before), "psnr_right_half_corrected_db": _mean(after)}
+    figures["psnr_right_half_db"] = _mean([before for before, _ in halves])
+    figures["psnr_right_half_corrected_db"] = _mean([after for _, after in halves])
     return HeldOut(figures, sheet)
 
 

@@ -1,5 +1,6 @@
 """Surfaces of unions of spheres and the distances between them; the photos of known meshes that measure them."""
 
+import importlib
 import sys
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def test_what_lies_inside_another_sphere_is_no_surface():
 def photos():
     sys.path.insert(0, str(BENCHMARKS))  # as `python benchmarks/known_mesh.py` has it
     try:
-        import mesh_photos
+        mesh_photos = importlib.import_module("mesh_photos")
     finally:
         sys.path.remove(str(BENCHMARKS))
     return mesh_photos

@@ -189,7 +189,7 @@ def _reduced_maps(maps: GeometryMaps, width: int, height: int) -> list[NDArray[n
     """
     size = (width, height)
     nearest = [
-        None if values is None else cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
+        None if values is None else np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST), np.float32)
         for values in (maps.depth_m, maps.normals_cam)
     ]
     features = None
@@ -197,7 +197,8 @@ def _reduced_maps(maps: GeometryMaps, width: int, height: int) -> list[NDArray[n
         channels = [maps.features[..., k] for k in range(maps.features.shape[2])]
         smaller = width < maps.features.shape[1]
         how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-        features = np.stack([cv2.resize(np.ascontiguousarray(one), size, interpolation=how) for one in channels], -1)
+        resized = [cv2.resize(np.ascontiguousarray(one), size, interpolation=how) for one in channels]
+        features = np.asarray(np.stack(resized, -1), np.float32)
     return [*nearest, features]
 
 
