@@ -95,8 +95,8 @@ def test_photos_of_a_known_mesh_show_it_where_it_is(photos):
     painted = photos.built_in(0)  # convex: its outline is the convex hull of its corners
     cameras = photos.cameras_around(painted.mesh, 6, 80)
     for camera in cameras.values():
-        image, mask = photos.draw(painted, camera)
-        pixel, _ = camera.project(painted.mesh.vertices)
+        image, mask, surface = photos.draw(painted, camera)
+        pixel, corner_depth = camera.project(painted.mesh.vertices)
         assert pixel.min() > 0
         assert pixel.max() < 80
         hull = cv2.convexHull(pixel.astype(np.float32))
@@ -106,6 +106,10 @@ def test_photos_of_a_known_mesh_show_it_where_it_is(photos):
         depth = depth.reshape(80, 80)
         assert (mask[depth > 0.6] == 1).all()
         assert (mask[depth < -0.6] == 0).all()
+        assert (surface[depth < -1] == 0).all()
+        on_it = surface[depth > 1]
+        assert corner_depth.min() < on_it.min()
+        assert on_it.max() < corner_depth.max()
         backdrop = np.round(255 * np.array(photos.BACKDROP))
         assert np.abs(image[depth < -1] - backdrop).max() <= 1
         assert np.abs(image[depth > 1] - backdrop).max(1).mean() > 20

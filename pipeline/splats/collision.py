@@ -186,7 +186,7 @@ def _add_support(chosen: _Chosen, solid: Solid, limit: int, tolerance: float) ->
     directions = fibonacci_directions(DIRECTIONS)
     extreme = np.array([int(np.argmax(solid.surface @ direction)) for direction in directions])
     points = solid.surface[extreme]
-    radii = _inscribed_radii(solid, points, directions)
+    radii = inscribed_radii(solid, points, directions)
     lack = (points * directions).sum(1)
     centers, sizes = chosen.arrays()
     lack = lack - support_of_spheres(centers, sizes, directions) if chosen.count else np.full(lack.shape, np.inf)
@@ -204,7 +204,7 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
     gaps most; what it lessens it by can only fall while others are added (the sum is submodular), so a candidate is
     weighed anew only when its old worth is the greatest. Then each is the one that comes nearest to the worst point.
     """
-    radii = _inscribed_radii(solid, points, normals)
+    radii = inscribed_radii(solid, points, normals)
     centers = points - radii[:, None] * normals
     # at a notch or a tip even the smallest sphere may stick out
     inside = solid.at(centers) + radii <= 2 * solid.tolerance
@@ -253,7 +253,7 @@ def _add_fill(chosen: _Chosen, solid: Volume, limit: int) -> None:
         bare &= np.linalg.norm(points - points[deepest], axis=1) > depth[deepest]
 
 
-def _inscribed_radii(solid: Solid, points: Array, normals: Array) -> Array:
+def inscribed_radii(solid: Solid, points: Array, normals: Array) -> Array:
     """Return the radius of the largest sphere that touches the surface at each point and lies inside, shape (n,).
 
     It may stick out by the solid's own tolerance.

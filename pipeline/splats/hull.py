@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -25,8 +26,10 @@ _BORDER_SMOOTHING_PX = 0.7
 _BORDER_BIAS_PX = 0.5
 _TIP_DIRECTIONS = 500
 _MIN_VIEWS = 3
-_AGREEING = 3
-"""So many depth maps have to see a point before their surface, for it to be empty."""
+_TRUNCATION_PX = 4.0
+"""Beyond so many pixel widths behind its surface a depth map says nothing; before it, only that there is nothing."""
+_LEAST_COSINE = 0.25
+"""Depth on surfaces that are seen at a more grazing angle changes too fast within a pixel."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,14 @@ class Silhouette:
     K: Array
     T_cam_world: Array
     depth_m: NDArray[np.float32] | None = None
+
+    @cached_property
+    def facing(self) -> Array:
+        """Return the cosine between each pixel's ray and the normal of the depth map's surface, shape (H, W)."""
+        assert self.depth_m is not None
+        depth = np.where(self.depth_m > 0, self.depth_m, np.nan).astype(float)
+        down, right = (slope / depth for slope in np.gradient(depth))
+        return np.nan_to_num(1 / np.sqrt(1 + (self.K[1, 1] * down) ** 2 + (self.K[0, 0] * right) ** 2))
 
     def pixel_at(self, point: Array) -> float:
         """Return the width of a pixel [m] at the depth of a point, world frame, shape (3,)."""
@@ -157,7 +168,7 @@ def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], 
     """Return about the distance from the hull's surface at points (n, 3) [m], positive inside, shape (n,)."""
     result = np.full(points.shape[0], np.inf)
     seen = np.zeros(points.shape[0], dtype=np.int32)
-    behind = np.full((_AGREEING, points.shape[0]), np.inf)  # the least of the depths behind a depth map's surface [m]
+    fused = _FusedDepth(points.shape[0])
     for view, field in zip(views, fields, strict=True):
         local = points @ view.T_cam_world[:3, :3].T + view.T_cam_world[:3, 3]
         depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
@@ -169,18 +180,45 @@ def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], 
         result[visible] = np.minimum(result[visible], metres)
         seen[visible] += 1
         if view.depth_m is not None:
-            rows, columns = v[visible].astype(int), u[visible].astype(int)
-            surface = view.depth_m[rows, columns]
-            known = (surface > 0) & view.mask[rows, columns]
-            below = np.where(known, depth[visible] - surface, np.inf)
-            behind[:, visible] = np.sort(np.concatenate([behind[:, visible], below[None]]), axis=0)[:_AGREEING]
+            fused.add(view, visible, u[visible], v[visible], depth[visible])
     far = np.abs(result[np.isfinite(result)]).max(initial=1.0)
     result = np.where(seen >= min(_MIN_VIEWS, len(views)), result, -far)
-    # What lies before the surface that a depth map shows is empty; a few maps must agree, for each has noise.
-    result = np.minimum(result, behind[-1])
+    result = np.minimum(result, fused.depth_behind_m())
     if ground is not None:
         result = np.minimum(result, points @ np.array(ground.normal) - ground.offset_m)
     return result
+
+
+class _FusedDepth:
+    """Mean depth of points behind the surfaces that depth maps show, positive inside the body.
+
+    Truncated signed distances, averaged over the maps with the cosine of the angle of sight as weight (Curless and
+    Levoy 1996, "A volumetric method for building complex models from range images"): noise averages out, where the
+    least of many noisy depths would eat thin walls away.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._sum, self._weight = np.zeros(count), np.zeros(count)
+        self._most = np.inf
+
+    def add(self, view: Silhouette, index: NDArray[np.bool_], u: Array, v: Array, depth: Array) -> None:
+        """Add a map: points (count,) that are in the picture, their pixels [px] and depths [m]."""
+        assert view.depth_m is not None
+        rows, columns = v.astype(int), u.astype(int)
+        surface, cosine = view.depth_m[rows, columns], view.facing[rows, columns]
+        reach = _TRUNCATION_PX * depth / view.K[0, 0]
+        below = (depth - surface) * cosine
+        counts = (surface > 0) & view.mask[rows, columns] & (cosine > _LEAST_COSINE) & (below < reach)
+        weight = np.where(counts, cosine, 0.0)
+        self._sum[index] += weight * np.maximum(below, -reach)
+        self._weight[index] += weight
+        self._most = min(self._most, float(reach.min(initial=np.inf)))
+
+    def depth_behind_m(self) -> Array:
+        """Return the mean (count,); infinite where no map says anything, or only that a point is well inside."""
+        known = self._weight > 0
+        mean = self._sum / np.where(known, self._weight, 1.0)
+        return np.where(known & (mean < 0.9 * self._most), mean, np.inf)
 
 
 def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:

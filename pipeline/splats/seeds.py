@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ...schemas import Ground
+from .collision import inscribed_radii
 from .directions import fibonacci_directions
 from .spheres import Spheres
 from .views import View, focus_of
@@ -25,6 +26,7 @@ _COARSE_SHELL = 80
 _PIXELS = 600_000
 _LEVELS = 12
 _CELL_SCALE = 0.55
+_THINNEST = 0.35  # of the radius elsewhere: smaller spheres would leave gaps
 
 
 def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int) -> tuple[Array, Array, int]:
@@ -47,10 +49,12 @@ def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int)
     index = candidates[chosen]
     radius = _COVER_FACTOR * spacing
     centers = solid.surface[index] - radius * solid.normals[index]
-    # Where the solid is thinner than two radii, its middle is as deep as a centre can lie.
-    depth = -solid.at(centers)
-    centers += np.where(depth < 0.5 * radius, 0.5, 0.0)[:, None] * radius * solid.normals[index]
     radii = np.full(len(index), radius)
+    # Where the solid is thinner than two radii, its middle is as deep as a centre can lie.
+    thin = np.flatnonzero(-solid.at(centers) < 0.5 * radius)
+    surface, normals = solid.surface[index[thin]], solid.normals[index[thin]]
+    radii[thin] = inscribed_radii(solid, surface, normals).clip(_THINNEST * radius, radius)
+    centers[thin] = surface - radii[thin, None] * normals
     inner, inner_radii = _filling(solid, centers, radii, max_spheres - len(index))
     scales = np.concatenate([radii, inner_radii]) / radius_factor
     return np.concatenate([centers, inner]), scales, len(index)
