@@ -15,6 +15,7 @@ from cgwm.pipeline.splats.fit import Rates, Trainable, descend
 from cgwm.pipeline.splats.hull import Silhouette, carve
 from cgwm.pipeline.splats.losses import geometry_loss, normals_of, scene_loss
 from cgwm.pipeline.splats.poses import Motions, motion_record, moved_for_good
+from cgwm.pipeline.splats.seeds import points_of_depth
 from cgwm.pipeline.splats.spheres import Spheres
 from cgwm.pipeline.splats.views import load_views, render_view, spread_of
 from test_sg_gs import PLACE, make_capture, world
@@ -166,6 +167,18 @@ def test_maps_are_read_checked_and_scaled(tmp_path, views, truth):
     assert any("depth/000.npy: the map has 4x3 px" in text for text in messages)
     assert any("normals/other.npy: there is no photo of that name" in text for text in messages)
     assert any("features/001.npy: float32 (72, 96)" in text for text in messages)
+
+
+def test_points_of_depth_lie_on_the_ground_and_not_on_the_body(views, truth):
+    with_depth = [replace(view, depth=_depth_of(view, truth)) for view in views]
+    points = points_of_depth(with_depth, 2000, 0)
+    assert points is not None
+    assert len(points) > 500
+    assert np.abs(np.median(points[:, 2])) < 0.02  # the ground is spheres of 12 mm
+    away = np.linalg.norm(points - PLACE, axis=1)
+    assert away.min() > 0.045  # the ball has a radius of 0.05
+    body = [replace(view, depth=view.depth * (view.cover[0] > 0.5)) for view in with_depth]
+    assert points_of_depth(body, 2000, 0) is None
 
 
 def test_normals_of_a_plane_point_to_the_camera(views):

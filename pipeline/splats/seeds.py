@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from ...schemas import Ground
 from .collision import inscribed_radii
 from .directions import fibonacci_directions
+from .losses import scene_weight
 from .spheres import Spheres
 from .views import View, focus_of
 from .volume import Array, Volume, grid_points
@@ -169,20 +170,21 @@ def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) 
 
 
 def points_of_depth(views: Sequence[View], count: int, seed: int) -> Array | None:
-    """Return points of the surfaces that the photos' depth maps show, world frame, (n, 3), or None without any."""
+    """Return points of the background that the photos' depth maps show, world frame, (n, 3), or None without any."""
     rng = np.random.default_rng(seed)
     known = [view for view in views if view.depth is not None]
     parts = []
     for view in known:
         depth = view.depth.cpu().numpy()  # type: ignore[union-attr]
-        v, u = np.nonzero(depth)
+        v, u = np.nonzero(depth * (scene_weight(view) > 0.95).cpu().numpy())
         chosen = rng.permutation(len(u))[: 1 + count // len(known)]
         v, u = v[chosen], u[chosen]
         K, z = view.K.double().cpu().numpy(), depth[v, u].astype(float)
         local = np.stack([z * (u + 0.5 - K[0, 2]) / K[0, 0], z * (v + 0.5 - K[1, 2]) / K[1, 1], z], 1)
         pose = view.camera.T_world_cam
         parts.append(local @ pose[:3, :3].T + pose[:3, 3])
-    return np.concatenate(parts) if parts else None
+    points = np.concatenate(parts) if parts else np.zeros((0, 3))
+    return points if len(points) else None
 
 
 @dataclass(frozen=True)
