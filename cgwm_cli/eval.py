@@ -54,6 +54,7 @@ def _summary(result: EvalResult) -> str:
             ("rotation error [deg]", turn, 1.0),
             ("PSNR, object [dB]", result.psnr_object_db, 1.0),
             ("PSNR, frame [dB]", result.psnr_db, 1.0),
+            ("SSIM, frame [%]", result.ssim, 100.0),
             ("state-fitted residual [mm]", result.state_fitted_residual_m, 1e3),
             ("noise of the start alone [mm]", result.state_noise_floor_m, 1e3),
         )

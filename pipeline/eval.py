@@ -281,6 +281,7 @@ def _result(episodes: Sequence[EpisodeEvaluation], warnings: Sequence[str]) -> E
         rotation_error_deg=model["rotation_error_deg"],
         psnr_db=model["psnr_db"],
         psnr_object_db=model["psnr_object_db"],
+        ssim=model["ssim"],
         state_fitted_residual_m=_summary([e.state_fitted_residual_m for e in errors]),
         state_noise_floor_m=_summary([e.state_noise_floor_m for e in errors]),
         baselines={method: _plain(_figures(episodes, method)) for method in BASELINES},
@@ -298,6 +299,7 @@ def _figures(episodes: Sequence[EpisodeEvaluation], method: str) -> dict[str, An
         "rotation_error_deg": _summary([mean for mean, _ in turned], [last for _, last in turned]),
         "psnr_db": _summary([_video_mean(e.videos, "psnr_db", method) for e in episodes]),
         "psnr_object_db": _summary([_video_mean(e.videos, "psnr_object_db", method) for e in episodes]),
+        "ssim": _summary([_video_mean(e.videos, "ssim", method) for e in episodes]),
     }
 
 
@@ -320,6 +322,7 @@ def _episode_errors(prediction: EpisodePrediction, videos: Sequence[VideoCompari
         rotation_final_deg=turned_last,
         psnr_db=_video_mean(videos, "psnr_db", MODEL),
         psnr_object_db=_video_mean(videos, "psnr_object_db", MODEL),
+        ssim=_video_mean(videos, "ssim", MODEL),
         state_fitted_residual_m=prediction.state_fitted_m,
         state_noise_floor_m=prediction.noise_floor_m,
     )

@@ -1,10 +1,11 @@
-"""Predicted motions against the frames of videos: peak signal-to-noise ratio of the frame and of the object."""
+"""Predicted motions against the frames of videos: PSNR of the frame and of the object, and SSIM of the frame."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..datasets.cameras import Camera, pose_count
@@ -13,6 +14,7 @@ from ..datasets.models import Model
 from ..schemas import Exposure
 from .labels import LabelRenderer
 from .prediction import MODEL, EpisodePrediction, Motion
+from .splats.losses import ssim_map
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -31,6 +33,7 @@ class VideoComparison:
         psnr_db: By method, over the whole frame, shape (F,).
         psnr_object_db: By method, over the union of the predicted and the true object mask, shape (F,); NaN where
             neither has a pixel.
+        ssim: By method, structural similarity of the whole frame, shape (F,).
         true_masks: Whether the true mask was known; without it the union is the predicted mask alone.
         real: The frames without distortion, uint8 RGB, shape (F, H, W, 3); None where frames are not kept.
         predicted: The model's, same shape, or None.
@@ -40,6 +43,7 @@ class VideoComparison:
     time_s: Array
     psnr_db: dict[str, Array]
     psnr_object_db: dict[str, Array]
+    ssim: dict[str, Array]
     true_masks: bool
     real: Image | None = None
     predicted: Image | None = None
@@ -82,15 +86,18 @@ class VideoErrors:
         exposure = self.model.file.exposures.get(camera, Exposure())
         psnr: dict[str, Array] = {}
         object_psnr: dict[str, Array] = {}
+        ssim: dict[str, Array] = {}
         shown: Image | None = None
         for method, motion in prediction.motions.items():
             pictures, labels = self._render(footage, camera, motion, at)
             exposed = expose(pictures, exposure)
             psnr[method], object_psnr[method] = self._ratios(footage, exposed, labels)
+            ssim[method] = self._similarities(footage, exposed)
             if method == MODEL and self.keep_frames:
                 shown = (exposed * 255).round().astype(np.uint8)
         real = footage.images if self.keep_frames else None
-        return VideoComparison(camera, footage.time_s, psnr, object_psnr, footage.objects is not None, real, shown)
+        known = footage.objects is not None
+        return VideoComparison(camera, footage.time_s, psnr, object_psnr, ssim, known, real, shown)
 
     def _footage(self, prediction: EpisodePrediction, camera: str) -> _Footage | None:
         capture, episode = self.capture, prediction.episode
@@ -148,6 +155,14 @@ class VideoErrors:
             whole[k] = _decibel(square[footage.valid])
             objects[k] = _decibel(square[union[k] & footage.valid])
         return whole, objects
+
+    @staticmethod
+    def _similarities(footage: _Footage, exposed: NDArray[np.float32]) -> Array:
+        similar = np.empty(len(exposed))
+        for k, picture in enumerate(exposed):
+            real = torch.from_numpy(footage.images[k].astype(np.float32) / 255)
+            similar[k] = float(ssim_map(torch.from_numpy(picture), real).numpy()[footage.valid].mean())
+        return similar
 
 
 def usable_cameras(capture: Capture, episode: str) -> tuple[list[str], list[str]]:

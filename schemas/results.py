@@ -29,6 +29,8 @@ class EpisodeErrors(FileModel):
     rotation_final_deg: float | None = None
     psnr_db: float | None = None
     psnr_object_db: float | None = None
+    ssim: float | None = None
+    """Structural similarity of the whole frame."""
     state_fitted_residual_m: float | None = None
     state_noise_floor_m: float | None = None
 
@@ -41,6 +43,7 @@ class EvalResult(FileModel):
     rotation_error_deg: ErrorSummary | None = None
     psnr_db: ErrorSummary | None = None
     psnr_object_db: ErrorSummary | None = None
+    ssim: ErrorSummary | None = None
     state_fitted_residual_m: ErrorSummary | None = None
     state_noise_floor_m: ErrorSummary | None = None
     baselines: dict[str, dict[str, Any]] = {}

@@ -174,6 +174,8 @@ def test_wrong_friction_is_told_from_the_right_one(slippery: EvalResult, perfect
     assert wrong.translation_error_m.final > wrong.translation_error_m.median  # it goes on sliding
     assert wrong.psnr_object_db is not None and perfect.result.psnr_object_db is not None
     assert wrong.psnr_object_db.median < perfect.result.psnr_object_db.median - 3
+    assert wrong.ssim is not None and perfect.result.ssim is not None
+    assert wrong.ssim.median < perfect.result.ssim.median <= 1
 
 
 def test_baselines_are_much_worse(perfect: Evaluation) -> None:
