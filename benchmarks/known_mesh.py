@@ -1,7 +1,7 @@
 """Bodies whose surface is known: held-out pictures, and how far the colliding spheres are from the true surface.
 
     python benchmarks/known_mesh.py [--objects built-in,mug,power_drill] [--views 48] [--size 400] [--spheres 16000]
-        [--joint] [--geometry-rate 0.5] [--collision-spheres N] [--depth-noise-mm 1]
+        [--two-step RATE] [--collision-spheres N] [--depth-noise-mm 1]
 
 Clean photos from all around of a mesh that floats before one colour (mesh_photos.py), with its masks and cameras; every
 eighth is held out. Distances are between the true surface, all of it (the inside of a mug too), and the surface of the
@@ -122,13 +122,16 @@ def main() -> int:
     parser.add_argument(
         "--collision-spheres", type=int, help="most colliding spheres; the default of sg-gs if left out"
     )
-    parser.add_argument("--joint", action="store_true", help="fit geometry and colours together")
-    parser.add_argument("--geometry-rate", type=float, default=0.5, help="of geometry while colours are fitted")
+    parser.add_argument(
+        "--two-step", type=float, metavar="RATE", help="geometry first; its rate while colours are fitted"
+    )
     parser.add_argument("--depth-noise-mm", type=float, help="give depth maps with so much noise")
     words = parser.parse_args()
     noise_m = None if words.depth_noise_mm is None else 1e-3 * words.depth_noise_mm
     config = SplatConfig(image_size=words.size, max_body_spheres=words.spheres, max_scene_spheres=500)
-    config = config.model_copy(update={"joint": words.joint, "geometry_rate": words.geometry_rate, "turntable": False})
+    config = config.model_copy(update={"turntable": False})
+    if words.two_step is not None:
+        config = config.model_copy(update={"joint": False, "geometry_rate": words.two_step})
     if words.collision_spheres is not None:
         config = config.model_copy(update={"max_collision_spheres": words.collision_spheres})
     data, store, met = shared_data(), Store("known_mesh"), []
@@ -145,7 +148,7 @@ def main() -> int:
                 painted = scanned(Path(folder) / "ycb" / "ycb" / name)
             key = f"{name}, {words.views} views, {words.size} px, {config.max_body_spheres} visual spheres, "
             key += f"at most {config.max_collision_spheres} colliding"
-            key += ", joint" if words.joint else f", geometry at {config.geometry_rate:g}"
+            key += "" if words.two_step is None else f", geometry first, then at {words.two_step:g} of its rate"
             key += "" if noise_m is None else f", depth maps with {words.depth_noise_mm:g} mm of noise"
             row = store.result(key, lambda painted=painted: measure(painted, words.views, words.size, config, noise_m))
             met += verdict(name, row)

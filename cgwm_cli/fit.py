@@ -35,7 +35,12 @@ def fit(
         typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres that go where needed."),
     ] = None,
     joint: Annotated[
-        bool | None, typer.Option("--joint", help="Fit geometry and colours of bodies together, not geometry first.")
+        bool | None,
+        typer.Option(
+            "--joint/--two-step",
+            show_default=False,
+            help="Fit geometry and colours of bodies together, or geometry first (the default where maps guide it).",
+        ),
     ] = None,
     exposure: Annotated[
         bool | None, typer.Option("--exposure", help="Learn exposure and white balance of every photo.")

@@ -334,15 +334,17 @@ def _hull(stage: _Stage, index: int, body: Body) -> Volume:
 
 
 def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Spheres:
-    """Fit a body's visual spheres: geometry first, then colours (or both together)."""
+    """Fit a body's visual spheres: geometry and colours together, or geometry first, which alone looks at maps."""
     config, device = stage.config, stage.device
     started = time.perf_counter()
     centers, scales, surface_count = body_seeds(solid, config.max_body_spheres, config.radius_factor, config.seed)
     spheres = to_spheres(centers, scales, 0.95, device)
     windows = body_windows(stage.train, index)
-    record: dict[str, Any] = {"spheres": len(spheres), "surface_spheres": surface_count}
     geometry = Rates(means=0.05, log_scales=0.02, logits=0.03)
-    if not config.joint:
+    maps = any(not (w.depth is None and w.normals is None and w.features is None) for w in windows)
+    joint = not maps if config.joint is None else config.joint
+    record: dict[str, Any] = {"spheres": len(spheres), "surface_spheres": surface_count, "joint": joint}
+    if not joint:
         spheres, losses = _fit_geometry(stage, index, body, solid, spheres, windows, geometry)
         record["geometry_loss"] = _thinned(losses)
         rate = config.geometry_rate
@@ -354,7 +356,7 @@ def _fit_spheres(stage: _Stage, index: int, body: Body, solid: Volume) -> Sphere
         appearance,
         windows,
         body_loss(index, stage.exposures),
-        stage.steps(0.75 if config.joint else 0.5),
+        stage.steps(0.75 if joint else 0.5),
         config.seed,
         f"{body.name}: colours",
         0.002,

@@ -38,11 +38,12 @@ class SplatConfig(FileModel):
     """Steps of the background's fit where there is a budget."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
-    joint: bool = False
-    """Fit geometry and colours of bodies together, not geometry first."""
+    joint: bool | None = None
+    """Whether geometry and colours of bodies are fitted together, or geometry first, to silhouettes and geometry maps;
+    left out, geometry comes first where there are maps beside the photos."""
     geometry_rate: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """How fast a body's geometry still moves while its colours are fitted, of how fast it moved before; 0 leaves it as
-    the silhouettes and maps had it, the published form."""
+    """Where geometry comes first, how fast it still moves while colours are fitted, of how fast it moved before; 0
+    leaves it as silhouettes and maps had it, the published form."""
     exposure: bool = False
     """Learn a gain of each colour channel for every photo: for photos whose exposure or white balance varies."""
     refine_poses: bool = False

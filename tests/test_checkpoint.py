@@ -56,7 +56,7 @@ def test_nothing_is_written_by_a_short_fit(tmp_path, capture):
 
 @pytest.mark.parametrize("settings", [{}, {"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1}])
 def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monkeypatch):
-    config = CONFIG.model_copy(update={"iterations": 12, **settings})
+    config = CONFIG.model_copy(update={"iterations": 12, "joint": False, **settings})
     monkeypatch.setattr(adaptive, "REFINED_EVERY", 10)
     monkeypatch.setattr(sg_gs, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))  # not what is tested
     whole = fit_scene(capture, config)
@@ -124,7 +124,13 @@ def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
         "checkpoint.Checkpoint.__init__.__defaults__ = (0.0,); from cgwm.cli import main; main()"
     )
     fast = [f"sg-gs.{key}={value}" for key, value in (("max_body_spheres", 200), ("max_scene_spheres", 400))]
-    fast += ["sg-gs.image_size=96", "sg-gs.iterations=160", "sg-gs.turntable=false", "sg-gs.exposure=false"]
+    fast += [
+        "sg-gs.joint=false",
+        "sg-gs.image_size=96",
+        "sg-gs.iterations=160",
+        "sg-gs.turntable=false",
+        "sg-gs.exposure=false",
+    ]
     command = ["fit", str(capture.root), "--stage", "sg-gs", "--device", "cpu", "--out", str(out), "--resume", "--json"]
     command += [word for setting in fast for word in ("--set", setting)]
     with subprocess.Popen([sys.executable, "-c", lines, *command], stderr=subprocess.PIPE) as process:

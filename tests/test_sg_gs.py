@@ -1,6 +1,7 @@
 """The stage sg-gs on a tiny capture that the renderer itself makes."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -123,6 +124,26 @@ def test_the_contact_sheet_shows_photos_renders_and_errors(result):
     photos, errors = sheet[:198, :width], sheet[-198:, :width]
     assert photos.mean() > 80
     assert errors.mean() < 60  # a fit that errs by a quarter of full scale would be bright
+
+
+def test_geometry_comes_first_on_request_or_where_maps_are(capture, result, tmp_path):
+    assert result.record["ball"]["joint"] is True
+    assert "geometry_loss" not in result.record["ball"]
+    frozen, moving = (
+        fit_scene(capture, CONFIG.model_copy(update={"joint": False, "geometry_rate": rate})) for rate in (0.0, 0.5)
+    )
+    for one in (frozen, moving):
+        losses = one.record["ball"]["geometry_loss"]
+        assert np.mean(losses[-5:]) < np.mean(losses[:5])
+    # the same descent on silhouettes; what comes after it moves the spheres in one of them only
+    apart = np.linalg.norm(frozen.bodies["ball"].visual.means - moving.bodies["ball"].visual.means, axis=1)
+    assert 0 < np.median(apart) < 2e-3
+    root = shutil.copytree(capture.root, tmp_path / "maps")
+    (root / "depth").mkdir()
+    for name in capture.photos():
+        np.save(root / "depth" / name.replace(".png", ".npy"), np.zeros((HEIGHT, WIDTH), np.float32))
+    with_maps = fit_scene(Capture.open(root, check=False), CONFIG.model_copy(update={"iterations": 4}))
+    assert with_maps.record["ball"]["joint"] is False
 
 
 def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result):
