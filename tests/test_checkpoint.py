@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.models import read_model
-from cgwm.pipeline import sg_gs
+from cgwm.pipeline import sg_gs_bodies
 from cgwm.pipeline.checkpoint import Checkpoint
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.sg_gs import fit_scene
@@ -58,7 +58,9 @@ def test_nothing_is_written_by_a_short_fit(tmp_path, capture):
 def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monkeypatch):
     config = CONFIG.model_copy(update={"iterations": 12, "joint": False, **settings})
     monkeypatch.setattr(adaptive, "REFINED_EVERY", 10)
-    monkeypatch.setattr(sg_gs, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))  # not what is tested
+    monkeypatch.setattr(
+        sg_gs_bodies, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0))
+    )  # not what is tested
     whole = fit_scene(capture, config)
     for stopped_after in (3, 5):  # again and again, in the midst of one descent or another
         written = 0
@@ -120,8 +122,8 @@ def test_a_folder_of_that_name_that_is_no_checkpoint_stays(tmp_path):
 def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
     out = tmp_path / "model"
     lines = (
-        "from cgwm.pipeline import checkpoint, sg_gs; from cgwm.pipeline.splats.stereo import Refinement; "
-        "sg_gs.refine = lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)); "
+        "from cgwm.pipeline import checkpoint, sg_gs_bodies; from cgwm.pipeline.splats.stereo import Refinement; "
+        "sg_gs_bodies.refine = lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)); "
         "checkpoint.Checkpoint.__init__.__defaults__ = (0.0,); from cgwm.cli import main; main()"
     )
     fast = [f"sg-gs.{key}={value}" for key, value in (("max_body_spheres", 200), ("max_scene_spheres", 400))]

@@ -151,7 +151,7 @@ def test_the_fit_shows_what_it_took_for_the_body(capture, found, tmp_path, monke
     shutil.rmtree(root / "masks")
     write_manifest(root / "capture.toml", with_bodies(capture, Body(name="block")).manifest)
     monkeypatch.setattr("cgwm.pipeline.sg_gs.separate", lambda *_: found)
-    monkeypatch.setattr("cgwm.pipeline.sg_gs.refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
+    monkeypatch.setattr("cgwm.pipeline.sg_gs_bodies.refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
     config = CONFIG.model_copy(update={"iterations": 8})
     fit(root, tmp_path / "model", stage="sg-gs", splat_config=config)
     model = read_model(tmp_path / "model")

@@ -187,3 +187,14 @@ def require_finite(values: Sequence[Tensor], iteration: int, iterations: int, wh
             f"The fit of '{what}' diverged by step {step} of {iterations}: its loss or its spheres are not finite.",
             todo="check that cameras and photos belong together ('cgwm validate CAPTURE'), or try another --seed.",
         )
+
+
+def detached(spheres: Spheres) -> Spheres:
+    """Return the spheres apart from what optimised them."""
+    return Spheres(spheres.means.detach(), spheres.scales.detach(), spheres.opacities.detach(), spheres.colors.detach())
+
+
+def thinned(losses: list[float], count: int = 50) -> list[float]:
+    """Return the losses averaged over equal stretches of iterations, for the record."""
+    parts = torch.tensor(losses, dtype=torch.float64).tensor_split(min(count, len(losses)))
+    return [round(float(part.mean()), 6) for part in parts]

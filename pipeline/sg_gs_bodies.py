@@ -1,0 +1,227 @@
+"""Bodies from photos: their solid, the spheres that are seen, and the spheres that collide."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..datasets.ply import Splats
+from ..schemas import Body, InputDataError, Pose, SplatConfig
+from .sg_gs_stage import Stage
+from .splats.collision import distil, shape_to_spheres
+from .splats.colors import mean_colors
+from .splats.fit import Rates, Trainable, descend, detached, thinned
+from .splats.hull import carve
+from .splats.losses import body_loss, geometry_loss
+from .splats.overlap import require_body_in_masks
+from .splats.seeds import body_seeds, to_spheres
+from .splats.shapes import shape_mass_properties, shape_volume
+from .splats.spheres import Spheres
+from .splats.stereo import refine
+from .splats.surface import Union
+from .splats.views import View, body_windows
+from .splats.volume import Array, MassProperties, Volume, grid_points
+
+
+@dataclass(frozen=True)
+class BodyResult:
+    """One body, in its body frame.
+
+    Attributes:
+        visual: What it looks like; None where nothing shows it (no photos).
+        collision: What it collides with: spheres of radius `radius_factor` times the scale.
+        collision_distance_m: Largest distance between the colliding spheres' surface and the body's solid [m].
+        photo_pose: T_world_body while the photos were taken.
+        mass_properties: Of a solid of uniform density.
+    """
+
+    visual: Splats | None
+    collision: Splats
+    collision_distance_m: float
+    photo_pose: Pose
+    mass_properties: MassProperties
+
+
+def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres | None]:
+    """Return a body in its frame, and its visual spheres in the world frame where it has any."""
+    masked = [view for view in stage.train if view.cover is not None and bool((view.cover[index] > 0.5).any())]
+    if body.shape is None and not masked:
+        raise InputDataError(
+            f"{stage.capture.root}: body '{body.name}' has neither a shape nor masks.",
+            f"shape = {{ box | sphere | mesh | splats }} in capture.toml, or masks/ with label {index + 1}.",
+            "add one of them.",
+        )
+    solid = None
+    T_world_body = _pose_matrix(body.photo_pose or Pose())
+    if body.shape is None:
+        solid = _hull(stage, index, body)
+    elif masked:
+        solid = _moved(shape_volume(body.shape, stage.capture.root, stage.config.radius_factor), T_world_body)
+        require_body_in_masks(solid.surface, masked, index, body.name)
+    elif stage.train:
+        stage.warnings.append(
+            f"body '{body.name}': no mask shows it, so that it has a shape for contact and no looks; masks/ with label "
+            f"{index + 1} would give it some."
+        )
+    world = None if solid is None else _fit_spheres(stage, index, body, solid)
+    if body.photo_pose is None and body.shape is None and world is not None:
+        T_world_body = np.eye(4)
+        T_world_body[:3, 3] = world.means.double().mean(0).cpu().numpy()
+    T_body_world = np.linalg.inv(T_world_body)
+    if body.shape is not None:
+        collision, distance = shape_to_spheres(
+            body.shape, stage.capture.root, stage.config.max_collision_spheres, stage.config.radius_factor
+        )
+        mass_properties = shape_mass_properties(body.shape, stage.capture.root, stage.config.radius_factor)
+    else:
+        assert solid is not None
+        local = _moved(solid, T_body_world)
+        spheres = distil(local, stage.config.max_collision_spheres, seed=stage.config.seed)
+        collision, distance = spheres.splats(stage.config.radius_factor), spheres.distance_m
+        mass_properties = _turned(solid.mass_properties(), T_body_world)
+        stage.record[body.name]["collision"] = {"support_error_m": spheres.support_error_m}
+    visual = None
+    if world is not None and solid is not None:
+        visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
+        nearest = KDTree(solid.surface).query(world.means.cpu().numpy())[1]
+        visual = replace(visual, normals=solid.normals[nearest] @ T_body_world[:3, :3].T)
+        if stage.config.collision == "visual":
+            collision = visual
+            distance = float(_union(visual, stage.config).distance(_moved(solid, T_body_world).surface).max())
+        _record_collision(stage, body.name, collision, visual, distance)
+    pose = body.photo_pose or _pose(T_world_body)
+    return BodyResult(visual, collision, distance, pose, mass_properties), world
+
+
+def _hull(stage: Stage, index: int, body: Body) -> Volume:
+    silhouettes = [view.silhouette(index) for view in stage.train]
+    hull = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
+    if any(view.depth_map is not None for view in stage.train):
+        return hull  # depth maps have carved it where photos would have to be compared
+    solid, refinement = refine(
+        hull, [view for view in stage.train if view.labels is not None], index, stage.config.seed
+    )
+    stage.record[body.name] = {"refinement": asdict(refinement)}
+    return solid
+
+
+def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres:
+    """Fit a body's visual spheres: geometry and colours together, or geometry first, which alone looks at maps."""
+    config, device = stage.config, stage.device
+    started = time.perf_counter()
+    centers, scales, surface_count = body_seeds(solid, config.max_body_spheres, config.radius_factor, config.seed)
+    spheres = to_spheres(centers, scales, 0.95, device)
+    windows = body_windows(stage.train, index)
+    geometry = Rates(means=0.05, log_scales=0.02, logits=0.03)
+    maps = any(not (w.depth is None and w.normals is None and w.features is None) for w in windows)
+    joint = not maps if config.joint is None else config.joint
+    record: dict[str, Any] = {"spheres": len(spheres), "surface_spheres": surface_count, "joint": joint}
+    if not joint:
+        spheres, losses = _fit_geometry(stage, index, body, solid, spheres, windows, geometry)
+        record["geometry_loss"] = thinned(losses)
+        rate = config.geometry_rate
+        geometry = Rates(rate * geometry.means, rate * geometry.log_scales, geometry.logits)
+    even = [stage.exposures.even(window) for window in windows]
+    spheres = replace(spheres, colors=mean_colors(spheres, even, index))
+    appearance = Trainable(spheres, replace(geometry, colors=0.02))
+    losses = descend(
+        appearance,
+        windows,
+        body_loss(index, stage.exposures),
+        stage.steps(0.75 if joint else 0.5),
+        config.seed,
+        f"{body.name}: colours",
+        0.002,
+        exposures=stage.exposures,
+        slot=stage.slot(f"{body.name} colours"),
+    )
+    record |= {"appearance_loss": thinned(losses), "seconds": round(time.perf_counter() - started, 2)}
+    stage.record[body.name] = stage.record.get(body.name, {}) | record
+    return detached(appearance.spheres())
+
+
+def _fit_geometry(
+    stage: Stage, index: int, body: Body, solid: Volume, start: Spheres, windows: Sequence[View], rates: Rates
+) -> tuple[Spheres, list[float]]:
+    """Fit centres, scales and opacities to silhouettes and to what geometry maps there are."""
+    with_features = [view for view in windows if view.features is not None]
+    codes = start.means.new_zeros(len(start), 0)
+    if with_features:
+        as_pictures = [replace(view, image=view.features) for view in with_features]
+        codes = mean_colors(start, as_pictures, index)
+    geometry = Trainable(replace(start, colors=codes), replace(rates, colors=0.02 if with_features else 0.0))
+    losses = descend(
+        geometry,
+        windows,
+        geometry_loss(index, solid.size(), stage.config.radius_factor),
+        stage.steps(0.25),
+        stage.config.seed,
+        f"{body.name}: shape",
+        0.002,
+        slot=stage.slot(f"{body.name} shape"),
+    )
+    return detached(geometry.spheres()), losses
+
+
+def _record_collision(stage: Stage, name: str, collision: Splats, visual: Splats, distance: float) -> None:
+    """Record how far what collides is from the solid, and from what is seen."""
+    record: dict[str, Any] = {"set": stage.config.collision, "spheres": len(collision), "surface_distance_m": distance}
+    if collision is not visual:
+        there, back = _union(collision, stage.config).gaps(_union(visual, stage.config))
+        record |= {"to_visual": asdict(there), "from_visual": asdict(back)}
+    stage.record[name]["collision"] = stage.record[name].get("collision", {}) | record
+
+
+def _union(splats: Splats, config: SplatConfig) -> Union:
+    return Union.of(np.asarray(splats.means), config.radius_factor * np.asarray(splats.scales))
+
+
+def _moved(solid: Volume, T_to_from: Array) -> Volume:
+    """Return a solid in another frame, on a grid of that frame."""
+    rotation, offset = T_to_from[:3, :3], T_to_from[:3, 3]
+    if np.allclose(rotation, np.eye(3)):
+        return replace(solid, origin=solid.origin + offset, surface=solid.surface + offset)
+    surface = solid.surface @ rotation.T + offset
+    origin = surface.min(0) - 3 * solid.pitch
+    shape = tuple(int(n) for n in np.ceil((surface.max(0) - origin) / solid.pitch).astype(int) + 4)
+    points = (grid_points(shape, origin, solid.pitch) - offset) @ rotation
+    inside = (solid.at(points) < 0).reshape(shape)
+    return Volume.from_inside(inside, origin, solid.pitch, surface, solid.corner_count)
+
+
+def _turned(properties: MassProperties, T_to_from: Array) -> MassProperties:
+    rotation, offset = T_to_from[:3, :3], T_to_from[:3, 3]
+    return MassProperties(
+        properties.volume_m3,
+        rotation @ properties.com_m + offset,
+        rotation @ properties.inertia_m2 @ rotation.T,
+    )
+
+
+def _pose_matrix(pose: Pose) -> Array:
+    w, x, y, z = pose.quat_wxyz
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = pose.position_m
+    return T
+
+
+def _pose(T_world_body: Array) -> Pose:
+    """Return a pose without rotation: only bodies whose frame has the world's axes come here."""
+    x, y, z = (float(value) for value in T_world_body[:3, 3])
+    return Pose(position_m=(x, y, z))
+
+
+def _tensor(array: Array, device: torch.device) -> Tensor:
+    return torch.as_tensor(array, dtype=torch.float32, device=device)
