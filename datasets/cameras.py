@@ -81,6 +81,16 @@ class Camera:
         distorted = distort(normalised, self.distortion)
         return distorted @ self.K[:2, :2].T + self.K[:2, 2], depth
 
+    def pixels_of(self, points_world: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+        """Return which points (N, 3), world frame, are in the picture, and the columns and rows of their pixels.
+
+        Each has shape (N,); column and row are 0 for a point that is not in the picture.
+        """
+        pixel, depth = self.project(points_world)
+        inside = (depth > 0) & (pixel >= 0).all(1) & (pixel < [self.width, self.height]).all(1)
+        column, row = np.where(inside[:, None], pixel, 0).astype(np.int64).T
+        return inside, column, row
+
     def undistorted(self, image: NDArray[Any], labels: bool = False) -> tuple[NDArray[Any], Camera]:
         """Return the image that a camera without distortion and with the same K takes, and that camera.
 

@@ -11,14 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .reporting.pictures import compared, small_png
+from .reporting.pictures import SHEET_BYTES, compared, small_png
 from .splats.exposures import least_squares_gain
 from .splats.losses import psnr, ssim_map
 from .splats.poses import find_motion, moved
 from .splats.spheres import Spheres
-from .splats.views import View, camera_center, render_view
-
-_SHEET_BYTES = 3_000_000
+from .splats.views import View, as_bytes, camera_center, render_view
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,9 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         seen = everything.seen_from(camera_center(view.viewmat))
         colored = Spheres(seen.means, seen.scales, seen.opacities, torch.cat([seen.colors, label], 1))
         features = render_view(colored, view).features[0]
-        picture = features[..., :3].clamp(0, 1)
-        pictures.append(_bytes(picture))
+        plain = features[..., :3]
+        picture = plain.clamp(0, 1)
+        pictures.append(as_bytes(picture))
         whole.append(psnr(picture, view.image))
         similar.append(float(ssim_map(picture, view.image).mean()))
         if view.cover is not None and bodies:
@@ -67,11 +66,11 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
                 inside.append(psnr(picture, view.image, true))
                 overlap.append(float((true & mine).sum() / (true | mine).sum()))
         right = slice(view.image.shape[1] // 2, None)
-        shown = _corrected(everything, view, spread, poses)
+        shown = _corrected(everything, view, plain, spread, poses)
         halves.append((psnr(picture[:, right], view.image[:, right]), psnr(shown[:, right], view.image[:, right])))
     sheet = None
     if pictures:
-        sheet = small_png(compared([_bytes(view.image) for view in views], pictures), _SHEET_BYTES)
+        sheet = small_png(compared([as_bytes(view.image) for view in views], pictures), SHEET_BYTES)
     figures = {
         "photos": [view.name for view in views],
         "psnr_db": _mean(whole),
@@ -79,25 +78,24 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         "psnr_object_db": _mean(inside),
         "mask_iou": _mean(overlap),
         "psnr_db_by_photo": [round(value, 3) for value in whole],
+        "psnr_right_half_db": _mean([before for before, _ in halves]),
+        "psnr_right_half_corrected_db": _mean([after for _, after in halves]),
     }
-    figures["psnr_right_half_db"] = _mean([before for before, _ in halves])
-    figures["psnr_right_half_corrected_db"] = _mean([after for _, after in halves])
     return HeldOut(figures, sheet)
 
 
-def _corrected(spheres: Spheres, view: View, spread: float, poses: bool) -> Tensor:
-    """Return the render of a photo in its own exposure (and from its own pose), both found on its left half."""
+def _corrected(spheres: Spheres, view: View, picture: Tensor, spread: float, poses: bool) -> Tensor:
+    """Return the render of a photo in its own exposure (and from its own pose), both found on its left half.
+
+    `picture` (H, W, 3) is the render from the pose as given.
+    """
     left = torch.zeros_like(view.image[..., 0])
     left[:, : left.shape[1] // 2] = 1.0
     if poses:
         with torch.enable_grad():
             view = moved(view, find_motion(spheres, view, left, spread))
-    picture = render_view(spheres, view).features[0]
+        picture = render_view(spheres, view).features[0]
     return (picture * least_squares_gain(picture, view.image, left)).clamp(0, 1)
-
-
-def _bytes(picture: Tensor) -> NDArray[np.uint8]:
-    return (picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def _mean(values: list[float]) -> float | None:

@@ -14,17 +14,16 @@ from ..datasets.ply import Splats
 from ..schemas import CamerasFile, InputDataError, SplatConfig, UsageError
 from .checkpoint import Checkpoint
 from .held_out import HeldOut, look
-from .reporting.pictures import separated, small_png
+from .reporting.pictures import SHEET_BYTES, separated, small_png
 from .sg_gs_background import fit_background, refine_poses
 from .sg_gs_bodies import BodyResult, fit_body
 from .sg_gs_stage import Stage
 from .splats.separation import separate
 from .splats.spheres import Spheres
-from .splats.views import load_views
+from .splats.views import as_bytes, load_views
 from .turntable import turntable, upward
 
 _MIN_PHOTOS = 3
-_SHEET_BYTES = 3_000_000
 _UNEVEN_DB = 1.0
 """Photos that gain so much from an exposure each were not taken at one."""
 
@@ -171,5 +170,5 @@ def _separated(stage: Stage) -> dict[str, bytes]:
     stage.record["separation"] = found.record
     stage.warnings += found.warnings
     masks = [(view.cover > 0.5).any(0).cpu().numpy() for view in found.train if view.cover is not None]
-    photos = [(view.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy() for view in found.train]
-    return {"separation.png": small_png(separated(photos, masks), _SHEET_BYTES)}
+    photos = [as_bytes(view.image) for view in found.train]
+    return {"separation.png": small_png(separated(photos, masks), SHEET_BYTES)}

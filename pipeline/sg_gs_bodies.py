@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..datasets.ply import Splats
 from ..schemas import Body, InputDataError, Pose, SplatConfig
+from .sampling import rotation_matrix
 from .sg_gs_stage import Stage
 from .splats.collision import distil, shape_to_spheres
 from .splats.colors import mean_colors
@@ -120,7 +121,7 @@ def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres
     spheres = to_spheres(centers, scales, 0.95, device)
     windows = body_windows(stage.train, index)
     geometry = Rates(means=0.05, log_scales=0.02, logits=0.03)
-    maps = any(not (w.depth is None and w.normals is None and w.features is None) for w in windows)
+    maps = any(one is not None for view in windows for one in (view.depth, view.normals, view.features))
     joint = not maps if config.joint is None else config.joint
     record: dict[str, Any] = {"spheres": len(spheres), "surface_spheres": surface_count, "joint": joint}
     if not joint:
@@ -206,13 +207,8 @@ def _turned(properties: MassProperties, T_to_from: Array) -> MassProperties:
 
 
 def _pose_matrix(pose: Pose) -> Array:
-    w, x, y, z = pose.quat_wxyz
     T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    T[:3, :3] = rotation_matrix(np.array(pose.quat_wxyz))
     T[:3, 3] = pose.position_m
     return T
 

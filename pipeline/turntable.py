@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..datasets.progress import progress
 from ..datasets.video import encoded_video
+from .sampling import look_at
+from .splats.directions import upright_axes
 from .splats.render import render
 from .splats.spheres import Spheres
-from .splats.views import View, focus_of
+from .splats.views import View, as_bytes, focus_of
 from .splats.volume import Array
 
 FRAMES, FRAME_RATE_HZ = 60, 20.0
@@ -38,18 +40,18 @@ def turntable(views: Sequence[View], bodies: Sequence[Spheres], scene: Spheres |
     high = max(high, _LEAST_HEIGHT * float(np.hypot(high, wide)))
     first = views[0].camera
     camera = first.resized(_WIDTH, 2 * round(_WIDTH * first.height / first.width / 2))
-    east = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    east /= np.linalg.norm(east)
+    east, north, _ = upright_axes(up)
     frames = []
     for angle in progress(np.arange(FRAMES) * 2 * np.pi / FRAMES, "turntable"):
-        eye = focus + high * up + wide * (np.cos(angle) * east + np.sin(angle) * np.cross(up, east))
-        viewmat = torch.as_tensor(_towards(eye, focus, up)).to(everything.means)
+        eye = focus + high * up + wide * (np.cos(angle) * east + np.sin(angle) * north)
+        camera = replace(camera, T_world_cam=look_at(eye, focus, up))
+        viewmat = torch.as_tensor(camera.T_cam_world).to(everything.means)
         seen = everything.seen_from(torch.as_tensor(eye).to(everything.means))
         K = torch.as_tensor(camera.K).to(everything.means)
         picture = render(
             seen.means, seen.scales, seen.opacities, seen.colors, viewmat[None], K[None], camera.width, camera.height
         )
-        frames.append((picture.features[0].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+        frames.append(as_bytes(picture.features[0]))
     return encoded_video(frames, FRAME_RATE_HZ)
 
 
@@ -64,14 +66,3 @@ def _focus(views: Sequence[View], bodies: Sequence[Spheres]) -> Array:
     if bodies:
         return torch.cat([body.means for body in bodies]).double().mean(0).cpu().numpy()
     return focus_of(views)
-
-
-def _towards(eye: Array, focus: Array, up: Array) -> NDArray[np.float64]:
-    """Return T_cam_world of a camera at `eye` that looks at `focus`, OpenCV axes, (4, 4)."""
-    forward = (focus - eye) / np.linalg.norm(focus - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation, -rotation @ eye
-    return T

@@ -15,6 +15,8 @@ Mask = NDArray[np.bool_]
 
 TILE_WIDTH = 264
 """Width of a frame in a report [px]; on a page of 1100 px six stand side by side."""
+SHEET_BYTES = 3_000_000
+"""Most bytes of a contact sheet in a model."""
 _ASPECT = 4 / 3
 _MARGIN = 0.2
 _COLUMNS = 4

@@ -1,4 +1,4 @@
-"""Directions that are evenly spread."""
+"""Directions that are evenly spread, and axes about one."""
 
 from __future__ import annotations
 
@@ -15,3 +15,10 @@ def fibonacci_directions(count: int) -> NDArray[np.float64]:
     angle = math.pi * (1 + math.sqrt(5)) * index
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return right-handed axes as rows, the last of them the unit vector `up` (3,), shape (3, 3)."""
+    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])

@@ -88,14 +88,14 @@ def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = 
     origin = center - radius
     shape = (_COARSE,) * 3
     coarse = _field(grid_points(shape, origin, pitch), views, fields, ground).reshape(shape)
-    inside = _largest_component(coarse > -pitch)
+    inside = largest_component(coarse > -pitch)
     if inside is None or not (coarse > 0).any():
         raise InputDataError(
             f"body '{name}': no point lies inside the masks of all {len(views)} photos that show it.",
             todo="check that masks and cameras belong together: 'cgwm validate' reprojects them.",
         )
     field, origin, pitch = _refined(coarse, inside, origin, pitch, views, fields, ground)
-    solid = _largest_component(field > 0)
+    solid = largest_component(field > 0)
     if solid is None:
         raise InputDataError(f"body '{name}': the masks leave nothing larger than {1e3 * pitch:.2g} mm.")
     field = np.where(solid, field, np.minimum(field, -1e-3 * pitch))
@@ -146,7 +146,7 @@ def _refined(
         near = np.abs(values) < 1.5 * pitch
         values[near] = _field(points[near], views, fields, ground)
         coarse, origin, pitch = values.reshape(shape), fine_origin, fine_pitch
-        found = _largest_component(coarse > -pitch)
+        found = largest_component(coarse > -pitch)
         inside = inside if found is None else found
     return coarse, origin, pitch
 
@@ -246,7 +246,7 @@ def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:
     return center, 1.25 * float(max(radii))
 
 
-def _largest_component(inside: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+def largest_component(inside: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     """Return the largest connected part, or None where nothing is inside."""
     labels, count = label(inside)  # type: ignore[misc]
     if count == 0:

@@ -57,8 +57,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 def psnr(image: Tensor, target: Tensor, chosen: Tensor | None = None) -> float:
     """Return the peak signal-to-noise ratio [dB] of values in [0, 1], over chosen pixels (H, W) or all."""
     square = (image - target).square().mean(-1)
-    error = square.mean() if chosen is None else square[chosen].mean()
-    return float(-10 * torch.log10(error.clamp_min(1e-10)))
+    return psnr_of(square.mean() if chosen is None else square[chosen].mean())
 
 
 def psnr_of(mean_square: Tensor) -> float:

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import label, map_coordinates
+from scipy.ndimage import map_coordinates
 
 from ...datasets.cameras import Camera
 from ...datasets.capture import Capture
 from ...schemas import Ground
-from .hull import signed_distance_px
+from .hull import largest_component, signed_distance_px
 from .render import render
 from .spheres import Spheres
 from .views import View, with_labels
@@ -312,12 +312,8 @@ def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera
 
 def _largest_part(field: Array, pitch: float) -> Array:
     """Return a field (X, Y, Z) that is positive in its largest connected part alone."""
-    parts, count = label(field > 0)  # type: ignore[misc]
-    if count == 0:
-        return field
-    sizes = np.bincount(parts.reshape(-1))
-    sizes[0] = 0
-    return np.where(parts == int(np.argmax(sizes)), field, np.minimum(field, -1e-3 * pitch))
+    part = largest_component(field > 0)
+    return field if part is None else np.where(part, field, np.minimum(field, -1e-3 * pitch))
 
 
 def _agreement(solid: _Solid, pictures: Sequence[_Picture], masks: Sequence[Mask], hidden: Sequence[Mask]) -> float:
@@ -339,9 +335,7 @@ def _pixels_per_metre(camera: Camera, points: Array) -> float | None:
 
 def _marked(camera: Camera, points: Array) -> Mask:
     """Return the pixels in which points (n, 3) lie."""
-    pixel, depth = camera.project(points)
-    column, row = np.floor(np.nan_to_num(pixel, nan=-1.0)).clip(-1, 1e6).astype(int).T
-    seen = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    seen, column, row = camera.pixels_of(points)
     mask = np.zeros((camera.height, camera.width), bool)
     mask[row[seen], column[seen]] = True
     return mask

@@ -26,7 +26,7 @@ def require_points_in_view(points: Array, views: Sequence[View], what: str) -> f
     Raises:
         InputDataError: If it is less than `LEAST_SHARE`.
     """
-    share = float(np.mean(np.any([_in_picture(points, view)[0] for view in views], 0))) if len(points) else 1.0
+    share = float(np.mean(np.any([view.camera.pixels_of(points)[0] for view in views], 0))) if len(points) else 1.0
     if share < LEAST_SHARE:
         raise InputDataError(
             f"{what}: {share:.0%} of its {len(points)} points lie in view of any of the {len(views)} photos.",
@@ -50,7 +50,7 @@ def require_body_in_masks(surface: Array, views: Sequence[View], body: int, name
     """
     seen, covered = 0, 0
     for view in views:
-        inside, column, row = _in_picture(surface, view)
+        inside, column, row = view.camera.pixels_of(surface)
         seen += np.count_nonzero(inside)
         if view.labels is not None:
             covered += np.count_nonzero(inside & (view.labels[row, column] == body + 1))
@@ -61,12 +61,3 @@ def require_body_in_masks(surface: Array, views: Sequence[View], body: int, name
             f"at least {LEAST_COVERED:.0%}.",
             f"correct photo_pose, the body's pose while the photos were taken; and {_HINT}",
         )
-
-
-def _in_picture(points: Array, view: View) -> tuple[Array, Array, Array]:
-    """Return which points a photo has in its picture (n,), and their columns and rows [px], inside of it."""
-    camera = view.camera
-    pixel, depth = camera.project(points)
-    inside = (depth > 0) & (pixel >= 0).all(1) & (pixel < [camera.width, camera.height]).all(1)
-    place = np.where(inside[:, None], pixel, 0).astype(int)
-    return inside, place[:, 0], place[:, 1]

@@ -41,7 +41,7 @@ class Motions:
 
     def moved(self, view: View) -> View:
         """Return a photo as its camera stands now, connected to what is learned; its `camera` stays."""
-        return replace(view, viewmat=_motion(self._twists[view.name], self._spread) @ view.viewmat)
+        return moved(view, _motion(self._twists[view.name], self._spread))
 
     def prior(self, view: View) -> Tensor:
         """Return the penalty of a photo's motion, ()."""
@@ -105,9 +105,9 @@ def moved(view: View, T_new_old: Tensor) -> View:
 
 def moved_for_good(view: View, T_new_old: Tensor) -> View:
     """Return a photo whose camera stands elsewhere."""
-    viewmat = T_new_old @ view.viewmat
-    camera = replace(view.camera, T_world_cam=np.linalg.inv(viewmat.double().cpu().numpy()))
-    return replace(view, viewmat=viewmat, camera=camera)
+    there = moved(view, T_new_old)
+    T_world_cam = np.linalg.inv(there.viewmat.double().cpu().numpy())
+    return replace(there, camera=replace(view.camera, T_world_cam=T_world_cam))
 
 
 def motion_record(motions: Mapping[str, Tensor]) -> dict[str, Any]:

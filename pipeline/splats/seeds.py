@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from ...schemas import Ground
 from .collision import inscribed_radii
-from .directions import fibonacci_directions
+from .directions import fibonacci_directions, upright_axes
 from .losses import scene_weight
 from .spheres import Spheres
 from .views import View, focus_of
@@ -151,11 +151,9 @@ def _on_bodies(points: Array, views: Sequence[View]) -> Array:
         if view.cover is None:
             continue
         width, height = view.size
-        pixel, depth = view.camera.resized(width, height).project(points)
-        column, row = (np.floor(np.nan_to_num(pixel[:, k], nan=-1)).astype(int) for k in range(2))
-        visible = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        visible, column, row = view.camera.resized(width, height).pixels_of(points)
         cover = view.cover.sum(0).cpu().numpy()
-        inside += visible & (cover[row.clip(0, height - 1), column.clip(0, width - 1)] > 0.5)
+        inside += visible & (cover[row, column] > 0.5)
         seen += visible
     return inside > 0.6 * np.maximum(seen, 1)
 
@@ -234,9 +232,7 @@ def _ground_cover(points: Array, colors: Array, normal: Array, budget: int) -> t
     """
     if len(points) == 0 or budget < 1:
         return np.zeros((0, 3)), np.zeros(0)
-    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
+    first, second, _ = upright_axes(normal)
     plane = np.stack([points @ first, points @ second], 1)
     corner = plane.min(0)
     side = float(np.ptp(plane, axis=0).max()) * 1.001

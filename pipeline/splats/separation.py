@@ -24,6 +24,7 @@ from torch.nn import functional
 from ...datasets.capture import Capture
 from ...schemas import Body, Ground, InputDataError, SplatConfig
 from .colors import mean_colors
+from .directions import upright_axes
 from .exposures import Exposures
 from .fit import Rates, Trainable, descend
 from .losses import scene_loss
@@ -249,7 +250,7 @@ class _Scene:
         """
         middle = focus_of(self._views)
         reach = _SEARCHED * float(np.median([np.linalg.norm(view.camera.center - middle) for view in self._views]))
-        axes = _upright(self._up)
+        axes = upright_axes(self._up)
         space = _Region(axes, axes @ middle - reach, axes @ middle + reach)
         spheres, count, pitch = self._fitted([space], _ROUGH, f"{body.name}: looking for it")
         clusters = [
@@ -399,13 +400,6 @@ class _Scene:
             seen = render_view(labelled, replace(view, viewmat=view.viewmat.cpu(), K=view.K.cpu())).features[0]
             total += (seen * central[..., None]).sum((0, 1))
         return (total / pixels).tolist()
-
-
-def _upright(up: Array) -> Array:
-    """Return axes, the last of them `up` (3,), shape (3, 3)."""
-    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(up, first), up])
 
 
 def _small(view: View) -> View:

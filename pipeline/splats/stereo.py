@@ -106,9 +106,7 @@ def _outlined(points: Array, views: Sequence[View], body: int) -> Array:
         if silhouette is None or not silhouette.mask.any():
             continue
         distance = signed_distance_px(silhouette.mask)
-        pixel, depth = view.camera.project(points)
-        column, row = (np.floor(np.nan_to_num(pixel[:, k], nan=-1)).astype(int) for k in range(2))
-        seen = (depth > 0) & (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
+        seen, column, row = view.camera.pixels_of(points)
         count[seen] += np.abs(distance[row[seen], column[seen]]) < _RIM_PX
     return count
 

@@ -133,6 +133,11 @@ def render_view(spheres: Spheres, view: View, background: Tensor | None = None) 
     )
 
 
+def as_bytes(picture: Tensor) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) with values about [0, 1] as uint8 on the CPU."""
+    return (picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
 def camera_center(viewmat: Tensor) -> Tensor:
     """Return the centre of a camera, world frame, from T_cam_world (4, 4)."""
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
