@@ -15,6 +15,7 @@ import numpy as np
 from ..datasets.atomic import refuse_existing, sha256
 from ..datasets.cameras import require_metric
 from ..datasets.capture import Capture
+from ..datasets.colmap_model import find_colmap_model
 from ..datasets.geometry_maps import KINDS
 from ..datasets.models import Model, read_model, write_model
 from ..schemas import (
@@ -83,7 +84,9 @@ def fit(
     opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
     started = time.perf_counter()
     config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
-    checkpoint = Checkpoint.beside(Path(out), _made_of(opened, splat_config), resume, overwrite)
+    # phys-geo alone makes no spheres, so that the photos need not be read for their hashes
+    made_of = {} if stage == "phys-geo" else _made_of(opened, splat_config)
+    checkpoint = Checkpoint.beside(Path(out), made_of, resume, overwrite)
     with enough_memory(*_needs(splat_config)):
         model = _start(opened, stage, parent, splat_config, checkpoint)
     if stage == "phys-geo" or (stage == "all" and _has_motion(opened, split)):
@@ -120,9 +123,11 @@ def _needs(config: SplatConfig | PhysConfig) -> tuple[str, str, str]:
 
 def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:
     """Return what the spheres are made of, so that checkpoints of anything else are refused."""
-    folders = ("images", "masks", *KINDS)
-    files = ("capture.toml", "cameras.json", "transforms.json", POINTS_NAME)
-    inputs = {name: sha256(capture.root / name) for name in (*folders, *files) if (capture.root / name).exists()}
+    root, colmap = capture.root, find_colmap_model(capture.root)
+    names = ("images", "masks", *KINDS, "capture.toml", "cameras.json", "transforms.json", POINTS_NAME)
+    shapes = [file for body in capture.manifest.bodies if (file := capture.shape_file(body)) is not None]
+    paths = [root / name for name in names] + ([] if colmap is None else [colmap]) + shapes
+    inputs = {path.relative_to(root).as_posix(): sha256(path) for path in paths if path.exists()}
     return {"settings": config.model_dump_json(), "versions": json.dumps(_versions()), **inputs}
 
 

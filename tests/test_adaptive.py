@@ -135,7 +135,7 @@ def test_a_fit_that_diverges_ends_at_its_step(bad):
         value = value * math.nan if bad == "loss" else value + (0 * spheres.means).square().sum().sqrt()
         return value, wrong
 
-    trainable = Trainable(truth, Rates(means=0.01))
+    trainable = Trainable(truth, Rates(means=0.01, log_scales=0.01, logits=0.01, colors=0.01))
     with pytest.raises(NotConvergedError, match=r"'background' diverged by step \d+ of 6") as caught:
         descend(trainable, views, loss, 6, 0, "background", 0.002)
     step = int(str(caught.value).split("step ")[1].split(" of")[0])

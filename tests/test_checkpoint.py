@@ -12,7 +12,7 @@ import torch
 from cgwm.datasets.models import read_model
 from cgwm.pipeline import sg_gs_bodies
 from cgwm.pipeline.checkpoint import Checkpoint
-from cgwm.pipeline.fit import fit
+from cgwm.pipeline.fit import _made_of, fit
 from cgwm.pipeline.sg_gs import fit_scene
 from cgwm.pipeline.splats import adaptive
 from cgwm.pipeline.splats import fit as descents
@@ -148,3 +148,16 @@ def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
     assert json.loads(done.stdout)["bodies"][0]["name"] == "ball"
     assert read_model(out).scene is not None
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_checkpoint_is_made_of_shapes_and_cameras_of_colmap_too(tmp_path):
+    capture = make_capture(tmp_path / "capture", shape='shape = { mesh = { path = "ball.obj" } }')
+    (capture.root / "ball.obj").write_text("v 0 0 0\n")
+    before = _made_of(capture, CONFIG)
+    (capture.root / "ball.obj").write_text("v 0 0 1\n")
+    model = capture.root / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras.txt", "images.txt"):
+        (model / name).write_text("# none\n")
+    after = _made_of(capture, CONFIG)
+    assert {name for name in after if after[name] != before.get(name)} == {"ball.obj", "sparse/0"}

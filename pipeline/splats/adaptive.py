@@ -246,8 +246,8 @@ def fit_adaptively(
             if slot is not None and slot.due():
                 slot.write(run.state(iteration + 1))
     fitted = run.population.spheres()
-    sums = [values.detach().sum() for values in (fitted.means, fitted.scales, fitted.colors)]
-    require_finite(sums, iterations - 1, iterations, what)
+    total = fitted.means.sum() + fitted.scales.sum() + fitted.colors.sum()
+    require_finite([total.detach()], iterations - 1, iterations, what)
     higher = None if fitted.harmonics is None else fitted.harmonics.detach()
     plain = (fitted.means, fitted.scales, fitted.opacities, fitted.colors)
     return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher), run.history

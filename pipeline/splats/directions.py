@@ -21,4 +21,4 @@ def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return right-handed axes as rows, the last of them the unit vector `up` (3,), shape (3, 3)."""
     first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(up, first), up])
+    return np.stack([first, np.cross(up, first), up]).astype(np.float64)

@@ -170,19 +170,20 @@ def descend(
                     "motions": None if motions is None else motions.state(),
                 }
             )
-    require_finite([group["params"][0].detach().sum() for group in trainable.groups], iterations - 1, iterations, what)
+    sums = [group["params"][0].detach().sum() for group in trainable.groups]
+    require_finite([torch.stack(sums).sum()], iterations - 1, iterations, what)
     return torch.stack(losses).tolist()
 
 
 def require_finite(values: Sequence[Tensor], iteration: int, iterations: int, what: str) -> None:
-    """Check losses of successive iterations, the last of which is `iteration`; or sums of what moves, at its end.
+    """Check losses of successive iterations, or sums of what moves, the last of which belongs to `iteration`.
 
     Raises:
         NotConvergedError: If one is not finite.
     """
     wrong = (~torch.isfinite(torch.stack(list(values)))).nonzero()
     if len(wrong):
-        step = min(iteration + 1, max(1, iteration + 2 - len(values) + int(wrong[0])))
+        step = iteration + 2 - len(values) + int(wrong[0])
         raise NotConvergedError(
             f"The fit of '{what}' diverged by step {step} of {iterations}: its loss or its spheres are not finite.",
             todo="check that cameras and photos belong together ('cgwm validate CAPTURE'), or try another --seed.",
