@@ -37,7 +37,8 @@ from ..schemas import (
 )
 from .labels import LabelRenderer
 from .memory import enough_memory
-from .physics.rollout import ContactRecord, simulate
+from .physics.records import ContactRecord
+from .physics.rollout import simulate
 from .physics.world import State, World
 from .posterior import draw_parameters, not_varied
 from .sampling import Start, draw_start, look_at_cameras, resolve_plan

@@ -12,6 +12,8 @@ from torch import Tensor
 from ...schemas import InputDataError
 from .contact import ContactLaw
 from .distance import plane_contacts
+from .effects.effect import ActiveEffect
+from .published import PublishedLaw
 
 if TYPE_CHECKING:
     from ...datasets.models import Model
@@ -44,15 +46,20 @@ class Body:
 
 @dataclass(frozen=True)
 class World:
-    """The bodies and what surrounds them; gravity (B, 3) [m/s2], ground normal (3,) and offset (B,) [m]."""
+    """The bodies and what surrounds them.
+
+    gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
+    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact.
+    """
 
     bodies: tuple[Body, ...]
     gravity: Tensor
     ground_normal: Tensor | None
     ground_offset: Tensor | None
-    contact: ContactLaw
+    contact: ContactLaw | PublishedLaw
     step_s: float = 0.001
     sweeps: int = 10
+    effects: tuple[ActiveEffect, ...] = ()
 
     @property
     def body_names(self) -> list[str]:
