@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...schemas import InputDataError
+from .checks import require_physical, require_state
 from .contacts import Contacts, PairImpulses
 from .detection import Placed
 from .driven import Drive
@@ -56,8 +57,11 @@ def simulate(
         The rollout at the frame times.
 
     Raises:
-        InputDataError: If a driven body has no track.
+        InputDataError: If a driven body has no track, the start is not finite, or masses, inertias, contact numbers or
+            the step cannot be simulated.
     """
+    require_physical(world)
+    require_state(state, world.body_names)
     engine = _Engine(world, state, times_s, driven or {})
     motions = engine.begin(state)
     frames = [engine.frame(motions)]
