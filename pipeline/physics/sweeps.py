@@ -125,7 +125,7 @@ class ContactGroup:
         group = ContactGroup(axes, relative, sides, target, share * mass, stop_t, touch.friction)
         if touch.viscous_n_s_m is not None:
             # implicit in the slip of the point itself, so that no viscosity turns it round
-            drag = h * touch.viscous_n_s_m * share * touching.to(share.dtype)
+            drag = h * touch.viscous_n_s_m * _shares(ahead, gap)
             slip = torch.cat((torch.zeros_like(relative[..., :1]), relative[..., 1:]), -1)
             group = replace(group, steady=-(drag / (1 + drag / stop_t))[..., None] * slip)
         if touch.torsion_m is not None or touch.rolling_m is not None:
@@ -223,9 +223,22 @@ def _crowding(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
     Derived: 1 + sum over the other touching contacts of the squared correlation of their rows in the mass metric, in
     O(C) through the small matrix sum of m r r^T.
     """
-    depth = -torch.minimum(ahead, gap)
-    touching = (depth / CONTACT_ONSET_M).clamp(0.0, 1.0)
+    touching = _onset(ahead, gap)
     weighted = rows * (touching * mass)[..., None]
     gram = weighted.transpose(-1, -2) @ rows
     total = mass * ((rows @ gram) * rows).sum(-1)
     return 1 + (total - touching).clamp_min(0.0)
+
+
+def _onset(ahead: Tensor, gap: Tensor) -> Tensor:
+    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is closed."""
+    return (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
+
+
+def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
+    """Return the shares (n, C) of what all the contacts of a pair carry together; they add up to 1.
+
+    Only within the first 2 % of the onset is it less, so that a grazing contact begins without a jump.
+    """
+    touching = _onset(ahead, gap)
+    return touching / touching.sum(1, keepdim=True).clamp_min(0.02)
