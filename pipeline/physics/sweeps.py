@@ -24,6 +24,9 @@ CONTACT_ONSET_M = 2e-4
 TINY = 1e-24
 """Added to squared lengths, so that the derivative of a contact without impulses stays finite."""
 
+FAR_M_S = 1e30
+"""An open contact asks for a gap speed below any [m/s]; finite, as the reverse derivative of infinity is no number."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -119,7 +122,7 @@ class ContactGroup:
         closed = torch.where(gap > 0, (-ahead / closing).clamp(0.0, 1.0), torch.ones_like(gap))
         demand = -d * closed * speed - k * ahead.clamp_max(0.0) / h
         touching = (gap < 0) | (ahead < 0)
-        target = torch.where(touching, speed + demand, torch.full_like(gap, -torch.inf))
+        target = torch.where(touching, speed + demand, torch.full_like(gap, -FAR_M_S))
         # the sum of the two tangential mobilities bounds the larger one
         stop_t = share / (mobility[..., 1] + mobility[..., 2])
         group = ContactGroup(axes, relative, sides, target, share * mass, stop_t, touch.friction)
