@@ -20,7 +20,7 @@ from .contact import Touch, coefficients
 from .rotation import cross
 
 CONTACT_ONSET_M = 2e-4
-"""A contact counts fully in the sharing of a body's mass from this depth on [m]; it only smooths the onset."""
+"""From this depth on [m] a contact counts fully in the sharing of a body's mass, however deep others are."""
 TINY = 1e-24
 """Added to squared lengths, so that the derivative of a contact without impulses stays finite."""
 
@@ -234,8 +234,14 @@ def _crowding(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
 
 
 def _onset(ahead: Tensor, gap: Tensor) -> Tensor:
-    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is closed."""
-    return (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
+    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is closed.
+
+    It counts fully from CONTACT_ONSET_M on, or as deep as the deepest contact of its pair: where all are shallow, as
+    under a stiff or light body, they must share all the same, or together they push more than the body weighs.
+    """
+    depth = -torch.minimum(ahead, gap)
+    full = depth.amax(1, keepdim=True).clamp(1e-12, CONTACT_ONSET_M)
+    return (depth / full).clamp(0.0, 1.0)
 
 
 def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
@@ -243,5 +249,5 @@ def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
 
     Only within the first 2 % of the onset is it less, so that a grazing contact begins without a jump.
     """
-    touching = _onset(ahead, gap)
-    return touching / touching.sum(1, keepdim=True).clamp_min(0.02)
+    depth = (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
+    return depth / depth.sum(1, keepdim=True).clamp_min(0.02)
