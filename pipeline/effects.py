@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 from ..datasets.atomic import new_file
@@ -59,7 +58,7 @@ def new_effect(file: Path | str, overwrite: bool = False) -> NewEffect:
     path = Path(file)
     if path.suffix != ".py":
         raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
-    text = resources.files(__package__).joinpath("physics/effects/template.py").read_text(encoding="utf-8")
+    text = (Path(__file__).parent / "physics" / "effects" / "template.py").read_text(encoding="utf-8")
     text = text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")  # from outside the package
     with new_file(path, overwrite) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -55,7 +55,7 @@ def rolled(world: World, state: State, duration_s: float, *effects: ActiveEffect
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch of short motions: high flight; a slide on four corners, with spin; a corner that is about to graze."""
+    """A batch of short motions: high flight; a slide on four corners, with spin; a corner that begins to graze."""
 
     world: World
     state: State
@@ -64,7 +64,7 @@ class Scenes:
 
 def scenes(name: str) -> Scenes:
     lowest = float(quat_rotate(state_of(((0, 0, 0), TILTED, (0, 0, 0), (0, 0, 0))).quat_wxyz[0], corners()).amin(0)[2])
-    grazing = -lowest + 0.001 + 0.2 * 0.008
+    grazing = -lowest + 0.001 + 0.0027
     rows = [
         ((0.02, 0.01, 0.5), TILTED, (2.0, 1.0, -0.5), (9.0, -5.0, 7.0)),
         ((0.03, 0.02, 0.02995), UP, (0.5, 0.3, 0.0), (0.3, -0.2, 3.0)),
@@ -106,6 +106,18 @@ def motion_of(name: str, there: Scenes):
         return torch.cat((poses.position_m[:, 1:].flatten(1), poses.quat_wxyz[:, 1:].flatten(1)), -1)
 
     return function
+
+
+def test_the_scenes_are_a_flight_a_contact_and_a_graze() -> None:
+    there = scenes("friction_patch")
+    world = replace(there.world, effects=(active("friction_patch", c_22=0.5),))
+    record = simulate(world, there.state, times(0.02, 1000.0), record_contacts=True).contacts
+    assert record is not None
+    pushes = record.impulse_n_s[..., 2].sum(-1) > 0
+    touching = pushes.sum(1).tolist()
+    assert touching[0] == 0 and touching[1] >= 15 and 2 <= touching[2] <= 12
+    assert bool(record.sliding[1].any())
+    assert not bool(pushes[2, :5].any())
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
