@@ -67,6 +67,19 @@ def test_a_head_on_impact_rebounds_with_the_analytic_restitution(zeta: float, st
     assert float(rollout.velocity_m_s[0, -1, 0, 2]) == expected
 
 
+@pytest.mark.parametrize("time_s", [0.001, 0.004])
+def test_a_box_rests_alike_on_four_spheres_and_on_sixteen(time_s: float) -> None:
+    """Also where stiff contacts are so shallow that none of them is deep in itself."""
+    rests = []
+    for copies in (1, 4):
+        body = box_body(mass=0.1)
+        body = replace(body, centers=body.centers.repeat(1, copies, 1), radii=body.radii.repeat(1, copies))
+        world = world_of(body, contact=law(contact_time_s=time_s))
+        rollout = simulate(world, state_of(((0, 0, 0.03), UP, (0, 0, 0), (0, 0, 0))), times(0.1, 50))
+        rests.append(rollout.position_m[0, :, 0])
+    torch.testing.assert_close(rests[1], rests[0], atol=1e-9, rtol=0)
+
+
 @pytest.mark.parametrize("copies", [1, 4, 100])
 def test_coincident_spheres_are_one_contact(copies: int) -> None:
     """Neither rest depth nor rebound depends on how many spheres touch at one place."""

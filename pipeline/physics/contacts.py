@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ...schemas import UsageError
 from .contact import ContactLaw, Touch
 from .detection import (
     GROUND,
@@ -145,7 +146,16 @@ class Contacts:
             b is None, points.position, points.normal, points.gap, velocity, spin, h[:, None], friction, time, ratio
         )
         for active in self.effects:
-            touch = active.effect.contact(active.at(items), touch)
+            changed = active.effect.contact(active.at(items), touch)
+            if isinstance(law, PublishedLaw) and not _only_friction(touch, changed):
+                raise UsageError(
+                    f"the effect '{active.effect.name}' changes what the published contact law does not have.",
+                    "effects on the friction coefficient.",
+                    "use the contact law closed_form with this effect.",
+                )
+            touch = changed
+        if self.effects:
+            touch = replace(touch, friction=touch.friction.clamp_min(0.0))  # no sum of effects pushes a slider on
         return touch, axes
 
     def _impulses(
@@ -168,6 +178,12 @@ class Contacts:
                     sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
             groups.append(ContactGroup.of(touch, axes, tuple(sides)))
         return settle(groups, self.world.sweeps)
+
+
+def _only_friction(before: Touch, after: Touch) -> bool:
+    """Tell whether an effect changed nothing of a contact but its friction."""
+    names = set(Touch.__dataclass_fields__) - {"friction"}
+    return all(getattr(before, name) is getattr(after, name) for name in names)
 
 
 def take(x: Tensor, items: Tensor | None) -> Tensor:

@@ -15,7 +15,7 @@ from .checks import require_physical, require_state
 from .contacts import Contacts, PairImpulses
 from .detection import Placed
 from .driven import Drive
-from .effects.effect import BodyMotion
+from .effects.effect import BodyMotion, check_needs
 from .motion import Inertia, Motion, advance, finish, start
 from .records import ContactRecord, Recorder
 from .rotation import quat_to_matrix
@@ -59,6 +59,7 @@ def simulate(
     Raises:
         InputDataError: If a driven body has no track, the start is not finite, or masses, inertias, contact numbers or
             the step cannot be simulated.
+        UsageError: If an effect needs what the world or the other effects lack, or the contact law cannot take it.
     """
     require_physical(world)
     require_state(state, world.body_names)
@@ -82,6 +83,7 @@ class _Engine:
     """The constants of one rollout, and its step."""
 
     def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
+        check_needs(world.effects, world.ground_normal is not None)
         for active in world.effects:
             world = active.effect.world(active.values, world)
         self.world = world
@@ -91,6 +93,7 @@ class _Engine:
         longest = self.lengths.amax(0).tolist()
         self.substeps = [max(1, math.ceil(length / world.step_s - 1e-6)) for length in longest]
         self.wrenches = [active for active in world.effects if active.effect.has("wrench")]
+        self.flows = [active for active in world.effects if active.effect.has("flow")]
         self.drives: dict[int, Drive] = {}
         for index, body in enumerate(world.bodies):
             if body.motion == "driven":
@@ -175,18 +178,12 @@ class _Engine:
         body, inertia, world = self.world.bodies[index], self.inertias[index], self.world
         omega = inertia.omega(rotation, motion.spin)
         turned = rotation @ inertia.matrix @ rotation.transpose(-1, -2)
-        if world.ground_normal is None or world.ground_offset is None:
-            up = -world.gravity / world.gravity.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-12)
-            height = torch.full_like(motion.com[:, 0], torch.inf)
-        else:
-            up = world.ground_normal[None]
-            if any("ground" in active.effect.needs for active in self.wrenches):
-                along = (rotation.transpose(-1, -2) @ world.ground_normal)[..., None]
-                low = ((body.centers - body.com[:, None]) @ along).squeeze(-1) - body.radii
-                height = motion.com @ world.ground_normal - world.ground_offset + low.amin(-1)
-            else:
-                height = torch.full_like(motion.com[:, 0], torch.inf)
-        return BodyMotion(body, inertia.mass, turned, motion.com, rotation, motion.velocity, omega, up, height)
+        up, offset = world.up, world.ground_offset
+        seen = BodyMotion(body, inertia.mass, turned, motion.com, rotation, motion.velocity, omega, up, offset)
+        for active in self.flows:
+            flow = active.effect.flow(active.values, seen)
+            seen = replace(seen, air=flow if seen.air is None else seen.air + flow)
+        return seen
 
     def _place(self, motions: list[Motion], rotations: list[Tensor]) -> list[Placed]:
         placed = []

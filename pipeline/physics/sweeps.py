@@ -20,9 +20,12 @@ from .contact import Touch, coefficients
 from .rotation import cross
 
 CONTACT_ONSET_M = 2e-4
-"""A contact counts fully in the sharing of a body's mass from this depth on [m]; it only smooths the onset."""
+"""From this depth on [m] a contact counts fully in the sharing of a body's mass, however deep others are."""
 TINY = 1e-24
 """Added to squared lengths, so that the derivative of a contact without impulses stays finite."""
+
+FAR_M_S = 1e30
+"""An open contact asks for a gap speed below any [m/s]; finite, as the reverse derivative of infinity is no number."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +122,13 @@ class ContactGroup:
         closed = torch.where(gap > 0, (-ahead / closing).clamp(0.0, 1.0), torch.ones_like(gap))
         demand = -d * closed * speed - k * ahead.clamp_max(0.0) / h
         touching = (gap < 0) | (ahead < 0)
-        target = torch.where(touching, speed + demand, torch.full_like(gap, -torch.inf))
+        target = torch.where(touching, speed + demand, torch.full_like(gap, -FAR_M_S))
         # the sum of the two tangential mobilities bounds the larger one
         stop_t = share / (mobility[..., 1] + mobility[..., 2])
         group = ContactGroup(axes, relative, sides, target, share * mass, stop_t, touch.friction)
         if touch.viscous_n_s_m is not None:
             # implicit in the slip of the point itself, so that no viscosity turns it round
-            drag = h * touch.viscous_n_s_m * share * touching.to(share.dtype)
+            drag = h * touch.viscous_n_s_m * _shares(ahead, gap)
             slip = torch.cat((torch.zeros_like(relative[..., :1]), relative[..., 1:]), -1)
             group = replace(group, steady=-(drag / (1 + drag / stop_t))[..., None] * slip)
         if touch.torsion_m is not None or touch.rolling_m is not None:
@@ -223,9 +226,28 @@ def _crowding(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
     Derived: 1 + sum over the other touching contacts of the squared correlation of their rows in the mass metric, in
     O(C) through the small matrix sum of m r r^T.
     """
-    depth = -torch.minimum(ahead, gap)
-    touching = (depth / CONTACT_ONSET_M).clamp(0.0, 1.0)
+    touching = _onset(ahead, gap)
     weighted = rows * (touching * mass)[..., None]
     gram = weighted.transpose(-1, -2) @ rows
     total = mass * ((rows @ gram) * rows).sum(-1)
     return 1 + (total - touching).clamp_min(0.0)
+
+
+def _onset(ahead: Tensor, gap: Tensor) -> Tensor:
+    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is closed.
+
+    It counts fully from CONTACT_ONSET_M on, or as deep as the deepest contact of its pair: where all are shallow, as
+    under a stiff or light body, they must share all the same, or together they push more than the body weighs.
+    """
+    depth = -torch.minimum(ahead, gap)
+    full = depth.amax(1, keepdim=True).clamp(1e-12, CONTACT_ONSET_M)
+    return (depth / full).clamp(0.0, 1.0)
+
+
+def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
+    """Return the shares (n, C) of what all the contacts of a pair carry together; they add up to 1.
+
+    Only within the first 2 % of the onset is it less, so that a grazing contact begins without a jump.
+    """
+    depth = (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
+    return depth / depth.sum(1, keepdim=True).clamp_min(0.02)

@@ -71,6 +71,13 @@ class World:
         """Indices of the free bodies."""
         return [index for index, body in enumerate(self.bodies) if body.free]
 
+    @property
+    def up(self) -> Tensor:
+        """Unit vector (1 or B, 3): the ground's normal, against gravity where there is no ground."""
+        if self.ground_normal is not None:
+            return self.ground_normal[None]
+        return -self.gravity / self.gravity.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-12)
+
     @staticmethod
     def from_model(model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu") -> World:
         """Build the world of a fitted model.

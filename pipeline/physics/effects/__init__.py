@@ -9,9 +9,11 @@ from .effect import (
     Poses,
     Values,
     Wrench,
+    horizontal,
     length,
     vector,
 )
+from .registry import effect_names, load_effect
 
 __all__ = [
     "ActiveEffect",
@@ -22,6 +24,9 @@ __all__ = [
     "Poses",
     "Values",
     "Wrench",
+    "effect_names",
+    "horizontal",
     "length",
+    "load_effect",
     "vector",
 ]

@@ -1,18 +1,21 @@
 """What a physical effect is: a plug-in that changes forces, contacts, bodies or what is measured.
 
-An effect is a class with a name, parameters and any of five methods; the others stay as they are. Everything is plain
+An effect is a class with a name, parameters and any of six methods; the others stay as they are. Everything is plain
 torch on batches, so that derivatives flow through it. It changes nothing when its parameters have the value 0.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from torch import Tensor
+
+from ....schemas import UsageError
+from ..sweeps import tangent_axes
 
 if TYPE_CHECKING:
     from ..contact import Touch
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 Values = Mapping[str, Tensor]
 """The values of an effect's parameters and constants by name, each of shape (1,) or (n,)."""
 Phase = Literal["flight", "contact", "measurement"]
+Need = Literal["ground", "drag", "contact", "spin", "driven"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class EffectParameter:
     name: str
     unit: str
     scale: float
-    limit: float = math.inf
+    limit: float
     nonnegative: bool = False
     shared: Literal["all", "group", "episode"] = "all"
 
@@ -60,8 +64,8 @@ class BodyMotion:
 
     body; mass (n,) [kg]; inertia (n, 3, 3) [kg m2] about the centre of mass, world axes; com (n, 3) [m]; rotation
     (n, 3, 3), body to world; velocity (n, 3) [m/s] of the centre of mass; omega (n, 3) [rad/s]; up (n or 1, 3): the
-    ground's normal, against gravity where there is no ground; height (n,) [m]: of the lowest sphere over the ground,
-    infinite where there is none.
+    ground's normal, against gravity where there is no ground; ground_offset (n or 1,) [m] along it, None where there is
+    no ground; air (n or 1, 3) [m/s]: velocity of the air, None where it stands still.
     """
 
     body: Body
@@ -72,7 +76,34 @@ class BodyMotion:
     velocity: Tensor
     omega: Tensor
     up: Tensor
-    height: Tensor
+    ground_offset: Tensor | None = None
+    air: Tensor | None = None
+
+    @property
+    def airspeed(self) -> Tensor:
+        """Velocity (n, 3) [m/s] relative to the air."""
+        return self.velocity if self.air is None else self.velocity - self.air
+
+    @property
+    def height(self) -> Tensor:
+        """Height (n,) [m] of the lowest sphere over the ground, infinite where there is none."""
+        return self.lowest_points()[1].amin(-1)
+
+    def lowest_points(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest points of the spheres that the ground can touch: arms (n, K, 3) [m], heights (n, K) [m].
+
+        The arms begin in the centre of mass, world axes; the heights are infinite where there is no ground.
+        """
+        body = self.body
+        centers, radii = body.centers, body.radii
+        if body.on_plane is not None:
+            centers, radii = centers[:, body.on_plane], radii[:, body.on_plane]
+        up = self.up[:, None]
+        arms = (centers - body.com[:, None]) @ self.rotation.transpose(-1, -2) - radii[..., None] * up
+        over = ((self.com[:, None] + arms) * up).sum(-1)
+        if self.ground_offset is None:
+            return arms, torch.full_like(over, math.inf)
+        return arms, over - self.ground_offset[:, None]
 
 
 @dataclass(frozen=True)
@@ -85,10 +116,14 @@ class Wrench:
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of the bodies' frames as measured: position_m (B, T, nb, 3), quat_wxyz (B, T, nb, 4)."""
+    """Poses of the bodies' frames as measured: position_m (B, T, nb, 3), quat_wxyz (B, T, nb, 4).
+
+    up (1 or B, 3): against gravity; None where that is the world's z.
+    """
 
     position_m: Tensor
     quat_wxyz: Tensor
+    up: Tensor | None = None
 
 
 class Effect:
@@ -101,7 +136,9 @@ class Effect:
         parameters: Its numbers.
         constants: Numbers that are tried on a grid.
         phase: Where it acts: in flight, in contact, or in the measurement alone.
-        needs: What it cannot do without, of "ground", "contact", "spin" (measured orientation), "driven" (a command).
+        needs: What it cannot do without: of the world "ground"; of the other effects "drag"; of the motion "contact",
+            "spin" (measured orientation), "driven" (a command). What the world or the effects lack is refused.
+        provides: What it is to other effects: "drag" where its wrench grows with `BodyMotion.airspeed`.
         reveals: The motion that shows it best.
         source: Where the formula comes from.
     """
@@ -112,13 +149,18 @@ class Effect:
     parameters: ClassVar[tuple[EffectParameter, ...]]
     constants: ClassVar[tuple[EffectConstant, ...]] = ()
     phase: ClassVar[Phase]
-    needs: ClassVar[tuple[str, ...]] = ()
+    needs: ClassVar[tuple[Need, ...]] = ()
+    provides: ClassVar[tuple[Literal["drag"], ...]] = ()
     reveals: ClassVar[str]
     source: ClassVar[str]
 
     def world(self, values: Values, world: World) -> World:
         """Return the world with other masses, geometry, gravity or ground; called once for a rollout."""
         return world
+
+    def flow(self, values: Values, motion: BodyMotion) -> Tensor:
+        """Return the velocity (n or 1, 3) [m/s] of the air around a free body; called in every step before `wrench`."""
+        raise NotImplementedError
 
     def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
         """Return the wrench on a free body; called in every step."""
@@ -136,7 +178,7 @@ class Effect:
         """Return what is measured of the true poses."""
         raise NotImplementedError
 
-    def has(self, hook: Literal["wrench", "contact", "times", "observe"]) -> bool:
+    def has(self, hook: Literal["world", "flow", "wrench", "contact", "times", "observe"]) -> bool:
         """Whether the effect has a hook of its own."""
         return getattr(type(self), hook) is not getattr(Effect, hook)
 
@@ -164,7 +206,10 @@ class ActiveEffect:
         like = torch.zeros(1, dtype=torch.float64) if like is None else like
         return ActiveEffect(
             effect,
-            {name: torch.as_tensor(value).to(like).reshape(-1) for name, value in (known | dict(values or {})).items()},
+            {
+                name: torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1)
+                for name, value in (known | dict(values or {})).items()
+            },
         )
 
     def at(self, items: Tensor | None) -> Values:
@@ -172,6 +217,26 @@ class ActiveEffect:
         if items is None:
             return self.values
         return {name: v if v.shape[0] == 1 else v.index_select(0, items) for name, v in self.values.items()}
+
+
+def check_needs(effects: Sequence[ActiveEffect], ground: bool) -> None:
+    """Refuse effects that lack something in the world or among the other effects.
+
+    Raises:
+        UsageError: If one needs a ground and there is none, or a drag and no other effect is one.
+    """
+    for active in effects:
+        effect = active.effect
+        if "ground" in effect.needs and not ground:
+            raise UsageError(
+                f"the effect '{effect.name}' needs a ground, and this world has none.",
+                todo="give the ground in capture.toml, under [world], or leave the effect out.",
+            )
+        if "drag" in effect.needs and not any("drag" in other.effect.provides for other in effects):
+            raise UsageError(
+                f"the effect '{effect.name}' acts through air resistance, and the model has none.",
+                todo=f"add a drag: --effects {effect.name},linear_drag or {effect.name},quadratic_drag.",
+            )
 
 
 def vector(values: Values, *names: str) -> Tensor:
@@ -182,3 +247,11 @@ def vector(values: Values, *names: str) -> Tensor:
 def length(x: Tensor) -> Tensor:
     """Return the length (..., 1) of vectors (..., d), with derivative 0 where it vanishes."""
     return (x.square().sum(-1, keepdim=True) + 1e-24).sqrt()
+
+
+def horizontal(components: Tensor, up: Tensor) -> Tensor:
+    """Return the vectors (n, 3), world frame, with the given components (n, 2) along the two horizontal axes.
+
+    These are the world's x and y where `up` (n or 1, 3), a unit vector, is its z.
+    """
+    return (components[..., None, :] @ tangent_axes(up)[..., 1:, :]).squeeze(-2)

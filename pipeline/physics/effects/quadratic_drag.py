@@ -13,10 +13,11 @@ class QuadraticDrag(Effect):
     formula = "a = -k |u| u"
     parameters = (EffectParameter("k", "1/m", scale=0.05, limit=5.0, nonnegative=True),)
     phase = "flight"
+    provides = ("drag",)
     reveals = "fast free flight, at different speeds"
     source = "turbulent drag; k = rho C_d A / (2 m)"
 
     def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
         """Return the drag."""
-        u = motion.velocity
+        u = motion.airspeed
         return Wrench(force=-(values["k"] * motion.mass)[:, None] * length(u) * u)
