@@ -15,7 +15,8 @@ from .estimation.observations import Observations
 from .estimation.states import StartUncertainty
 from .estimation.warmup import estimate_states, warmup_frames
 from .physics.checks import require_finite
-from .physics.rollout import Rollout, simulate
+from .physics.measured import measure
+from .physics.rollout import Rollout
 from .physics.rotation import quat_exp, quat_multiply, quat_to_matrix
 from .physics.world import World
 
@@ -192,7 +193,7 @@ class _Batch:
         longest = max(len(grid) for grid, _ in grids)
         padded = np.stack([_padded(grid, longest) for grid, _ in grids])
         with torch.no_grad():
-            rollout = simulate(self.world, seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
+            rollout = measure(self.world, seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
         require_finite(rollout, self.world, seen.state, [f"episode '{name}'" for name in seen.names])
         return [self._prediction(k, time, *grids[k], rollout) for k, time in enumerate(times)]
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 from cgwm.pipeline.physics import PublishedLaw, simulate
+from cgwm.pipeline.physics.distance import log_sum_exp_distance
 from cgwm.pipeline.physics.published import (
     clamped,
     creep_speed,
-    log_sum_exp_distance,
     rest_penetration,
     stable_step,
 )
@@ -92,3 +92,16 @@ def test_its_clamp_is_off_by_the_known_offset() -> None:
     assert value.tolist() == pytest.approx([0.0, -0.01, -0.02], abs=1e-9)
     (slope,) = torch.autograd.grad(value[0], distance)
     assert float(slope[0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_bodies_meet_at_the_published_distance() -> None:
+    """A ball over two coincident ones feels the inflation log(2)/beta, and rests that much higher."""
+    beta = 200.0
+    fixed = replace(ball_body(0.05, copies=2, name="below"), motion="fixed")
+    heights = []
+    for sharpness in (None, beta):
+        world = world_of(ball_body(mass=MASS), fixed, contact=law(sharpness_per_m=sharpness), ground=False, step_s=STEP)
+        start = state_of(((0, 0, 0.0895), UP, (0, 0, 0), (0, 0, 0)), ((0, 0, 0), UP, (0, 0, 0), (0, 0, 0)))
+        heights.append(float(simulate(world, start, times(1.0, 1.0)).position_m[0, -1, 0, 2]))
+    # both ways: only the ball's centre over the pair is inflated, so the shift is between half of it and all
+    assert 0.5 * math.log(2) / beta < heights[1] - heights[0] <= 1.05 * math.log(2) / beta

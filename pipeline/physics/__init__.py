@@ -1,6 +1,6 @@
 """Contact geometry, dynamics and rollouts of bodies made of spheres."""
 
-from .contact import ContactLaw, restitution
+from .contact import ContactLaw, damping_ratio_of, restitution
 from .published import PublishedLaw
 from .records import ContactRecord
 from .rollout import Rollout, simulate
@@ -14,6 +14,7 @@ __all__ = [
     "Rollout",
     "State",
     "World",
+    "damping_ratio_of",
     "restitution",
     "simulate",
     "symmetric",

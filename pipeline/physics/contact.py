@@ -13,11 +13,14 @@ anisotropy of polyhedral rows. `sweeps.py` applies the law; `published.py` has t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
+
+from ...schemas import InputDataError
 
 
 @dataclass(frozen=True)
@@ -97,3 +100,26 @@ def restitution(damping_ratio: Tensor) -> Tensor:
     under = torch.exp(-zeta / root * torch.atan2(2 * zeta * root, 2 * zeta.square() - 1))
     over = torch.exp(-zeta / root * torch.log((zeta + root) / (zeta - root).clamp_min(1e-12)))
     return torch.where(gap > 0, under, over)
+
+
+def damping_ratio_of(restitution_wanted: Tensor) -> Tensor:
+    """Return the damping ratio zeta [1] of restitutions in (0.005, 1), same shape: the inverse of `restitution`.
+
+    By bisection of log zeta, for e(zeta) falls monotonically; accurate to rounding, without derivatives.
+
+    Raises:
+        InputDataError: If a restitution lies outside that range.
+    """
+    wanted = restitution_wanted.detach()
+    if not bool(((wanted > 0.005) & (wanted < 1)).all()):
+        raise InputDataError(
+            f"restitution {wanted.flatten().tolist()}: no damping ratio gives one of its values.",
+            "0.005 < restitution < 1.",
+            "use 0.99 for a nearly lossless contact, 0.01 for a dead one.",
+        )
+    low, high = torch.full_like(wanted, math.log(1e-4)), torch.full_like(wanted, math.log(10.0))
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        bouncy = restitution(middle.exp()) > wanted
+        low, high = torch.where(bouncy, middle, low), torch.where(bouncy, high, middle)
+    return (0.5 * (low + high)).exp()

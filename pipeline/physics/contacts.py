@@ -20,6 +20,7 @@ from .detection import (
     near_body,
     near_ground,
     pairs_of,
+    slot_count,
 )
 from .motion import Inertia, Motion
 from .published import PublishedLaw, published_impulses
@@ -32,9 +33,10 @@ from .world import World
 class PairImpulses:
     """What one pair of bodies gave each other in a step.
 
-    pair: number in the world's list of pairs; a, b: bodies, b = -1 the ground; free: which of the two move; items (n,):
-    which items of the batch, all for None; points: where; impulse_n_s (n, C, 3): on a, world frame; angular_n_m_s
-    (n, 3): on a beyond the moments of the impulses, None where nothing resists turning; friction: of the contacts.
+    pair: number in the world's list of pairs; a, b: bodies, b = -1 the ground; free: which of the two move; items
+    (n,): which items of the batch, all for None; points: where; impulse_n_s (n, C, 3): on a, world frame;
+    along_axes_n_s (n, C, 3): the same along the contacts' axes; angular_n_m_s (n, 3): on a beyond the moments of the
+    impulses, None where nothing resists turning; friction: of the contacts.
     """
 
     pair: int
@@ -44,6 +46,7 @@ class PairImpulses:
     items: Tensor | None
     points: Points
     impulse_n_s: Tensor
+    along_axes_n_s: Tensor
     angular_n_m_s: Tensor | None
     friction: Tensor
 
@@ -62,6 +65,13 @@ class PairImpulses:
                 found[index] = (put(impulse.sum(1), self.items, batch), put(moment, self.items, batch))
         return found
 
+    def at(self, slot: Tensor, items: Tensor | None, slots: int, batch: int) -> Tensor:
+        """Return the impulses along the axes (m, K, 3) of given slots (m, K) of given items, 0 where none acted."""
+        index = self.points.slot[..., None].expand_as(self.along_axes_n_s)
+        wide = self.along_axes_n_s.new_zeros((index.shape[0], slots, 3)).scatter(1, index, self.along_axes_n_s)
+        full = take(put(wide, self.items, batch), items)
+        return full.gather(1, slot[..., None].expand(-1, -1, 3))
+
 
 class Contacts:
     """Finds and settles the contacts of a world's bodies."""
@@ -71,16 +81,21 @@ class Contacts:
         self.inertias = inertias
         self.pairs = pairs_of(world)
         self.effects = [active for active in world.effects if active.effect.has("contact")]
-        normal = world.ground_normal
+        law, normal = world.contact, world.ground_normal
+        self.sharpness_per_m = law.sharpness_per_m if isinstance(law, PublishedLaw) else None
         self.ground_axes = None if normal is None else tangent_axes(normal)
 
-    def resolve(self, placed: Sequence[Placed], step_s: Tensor) -> list[PairImpulses]:
+    def resolve(
+        self, placed: Sequence[Placed], step_s: Tensor, before: Sequence[PairImpulses] = ()
+    ) -> list[PairImpulses]:
         """Return the impulses of a step.
 
         Args:
             placed: The bodies with their free velocities; B items each.
             step_s: Step [s], shape (B,).
+            before: The impulses of the step before, from which the sweeps begin.
         """
+        self._batch = placed[0].reference.shape[0] if placed else 0
         candidates = self._candidates(placed, step_s)
         if not candidates:
             return []
@@ -97,20 +112,22 @@ class Contacts:
                 slots = near.topk(most, dim=1, largest=False, sorted=False).indices
                 points = ground_points(_on(self.world, items), some[a], slots)
             else:
-                points = body_points(some[a], some[b], h)
+                points = body_points(some[a], some[b], h, self.sharpness_per_m)
             if points is not None:
                 touch, axes = self._touch(points, some[a], None if b == GROUND else some[b], h, items)
                 found.append((number, points, touch, axes))
         if not found:
             return []
-        impulses = self._impulses(found, some, items)
+        impulses = self._impulses(found, some, items, before)
         results = []
         for (number, points, touch, axes), impulse in zip(found, impulses, strict=True):
             a, b = self.pairs[number]
             free = (True, b != GROUND and self.world.bodies[b].free)
             world_impulse = (impulse.linear[..., None, :] @ axes).squeeze(-2)
             angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
-            results.append(PairImpulses(number, a, b, free, items, points, world_impulse, angular, touch.friction))
+            results.append(
+                PairImpulses(number, a, b, free, items, points, world_impulse, impulse.linear, angular, touch.friction)
+            )
         return results
 
     def _candidates(self, placed: Sequence[Placed], step_s: Tensor) -> dict[int, tuple[Tensor, Tensor | None]]:
@@ -121,7 +138,7 @@ class Contacts:
                 depth = near_ground(self.world, placed[a], step_s)
                 touching = (depth < ROUNDING_M).any(1)
             else:
-                depth, touching = None, near_body(placed[a], placed[b], step_s)
+                depth, touching = None, near_body(placed[a], placed[b], step_s, self.sharpness_per_m)
             if bool(touching.any()):
                 found[number] = (touching, depth)
         return found
@@ -159,7 +176,11 @@ class Contacts:
         return touch, axes
 
     def _impulses(
-        self, found: list[tuple[int, Points, Touch, Tensor]], placed: Sequence[Placed], items: Tensor | None
+        self,
+        found: list[tuple[int, Points, Touch, Tensor]],
+        placed: Sequence[Placed],
+        items: Tensor | None,
+        before: Sequence[PairImpulses],
     ) -> list[Impulses]:
         law = self.world.contact
         if isinstance(law, PublishedLaw):
@@ -177,7 +198,17 @@ class Contacts:
                     root = body.rotation @ take(inertia.root, items)
                     sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
             groups.append(ContactGroup.of(touch, axes, tuple(sides)))
-        return settle(groups, self.world.sweeps)
+        if self.world.sweeps == 1:  # the closed form begins from nothing
+            return settle(groups, 1)
+        old = {pair.pair: pair for pair in before}
+        batch = placed[0].reference.shape[0] if items is None else self._batch
+        warm = [
+            old[number].at(points.slot, items, slot_count(self.world, self.pairs[number]), batch)
+            if number in old
+            else None
+            for number, points, _, _ in found
+        ]
+        return settle(groups, self.world.sweeps, warm)
 
 
 def _only_friction(before: Touch, after: Touch) -> bool:

@@ -6,13 +6,14 @@ nothing. What is left out is decided without derivatives; what remains is comput
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from .distance import smooth_min
+from .distance import log_sum_exp_distance, smooth_min
 from .rotation import cross
 from .world import Body, World
 
@@ -114,11 +115,12 @@ def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
         return torch.minimum(gap, gap + plain(step_s)[:, None] * (rate + (still.velocity @ normal)[:, None]))
 
 
-def near_body(a: Placed, b: Placed, step_s: Tensor) -> Tensor:
-    """Return whether (n,) the balls around two bodies meet within a step."""
+def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | None = None) -> Tensor:
+    """Return whether (n,) the balls around two bodies meet within a step; see :func:`body_points`."""
     with torch.no_grad():
+        soft = max(_softness(x, sharpness_per_m) for x in (a, b))
         apart = (plain(a.reference) - plain(b.reference)).square().sum(-1).sqrt()
-        return apart < a.reach() + b.reach() + plain(step_s) * _speed_bound(a, b)
+        return apart < a.reach() + b.reach() + plain(step_s) * _speed_bound(a, b) + soft
 
 
 def ground_points(world: World, placed: Placed, slot: Tensor) -> Points:
@@ -132,7 +134,7 @@ def ground_points(world: World, placed: Placed, slot: Tensor) -> Points:
     return Points(slot, gap, normal.expand_as(position), position)
 
 
-def body_points(a: Placed, b: Placed, step_s: Tensor | None) -> Points | None:
+def body_points(a: Placed, b: Placed, step_s: Tensor | None, sharpness_per_m: float | None = None) -> Points | None:
     """Return the points where two bodies touch, or will by the end of the step, both ways; None for none.
 
     The spheres of b against the union of a come first, then those of a against the union of b.
@@ -141,8 +143,9 @@ def body_points(a: Placed, b: Placed, step_s: Tensor | None) -> Points | None:
         a: The first body.
         b: The second body; normals point from it.
         step_s: Step [s], shape (n,); None for all points, touching or not.
+        sharpness_per_m: beta [1/m] of the published log-sum-exp distance; None for the simplex smooth minimum.
     """
-    on_a, on_b = _against_union(a, b, step_s), _against_union(b, a, step_s)
+    on_a, on_b = (_against_union(*order, step_s, sharpness_per_m) for order in ((a, b), (b, a)))
     count = b.body.radii.shape[-1]
     parts = []
     if on_a is not None:
@@ -154,11 +157,14 @@ def body_points(a: Placed, b: Placed, step_s: Tensor | None) -> Points | None:
     return Points(*(torch.cat([getattr(part, name) for part in parts], 1) for name in Points.__dataclass_fields__))
 
 
-def _against_union(union: Placed, spheres: Placed, step_s: Tensor | None) -> Points | None:
+def _against_union(
+    union: Placed, spheres: Placed, step_s: Tensor | None, sharpness_per_m: float | None
+) -> Points | None:
     """Return the points of `spheres` at the surface of `union`; normals point out of the union."""
+    softness = _softness(union, sharpness_per_m)
     with torch.no_grad():
         surface, queries = union.plain(), spheres.plain()
-        near = None if step_s is None else _within(queries, surface, step_s)
+        near = None if step_s is None else _within(queries, surface, step_s, softness)
         if near is not None and not near.shape[1]:
             return None
         distance = torch.cdist(queries.centers(near), surface.centers(), compute_mode="donot_use_mm_for_euclid_dist")
@@ -167,13 +173,14 @@ def _against_union(union: Placed, spheres: Placed, step_s: Tensor | None) -> Poi
         slot = _all(spheres, least) if near is None else near
         if step_s is not None:
             depth = least - queries.radii(near) - plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
-            kept = _lowest(depth, ROUNDING_M + PAIR_SMOOTHING_M)
+            kept = _lowest(depth, ROUNDING_M + softness)
             if kept is None:
                 return None
             slot, least = near.gather(1, kept), least.gather(1, kept)
             distance = distance.gather(1, kept[..., None].expand(-1, -1, distance.shape[-1]))
-        # only spheres within the smoothing width of the nearest one have a weight in the smooth minimum
-        most = int((distance < least[..., None] + PAIR_SMOOTHING_M + ROUNDING_M).sum(-1).max())
+        most = distance.shape[-1]
+        if sharpness_per_m is None:  # only spheres within the width of the nearest one have a weight in the minimum
+            most = int((distance < least[..., None] + PAIR_SMOOTHING_M + ROUNDING_M).sum(-1).max())
         members = distance.topk(most, dim=-1, largest=False, sorted=False).indices
     points = spheres.centers(slot)
     radii = spheres.radii(slot)
@@ -181,9 +188,11 @@ def _against_union(union: Placed, spheres: Placed, step_s: Tensor | None) -> Poi
     offset = points[:, :, None] - gathered
     length2 = offset.square().sum(-1)
     length = torch.where(length2 > 0, length2, torch.ones_like(length2)).sqrt() * (length2 > 0)
-    value, weights = smooth_min(
-        length - union.radii(members.flatten(1)).unflatten(1, members.shape[1:]), PAIR_SMOOTHING_M
-    )
+    distances = length - union.radii(members.flatten(1)).unflatten(1, members.shape[1:])
+    if sharpness_per_m is None:
+        value, weights = smooth_min(distances, PAIR_SMOOTHING_M)
+    else:
+        value, weights = log_sum_exp_distance(distances, sharpness_per_m)
     gradient = (weights[..., None] * offset / length.clamp_min(1e-12)[..., None]).sum(-2)
     normal = unit_or_up(gradient)
     gap = value - radii
@@ -202,11 +211,18 @@ def unit_or_up(gradient: Tensor) -> Tensor:
     return torch.where(known, gradient / torch.where(known, norm2, torch.ones_like(norm2)).sqrt(), up)
 
 
-def _within(queries: Placed, surface: Placed, step_s: Tensor) -> Tensor:
+def _softness(union: Placed, sharpness_per_m: float | None) -> float:
+    """Return how far [m] the smooth distance may lie below that of the nearest sphere, and a little more."""
+    if sharpness_per_m is None:
+        return PAIR_SMOOTHING_M
+    return math.log(union.body.radii.shape[-1]) / sharpness_per_m
+
+
+def _within(queries: Placed, surface: Placed, step_s: Tensor, softness_m: float) -> Tensor:
     """Return the slots (n, K) of the spheres near the ball around the other body."""
     centers = queries.centers()
     apart = (centers - surface.reference[:, None]).square().sum(-1).sqrt() - queries.radii()
-    margin = surface.reach() + plain(step_s) * _speed_bound(queries, surface) + PAIR_SMOOTHING_M
+    margin = surface.reach() + plain(step_s) * _speed_bound(queries, surface) + softness_m
     kept = _lowest(apart - margin[:, None], 0.0)
     return apart.new_zeros((apart.shape[0], 0), dtype=torch.int64) if kept is None else kept
 

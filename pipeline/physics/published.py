@@ -27,7 +27,8 @@ class PublishedLaw:
     """The published numbers: friction [1], stiffness K [N/m] and damping D [N s/m] of a row, each (1,) or (B,).
 
     directions: rows of a contact's friction pyramid; softplus_per_n: sharpness of SoftPlus [1/N], infinite for a plain
-    maximum; clamp_depth_m, clamp_per_m: delta and gamma of the sigmoid clamp of the distance, none for None.
+    maximum; sharpness_per_m: beta of the log-sum-exp distance between bodies, the simplex smooth minimum for None;
+    clamp_depth_m, clamp_per_m: delta and gamma of the sigmoid clamp of the distance, none for None.
     """
 
     name: ClassVar[str] = "published"
@@ -36,6 +37,7 @@ class PublishedLaw:
     damping_n_s_m: Tensor
     directions: int = 4
     softplus_per_n: float = math.inf
+    sharpness_per_m: float | None = None
     clamp_depth_m: float | None = None
     clamp_per_m: float | None = None
 
@@ -44,15 +46,6 @@ def clamped(distance: Tensor, depth_m: float, per_m: float) -> Tensor:
     """Return the published clamp of a distance [m]: sig(gamma d) d - (1 - sig(gamma d)) delta, any shape."""
     inside = torch.sigmoid(per_m * distance)
     return inside * distance - (1 - inside) * depth_m
-
-
-def log_sum_exp_distance(distances: Tensor, per_m: float) -> tuple[Tensor, Tensor]:
-    """Return the published smooth minimum of distances (..., N) [m] and its weights.
-
-    -(1/beta) log sum exp(-beta d): between min d - log(N)/beta and min d.
-    """
-    scaled = -per_m * distances
-    return -torch.logsumexp(scaled, -1) / per_m, torch.softmax(scaled, -1)
 
 
 def rest_penetration(mass: float, gravity: float, rows: int, law: tuple[float, float], step_s: float) -> float:

@@ -107,6 +107,7 @@ class _Engine:
                 self.drives[index] = command if isinstance(command, Drive) else Drive.of([command], like)
         self.batch = self._batch(state)
         self.contacts = Contacts(world, self.inertias)
+        self.touched: list[PairImpulses] = []
 
     def _batch(self, state: State) -> int:
         """Return the size of the batch that all the tensors together have."""
@@ -144,7 +145,8 @@ class _Engine:
             self._free(index, motion, rotations[index], h) if self.world.bodies[index].free else motion
             for index, motion in enumerate(motions)
         ]
-        touched = self.contacts.resolve(self._place(ahead, rotations), h)
+        touched = self.contacts.resolve(self._place(ahead, rotations), h, self.touched)
+        self.touched = touched
         velocity, spin = self._after(ahead, touched)
         moved = []
         for index, body in enumerate(self.world.bodies):

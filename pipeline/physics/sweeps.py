@@ -20,10 +20,9 @@ from .contact import Touch, coefficients
 from .rotation import cross
 
 CONTACT_ONSET_M = 2e-4
-"""From this depth on [m] a contact counts fully in the sharing of a body's mass, however deep others are."""
+"""A contact counts fully in the sharing of a body's mass from this depth on [m]; it only smooths the onset."""
 TINY = 1e-24
 """Added to squared lengths, so that the derivative of a contact without impulses stays finite."""
-
 FAR_M_S = 1e30
 """An open contact asks for a gap speed below any [m/s]; finite, as the reverse derivative of infinity is no number."""
 
@@ -114,7 +113,7 @@ class ContactGroup:
         normal_rows = rows.unflatten(1, (-1, 3))[:, :, 0]
         mass = 1 / mobility[..., 0]
         ahead = gap + h * speed
-        share = 1 / _crowding(normal_rows, mass, ahead, gap)
+        share = _share(normal_rows, mass, ahead, gap)
 
         k, d = coefficients(touch.contact_time_s, touch.damping_ratio, h)
         # the fraction of the step that the contact is closed makes the damper's onset continuous in the gap
@@ -154,17 +153,52 @@ class Impulses:
     angular: Tensor | None = None
 
 
-def settle(groups: Sequence[ContactGroup], sweeps: int) -> list[Impulses]:
-    """Return the impulses of all groups after the given number of sweeps; one is the closed form."""
-    found = [_sweep(group, None, group.relative, group.spin) for group in groups]
-    for _ in range(1, sweeps):
-        moved: dict[int, Tensor] = {}
-        for group, impulses in zip(groups, found, strict=True):
-            for side in group.sides:
-                motion = _motion(side, group, impulses)
-                moved[side.body] = motion if side.body not in moved else moved[side.body] + motion
-        found = [_sweep(group, impulses, *_seen(group, moved)) for group, impulses in zip(groups, found, strict=True)]
+def settle(groups: Sequence[ContactGroup], sweeps: int, warm: Sequence[Tensor | None] | None = None) -> list[Impulses]:
+    """Return the impulses of all groups after the given number of sweeps; one from nothing is the closed form.
+
+    Args:
+        groups: The contacts of a step.
+        sweeps: How often every contact is projected anew.
+        warm: Impulses (n, C, 3) [N s] along the axes from which each group begins, those of the step before: what a few
+            sweeps leave of slow modes is then made up for in the following steps, and bodies at rest do not creep.
+    """
+    groups = _splitting(groups)
+    begin = warm if warm is not None else [None] * len(groups)
+    found = [
+        Impulses(torch.zeros_like(group.relative) if old is None else old)
+        for group, old in zip(groups, begin, strict=True)
+    ]
+    for _ in range(sweeps):
+        seen = _all_seen(groups, found)
+        found = [_sweep(group, given, *now) for group, given, now in zip(groups, found, seen, strict=True)]
     return found
+
+
+def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
+    """Return the groups, each to move its share of a body that others touch too, or the sweeps would overshoot."""
+    if len(groups) < 2:
+        return groups
+    count: dict[int, Tensor] = {}
+    for group in groups:
+        active = (group.target > -0.5 * FAR_M_S).any(1, keepdim=True).to(group.target.dtype)
+        for side in group.sides:
+            count[side.body] = active if side.body not in count else count[side.body] + active
+    split = []
+    for group in groups:
+        share = 1 / torch.stack([count[side.body] for side in group.sides]).amax(0).clamp_min(1.0)
+        wide = None if group.stop_w is None else share[..., None] * group.stop_w
+        split.append(replace(group, stop_n=share * group.stop_n, stop_t=share * group.stop_t, stop_w=wide))
+    return split
+
+
+def _all_seen(groups: Sequence[ContactGroup], impulses: Sequence[Impulses]) -> list[tuple[Tensor, Tensor | None]]:
+    """Return for each group the velocities of its points (n, C, 3) and its spin (n, 3) under all impulses."""
+    moved: dict[int, Tensor] = {}
+    for group, given in zip(groups, impulses, strict=True):
+        for side in group.sides:
+            motion = _motion(side, group, given)
+            moved[side.body] = motion if side.body not in moved else moved[side.body] + motion
+    return [_seen(group, moved) for group in groups]
 
 
 def _motion(side: Rows, group: ContactGroup, impulses: Impulses) -> Tensor:
@@ -188,17 +222,14 @@ def _seen(group: ContactGroup, moved: dict[int, Tensor]) -> tuple[Tensor, Tensor
     return relative, omega
 
 
-def _sweep(group: ContactGroup, before: Impulses | None, relative: Tensor, omega: Tensor | None) -> Impulses:
+def _sweep(group: ContactGroup, before: Impulses, relative: Tensor, omega: Tensor | None) -> Impulses:
     """Return the impulses after one projected sweep from those before, under the velocities (n, C, 3) they leave."""
     steady = group.steady
-    normal, slip = relative[..., 0], relative[..., 1:]
-    along = group.stop_n * (group.target - normal)
-    wanted = -group.stop_t[..., None] * slip
-    if before is not None:
-        linear = before.linear if steady is None else before.linear - steady
-        along, wanted = linear[..., 0] + along, linear[..., 1:] + wanted
+    linear = before.linear if steady is None else before.linear - steady
+    along = linear[..., 0] + group.stop_n * (group.target - relative[..., 0])
+    wanted = linear[..., 1:] - group.stop_t[..., None] * relative[..., 1:]
     along = along.clamp_min(0.0)
-    across = _in_disc(wanted, group.friction * along)
+    across = in_disc(wanted, group.friction * along)
     linear = torch.cat((along[..., None], across), -1)
     if steady is not None:
         linear = linear + steady
@@ -207,41 +238,36 @@ def _sweep(group: ContactGroup, before: Impulses | None, relative: Tensor, omega
     assert group.stop_w is not None and group.torsion_m is not None and group.rolling_m is not None
     turning = (group.axes @ omega[:, None, :, None]).squeeze(-1)
     wanted = -torch.cat((group.stop_w[..., :1], group.stop_w[..., 1:].expand(-1, -1, 2)), -1) * turning
-    if before is not None and before.angular is not None:
+    if before.angular is not None:
         wanted = before.angular + wanted
-    torsion = _in_disc(wanted[..., :1], group.torsion_m * along)
-    rolling = _in_disc(wanted[..., 1:], group.rolling_m * along)
+    torsion = in_disc(wanted[..., :1], group.torsion_m * along)
+    rolling = in_disc(wanted[..., 1:], group.rolling_m * along)
     return Impulses(linear, torch.cat((torsion, rolling), -1))
 
 
-def _in_disc(wanted: Tensor, limit: Tensor) -> Tensor:
+def in_disc(wanted: Tensor, limit: Tensor) -> Tensor:
     """Return vectors (..., d) shortened to at most `limit` (...)."""
     size = (wanted.square().sum(-1) + TINY).sqrt()
     return (limit / size).clamp_max(1.0)[..., None] * wanted
 
 
-def _crowding(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
-    """Return how many contacts do the work of each one (n, C): 1 alone, c for c coincident ones.
+def _share(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
+    """Return the share of its work that each contact does itself (n, C): 1 alone, 1/n for n coincident ones.
 
-    Derived: 1 + sum over the other touching contacts of the squared correlation of their rows in the mass metric, in
-    O(C) through the small matrix sum of m r r^T.
+    Derived: its weight over the sum of the touching contacts' weights times the squared correlations of their rows with
+    its own in the mass metric, in O(C) through the small matrix sum of m r r^T. Only ratios of weights count: contacts
+    that all touch lightly share like contacts that all touch hard, or the sweeps would overshoot.
     """
-    touching = _onset(ahead, gap)
-    weighted = rows * (touching * mass)[..., None]
+    weight = _onset(ahead, gap)
+    weighted = rows * (weight * mass)[..., None]
     gram = weighted.transpose(-1, -2) @ rows
     total = mass * ((rows @ gram) * rows).sum(-1)
-    return 1 + (total - touching).clamp_min(0.0)
+    return (weight + 1e-9) / (torch.maximum(total, weight) + 1e-9)
 
 
 def _onset(ahead: Tensor, gap: Tensor) -> Tensor:
-    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is closed.
-
-    It counts fully from CONTACT_ONSET_M on, or as deep as the deepest contact of its pair: where all are shallow, as
-    under a stiff or light body, they must share all the same, or together they push more than the body weighs.
-    """
-    depth = -torch.minimum(ahead, gap)
-    full = depth.amax(1, keepdim=True).clamp(1e-12, CONTACT_ONSET_M)
-    return (depth / full).clamp(0.0, 1.0)
+    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is deep."""
+    return (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
 
 
 def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
@@ -249,5 +275,5 @@ def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
 
     Only within the first 2 % of the onset is it less, so that a grazing contact begins without a jump.
     """
-    depth = (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
-    return depth / depth.sum(1, keepdim=True).clamp_min(0.02)
+    touching = _onset(ahead, gap)
+    return touching / touching.sum(1, keepdim=True).clamp_min(0.02)

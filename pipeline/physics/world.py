@@ -13,10 +13,12 @@ from ...schemas import InputDataError
 from .contact import ContactLaw
 from .distance import plane_contacts
 from .effects.effect import ActiveEffect
+from .effects.registry import load_effect
 from .published import PublishedLaw
 
 if TYPE_CHECKING:
     from ...datasets.models import Model
+    from ...schemas import EffectModel
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class World:
             law,
             file.solver.step_s,
             file.solver.sweeps,
+            tuple(_active(effect, str(model.root), tensor(0.0)) for effect in file.effects),
         )
 
     def with_body(self, index: int, **changes: Tensor) -> World:
@@ -145,6 +148,14 @@ class State:
     quat_wxyz: Tensor
     velocity_m_s: Tensor
     omega_body_rad_s: Tensor
+
+
+def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
+    effect = load_effect(entry.name)
+    try:
+        return ActiveEffect.of(effect, entry.parameters, like)
+    except KeyError as error:
+        raise InputDataError(f"{where}: {error.args[0]}.", todo="fit the model again with this effect.") from error
 
 
 def symmetric(six: tuple[float, ...]) -> np.ndarray:
