@@ -75,6 +75,9 @@ class PhysConfig(FileModel):
     iterations: Annotated[int, Field(ge=1)] = 10
     """Most steps of the local refinement (Levenberg-Marquardt)."""
     warmup_s: Annotated[float, Field(gt=0)] = 0.1
+    mass_distribution: bool = False
+    """Fit where the mass of free bodies is, too: its centre and second moments, from 8 tracked episodes or more. What
+    the capture gives of them is then only the start."""
 
 
 class SynthesizeConfig(FileModel):
