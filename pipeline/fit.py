@@ -31,6 +31,7 @@ from ..schemas import (
     Provenance,
     Solver,
     SplatConfig,
+    UsageError,
 )
 from .checkpoint import Checkpoint
 from .fit_effects import fit_with_constants, fitted_effects, with_effects
@@ -270,6 +271,12 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
         found = fit_with_constants(world, track_episodes(capture, split), config, noise)
+    elif config.mass_distribution:
+        raise UsageError(
+            f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not show where the mass is.",
+            "--supervise tracks.",
+            "fit to tracks, or leave phys-geo.mass_distribution at false.",
+        )
     else:
         from .phys_images import fit_physics_from_images
 
@@ -298,8 +305,23 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     ground = file.ground
     if ground is not None and found.ground_offset_m is not None:
         ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
+    bodies = file.bodies
+    if found.mass is not None:
+        placed = {body.name: body for body in found.mass.world.bodies}
+        bodies = tuple(
+            body.model_copy(
+                update={
+                    "com_m": _three(placed[body.name].com[0].numpy()),
+                    "inertia_kg_m2": _six(placed[body.name].inertia[0].numpy()),
+                }
+            )
+            if body.motion == "free"
+            else body
+            for body in bodies
+        )
     return file.model_copy(
         update={
+            "bodies": bodies,
             "contact": found.contact,
             "ground": ground,
             "parameters": (*found.parameters, *kept),

@@ -1,11 +1,12 @@
 """The stage phys-geo: the numbers of the contact model from measured motion.
 
 1. The noise of the tracks, given or estimated from them.
-2. Initial states from each episode's warm-up, by the model itself.
-3. A global search (adaptive importance sampling) on the open-loop error, many rollouts at once: what the model is for
+2. Where it is asked for, where the mass is (`mass_distribution.py`).
+3. Initial states from each episode's warm-up, by the model itself.
+4. A global search (adaptive importance sampling) on the open-loop error, many rollouts at once: what the model is for
    is to predict long unseen motion, and that error has several valleys. The estimate is the mean over the samples
    that predict about equally well, not the luckiest one.
-4. Where a few episodes are explained down to their noise, Levenberg-Marquardt with exact forward-mode derivatives,
+5. Where a few episodes are explained down to their noise, Levenberg-Marquardt with exact forward-mode derivatives,
    states and parameters together: the sharper estimate if the model is right, and misleading if it is not. With many
    episodes, their scatter gives the intervals.
 """
@@ -32,6 +33,7 @@ from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
+from .mass_distribution import MassDistribution, fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
 from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
@@ -67,8 +69,8 @@ class PhysicsFit:
     """What the stage found.
 
     contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there
-    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; constants: of
-    effects, `effect.constant` by name.
+    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; mass: where that was fitted;
+    constants: of effects, `effect.constant` by name.
     """
 
     contact: ContactParameters
@@ -77,6 +79,7 @@ class PhysicsFit:
     noise: tuple[float, float]
     record: dict[str, Any]
     warnings: tuple[str, ...]
+    mass: MassDistribution | None = None
     constants: dict[str, float] = field(default_factory=dict)
 
 
@@ -104,7 +107,7 @@ def fit_physics(
     config: PhysConfig,
     noise: tuple[float | None, float | None] = (None, None),
 ) -> PhysicsFit:
-    """Fit friction, contact time, damping ratio and ground height to measured tracks.
+    """Fit friction, contact time, damping ratio and ground height to measured tracks; where asked for, the mass too.
 
     Args:
         world: The world with its geometry and inertia; its contact law is the start of the search.
@@ -114,6 +117,7 @@ def fit_physics(
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
+        InputDataError: If the tracks do not show where the mass is, and that is asked for.
     """
     free_tracks = [
         tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
@@ -123,6 +127,10 @@ def fit_physics(
     # few episodes cannot tell the ground's height from the way of bouncing, and the manifest gives the height
     height = world.ground_normal is not None and len(episodes) >= ENOUGH_EPISODES
     names = [*CONTACT_PARAMETERS, *effect_parameters(world), *([GROUND_SHIFT] if height else [])]
+    mass: MassDistribution | None = None
+    if config.mass_distribution:
+        mass = fit_mass_distribution(world, episodes, [(p, p.prior[0]) for p in names], sigma)
+        world = mass.world
     windows = [_span(tracks) for _, tracks in episodes]
     observations = Observations.of(world, episodes, windows)
     warm = warmup_frames(world, observations, config.warmup_s)
@@ -139,13 +147,18 @@ def fit_physics(
         "search_open_loop_m": search.history,
         "search_effective_samples": search.effective_samples,
     }
+    if mass is not None:
+        record["mass_distribution"] = mass.record
     best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
     if covariance is None:
         best, covariance = search.mean, search.covariance
         if search.lowest < WORTH_REFINING * _noise_floor(world, observations, sigma):
             best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
     record["correlation"] = _correlation(covariance).tolist()
-    return physics_fit(world, names, best, covariance, sigma, record)
+    found = physics_fit(world, names, best, covariance, sigma, record)
+    if mass is None:
+        return found
+    return replace(found, parameters=(*found.parameters, *mass.parameters), mass=mass)
 
 
 def _noise_floor(world: World, observations: Observations, sigma: tuple[float, float]) -> float:

@@ -77,6 +77,9 @@ class PhysConfig(FileModel):
     warmup_s: Annotated[float, Field(gt=0)] = 0.1
     effects: tuple[str, ...] = ()
     """Effects to add to the model and to fit: names of built-in ones, or `path/to/file.py:ClassName`."""
+    mass_distribution: bool = False
+    """Fit where the mass of free bodies is, too: its centre and second moments, from 8 tracked episodes or more. What
+    the capture gives of them is then only the start."""
 
 
 class SynthesizeConfig(FileModel):

@@ -69,6 +69,34 @@ def effect_parameters(world: World) -> list[Parameter]:
     return found
 
 
+def mass_distribution(body: str, size_m: float) -> tuple[Parameter, ...]:
+    """Return the parameters of where a body's mass is: its centre, and factors of its second moments about it.
+
+    The second moment along a body axis, the integral of x^2 dm, may be any positive number, so that every inertia made
+    of three of them is one that a body can have.
+
+    Args:
+        body: Its name.
+        size_m: Distance of its surface from the centre of mass [m], which bounds how far that may move.
+    """
+    centre = [
+        Parameter(
+            f"{body}.com_{axis}_m",
+            "m",
+            (-0.5 * size_m, 0.5 * size_m),
+            False,
+            "spinning flight and impacts",
+            (0.0, 0.25 * size_m),
+        )
+        for axis in "xyz"
+    ]
+    moments = [
+        Parameter(f"{body}.moment_{axis}", "1", (0.1, 10.0), True, "impacts that change the spin", (1.0, 0.5))
+        for axis in "xyz"
+    ]
+    return (*centre, *moments)
+
+
 def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tensor) -> World:
     """Return the world with the given values (B, P), in the units of `parameters`."""
     column = {parameter.name: values[:, index] for index, parameter in enumerate(parameters)}
@@ -89,4 +117,21 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
         if any(value is not None for value in com):
             given = [body.com[:, k] if value is None else value for k, value in enumerate(com)]
             world = world.with_body(index, com=torch.stack(torch.broadcast_tensors(*given), -1))
+        factors = [column.get(f"{body.name}.moment_{axis}") for axis in "xyz"]
+        if any(factor is not None for factor in factors):
+            known = [torch.ones_like(values[:, 0]) if factor is None else factor for factor in factors]
+            world = world.with_body(index, inertia=scaled_inertia(body.inertia, torch.stack(known, -1)))
     return world
+
+
+def scaled_inertia(inertia: Tensor, factors: Tensor) -> Tensor:
+    """Return the inertia (B, 3, 3) of a body whose second moments of mass along its axes are scaled by factors (B, 3).
+
+    With C = tr(I)/2 - I the second moments (Wensing et al., "Linear matrix inequalities for physically consistent
+    inertial parameter identification", 2018) and S the square roots of the factors: C' = S C S, I' = tr(C') - C'.
+    """
+    eye = torch.eye(3).to(inertia)
+    trace = inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    root = factors.sqrt()
+    moments = root[..., :, None] * (0.5 * trace * eye - inertia) * root[..., None, :]
+    return moments.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * eye - moments
