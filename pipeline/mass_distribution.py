@@ -1,8 +1,6 @@
 """Where a body's mass is: its centre and second moments, from the motion about first contacts.
 
 A published inertia or the assumption of uniform density may be far off, and every impact turns the body by it.
-Open-loop errors over many impacts are rough in these numbers; over the short windows about first contacts, whose states
-at the start are fitted too, they are smooth, and exact derivatives find them in a few steps.
 """
 
 from __future__ import annotations
@@ -18,26 +16,10 @@ from torch import Tensor
 from ..datasets.tracks import Track
 from ..schemas import InputDataError
 from ..schemas import Parameter as FittedParameter
-from .estimation.least_squares import Solution, minimise
-from .estimation.observations import Observations
-from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
-from .estimation.warmup import flight_frames
+from .first_contacts import fit_first_contacts, sandwich
 from .physics.parameters import Parameter, apply_parameters, mass_distribution
 from .physics.world import World
 
-Array = np.ndarray[Any, np.dtype[np.float64]]
-
-LEAD_FRAMES = 6
-"""Frames of flight before the first contact in a window: they give the velocities with which it begins."""
-AFTER_S = 0.1
-"""How long a window goes on after the first contact: about one tumble of a thrown body."""
-MODEL_ERROR = (0.0005, 0.01)
-"""What a rigid body and this contact law miss in such a window (position [m], rotation [rad]) beside the tracks' noise.
-Only their ratio matters much; the residuals are weighed robustly, and the intervals come from the episodes' scatter."""
-ROBUST_SCALE = 3.0
-MAX_WINDOWS = 100
-"""So many give the second moments within 2 %."""
-ITERATIONS = 16
 LEAST_EPISODES = 8
 """Fewer cannot tell where the mass is from how the body happens to bounce."""
 
@@ -76,26 +58,15 @@ def fit_mass_distribution(
             f"{LEAST_EPISODES} or more, to find where the mass is.",
             "record more, or leave phys-geo.mass_distribution at false.",
         )
-    observations = _windows(world, turning)
-    names = [parameter for parameter, _ in contact]
-    start = [parameter.encode(value) for parameter, value in contact]
+    start = list(contact)
     for index in world.free:
         added = mass_distribution(world.bodies[index].name, _size_m(world, index))
-        names += added
-        start += [float(value) for value in world.bodies[index].com[0]] + [0.0, 0.0, 0.0]
-    std = [float(np.hypot(error, sigma)) for error, sigma in zip(MODEL_ERROR, noise, strict=True)]
-    solution = minimise(
-        TrajectoryResiduals(world, names, observations, *std),
-        torch.tensor(start).to(world.gravity),
-        torch.zeros(len(observations.names), STATE_SIZE * len(observations.free)).to(world.gravity),
-        torch.tensor([parameter.limits for parameter in names]).to(world.gravity),
-        robust_scale=ROBUST_SCALE,
-        iterations=ITERATIONS,
-        prior_information=state_prior(len(observations.free)),
-    )
-    first = len(contact)
-    covariance = _sandwich(solution)[first:, first:]
-    record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
+        values = [float(value) for value in world.bodies[index].com[0]] + [1.0, 1.0, 1.0]
+        start += zip(added, values, strict=True)
+    solution, windows = fit_first_contacts(world, turning, start, noise)
+    first, names = len(contact), [parameter for parameter, _ in start]
+    covariance = sandwich(solution)[first:, first:]
+    record = {"windows": windows, "costs": solution.costs, "converged": solution.converged}
     return MassDistribution(
         _placed(world, names[first:], solution.shared[first:]),
         tuple(
@@ -110,32 +81,10 @@ def _turns(track: Track | None) -> bool:
     return track is not None and track.quat_wxyz is not None
 
 
-def _windows(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> Observations:
-    """Return a window about the first contact of each episode, of at most `MAX_WINDOWS` evenly spread ones."""
-    chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_WINDOWS)).round().astype(int)
-    picked = [episodes[i] for i in chosen]
-    whole = Observations.of(world, picked, [(-np.inf, np.inf)] * len(picked))
-    flying = flight_frames(world, whole).sum(1)
-    windows = []
-    for times, count in zip(whole.times_s, flying.tolist(), strict=True):
-        first, contact = times[max(0, count - LEAD_FRAMES)], times[min(count, len(times) - 1)]
-        windows.append((float(first) - 1e-9, float(contact) + AFTER_S))
-    return Observations.of(world, picked, windows)
-
-
 def _size_m(world: World, index: int) -> float:
     """Return the largest distance of a body's surface from its centre of mass [m]."""
     body = world.bodies[index]
     return float(((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).max())
-
-
-def _sandwich(solution: Solution) -> Array:
-    """Return the covariance (P, P) from the scatter of the episodes' gradients (Huber 1967)."""
-    information = solution.information.numpy()
-    scale = np.sqrt(np.diag(information).clip(1e-300))
-    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-    scores = solution.scores.numpy()
-    return inverse @ (scores.T @ scores) @ inverse
 
 
 def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:

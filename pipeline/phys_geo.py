@@ -33,6 +33,7 @@ from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
+from .first_contacts import curvature_covariance, fit_first_contacts
 from .mass_distribution import MassDistribution, fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
@@ -57,6 +58,8 @@ WITHIN_REACH = 2.0
 steps would not explain the motion either, and they are what takes long."""
 OPEN_LOOP_TOLERANCE = 1.5
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
+HINT_WIDTH = 3.0
+"""The search first looks this many standard errors about what flight and first contacts say."""
 ENOUGH_EPISODES = 8
 """From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
 without trusting the model."""
@@ -134,9 +137,12 @@ def fit_physics(
     windows = [_span(tracks) for _, tracks in episodes]
     observations = Observations.of(world, episodes, windows)
     warm = warmup_frames(world, observations, config.warmup_s)
-    observations, _ = estimate_states(world, observations, warm, sigma)
+    hint = _hint(world, episodes, names, sigma)
+    informed = world if hint is None else _at(world, names, hint[0])  # drag, say, is no part of a start's velocity
+    observations, _ = estimate_states(informed, observations, warm, sigma)
 
-    search = _search(world, observations, warm, names, _noise_floor(world, observations, sigma), config)
+    floor = _noise_floor(world, observations, sigma)
+    search = _search(world, observations, warm, names, floor, config, hint)
     if not math.isfinite(search.lowest):
         raise NotConvergedError(
             "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
@@ -159,6 +165,28 @@ def fit_physics(
     if mass is None:
         return found
     return replace(found, parameters=(*found.parameters, *mass.parameters), mass=mass)
+
+
+def _hint(
+    world: World, episodes: Sequence[tuple[str, dict[str, Track]]], names: list[Parameter], sigma: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return where the search may look first: what flight and first contacts say, where there are effects to find.
+
+    Three numbers of contact are searched well from the prior; with every effect the valley gets narrower.
+    """
+    if not world.effects:
+        return None
+    solution, _ = fit_first_contacts(world, episodes, [(p, p.prior[0]) for p in names], sigma, whole_flight=True)
+    covariance = HINT_WIDTH**2 * curvature_covariance(solution)
+    widest = np.square([p.prior[1] for p in names])
+    shrink = np.sqrt(np.minimum(1.0, widest / np.maximum(np.diag(covariance), 1e-300)))
+    return solution.shared.numpy(), covariance * np.outer(shrink, shrink)
+
+
+def _at(world: World, names: list[Parameter], coordinates: np.ndarray) -> World:
+    """Return the world at fitted coordinates (P,)."""
+    values = [p.decode(torch.tensor(z, dtype=torch.float64)) for p, z in zip(names, coordinates, strict=True)]
+    return apply_parameters(world, names, torch.stack(values)[None])
 
 
 def _noise_floor(world: World, observations: Observations, sigma: tuple[float, float]) -> float:
@@ -204,6 +232,7 @@ def _search(
     names: list[Parameter],
     floor: float,
     config: PhysConfig,
+    hint: tuple[np.ndarray, np.ndarray] | None,
 ) -> SearchResult:
     episodes = len(observations.names)
     prior = Prior(
@@ -227,6 +256,7 @@ def _search(
         errors=ERRORS_PER_EPISODE * episodes,
         floor=floor,
         on_generation=advance,
+        hint=hint,
     )
     bar.close()
     return result

@@ -1,0 +1,109 @@
+"""Effects in a fit: added by name, fitted with the rest, kept in the model, and used wherever the model is."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets import Track
+from cgwm.datasets.models import read_model
+from cgwm.pipeline import first_contacts
+from cgwm.pipeline.fit_effects import fit_with_constants, fitted_effects, with_effects
+from cgwm.pipeline.physics import World, simulate
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.measured import measure
+from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig
+from small_model import write_small_model
+from worlds import F64, box_body, state_of, times, world_of
+
+BRIEF = PhysConfig(generations=5, population=24)
+
+
+def thrown(world: World, count: int, noise_m: float = 5e-4) -> list[tuple[str, dict[str, Track]]]:
+    """Tracks of boxes that the world threw, with noise of the positions."""
+    generator = torch.Generator().manual_seed(0)
+    episodes = []
+    for item in range(count):
+        quat = torch.randn(4, generator=generator, dtype=F64)
+        start = state_of(((0, 0, 0.4), tuple(quat.tolist()), (3.0, 0.5 * item - 1, 0.5), (3.0, -2.0, 1.0)))
+        rollout = simulate(world, start, times(0.5, 60.0))
+        position = rollout.position_m[0, :, 0]
+        position = position + noise_m * torch.randn(position.shape, generator=generator, dtype=F64)
+        track = Track(rollout.times_s.numpy(), position.numpy(), rollout.quat_wxyz[0, :, 0].numpy())
+        episodes.append((str(item), {"box": track}))
+    return episodes
+
+
+def active(name: str, **values: float) -> ActiveEffect:
+    return ActiveEffect.of(load_effect(name), values)
+
+
+def test_drag_is_found_with_the_contact_and_lowers_the_error() -> None:
+    episodes = thrown(replace(world_of(box_body()), effects=(active("quadratic_drag", k=0.2),)), 4)
+    plain = fit_with_constants(world_of(box_body()), episodes, BRIEF, (5e-4, 1e-3))
+    world = replace(world_of(box_body()), effects=(active("quadratic_drag"),))
+    found = fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
+    drag = next(p for p in found.parameters if p.name == "quadratic_drag.k")
+    assert drag.interval_95 is not None and drag.interval_95[0] < 0.2 < drag.interval_95[1]
+    assert drag.estimate == pytest.approx(0.2, rel=0.25) and drag.unit == "1/m"
+    assert found.record["search_open_loop_m"][-1] < 0.75 * plain.record["search_open_loop_m"][-1]
+
+
+def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_contacts, "ITERATIONS", 1)
+    effect = load_effect("ground_magnet")
+    (constant,) = effect.constants
+    truth = {effect.parameters[0].name: 6.0, constant.name: constant.grid[-1]}
+    episodes = thrown(replace(world_of(box_body()), effects=(active("ground_magnet", **truth),)), 1)
+    brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "iterations": 1})
+    world = replace(world_of(box_body()), effects=(active("ground_magnet"),))
+    found = fit_with_constants(world, episodes, brief, (5e-4, 1e-3))
+    tried = found.record["constants_tried"]
+    assert [row[f"ground_magnet.{constant.name}"] for row in tried] == list(constant.grid)
+    best = min(tried, key=lambda row: row["open_loop_m"])
+    assert found.constants == {f"ground_magnet.{constant.name}": best[f"ground_magnet.{constant.name}"]}
+
+
+def test_an_effect_that_lacks_what_it_needs_is_refused() -> None:
+    episodes = thrown(world_of(box_body(), ground=False), 1)
+    world = replace(world_of(box_body(), ground=False), effects=(active("ground_magnet"),))
+    with pytest.raises(InputDataError, match="'ground_magnet' needs a ground in the manifest, and this capture has"):
+        fit_with_constants(world, episodes, BRIEF, (None, None))
+
+
+def test_effects_join_those_of_the_parent_and_take_their_fitted_values() -> None:
+    present = (EffectModel(name="linear_drag", parameters={"c": 0.1}),)
+    joined = with_effects(present, ["quadratic_drag", "linear_drag", "quadratic_drag"])
+    assert [effect.name for effect in joined] == ["linear_drag", "quadratic_drag"]
+    found = [
+        Parameter(name="quadratic_drag.k", unit="1/m", estimate=0.3),
+        Parameter(name="friction", unit="1", estimate=0.2),
+    ]
+    names = {effect.name: effect.name for effect in joined}
+    fitted = fitted_effects(joined, names, found, {})
+    assert [effect.parameters for effect in fitted] == [{"c": 0.1}, {"k": 0.3}]
+
+
+def test_a_models_effects_act_in_its_world_and_a_wrong_parameter_is_refused(tmp_path: Path) -> None:
+    path = write_small_model(tmp_path / "model")
+    model = read_model(path)
+    dragged = model.file.model_copy(update={"effects": (EffectModel(name="linear_drag", parameters={"c": 2.0}),)})
+    worlds = [World.from_model(replace(model, file=file)) for file in (model.file, dragged)]
+    start = state_of(
+        *[((0, 0, 5.0 * k + 5), (1, 0, 0, 0), (1.0, 0, 0), (0, 0, 0)) for k in range(len(worlds[0].bodies))]
+    )
+    free = worlds[0].free[0]
+    ends = [float(simulate(world, start, times(0.2)).velocity_m_s[0, -1, free, 0]) for world in worlds]
+    assert ends == [pytest.approx(1.0), pytest.approx(np.exp(-0.4), rel=1e-2)]
+    wrong = model.file.model_copy(update={"effects": (EffectModel(name="linear_drag", parameters={"k": 2.0}),)})
+    with pytest.raises(InputDataError, match="linear_drag has no k; it has c"):
+        World.from_model(replace(model, file=wrong))
+
+
+def test_a_measurement_effect_changes_what_is_seen_and_not_what_happens() -> None:
+    world = replace(world_of(box_body()), effects=(active("length_scale", s=0.02),))
+    start = state_of(((0.5, 0, 1.0), (1, 0, 0, 0), (1.0, 0, 0), (0, 0, 0)))
+    true, seen = simulate(world, start, times(0.3)), measure(world, start, times(0.3))
+    torch.testing.assert_close(seen.position_m, 1.02 * true.position_m, atol=1e-12, rtol=0)
+    torch.testing.assert_close(seen.velocity_m_s, true.velocity_m_s, atol=0, rtol=0)
