@@ -60,6 +60,9 @@ OPEN_LOOP_TOLERANCE = 1.5
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
 HINT_WIDTH = 3.0
 """The search first looks this many standard errors about what flight and first contacts say."""
+MAX_EPISODES = 100
+"""Of more episodes the search looks at so many, evenly spread: that is enough for four numbers, and it is what takes
+long."""
 ENOUGH_EPISODES = 8
 """From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
 without trusting the model."""
@@ -134,8 +137,9 @@ def fit_physics(
     if config.mass_distribution:
         mass = fit_mass_distribution(world, episodes, [(p, p.prior[0]) for p in names], sigma)
         world = mass.world
-    windows = [_span(tracks) for _, tracks in episodes]
-    observations = Observations.of(world, episodes, windows)
+    chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
+    searched = [episodes[i] for i in chosen]
+    observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
     warm = warmup_frames(world, observations, config.warmup_s)
     hint = _hint(world, episodes, names, sigma)
     informed = world if hint is None else _at(world, names, hint[0])  # drag, say, is no part of a start's velocity
@@ -149,6 +153,7 @@ def fit_physics(
         )
     record: dict[str, Any] = {
         "episodes": len(episodes),
+        "search_episodes": len(searched),
         "noise_estimated": {"position_m": estimated[0], "rotation_rad": estimated[1]},
         "search_open_loop_m": search.history,
         "search_effective_samples": search.effective_samples,

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from worlds import batch, box_body, law, state_of, times, world_of
 
 NOISE = (0.0003, 0.003)
+STEP_S = 0.002
 COM_M = (0.003, -0.002, 0.006)
 MOMENTS = (1.4, 1.2, 1.8)
 CONTACT = list(zip(CONTACT_PARAMETERS, (0.2, 0.003, 0.5), strict=True))
@@ -36,7 +37,7 @@ CONTACT = list(zip(CONTACT_PARAMETERS, (0.2, 0.003, 0.5), strict=True))
 def weighted_world():
     """A box with a weight off its centre, which nobody has told of."""
     parameters = mass_distribution("box", 0.07)
-    return apply_parameters(world_of(box_body(), contact=law()), parameters, batch((*COM_M, *MOMENTS)))
+    return apply_parameters(world_of(box_body(), contact=law(), step_s=STEP_S), parameters, batch((*COM_M, *MOMENTS)))
 
 
 def tosses(count: int) -> list[tuple[str, dict[str, Track]]]:
@@ -74,7 +75,7 @@ def test_any_factors_give_an_inertia_that_a_body_can_have() -> None:
 
 
 def test_a_hidden_weight_is_found_from_tosses() -> None:
-    found = fit_mass_distribution(world_of(box_body()), tosses(10), CONTACT, NOISE)
+    found = fit_mass_distribution(world_of(box_body(), step_s=STEP_S), tosses(10), CONTACT, NOISE)
     numbers = {parameter.name: parameter for parameter in found.parameters}
     truth = {f"box.com_{axis}_m": value for axis, value in zip("xyz", COM_M, strict=True)}
     truth |= {f"box.moment_{axis}": value for axis, value in zip("xyz", MOMENTS, strict=True)}
@@ -114,7 +115,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_model_holds_the_mass_distribution_that_was_fitted(capture: Path, tmp_path: Path) -> None:
-    config = PhysConfig(population=8, generations=2, mass_distribution=True)
+    config = PhysConfig(population=8, generations=2, step_s=STEP_S, mass_distribution=True)
     file = fit(capture, tmp_path / "model", phys_config=config)
     numbers = {parameter.name: parameter for parameter in file.parameters}
     assert file.bodies[0].com_m == tuple(numbers[f"box.com_{axis}_m"].estimate for axis in "xyz")
