@@ -171,7 +171,7 @@ def _against_union(
         distance = distance - surface.radii()[:, None]
         least = distance.amin(-1)
         slot = _all(spheres, least) if near is None else near
-        if step_s is not None:
+        if step_s is not None and near is not None:
             depth = least - queries.radii(near) - plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
             kept = _lowest(depth, ROUNDING_M + softness)
             if kept is None:
