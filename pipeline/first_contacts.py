@@ -7,17 +7,20 @@ at its start fitted too, they are smooth, and exact derivatives find in a few st
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..datasets.tracks import Track
+from ..schemas import Parameter as FittedParameter
 from .estimation.least_squares import Solution, minimise
 from .estimation.observations import Observations
 from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .estimation.warmup import flight_frames
-from .physics.parameters import Parameter
+from .physics.parameters import Parameter, apply_parameters
 from .physics.world import World
 
 Array = NDArray[np.float64]
@@ -33,31 +36,44 @@ ROBUST_SCALE = 3.0
 MAX_WINDOWS = 100
 """So many give second moments of mass within 2 %."""
 ITERATIONS = 16
+ENOUGH_EPISODES = 8
+"""From so many episodes on their scatter gives the intervals."""
+UNOBSERVABLE_SHARE = 0.8
+"""A parameter that the windows leave with more than this share of its prior's width is called not observable."""
+
+
+@dataclass(frozen=True)
+class FirstContacts:
+    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`."""
+
+    world: World
+    parameters: tuple[FittedParameter, ...]
+    record: dict[str, Any]
 
 
 def fit_first_contacts(
     world: World,
     episodes: Sequence[tuple[str, dict[str, Track]]],
-    start: Sequence[tuple[Parameter, float]],
+    wanted: Sequence[tuple[Parameter, float]],
+    along: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
     whole_flight: bool = False,
-) -> tuple[Solution, int]:
+) -> FirstContacts:
     """Fit parameters to a window about the first contact of each episode, with the windows' states.
 
     Args:
         world: The world.
         episodes: Name and tracks by body of each episode.
-        start: What is fitted, and the values that it starts from.
+        wanted: What is to be found, and the values that it starts from.
+        along: What is fitted along, and found again later, open loop: the contact's numbers.
         noise: Of the tracks (position [m], rotation [rad]).
         whole_flight: Whether a window holds all frames before the contact, not the last few.
-
-    Returns:
-        The solution in fitted coordinates, and the number of windows.
 
     Raises:
         NotConvergedError: If the rollouts diverge at the start.
     """
     observations = _windows(world, episodes, None if whole_flight else LEAD_FRAMES)
+    start = [*wanted, *along]
     names = [parameter for parameter, _ in start]
     std = [float(np.hypot(error, sigma)) for error, sigma in zip(MODEL_ERROR, noise, strict=True)]
     solution = minimise(
@@ -69,19 +85,25 @@ def fit_first_contacts(
         iterations=ITERATIONS,
         prior_information=state_prior(len(observations.free)),
     )
-    return solution, len(observations.names)
+    count = len(wanted)
+    std_errors = np.sqrt(np.diag(_covariance(solution)))[:count]
+    found, coordinates = names[:count], solution.shared[:count]
+    record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
+    return FirstContacts(
+        _placed(world, found, coordinates),
+        tuple(_parameter(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
+        record,
+    )
 
 
-def sandwich(solution: Solution) -> Array:
-    """Return the covariance (P, P) from the scatter of the episodes' gradients (Huber 1967)."""
+def _covariance(solution: Solution) -> Array:
+    """Return the covariance (P, P): from the scatter of the episodes' gradients (Huber 1967), or for few the curvature.
+
+    A scatter of a few episodes is no estimate; the curvature rests on `MODEL_ERROR`.
+    """
     inverse = _pinv(solution.information.numpy())
     scores = solution.scores.numpy()
-    return inverse @ (scores.T @ scores) @ inverse
-
-
-def curvature_covariance(solution: Solution) -> Array:
-    """Return the covariance (P, P) from the curvature alone, for few episodes."""
-    return _pinv(solution.information.numpy())
+    return inverse if len(scores) < ENOUGH_EPISODES else inverse @ (scores.T @ scores) @ inverse
 
 
 def _pinv(information: Array) -> Array:
@@ -100,3 +122,34 @@ def _windows(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lea
         first = times[0] if lead_frames is None else times[max(0, count - lead_frames)]
         windows.append((float(first) - 1e-9, float(times[min(count, len(times) - 1)]) + AFTER_S))
     return Observations.of(world, picked, windows)
+
+
+def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:
+    values = torch.stack([p.decode(z) for p, z in zip(names, coordinates, strict=True)])[None]
+    moved = apply_parameters(world, names, values)
+    bodies = [replace(b, com=b.com.clone(), inertia=b.inertia.clone()) for b in moved.bodies]
+    return replace(world, bodies=tuple(bodies))
+
+
+def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
+    low, high = parameter.limits
+    estimate, *interval = (
+        float(parameter.decode(torch.tensor(min(max(z, low), high), dtype=torch.float64)))
+        for z in (coordinate, coordinate - 1.96 * std, coordinate + 1.96 * std)
+    )
+    on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
+    factor = "factor of the second moment of mass given or derived before; " if ".moment_" in parameter.name else ""
+    return FittedParameter(
+        name=parameter.name,
+        unit=parameter.unit,
+        estimate=estimate,
+        std_error=std * (estimate if parameter.logarithmic else 1.0),
+        interval_95=(interval[0], interval[1]),
+        bounds=parameter.bounds,
+        state="not_observable"
+        if std > UNOBSERVABLE_SHARE * parameter.prior[1]
+        else "on_bound"
+        if on_bound
+        else "fitted",
+        note=f"{factor}{parameter.reveals} would reveal it",
+    )

@@ -6,31 +6,15 @@ A published inertia or the assumption of uniform density may be far off, and eve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-import torch
-from torch import Tensor
 
 from ..datasets.tracks import Track
 from ..schemas import InputDataError
-from ..schemas import Parameter as FittedParameter
-from .first_contacts import fit_first_contacts, sandwich
-from .physics.parameters import Parameter, apply_parameters, mass_distribution
+from .first_contacts import FirstContacts, fit_first_contacts
+from .physics.parameters import Parameter, mass_distribution
 from .physics.world import World
 
 LEAST_EPISODES = 8
 """Fewer cannot tell where the mass is from how the body happens to bounce."""
-
-
-@dataclass(frozen=True)
-class MassDistribution:
-    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`."""
-
-    world: World
-    parameters: tuple[FittedParameter, ...]
-    record: dict[str, Any]
 
 
 def fit_mass_distribution(
@@ -38,7 +22,7 @@ def fit_mass_distribution(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     contact: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
-) -> MassDistribution:
+) -> FirstContacts:
     """Fit centre of mass and second moments of every free body, the contact's numbers beside them.
 
     Args:
@@ -58,23 +42,12 @@ def fit_mass_distribution(
             f"{LEAST_EPISODES} or more, to find where the mass is.",
             "record more, or leave phys-geo.mass_distribution at false.",
         )
-    start = list(contact)
+    wanted: list[tuple[Parameter, float]] = []
     for index in world.free:
         added = mass_distribution(world.bodies[index].name, _size_m(world, index))
         values = [float(value) for value in world.bodies[index].com[0]] + [1.0, 1.0, 1.0]
-        start += zip(added, values, strict=True)
-    solution, windows = fit_first_contacts(world, turning, start, noise)
-    first, names = len(contact), [parameter for parameter, _ in start]
-    covariance = sandwich(solution)[first:, first:]
-    record = {"windows": windows, "costs": solution.costs, "converged": solution.converged}
-    return MassDistribution(
-        _placed(world, names[first:], solution.shared[first:]),
-        tuple(
-            _parameter(p, float(z), float(s))
-            for p, z, s in zip(names[first:], solution.shared[first:], np.sqrt(np.diag(covariance)), strict=True)
-        ),
-        record,
-    )
+        wanted += zip(added, values, strict=True)
+    return fit_first_contacts(world, turning, wanted, contact, noise)
 
 
 def _turns(track: Track | None) -> bool:
@@ -85,30 +58,3 @@ def _size_m(world: World, index: int) -> float:
     """Return the largest distance of a body's surface from its centre of mass [m]."""
     body = world.bodies[index]
     return float(((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).max())
-
-
-def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:
-    values = torch.stack([p.decode(z) for p, z in zip(names, coordinates, strict=True)])[None]
-    moved = apply_parameters(world, names, values)
-    bodies = [replace(b, com=b.com.clone(), inertia=b.inertia.clone()) for b in moved.bodies]
-    return replace(world, bodies=tuple(bodies))
-
-
-def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
-    low, high = parameter.limits
-    estimate, *interval = (
-        float(parameter.decode(torch.tensor(min(max(z, low), high), dtype=torch.float64)))
-        for z in (coordinate, coordinate - 1.96 * std, coordinate + 1.96 * std)
-    )
-    on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
-    factor = "factor of the second moment of mass given or derived before; " if parameter.unit == "1" else ""
-    return FittedParameter(
-        name=parameter.name,
-        unit=parameter.unit,
-        estimate=estimate,
-        std_error=std * (estimate if parameter.logarithmic else 1.0),
-        interval_95=(interval[0], interval[1]),
-        bounds=parameter.bounds,
-        state="on_bound" if on_bound else "fitted",
-        note=f"{factor}{parameter.reveals} would reveal it",
-    )

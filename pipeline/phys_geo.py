@@ -33,8 +33,8 @@ from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
-from .first_contacts import curvature_covariance, fit_first_contacts
-from .mass_distribution import MassDistribution, fit_mass_distribution
+from .first_contacts import FirstContacts, fit_first_contacts
+from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
 from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
@@ -58,8 +58,6 @@ WITHIN_REACH = 2.0
 steps would not explain the motion either, and they are what takes long."""
 OPEN_LOOP_TOLERANCE = 1.5
 """The refined estimate may raise the open-loop error by this factor before the search's own is kept."""
-HINT_WIDTH = 3.0
-"""The search first looks this many standard errors about what flight and first contacts say."""
 MAX_EPISODES = 100
 """Of more episodes the search looks at so many, evenly spread: that is enough for four numbers, and it is what takes
 long."""
@@ -75,8 +73,8 @@ class PhysicsFit:
     """What the stage found.
 
     contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there
-    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; mass: where that was fitted;
-    constants: of effects, `effect.constant` by name.
+    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; mass, effects: where these were
+    fitted; constants: of effects, `effect.constant` by name.
     """
 
     contact: ContactParameters
@@ -85,7 +83,8 @@ class PhysicsFit:
     noise: tuple[float, float]
     record: dict[str, Any]
     warnings: tuple[str, ...]
-    mass: MassDistribution | None = None
+    mass: FirstContacts | None = None
+    effects: FirstContacts | None = None
     constants: dict[str, float] = field(default_factory=dict)
 
 
@@ -132,21 +131,23 @@ def fit_physics(
     sigma = (noise[0] or estimated[0], noise[1] or estimated[1])
     # few episodes cannot tell the ground's height from the way of bouncing, and the manifest gives the height
     height = world.ground_normal is not None and len(episodes) >= ENOUGH_EPISODES
-    names = [*CONTACT_PARAMETERS, *effect_parameters(world), *([GROUND_SHIFT] if height else [])]
-    mass: MassDistribution | None = None
+    names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
+    mass: FirstContacts | None = None
+    effects: FirstContacts | None = None
     if config.mass_distribution:
         mass = fit_mass_distribution(world, episodes, [(p, p.prior[0]) for p in names], sigma)
         world = mass.world
+    if effect_parameters(world):
+        effects = _fit_effects(world, episodes, names, sigma)
+        world = effects.world
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
     searched = [episodes[i] for i in chosen]
     observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
     warm = warmup_frames(world, observations, config.warmup_s)
-    hint = _hint(world, episodes, names, sigma)
-    informed = world if hint is None else _at(world, names, hint[0])  # drag, say, is no part of a start's velocity
-    observations, _ = estimate_states(informed, observations, warm, sigma)
+    observations, _ = estimate_states(world, observations, warm, sigma)
 
     floor = _noise_floor(world, observations, sigma)
-    search = _search(world, observations, warm, names, floor, config, hint)
+    search = _search(world, observations, warm, names, floor, config)
     if not math.isfinite(search.lowest):
         raise NotConvergedError(
             "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
@@ -160,6 +161,8 @@ def fit_physics(
     }
     if mass is not None:
         record["mass_distribution"] = mass.record
+    if effects is not None:
+        record["effects"] = effects.record
     best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
     if covariance is None:
         best, covariance = search.mean, search.covariance
@@ -167,31 +170,22 @@ def fit_physics(
             best, covariance = _refined(world, observations, warm, names, search, sigma, config, record)
     record["correlation"] = _correlation(covariance).tolist()
     found = physics_fit(world, names, best, covariance, sigma, record)
-    if mass is None:
-        return found
-    return replace(found, parameters=(*found.parameters, *mass.parameters), mass=mass)
+    more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
+    return replace(found, parameters=(*found.parameters, *more), mass=mass, effects=effects)
 
 
-def _hint(
-    world: World, episodes: Sequence[tuple[str, dict[str, Track]]], names: list[Parameter], sigma: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return where the search may look first: what flight and first contacts say, where there are effects to find.
+def _fit_effects(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    contact: Sequence[Parameter],
+    sigma: tuple[float, float],
+) -> FirstContacts:
+    """Fit the world's effects to flight and first contacts, from neutral values; the contact's numbers beside them.
 
-    Three numbers of contact are searched well from the prior; with every effect the valley gets narrower.
+    The open-loop search is for few numbers: with every effect its valley gets narrower, while windows show effects well.
     """
-    if not world.effects:
-        return None
-    solution, _ = fit_first_contacts(world, episodes, [(p, p.prior[0]) for p in names], sigma, whole_flight=True)
-    covariance = HINT_WIDTH**2 * curvature_covariance(solution)
-    widest = np.square([p.prior[1] for p in names])
-    shrink = np.sqrt(np.minimum(1.0, widest / np.maximum(np.diag(covariance), 1e-300)))
-    return solution.shared.numpy(), covariance * np.outer(shrink, shrink)
-
-
-def _at(world: World, names: list[Parameter], coordinates: np.ndarray) -> World:
-    """Return the world at fitted coordinates (P,)."""
-    values = [p.decode(torch.tensor(z, dtype=torch.float64)) for p, z in zip(names, coordinates, strict=True)]
-    return apply_parameters(world, names, torch.stack(values)[None])
+    wanted = [(parameter, 0.0) for parameter in effect_parameters(world)]
+    return fit_first_contacts(world, episodes, wanted, [(p, p.prior[0]) for p in contact], sigma, whole_flight=True)
 
 
 def _noise_floor(world: World, observations: Observations, sigma: tuple[float, float]) -> float:
@@ -237,7 +231,6 @@ def _search(
     names: list[Parameter],
     floor: float,
     config: PhysConfig,
-    hint: tuple[np.ndarray, np.ndarray] | None,
 ) -> SearchResult:
     episodes = len(observations.names)
     prior = Prior(
@@ -261,7 +254,6 @@ def _search(
         errors=ERRORS_PER_EPISODE * episodes,
         floor=floor,
         on_generation=advance,
-        hint=hint,
     )
     bar.close()
     return result

@@ -58,7 +58,6 @@ def importance_search(
     errors: float,
     floor: float,
     on_generation: Callable[[int, float], None] | None = None,
-    hint: tuple[Array, Array] | None = None,
 ) -> SearchResult:
     """Sample the posterior under a tempered likelihood, exp(-errors / 2 * (cost / scale)^2) with scale the lowest cost.
 
@@ -77,25 +76,17 @@ def importance_search(
         errors: Number of independent errors in the mean cost.
         floor: Cost that the measurement's noise alone makes; the scale is never below it.
         on_generation: Called with the generation and the lowest cost so far.
-        hint: Mean (P,) and covariance (P, P) of where a good sample may be, in the fitted coordinates; half of the
-            first generation is drawn there. It says where to look, not what to believe: the prior stays as it is.
     """
     rng = np.random.default_rng(seed)
     size = len(prior.mean)
     proposals = [(prior.mean.astype(float), np.diag(np.square(prior.std)))]
-    if hint is not None:
-        proposals.append((hint[0].astype(float), hint[1] + np.diag(np.square(_LEAST_STD * prior.std))))
     samples, found = np.empty((0, size)), np.empty((0, 0))
     history: list[float] = []
     mean, covariance, effective = *proposals[0], 0.0
     for generation in range(generations):
-        drawn = rng.multivariate_normal(*proposals[-1], population)
+        drawn = rng.multivariate_normal(*proposals[-1], population).clip(prior.bounds[:, 0], prior.bounds[:, 1])
         if generation == 0:
-            if hint is not None:
-                drawn[::2] = rng.multivariate_normal(*proposals[0], len(drawn[::2]))
-                drawn[1] = hint[0]
             drawn[0] = prior.mean
-        drawn = drawn.clip(prior.bounds[:, 0], prior.bounds[:, 1])
         new = costs(drawn)
         samples, found = np.concatenate([samples, drawn]), np.concatenate([found.reshape(-1, new.shape[1]), new])
         total = np.where(np.isfinite(found).all(1), found.mean(1), np.inf)
