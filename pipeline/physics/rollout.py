@@ -130,7 +130,7 @@ class _Engine:
         self.lengths = self.times.diff(dim=1)
         longest = self.lengths.amax(0).tolist()
         self.substeps = [max(1, math.ceil(length / world.step_s - 1e-6)) for length in longest]
-        self.pairs = _pairs(world)
+        self.pairs = contact_pairs(world)
         self.drives: dict[int, Drive] = {}
         for index, body in enumerate(world.bodies):
             if body.motion == "driven":
@@ -366,7 +366,7 @@ def _pick(values: Tensor, chosen: Tensor | None) -> Tensor:
     return values.expand(chosen.shape[0], *values.shape[1:]).gather(1, chosen)
 
 
-def _pairs(world: World) -> list[tuple[int, int]]:
+def contact_pairs(world: World) -> list[tuple[int, int]]:
     """Return the pairs of bodies that can touch: each free body with the ground (-1) and with every other body.
 
     The body with more spheres comes first: its union is the surface that the other's spheres touch.

@@ -1,0 +1,117 @@
+"""What a fused kernel is compiled for: the constants of one kind of world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from ..contact import CONTACT_ONSET_M
+from ..rollout import PAIR_SMOOTHING_M
+from .arithmetic_source import ARITHMETIC
+from .contact_source import CONTACTS
+from .rollout_source import ROLLOUT
+
+THREADS = 32
+"""Of a block: one warp, so that few environments still spread over all multiprocessors."""
+BODY_COLUMNS, WRENCH_COLUMNS, WORLD_COLUMNS = 23, 12, 5
+_BUSY_THREADS = 32_768
+"""With so many threads an H200 is busy; more environments need fewer threads each."""
+_FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
+"""How many contacts fit into a thread's registers, by (single precision, with derivatives)."""
+
+_LANGUAGE = """
+#if HOST
+#define INLINE inline
+#define EACH_BODY
+#define EACH_SLOT
+#define EACH_PAIR
+#define KEEP_LOOP
+#else
+#define INLINE __device__ __forceinline__
+#define EACH_BODY _Pragma("unroll")
+#define EACH_PAIR _Pragma("unroll 1")
+#if UNROLLED
+#define EACH_SLOT _Pragma("unroll")
+#else
+#define EACH_SLOT _Pragma("unroll 1")
+#endif
+#define KEEP_LOOP _Pragma("unroll 1")
+#endif
+"""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """The constants of a kernel.
+
+    single: float32, else float64; dual: with a derivative in one direction; lanes: threads of an environment, a power
+    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; free (bodies,); drives
+    (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
+    ground, each with its number of contacts.
+    """
+
+    single: bool
+    dual: bool
+    lanes: int
+    record: bool
+    effects: bool
+    free: tuple[bool, ...]
+    drives: tuple[int, ...]
+    spheres: tuple[int, ...]
+    pairs: tuple[tuple[int, int, int], ...]
+
+    @property
+    def contacts(self) -> int:
+        """How many contacts an environment may have."""
+        return sum(count for _, _, count in self.pairs)
+
+    @property
+    def slots(self) -> int:
+        """How many of them each thread takes."""
+        return max(1, -(-self.contacts // self.lanes))
+
+    @property
+    def table_width(self) -> int:
+        """Numbers of an environment."""
+        return WORLD_COLUMNS + len(self.free) * (BODY_COLUMNS + self.effects * WRENCH_COLUMNS)
+
+    def source(self, host: bool = False) -> str:
+        """Return the program; for the host, without the kernel's entry."""
+        paired = len(self.free) > 1
+        unrolled = self.slots <= _FREE_SLOTS[True, False]
+        constants = {
+            "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
+            "RECORD": self.record, "EFFECTS": self.effects, "BODIES": len(self.free), "PAIRS": len(self.pairs),
+            "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": unrolled and not paired,
+            "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
+        }  # fmt: skip
+        lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
+        lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define ONSET_M {CONTACT_ONSET_M!r}"]
+        lists = {
+            "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
+            "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
+            "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
+            "contact_start": _starts([count for _, _, count in self.pairs]),
+        }  # fmt: skip
+        functions = [_function(name, values) for name, values in lists.items()]
+        return "\n".join((*lines, _LANGUAGE, *functions, ARITHMETIC, CONTACTS, ROLLOUT))
+
+
+def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool) -> int:
+    """Return how many threads should share an environment."""
+    wanted = min(contacts, 32) if paired else min(contacts, _BUSY_THREADS // max(1, environments))
+    wanted = max(wanted, -(-contacts // _FREE_SLOTS[single, dual]), 1)
+    lanes = 1
+    while lanes < min(wanted, 32):
+        lanes *= 2
+    return lanes
+
+
+def _starts(counts: Sequence[int]) -> list[int]:
+    return [sum(counts[:index]) for index in range(len(counts))]
+
+
+def _function(name: str, values: Iterable[int]) -> str:
+    """Return a list as a function, which the compiler resolves where the index is known."""
+    cases = "".join(f"i == {index} ? {int(value)} : " for index, value in enumerate(values))
+    return f"INLINE int {name}(int i) {{ return {cases}0; }}"
