@@ -68,7 +68,7 @@ static const Problem* shared_problem;
 static int shared_index;
 
 static void lane_main() {
-    Lanes lanes = {fibres.current, 0u};
+    Lanes lanes = {fibres.current, false};
     roll(*shared_problem, shared_index, lanes);
     fibres.done[fibres.current] = true;
     if (fibres.current + 1 < LANES) next_fibre();  // the others end one after the other
@@ -79,7 +79,7 @@ extern "C" void run(PARAMETERS) {
     Problem problem = PROBLEM;
     for (int index = 0; index < environments; index++) {
 #if LANES == 1
-        Lanes lanes = {0, 0u};
+        Lanes lanes = {0, false};
         roll(problem, index, lanes);
 #else
         static char stacks[LANES][1 << 20];

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 ARITHMETIC = r"""
+#define FULL 0xffffffffu
 #if SINGLE
 typedef float Number;
 #else
@@ -196,35 +197,37 @@ __device__ inline void write_row(Number* to, Number a, Number b, Number c, Numbe
     *reinterpret_cast<AlignedRow*>(to) = row;
 }
 
-// The LANES neighbouring threads that share an environment; all of them hold the same state.
+// The LANES neighbouring threads that share an environment; all of them hold the same state. A warp stays together
+// wherever its threads exchange something, whichever of its environments need it: apart, each exchange costs tenfold.
 struct Lanes {
     int lane;
-    unsigned mask;
+    bool idle;  // there is no such environment, and nothing to write
+    // Whether it holds for any environment of the warp; with one thread each, where nothing is exchanged, for this one.
     __device__ bool any(bool mine) const {
 #if LANES == 1
         return mine;
 #else
-        return __any_sync(mask, mine);
+        return __any_sync(FULL, mine);
 #endif
     }
     __device__ int from(int mine, int source) const {
 #if LANES == 1
         return mine;
 #else
-        return __shfl_sync(mask, mine, source, LANES);
+        return __shfl_sync(FULL, mine, source, LANES);
 #endif
     }
     __device__ Number from(Number mine, int source) const {
 #if LANES == 1
         return mine;
 #else
-        return __shfl_sync(mask, mine, source, LANES);
+        return __shfl_sync(FULL, mine, source, LANES);
 #endif
     }
     __device__ Number sum(Number mine) const {
 #if LANES > 1
 #pragma unroll
-        for (int apart = LANES / 2; apart > 0; apart /= 2) mine += __shfl_xor_sync(mask, mine, apart, LANES);
+        for (int apart = LANES / 2; apart > 0; apart /= 2) mine += __shfl_xor_sync(FULL, mine, apart, LANES);
 #endif
         return mine;
     }

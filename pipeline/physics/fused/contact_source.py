@@ -201,10 +201,10 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
     for (int i = first; i < end; i++) totals[i] = Real(0);
     for (int source = 0; source < LANES; source++) {
         int theirs = lanes.from(end - first, source);
-        for (int j = 0; j < theirs; j++) {
+        for (int j = 0; lanes.any(j < theirs); j++) {
             Vec normal = none(), turn_a = none(), turn_b = none();
             Real weight = Real(0);
-            if (source == lanes.lane) {
+            if (source == lanes.lane && j < theirs) {
                 const Contact& c = list[first + j];
                 normal = c.normal;
                 turn_a = bodies[c.a].inverse_inertia * cross(c.arm, normal);

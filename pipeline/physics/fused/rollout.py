@@ -86,8 +86,10 @@ def roll(
     lanes: int | None = None,
 ) -> Rollout:
     """Do the work of `simulate_fused` with the given way to run the kernel."""
+    _check_kinds(world.gravity, state.position_m, state.quat_wxyz, state.velocity_m_s, state.omega_body_rad_s, times_s)
     packed = pack(world, state, times_s, driven or {}, wrenches or {}, record_contacts)
     inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
+    _check_kinds(*inputs)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         raise UsageError(
             "the fused kernel has no reverse derivatives.",
@@ -116,6 +118,13 @@ def roll(
     return _rollout(world, times_s, packed, frames, labels)
 
 
+def _check_kinds(*tensors: Tensor) -> None:
+    kinds = {(tensor.dtype, tensor.device) for tensor in tensors}
+    if len(kinds) > 1:
+        found = ", ".join(sorted(f"{dtype} on {device}" for dtype, device in kinds))
+        raise UsageError(f"the world, the state, the times and the commands are of several kinds: {found}.", "one.")
+
+
 def _rollout(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labels: Tensor | None) -> Rollout:
     position, quat, velocity = frames[..., :3], frames[..., 4:8], frames[..., 8:11]
     back = None if packed.turn is None else quat_conjugate(packed.turn)
@@ -124,11 +133,11 @@ def _rollout(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labe
         quat = quat_multiply(back, quat)
     contacts = None
     if labels is not None:
-        vectors = [labels[..., :3], labels[..., 4:7], labels[..., 8:11]]
+        impulse, place, normal = labels[..., :3], labels[..., 4:7], labels[..., 8:11]
         if back is not None:
-            vectors = [quat_rotate(back, vector) for vector in vectors]
+            impulse, place, normal = (quat_rotate(back, vector) for vector in (impulse, place, normal))
         pairs = packed.structure.pairs
         body_a = torch.tensor([a for a, _, count in pairs for _ in range(count)])
         body_b = torch.tensor([b for _, b, count in pairs for _ in range(count)])
-        contacts = ContactRecord(body_a, body_b, *vectors, labels[..., 3], labels[..., 7] > 0.5)
+        contacts = ContactRecord(body_a, body_b, impulse, place, normal, labels[..., 3], labels[..., 7] > 0.5)
     return Rollout(times_s, position, quat, velocity, frames[..., 12:15], contacts)

@@ -310,13 +310,13 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         int a = pair_a(p);
         if (pair_b(p) >= 0) {
             touch_pair(problem, env, p, rotations, motions, list, weights, count);
-        } else if (near_ground(env, a, motions[a])) {
+        } else if (env.lanes.any(near_ground(env, a, motions[a]))) {
             touch_plane(problem, env, p, rotations[a], motions[a], list, weights, count);
         }
     }
     if (!env.lanes.any(count > 0)) return;
 #else
-    if (!near_ground(env, 0, motions[0])) return;
+    if (!env.lanes.any(near_ground(env, 0, motions[0]))) return;
     motions[0].inverse_inertia = turned(rotations[0], env.constants[0].inverse_inertia);
     touch_plane(problem, env, 0, rotations[0], motions[0], list, weights, count);
     if (!env.lanes.any(count > 0)) return;
@@ -432,7 +432,7 @@ INLINE void write_vector(const Problem& problem, long long at, Vec v) {
 
 // Writes position, quaternion, velocity (of the body frame's origin) and angular velocity (body frame).
 INLINE void write_frame(const Problem& problem, const Environment& env, int frame) {
-    if (env.lanes.lane != 0) return;
+    if (env.lanes.lane != 0 || env.lanes.idle) return;
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
         const Body& body = env.bodies[b];
@@ -474,6 +474,7 @@ INLINE void write_label(const Problem& problem, Environment& env, int frame, int
 
 // Writes what each contact passed on since the last frame, and the geometry now; and starts the sums anew.
 INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
+    if (env.lanes.idle) return;
     EACH_PAIR
     for (int p = 0; p < PAIRS; p++) {
         int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
@@ -576,11 +577,9 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
 #if !HOST
 extern "C" __global__ void __launch_bounds__(THREADS) rollout(PARAMETERS) {
     Problem problem = PROBLEM;
-    int thread = blockIdx.x * THREADS + threadIdx.x, index = thread / LANES, lane = threadIdx.x % 32;
-    if (index >= environments) return;
-    unsigned within = LANES == 32 ? 0xffffffffu : (1u << (LANES % 32)) - 1u;
-    Lanes lanes = {lane % LANES, within << (lane / LANES * LANES)};
-    roll(problem, index, lanes);
+    int thread = blockIdx.x * THREADS + threadIdx.x, index = thread / LANES;
+    Lanes lanes = {(int)threadIdx.x % LANES, index >= environments};
+    roll(problem, lanes.idle ? environments - 1 : index, lanes);
 }
 #endif
 """
