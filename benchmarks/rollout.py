@@ -19,13 +19,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
+from cgwm.pipeline import nvrtc
 from cgwm.pipeline.estimation.forward import batched_jacobian
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, simulate
 from cgwm.pipeline.physics.distance import plane_contacts
-from cgwm.pipeline.physics.fused import launch, simulate_fused
+from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
 from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
 from store import Store
@@ -151,6 +151,8 @@ def mjcf() -> str:
 
 def mujoco_cpu() -> dict[str, Any]:
     """Measure MuJoCo on one thread of the CPU: 20 of the starts one after the other."""
+    import mujoco
+
     model, count, steps = mujoco.MjModel.from_xml_string(mjcf()), 20, STEPS[4096]
     data = mujoco.MjData(model)
     started = time.perf_counter()
@@ -163,6 +165,7 @@ def mujoco_cpu() -> dict[str, Any]:
 
 def mujoco_warp(count: int) -> dict[str, Any]:
     """Measure MuJoCo Warp: a CUDA graph of one step, launched for every step; no labels are read."""
+    import mujoco
     import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
     import warp as wp  # pyright: ignore[reportMissingImports]
 
@@ -234,7 +237,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="names to measure, or their beginnings")
     parser.add_argument("--lanes", action="store_true", help="measure other numbers of threads an environment, too")
     options = parser.parse_args()
-    store, cuda = Store("rollout"), torch.cuda.is_available() and launch.available()
+    store, cuda = Store("rollout"), torch.cuda.is_available() and nvrtc.available()
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
     tasks: dict[str, Callable[[], dict[str, Any]]] = {}
     if cuda:
@@ -250,12 +253,14 @@ def main() -> None:
         print("absent: a CUDA device with cuda.core, so the fused kernel is not measured", flush=True)
     tasks["fitting cpu"] = lambda: fitting("cpu")
     tasks["torch cpu 4096"] = lambda: torch_engine(4096, "cpu")
-    tasks["mujoco cpu"] = mujoco_cpu
-    if cuda and importlib.util.find_spec("mujoco_warp") and importlib.util.find_spec("warp"):
+    absent = [name for name in ("mujoco", "mujoco_warp", "warp") if importlib.util.find_spec(name) is None]
+    if "mujoco" not in absent:
+        tasks["mujoco cpu"] = mujoco_cpu
+    if cuda and not absent:
         for count in STEPS:
             tasks[f"mujoco warp {count}"] = lambda count=count: mujoco_warp(count)
-    else:
-        print("absent: mujoco_warp or a CUDA device for it", flush=True)
+    for name in absent:
+        print(f"absent: {name}", flush=True)
     wanted = tuple(options.only or ("",))
     for name, task in tasks.items():
         if name.startswith(wanted):

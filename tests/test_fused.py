@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.tracks import Track
+from cgwm.pipeline import nvrtc
 from cgwm.pipeline.estimation.forward import batched_jacobian
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, simulate
 from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
-from cgwm.pipeline.physics.fused import launch, simulate_fused, unsupported
+from cgwm.pipeline.physics.fused import simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
 from cgwm.pipeline.physics.motion import Inertia, advance, finish, start
@@ -25,7 +26,7 @@ from cgwm.schemas import InputDataError, UsageError
 from torch import Tensor
 from worlds import F64, ball_body, batch, box_body, state_of, times, world_of
 
-CUDA = torch.cuda.is_available() and launch.available()
+CUDA = torch.cuda.is_available() and nvrtc.available()
 NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
 POSES = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")

@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ....schemas import UsageError
+from ... import nvrtc
 from ..driven import Drive
 from ..rollout import ContactRecord, Rollout
 from ..rotation import quat_conjugate, quat_multiply, quat_rotate
 from ..world import State, World
-from . import launch
+from .launch import launch
 from .packing import Packed, pack, reason_against
 from .structure import Structure, lanes_for
 
@@ -31,7 +32,7 @@ def unsupported(world: World) -> str | None:
     """Return why the fused kernel cannot take a world; None where it can."""
     if world.gravity.device.type != "cuda":
         return f"its tensors are on the device '{world.gravity.device.type}', not on CUDA"
-    if not launch.available():
+    if not nvrtc.available():
         return "cuda.core is not installed, which compiles the kernel (pip install 'cgwm[gpu]')"
     return reason_against(world)
 
@@ -72,7 +73,7 @@ def simulate_fused(
     reason = unsupported(world)
     if reason is not None:
         raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use simulate, which can.")
-    return roll(launch.launch, world, state, times_s, driven, record_contacts, wrenches, lanes)
+    return roll(launch, world, state, times_s, driven, record_contacts, wrenches, lanes)
 
 
 def roll(
