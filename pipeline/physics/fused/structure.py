@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from ..contact import CONTACT_ONSET_M
 from ..rollout import PAIR_SMOOTHING_M
 from .arithmetic_source import ARITHMETIC
+from .collision_source import COLLISION
 from .contact_source import CONTACTS
+from .environment_source import ENVIRONMENT
 from .rollout_source import ROLLOUT
 
 THREADS = 32
@@ -94,7 +96,7 @@ class Structure:
             "contact_start": _starts([count for _, _, count in self.pairs]),
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]
-        return "\n".join((*lines, _LANGUAGE, *functions, ARITHMETIC, CONTACTS, ROLLOUT))
+        return "\n".join((*lines, _LANGUAGE, *functions, ARITHMETIC, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT))
 
 
 def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool) -> int:
