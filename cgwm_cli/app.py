@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from .calibrate import calibrate
 from .demo import demo
 from .doctor import doctor
+from .effects import list_effects, new_effect, show_effect
 from .eval import evaluate
 from .fit import fit
 from .import_ import import_capture
@@ -26,18 +27,38 @@ VERBS = (
     ("doctor", doctor, "What this machine has, and what would be used."),
 )
 
+GROUPS = {
+    "effects": (
+        "Effects that can be added to a model; a template.",
+        (
+            ("list", list_effects, "All effects that there are."),
+            ("show", show_effect, "An effect's formula, parameters, and what reveals it."),
+            ("new", new_effect, "A template of one's own effect."),
+        ),
+    ),
+}
+"""Verbs with verbs of their own."""
+
+_MANNERS: dict[str, Any] = {
+    "no_args_is_help": True,
+    "add_completion": False,
+    "rich_markup_mode": None,
+    "pretty_exceptions_enable": False,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
 app = typer.Typer(
     name="cgwm",
     help="From photos and one short contact-rich motion to a fitted physical world model and labelled 4D datasets.",
     epilog="Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 130 interrupted.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    **_MANNERS,
 )
 for _name, _function, _short_help in VERBS:
     app.command(_name, short_help=_short_help)(_function)
+for _name, (_short_help, _verbs) in GROUPS.items():
+    _group = typer.Typer(name=_name, help=_short_help, **_MANNERS)
+    for _verb, _function, _help in _verbs:
+        _group.command(_verb, short_help=_help)(_function)
+    app.add_typer(_group)
 
 
 def _print_version(wanted: bool) -> None:

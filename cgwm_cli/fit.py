@@ -30,6 +30,15 @@ def fit(
         typer.Option("--supervise", show_default="tracks", help="What the motion is compared with."),
     ] = None,
     split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to fit.")] = "train",
+    effects: Annotated[
+        str | None,
+        typer.Option(
+            "--effects",
+            metavar="NAME,NAME",
+            help="Effects to add and to fit ('cgwm effects list'), or one's own: file.py:Class.",
+            show_default=False,
+        ),
+    ] = None,
     spheres: Annotated[
         int | None,
         typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres that go where needed."),
@@ -76,8 +85,10 @@ def fit(
             "refine_poses": refine_poses,
             "collision": collision,
         }
+        names = None if effects is None else [name.strip() for name in effects.split(",")]
+        motion = {"supervise": supervise, "effects": names}
         splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
-        physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, supervise=supervise)
+        physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, **motion)
         emit(
             work(capture, out, stage, parent, split, splats, physics, overwrite, resume),
             lambda model: _summary(model, out),

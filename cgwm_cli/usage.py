@@ -23,7 +23,8 @@ def explain(error: Any, arguments: list[str]) -> str:
     verbs = list(getattr(context.command, "commands", {})) if context else []
     message = _sentence(error.format_message().replace("Value error, ", ""))
     if message.startswith("No such command"):
-        verb = next((word for word in arguments if not word.startswith("-")), "")
+        before = len(command.split()) - 1  # the group that the verb was looked for in
+        verb = next((word for word in arguments[before:] if not word.startswith("-")), "")
         found = f"{command}: there is no command '{verb}'."
         return str(UsageError(found, f"{', '.join(verbs)}.{did_you_mean(verb, verbs)}", todo))
     return str(UsageError(f"{command}: {message}{_nearest_choice(message)}", todo=todo))

@@ -33,8 +33,10 @@ from ..schemas import (
     SplatConfig,
 )
 from .checkpoint import Checkpoint
+from .fit_effects import fit_with_constants, fitted_effects, with_effects
 from .memory import enough_memory
-from .phys_geo import PhysicsFit, fit_physics, track_episodes
+from .phys_geo import PhysicsFit, track_episodes
+from .physics.effects.registry import load_effect
 from .physics.world import World, symmetric
 from .sfm.points import POINTS_NAME
 from .sg_gs import SgGsResult, fit_scene, resolve_device
@@ -81,6 +83,8 @@ def fit(
     """
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
     refuse_existing(out, overwrite)
+    for name in phys_config.effects:
+        load_effect(name)  # a name that is wrong is told before hours of work
     opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
     started = time.perf_counter()
     config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
@@ -255,14 +259,17 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
             f"{capture.root / 'capture.toml'}: no body is free, so no motion tells about contact.",
             'motion = "free" for the body whose physics is wanted.',
         )
-    start = model.file.model_copy(update={"contact": ContactParameters(), "solver": Solver(step_s=config.step_s)})
+    effects = with_effects(model.file.effects, config.effects)
+    start = model.file.model_copy(
+        update={"contact": ContactParameters(), "solver": Solver(step_s=config.step_s), "effects": effects}
+    )
     ready = replace(model, file=start)
     world = World.from_model(ready)
     started = time.perf_counter()
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        found = fit_physics(world, track_episodes(capture, split), config, noise)
+        found = fit_with_constants(world, track_episodes(capture, split), config, noise)
     else:
         from .phys_images import fit_physics_from_images
 
@@ -296,6 +303,12 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
             "contact": found.contact,
             "ground": ground,
             "parameters": (*found.parameters, *kept),
+            "effects": fitted_effects(
+                file.effects,
+                {e.name: load_effect(e.name).name for e in file.effects},
+                found.parameters,
+                found.constants,
+            ),
             "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
             "warnings": (*file.warnings, *found.warnings),
         }

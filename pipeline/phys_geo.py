@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,20 +33,11 @@ from .estimation.search import Prior, SearchResult, episode_covariance, importan
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
 from .physics.contact import restitution
-from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
-from .physics.rollout import simulate
+from .physics.measured import measure
+from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
 from .physics.rotation import geodesic_angle
 from .physics.world import State, World
 
-PRIOR = {
-    "friction": (0.3, 0.5),
-    "contact_time_s": (0.0033, 0.5),
-    "damping_ratio": (0.4, 0.6),
-    "ground_shift_m": (0.0, 0.002),
-}
-"""Median and standard deviation before any data, the latter in the fitted coordinate (natural logarithm where the
-parameter is logarithmic). One toss hardly shows some of them; this keeps those plausible. The contact time is that of
-the real cube tosses: what is called rigid touches for a few milliseconds."""
 ERRORS_PER_EPISODE = 3.0
 """Independent errors in one episode's open-loop error; `docs/benchmarks.md` has how the intervals cover with it."""
 MAX_SPAN_S = 0.8
@@ -76,7 +67,8 @@ class PhysicsFit:
     """What the stage found.
 
     contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there
-    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings.
+    is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; constants: of
+    effects, `effect.constant` by name.
     """
 
     contact: ContactParameters
@@ -85,6 +77,7 @@ class PhysicsFit:
     noise: tuple[float, float]
     record: dict[str, Any]
     warnings: tuple[str, ...]
+    constants: dict[str, float] = field(default_factory=dict)
 
 
 def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
@@ -129,7 +122,7 @@ def fit_physics(
     sigma = (noise[0] or estimated[0], noise[1] or estimated[1])
     # few episodes cannot tell the ground's height from the way of bouncing, and the manifest gives the height
     height = world.ground_normal is not None and len(episodes) >= ENOUGH_EPISODES
-    names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
+    names = [*CONTACT_PARAMETERS, *effect_parameters(world), *([GROUND_SHIFT] if height else [])]
     windows = [_span(tracks) for _, tracks in episodes]
     observations = Observations.of(world, episodes, windows)
     warm = warmup_frames(world, observations, config.warmup_s)
@@ -201,8 +194,8 @@ def _search(
 ) -> SearchResult:
     episodes = len(observations.names)
     prior = Prior(
-        np.array([p.encode(PRIOR[p.name][0]) for p in names]),
-        np.array([PRIOR[p.name][1] for p in names]),
+        np.array([p.encode(p.prior[0]) for p in names]),
+        np.array([p.prior[1] for p in names]),
         np.array([p.limits for p in names]),
     )
     bar = progress(range(config.generations), "phys-geo: search", total=config.generations)
@@ -246,7 +239,7 @@ def _open_loop(world: World, observations: Observations, warm: Tensor, names: li
         )
         drives = {name: drive.repeat(repeats) for name, drive in observations.drives.items()}
         with torch.no_grad():
-            rollout = simulate(
+            rollout = measure(
                 apply_parameters(world, names, decoded), base, observations.times_s.repeat(repeats, 1), drives
             )
         free = list(observations.free)
@@ -409,7 +402,7 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
     slope = estimate if parameter.logarithmic else 1.0
     on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
     state = "on_bound" if on_bound else "fitted"
-    centre, width = PRIOR[parameter.name]
+    centre, width = parameter.prior
     if std > UNOBSERVABLE_SHARE * width:
         state = "not_observable"
     note = f"{parameter.reveals} would reveal it"

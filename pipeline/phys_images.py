@@ -36,7 +36,7 @@ from .imaging.pose_tracks import PoseTrack, PoseTracker
 from .imaging.refinement import ImageObjective, Refined, TrackTerm, refine_end_to_end
 from .phys_geo import MAX_SPAN_S, PhysicsFit, fit_physics, physics_fit
 from .physics.driven import Drive
-from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
+from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
 from .physics.world import World
 
 COARSE_SIZE, FINE_SIZE = 80, 144
@@ -101,7 +101,7 @@ def fit_physics_from_images(
     start = fit_physics(world, [(episode.name, episode.tracks) for episode in episodes], brief, noise)
     seconds["dynamics"] = round(time.perf_counter() - started - seconds["pose_tracks"], 2)
 
-    names: list[Parameter] = list(CONTACT_PARAMETERS)
+    names: list[Parameter] = [*CONTACT_PARAMETERS, *effect_parameters(world)]
     if start.ground_offset_m is not None:
         names.append(GROUND_SHIFT)
     shared = _coordinates(world, names, start)

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datasets.tracks import Track
-from ..schemas import NotConvergedError
 from .estimation.observations import Observations
 from .estimation.states import StartUncertainty
 from .estimation.warmup import estimate_states, warmup_frames
-from .physics.rollout import Rollout, simulate
+from .physics.checks import require_finite
+from .physics.measured import measure
+from .physics.rollout import Rollout
 from .physics.rotation import quat_exp, quat_multiply, quat_to_matrix
 from .physics.world import World
 
@@ -192,13 +193,8 @@ class _Batch:
         longest = max(len(grid) for grid, _ in grids)
         padded = np.stack([_padded(grid, longest) for grid, _ in grids])
         with torch.no_grad():
-            rollout = simulate(self.world, seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
-        for k, (grid, _) in enumerate(grids):
-            if not bool(torch.isfinite(rollout.position_m[k, : len(grid)]).all()):
-                raise NotConvergedError(
-                    f"episode '{seen.names[k]}': the model's rollout diverged (its positions are not finite).",
-                    todo="fit again with a smaller --step-s, or check masses and units.",
-                )
+            rollout = measure(self.world, seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
+        require_finite(rollout, self.world, seen.state, [f"episode '{name}'" for name in seen.names])
         return [self._prediction(k, time, *grids[k], rollout) for k, time in enumerate(times)]
 
     def _prediction(

@@ -29,7 +29,6 @@ from ..schemas import (
     DatasetSummary,
     InputDataError,
     ModelFile,
-    NotConvergedError,
     SamplingPlan,
     ShardEntry,
     SynthesizeConfig,
@@ -37,7 +36,9 @@ from ..schemas import (
 )
 from .labels import LabelRenderer
 from .memory import enough_memory
-from .physics.rollout import ContactRecord, simulate
+from .physics.checks import require_apart, require_finite
+from .physics.records import ContactRecord
+from .physics.rollout import simulate
 from .physics.world import State, World
 from .posterior import draw_parameters, not_varied
 from .sampling import Start, draw_start, look_at_cameras, resolve_plan
@@ -147,17 +148,14 @@ def simulate_rollout(job: _Job, index: int) -> RolloutLabels:
     world = World.from_model(model, torch.float64, job.device)
     state = State(*(_batched(values, job.device) for values in _state(start)))
     times = torch.as_tensor(job.times_s, dtype=torch.float64, device=job.device)
+    require_apart(world, state)
     with torch.no_grad():
         rollout = simulate(world, state, times, start.driven, record_contacts=True)
+    require_finite(rollout, world, state, [f"rollout {index} (seed {job.config.seed})"])
     poses = tuple(
         values[0].cpu().numpy()
         for values in (rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s)
     )
-    if not all(np.isfinite(values).all() for values in poses):
-        raise NotConvergedError(
-            f"rollout {index} (seed {job.config.seed}) diverged: its state is not finite.",
-            todo="fit the model again with a smaller solver step, or narrow the sampling plan.",
-        )
     assert rollout.contacts is not None  # asked for above
     contacts = _contact_table(rollout.contacts)
     return _labels(job, index, model, parameters, start, poses, contacts)

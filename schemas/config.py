@@ -75,6 +75,8 @@ class PhysConfig(FileModel):
     iterations: Annotated[int, Field(ge=1)] = 10
     """Most steps of the local refinement (Levenberg-Marquardt)."""
     warmup_s: Annotated[float, Field(gt=0)] = 0.1
+    effects: tuple[str, ...] = ()
+    """Effects to add to the model and to fit: names of built-in ones, or `path/to/file.py:ClassName`."""
 
 
 class SynthesizeConfig(FileModel):

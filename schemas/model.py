@@ -74,9 +74,10 @@ class Solver(FileModel):
 
 
 class EffectModel(FileModel):
-    """An effect in the model, with its parameters."""
+    """An effect in the model, with the values of its parameters and constants."""
 
     name: str
+    """A built-in effect, `path/to/file.py:ClassName`, or the name of an entry point of the group `cgwm.effects`."""
     parameters: dict[str, float] = {}
 
 

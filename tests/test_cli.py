@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from cgwm.cli import main
-from cgwm.cli.app import VERBS
+from cgwm.cli.app import GROUPS, VERBS
 from cgwm.cli.output import quantity, table
 from cgwm.schemas import (
     CalibrateConfig,
@@ -100,14 +100,24 @@ def test_help_imports_nothing_heavy() -> None:
 def test_help_names_every_verb_and_the_exit_codes(run: Run) -> None:
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    assert all(f"  {name} " in out for name, _, _ in VERBS)
+    assert all(f"  {name} " in out for name in [*(name for name, _, _ in VERBS), *GROUPS])
     assert "..." not in out.replace("COMMAND [ARGS]...", "")  # no sentence is cut off
     assert "Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 130" in out
 
 
-@pytest.mark.parametrize("verb", [name for name, _, _ in VERBS])
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_group_names_its_verbs(run: Run, group: str) -> None:
+    code, out, _ = run(group, "--help")
+    assert code == 0
+    assert all(f"  {verb} " in out for verb, _, _ in GROUPS[group][1])
+    assert "..." not in out.replace("COMMAND [ARGS]...", "")
+
+
+@pytest.mark.parametrize(
+    "verb", [name for name, _, _ in VERBS] + [f"{g} {v}" for g in GROUPS for v, _, _ in GROUPS[g][1]]
+)
 def test_every_verb_has_the_same_manners(run: Run, verb: str) -> None:
-    code, out, _ = run(verb, "--help")
+    code, out, _ = run(*verb.split(), "--help")
     assert code == 0
     assert all(option in out for option in ("--json", "--quiet", "--debug"))
 
@@ -149,8 +159,15 @@ def test_an_unknown_verb(run: Run) -> None:
         2,
         "",
         "cgwm: there is no command 'fti'.\n"
-        "Allowed: demo, calibrate, fit, synthesize, eval, import, validate, doctor. Did you mean 'fit'?\n"
+        "Allowed: demo, calibrate, fit, synthesize, eval, import, validate, doctor, effects. Did you mean 'fit'?\n"
         "Next: run 'cgwm --help'.\n",
+    )
+    assert run("effects", "shwo", "wind") == (
+        2,
+        "",
+        "cgwm effects: there is no command 'shwo'.\n"
+        "Allowed: list, show, new. Did you mean 'show'?\n"
+        "Next: run 'cgwm effects --help'.\n",
     )
 
 

@@ -44,6 +44,9 @@ def test_the_commands_exist(line: str) -> None:
     verb, *words = shlex.split(line, comments=True)[1:]
     verbs = get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
     assert verb in verbs
+    if hasattr(verbs[verb], "commands"):  # a group
+        verbs, (verb, *words) = verbs[verb].commands, words
+        assert verb in verbs
     options = {name for parameter in verbs[verb].params for name in parameter.opts}
     assert {word for word in words if word.startswith("-")} <= options
 

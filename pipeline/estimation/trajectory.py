@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..physics.measured import measure
 from ..physics.parameters import Parameter, apply_parameters
-from ..physics.rollout import Rollout, simulate
+from ..physics.rollout import Rollout
 from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..physics.world import State, World
 from .forward import batched_jacobian
@@ -74,7 +75,7 @@ class TrajectoryResiduals:
         base = State(*(getattr(seen.state, key).repeat(repeats, 1, 1) for key in seen.state.__dataclass_fields__))
         state = retract(base, inputs[:, count:], seen.free)
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
-        return simulate(world, state, seen.times_s.repeat(repeats, 1), drives)
+        return measure(world, state, seen.times_s.repeat(repeats, 1), drives)
 
     def _residuals(self, inputs: Tensor, repeats: int) -> Tensor:
         rollout, seen, free = self._roll(inputs, repeats), self.observations, list(self.observations.free)

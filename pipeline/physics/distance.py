@@ -41,6 +41,15 @@ def smooth_min(distances: Tensor, width: float) -> tuple[Tensor, Tensor]:
     return value, a.square()
 
 
+def log_sum_exp_distance(distances: Tensor, per_m: float) -> tuple[Tensor, Tensor]:
+    """Return the published smooth minimum of distances (..., N) [m] and its weights.
+
+    -(1/beta) log sum exp(-beta d): between min d - log(N)/beta and min d.
+    """
+    scaled = -per_m * distances
+    return -torch.logsumexp(scaled, -1) / per_m, torch.softmax(scaled, -1)
+
+
 def union_distance(points: Tensor, centers: Tensor, radii: Tensor, width: float) -> tuple[Tensor, Tensor]:
     """Return the signed distance of points to a union of spheres, and its outward unit normal.
 

@@ -1,4 +1,4 @@
-"""Bodies whose motion is given: measured tracks as commands."""
+"""Bodies whose motion is given: measured tracks, or velocities, as commands."""
 
 from __future__ import annotations
 
@@ -37,6 +37,29 @@ class Drive:
         longest = max(len(track.time_s) for track in tracks)
         rows = [_prepare(track, longest, like) for track in tracks]
         return Drive(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+    @staticmethod
+    def from_velocities(
+        times_s: Tensor, position_m: Tensor, quat_wxyz: Tensor, velocity_m_s: Tensor, omega_world_rad_s: Tensor
+    ) -> Drive:
+        """Integrate a velocity command: each velocity holds until the next sample.
+
+        Args:
+            times_s: Samples [s], increasing, shape (B, S).
+            position_m: Position at the first sample [m], shape (B, 3).
+            quat_wxyz: Orientation there, shape (B, 4).
+            velocity_m_s: Velocity of the frame's origin from each sample to the next [m/s], shape (B, S - 1, 3).
+            omega_world_rad_s: Angular velocity, world frame [rad/s], shape (B, S - 1, 3).
+        """
+        length = times_s.diff(dim=1)[..., None]
+        position = torch.cat((position_m[:, None], position_m[:, None] + (velocity_m_s * length).cumsum(1)), 1)
+        quats = [quat_wxyz]
+        for turn in (omega_world_rad_s * length).unbind(1):
+            quats.append(quat_multiply(quat_exp(turn), quats[-1]))
+        still = torch.zeros_like(position_m)[:, None]
+        last = torch.full(times_s.shape[:1], times_s.shape[1] - 2, device=times_s.device)
+        velocity, omega = (torch.cat((x, still), 1) for x in (velocity_m_s, omega_world_rad_s))
+        return Drive(times_s, position, torch.stack(quats, 1), velocity, omega, last)
 
     def repeat(self, times: int) -> Drive:
         """Return the batch repeated, as `Tensor.repeat` does."""

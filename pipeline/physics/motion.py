@@ -40,6 +40,14 @@ class Inertia:
         inverse = torch.linalg.inv(body.inertia)
         return Inertia(body.mass, inverse, torch.linalg.cholesky(inverse), body.inertia)
 
+    def omega(self, rotation: Tensor, spin: Tensor) -> Tensor:
+        """Return the angular velocity (B, 3) [rad/s], world frame, of an angular momentum (B, 3) [kg m2/s]."""
+        return (rotation @ self.omega_body(rotation, spin)[..., None]).squeeze(-1)
+
+    def omega_body(self, rotation: Tensor, spin: Tensor) -> Tensor:
+        """Return the same in the body frame."""
+        return (self.inverse @ (rotation.transpose(-1, -2) @ spin[..., None])).squeeze(-1)
+
 
 def start(body: Body, position: Tensor, quat: Tensor, velocity: Tensor, omega_body: Tensor) -> Motion:
     """Return the motion of a free body whose frame's origin has the given pose and velocity."""
@@ -52,27 +60,28 @@ def start(body: Body, position: Tensor, quat: Tensor, velocity: Tensor, omega_bo
 def finish(body: Body, inertia: Inertia, motion: Motion) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return position, quaternion, velocity of the body frame's origin and omega_body; inverse of :func:`start`."""
     rotation = quat_to_matrix(motion.quat_wxyz)
-    omega_body = _omega_body(rotation, inertia, motion.spin)
+    omega_body = inertia.omega_body(rotation, motion.spin)
     omega = (rotation @ omega_body[..., None]).squeeze(-1)
     arm = (rotation @ body.com[..., None]).squeeze(-1)
     return motion.com - arm, motion.quat_wxyz, motion.velocity - cross(omega, arm), omega_body
 
 
-def advance(inertia: Inertia, before: Motion, velocity: Tensor, spin: Tensor, step_s: Tensor) -> Motion:
+def advance(
+    inertia: Inertia, before: Motion, velocity: Tensor, spin: Tensor, step_s: Tensor, semi_implicit: bool = False
+) -> Motion:
     """Move a body over one step in which its velocity and angular momentum went from `before` to the given ones.
 
     Positions follow the mean velocity (exact for constant acceleration); the rotation follows the angular velocity
-    that the mean angular momentum has half-way through the step (explicit midpoint, second order; derived).
+    that the mean angular momentum has half-way through the step (explicit midpoint, second order; derived). The
+    published law is `semi_implicit`: positions and rotations follow the velocities at the end of the step.
     """
     h = step_s[:, None]
-    mean_spin = 0.5 * (before.spin + spin)
+    mean_spin, mean_velocity = (
+        (spin, velocity) if semi_implicit else (0.5 * (before.spin + spin), 0.5 * (before.velocity + velocity))
+    )
     rotation = quat_to_matrix(before.quat_wxyz)
-    omega_start = _omega_body(rotation, inertia, before.spin)
+    omega_start = inertia.omega_body(rotation, before.spin)
     half = quat_normalize(quat_multiply(before.quat_wxyz, quat_exp(0.5 * h * omega_start)))
-    omega_half = _omega_body(quat_to_matrix(half), inertia, mean_spin)
+    omega_half = inertia.omega_body(quat_to_matrix(half), mean_spin)
     quat = quat_normalize(quat_multiply(before.quat_wxyz, quat_exp(h * omega_half)))
-    return Motion(before.com + 0.5 * h * (before.velocity + velocity), quat, velocity, spin)
-
-
-def _omega_body(rotation: Tensor, inertia: Inertia, momentum: Tensor) -> Tensor:
-    return (inertia.inverse @ (rotation.transpose(-1, -2) @ momentum[..., None])).squeeze(-1)
+    return Motion(before.com + h * mean_velocity, quat, velocity, spin)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .contact import ContactLaw
 from .world import World
 
 
@@ -17,7 +16,8 @@ from .world import World
 class Parameter:
     """A number to fit: bounded, and fitted as its logarithm where it is positive over decades.
 
-    `reveals` says which motion makes it observable.
+    reveals: which motion makes it observable; prior: median and standard deviation before any data, the latter in the
+    fitted coordinate (natural logarithm where the parameter is logarithmic).
     """
 
     name: str
@@ -25,6 +25,7 @@ class Parameter:
     bounds: tuple[float, float]
     logarithmic: bool
     reveals: str
+    prior: tuple[float, float]
 
     def encode(self, value: float) -> float:
         """Return the fitted coordinate of a value."""
@@ -40,24 +41,47 @@ class Parameter:
         return self.encode(self.bounds[0]), self.encode(self.bounds[1])
 
 
-FRICTION = Parameter("friction", "1", (0.01, 2.0), True, "sliding on the ground")
-CONTACT_TIME = Parameter("contact_time_s", "s", (0.001, 0.03), True, "an impact sampled faster than the contact lasts")
-DAMPING_RATIO = Parameter("damping_ratio", "1", (0.02, 3.0), True, "an impact and the rebound after it")
-GROUND_SHIFT = Parameter("ground_shift_m", "m", (-0.02, 0.02), False, "resting on the ground")
+# One toss hardly shows some of these; their priors keep them plausible. The contact time is that of the real cube
+# tosses: what is called rigid touches for a few milliseconds.
+FRICTION = Parameter("friction", "1", (0.01, 2.0), True, "sliding on the ground", (0.3, 0.5))
+CONTACT_TIME = Parameter(
+    "contact_time_s", "s", (0.001, 0.03), True, "an impact sampled faster than the contact lasts", (0.0033, 0.5)
+)
+DAMPING_RATIO = Parameter("damping_ratio", "1", (0.02, 3.0), True, "an impact and the rebound after it", (0.4, 0.6))
+GROUND_SHIFT = Parameter("ground_shift_m", "m", (-0.02, 0.02), False, "resting on the ground", (0.0, 0.002))
 """How far the ground lies above where the world has it; it also takes up an error of the body's size."""
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
+
+
+PRIOR_SCALES = 5.0
+"""Width of the prior of an effect's parameter, in scales that matter."""
+
+
+def effect_parameters(world: World) -> list[Parameter]:
+    """Return the parameters of the world's effects, named `effect.parameter`."""
+    found = []
+    for active in world.effects:
+        effect = active.effect
+        for number in effect.parameters:
+            low = 0.0 if number.nonnegative else -number.limit
+            name, prior = f"{effect.name}.{number.name}", (0.0, PRIOR_SCALES * number.scale)
+            found.append(Parameter(name, number.unit, (low, number.limit), False, effect.reveals, prior))
+    return found
 
 
 def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tensor) -> World:
     """Return the world with the given values (B, P), in the units of `parameters`."""
     column = {parameter.name: values[:, index] for index, parameter in enumerate(parameters)}
     law = world.contact
-    contact = ContactLaw(
-        column.get("friction", law.friction),
-        column.get("contact_time_s", law.contact_time_s),
-        column.get("damping_ratio", law.damping_ratio),
-    )
-    world = replace(world, contact=contact)
+    world = replace(world, contact=replace(law, **{name: column[name] for name in vars(law) if name in column}))
+    effects = [
+        replace(
+            active,
+            values={name: column.get(f"{active.effect.name}.{name}", value) for name, value in active.values.items()},
+        )
+        for active in world.effects
+    ]
+    world = replace(world, effects=tuple(effects))
     if "ground_shift_m" in column and world.ground_offset is not None:
         world = replace(world, ground_offset=world.ground_offset + column["ground_shift_m"])
     for index, body in enumerate(world.bodies):

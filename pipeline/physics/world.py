@@ -12,9 +12,13 @@ from torch import Tensor
 from ...schemas import InputDataError
 from .contact import ContactLaw
 from .distance import plane_contacts
+from .effects.effect import ActiveEffect
+from .effects.registry import load_effect
+from .published import PublishedLaw
 
 if TYPE_CHECKING:
     from ...datasets.models import Model
+    from ...schemas import EffectModel
 
 
 @dataclass(frozen=True)
@@ -44,15 +48,20 @@ class Body:
 
 @dataclass(frozen=True)
 class World:
-    """The bodies and what surrounds them; gravity (B, 3) [m/s2], ground normal (3,) and offset (B,) [m]."""
+    """The bodies and what surrounds them.
+
+    gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
+    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact.
+    """
 
     bodies: tuple[Body, ...]
     gravity: Tensor
     ground_normal: Tensor | None
     ground_offset: Tensor | None
-    contact: ContactLaw
+    contact: ContactLaw | PublishedLaw
     step_s: float = 0.001
     sweeps: int = 10
+    effects: tuple[ActiveEffect, ...] = ()
 
     @property
     def body_names(self) -> list[str]:
@@ -63,6 +72,13 @@ class World:
     def free(self) -> list[int]:
         """Indices of the free bodies."""
         return [index for index, body in enumerate(self.bodies) if body.free]
+
+    @property
+    def up(self) -> Tensor:
+        """Unit vector (1 or B, 3): the ground's normal, against gravity where there is no ground."""
+        if self.ground_normal is not None:
+            return self.ground_normal[None]
+        return -self.gravity / self.gravity.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-12)
 
     @staticmethod
     def from_model(model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu") -> World:
@@ -110,6 +126,7 @@ class World:
             law,
             file.solver.step_s,
             file.solver.sweeps,
+            tuple(_active(effect, str(model.root), tensor(0.0)) for effect in file.effects),
         )
 
     def with_body(self, index: int, **changes: Tensor) -> World:
@@ -131,6 +148,14 @@ class State:
     quat_wxyz: Tensor
     velocity_m_s: Tensor
     omega_body_rad_s: Tensor
+
+
+def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
+    effect = load_effect(entry.name)
+    try:
+        return ActiveEffect.of(effect, entry.parameters, like)
+    except KeyError as error:
+        raise InputDataError(f"{where}: {error.args[0]}.", todo="fit the model again with this effect.") from error
 
 
 def symmetric(six: tuple[float, ...]) -> np.ndarray:

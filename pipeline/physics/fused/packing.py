@@ -14,7 +14,7 @@ from ....schemas import InputDataError, UsageError, did_you_mean
 from ..contact import ContactLaw
 from ..driven import Drive
 from ..motion import start
-from ..rollout import contact_pairs
+from ..detection import pairs_of
 from ..rotation import quat_multiply, quat_normalize, quat_rotate
 from ..world import Body, State, World
 from .structure import WRENCH_COLUMNS, Structure
@@ -60,7 +60,7 @@ def reason_against(world: World) -> str | None:
         return "its numbers have several types"
     if not world.bodies:
         return "it has no bodies"
-    contacts = sum(_contact_count(world, a, b) for a, b in contact_pairs(world))
+    contacts = sum(_contact_count(world, a, b) for a, b in pairs_of(world))
     if contacts > MOST_CONTACTS:
         return f"its bodies may have {contacts} contacts, more than {MOST_CONTACTS}"
     return None
@@ -96,7 +96,7 @@ def pack(
     )  # fmt: skip
     for index, extra in enumerate(coefficients):
         columns.insert(3 + 7 * (index + 1) + index, extra)
-    pairs = tuple((a, b, _contact_count(world, a, b)) for a, b in contact_pairs(world))
+    pairs = tuple((a, b, _contact_count(world, a, b)) for a, b in pairs_of(world))
     single = world.gravity.dtype == torch.float32
     starts = [sum(body.radii.shape[-1] for body in world.bodies[:index]) for index in range(len(world.bodies))]
     structure = Structure(
@@ -215,7 +215,7 @@ def _drive_starts(rows: Mapping[int, tuple[Tensor, Tensor]], like: Tensor) -> Te
 def _contact_spheres(world: World, starts: list[int]) -> Tensor:
     """Return for each contact (C,) the row of its sphere."""
     parts = []
-    for a, b in contact_pairs(world):
+    for a, b in pairs_of(world):
         index = a if b < 0 else b
         body = world.bodies[index]
         every = torch.arange(body.radii.shape[-1], device=body.radii.device)

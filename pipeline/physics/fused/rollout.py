@@ -13,7 +13,8 @@ from torch.autograd import forward_ad
 from ....schemas import UsageError
 from ... import nvrtc
 from ..driven import Drive
-from ..rollout import ContactRecord, Rollout
+from ..records import ContactRecord
+from ..rollout import Rollout
 from ..rotation import quat_conjugate, quat_multiply, quat_rotate
 from ..world import State, World
 from .launch import launch

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from ..contact import CONTACT_ONSET_M
-from ..rollout import PAIR_SMOOTHING_M
+from ..detection import PAIR_SMOOTHING_M
+from ..sweeps import CONTACT_ONSET_M
 from .arithmetic_source import ARITHMETIC
 from .collision_source import COLLISION
 from .contact_source import CONTACTS

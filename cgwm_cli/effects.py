@@ -1,0 +1,85 @@
+"""`cgwm effects`: what can be added to a model, and a template of one's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import Debug, Json, Overwrite, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas.effects import EffectCard, EffectList, NewEffect
+
+
+def list_effects(json: Json = False, quiet: Quiet = False, debug: Debug = False) -> None:
+    """The effects that can be added to a model: built in, and those of installed packages."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.effects import list_effects as work
+
+        emit(work(), _listed)
+
+
+def show_effect(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="An effect, or path/to/file.py:ClassName.", show_default=False)
+    ],
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """An effect's formula, its parameters, the motion that reveals it, and what it can be mistaken for."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.effects import show_effect as work
+
+        emit(work(name), _shown)
+
+
+def new_effect(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The Python file to write.", show_default=False)],
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """A template of one's own effect, which runs as it stands."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.effects import new_effect as work
+
+        emit(work(file, overwrite), _written)
+
+
+def _listed(found: EffectList) -> str:
+    from .output import table
+
+    rows = [[card.name, card.phase, card.summary] for card in found.effects]
+    return "\n".join([table(rows, ["effect", "acts in", "what it is"]), "Next: cgwm effects show NAME"])
+
+
+def _shown(card: EffectCard) -> str:
+    from .output import quantity, table
+
+    parameters = [[p.name, p.unit, _sign(p.sign), quantity(p.scale), quantity(p.limit)] for p in card.parameters]
+    constants = [[c.name, c.unit, "each of " + ", ".join(f"{x:g}" for x in c.grid)] for c in card.constants]
+    facts = [
+        ["acts in", card.phase],
+        ["needs", ", ".join(card.needs) or "nothing"],
+        ["shown best by", card.reveals],
+        ["in free flight the same as", "; ".join(card.aliases) or "no other effect"],
+        ["source", card.source],
+    ]
+    lines = [f"{card.name}: {card.summary}", f"  {card.formula}"]
+    lines.append(table(parameters, ["parameter", "unit", "sign", "scale", "at most"]))
+    if constants:
+        lines.append(table(constants, ["constant", "unit", "tried at"]))
+    return "\n".join([*lines, table(facts)])
+
+
+def _sign(sign: str) -> str:
+    return "not negative" if sign == "nonnegative" else "either"
+
+
+def _written(new: NewEffect) -> str:
+    return f"Wrote {new.path}.\nNext: change it, then cgwm effects show {new.name}"

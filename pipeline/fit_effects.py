@@ -1,0 +1,111 @@
+"""Effects in a fit: added to the model, their constants tried on their grids, their values written back."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import torch
+
+from ..datasets.tracks import Track
+from ..schemas import EffectModel, InputDataError, PhysConfig
+from ..schemas import Parameter as FittedParameter
+from .phys_geo import PhysicsFit, fit_physics
+from .physics.effects import ActiveEffect
+from .physics.world import World
+
+
+def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple[EffectModel, ...]:
+    """Return the effects of a model and the wanted ones that it does not have yet, at their neutral values."""
+    names = [effect.name for effect in present]
+    fresh = dict.fromkeys(name for name in wanted if name not in names)
+    return (*present, *(EffectModel(name=name) for name in fresh))
+
+
+def fitted_effects(
+    present: Sequence[EffectModel],
+    names: Mapping[str, str],
+    parameters: Iterable[FittedParameter],
+    constants: Mapping[str, float],
+) -> tuple[EffectModel, ...]:
+    """Return the effects with the values that a fit found.
+
+    Args:
+        present: The model's effects.
+        names: The name that an effect gives itself, by the name that the model has for it.
+        parameters: What was fitted, `effect.parameter` by name.
+        constants: The chosen constants, `effect.constant` by name.
+    """
+    found = {parameter.name: parameter.estimate for parameter in parameters} | dict(constants)
+    effects = []
+    for effect in present:
+        prefix = f"{names[effect.name]}."
+        values = {key.removeprefix(prefix): value for key, value in found.items() if key.startswith(prefix)}
+        effects.append(effect.model_copy(update={"parameters": effect.parameters | values}))
+    return tuple(effects)
+
+
+def fit_with_constants(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    config: PhysConfig,
+    noise: tuple[float | None, float | None],
+) -> PhysicsFit:
+    """Fit the world, once for each combination of the constants of its effects, and return the best.
+
+    A constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be searched from there:
+    it is tried at each value of its grid, and the one with the lowest open-loop error on the fitted episodes is kept.
+
+    Raises:
+        InputDataError: If an effect needs what the world or the episodes do not have.
+        NotConvergedError: If every rollout diverges.
+    """
+    _require_needs(world, episodes)
+    grids = [(active.effect.name, constant) for active in world.effects for constant in active.effect.constants]
+    best: PhysicsFit | None = None
+    tried = []
+    for values in itertools.product(*(constant.grid for _, constant in grids)):
+        chosen = {f"{effect}.{constant.name}": value for (effect, constant), value in zip(grids, values, strict=True)}
+        fit = fit_physics(_at(world, chosen), episodes, config, noise)
+        error = fit.record["search_open_loop_m"][-1]
+        tried.append(chosen | {"open_loop_m": error})
+        if best is None or error < best.record["search_open_loop_m"][-1]:
+            best = replace(fit, constants=chosen)
+    assert best is not None  # the product of no grids has one member
+    return best if not grids else replace(best, record=best.record | {"constants_tried": tried})
+
+
+def _at(world: World, constants: Mapping[str, float]) -> World:
+    effects = []
+    for active in world.effects:
+        own = {c.name: constants[f"{active.effect.name}.{c.name}"] for c in active.effect.constants}
+        like = next(iter(active.values.values()), torch.zeros(1))
+        effects.append(ActiveEffect.of(active.effect, active.values | own, like))
+    return replace(world, effects=tuple(effects))
+
+
+def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> None:
+    free = {body.name for body in world.bodies if body.free}
+    turned = any(
+        name in free and track.quat_wxyz is not None for _, tracks in episodes for name, track in tracks.items()
+    )
+    has = {
+        "ground": world.ground_normal is not None,
+        "contact": world.ground_normal is not None or len(world.bodies) > 1,
+        "spin": turned,
+        "driven": any(body.motion == "driven" for body in world.bodies),
+    }
+    words = {
+        "ground": "a ground in the manifest",
+        "contact": "something to touch",
+        "spin": "measured orientations",
+        "driven": "a driven body",
+    }
+    for active in world.effects:
+        for need in active.effect.needs:
+            if not has.get(need, True):
+                raise InputDataError(
+                    f"the effect '{active.effect.name}' needs {words[need]}, and this capture has none.",
+                    todo="add it to the capture, or leave the effect out of --effects.",
+                )

@@ -1,0 +1,250 @@
+"""The contacts of all pairs of bodies in a step: found, prepared, and settled together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ...schemas import UsageError
+from .contact import ContactLaw, Touch
+from .detection import (
+    GROUND,
+    ROUNDING_M,
+    Placed,
+    Points,
+    body_points,
+    ground_points,
+    near_body,
+    near_ground,
+    pairs_of,
+    slot_count,
+)
+from .motion import Inertia, Motion
+from .published import PublishedLaw, published_impulses
+from .rotation import cross
+from .sweeps import ContactGroup, Impulses, Rows, settle, tangent_axes
+from .world import World
+
+
+@dataclass(frozen=True)
+class PairImpulses:
+    """What one pair of bodies gave each other in a step.
+
+    pair: number in the world's list of pairs; a, b: bodies, b = -1 the ground; free: which of the two move; items
+    (n,): which items of the batch, all for None; points: where; impulse_n_s (n, C, 3): on a, world frame;
+    along_axes_n_s (n, C, 3): the same along the contacts' axes; angular_n_m_s (n, 3): on a beyond the moments of the
+    impulses, None where nothing resists turning; friction: of the contacts.
+    """
+
+    pair: int
+    a: int
+    b: int
+    free: tuple[bool, bool]
+    items: Tensor | None
+    points: Points
+    impulse_n_s: Tensor
+    along_axes_n_s: Tensor
+    angular_n_m_s: Tensor | None
+    friction: Tensor
+
+    def on_bodies(self, motions: Sequence[Motion]) -> dict[int, tuple[Tensor, Tensor]]:
+        """Return for each free body the impulse (B, 3) and its moment (B, 3) about the centre of mass."""
+        found = {}
+        for index, sign, free in ((self.a, 1.0, self.free[0]), (self.b, -1.0, self.free[1])):
+            if free:
+                com = take(motions[index].com, self.items)
+                arms = self.points.position - com[:, None]
+                impulse = sign * self.impulse_n_s
+                moment = cross(arms, impulse).sum(1)
+                if self.angular_n_m_s is not None:
+                    moment = moment + sign * self.angular_n_m_s
+                batch = motions[index].com.shape[0]
+                found[index] = (put(impulse.sum(1), self.items, batch), put(moment, self.items, batch))
+        return found
+
+    def at(self, slot: Tensor, items: Tensor | None, slots: int, batch: int) -> Tensor:
+        """Return the impulses along the axes (m, K, 3) of given slots (m, K) of given items, 0 where none acted."""
+        index = self.points.slot[..., None].expand_as(self.along_axes_n_s)
+        wide = self.along_axes_n_s.new_zeros((index.shape[0], slots, 3)).scatter(1, index, self.along_axes_n_s)
+        full = take(put(wide, self.items, batch), items)
+        return full.gather(1, slot[..., None].expand(-1, -1, 3))
+
+
+class Contacts:
+    """Finds and settles the contacts of a world's bodies."""
+
+    def __init__(self, world: World, inertias: Sequence[Inertia]) -> None:
+        self.world = world
+        self.inertias = inertias
+        self.pairs = pairs_of(world)
+        self.effects = [active for active in world.effects if active.effect.has("contact")]
+        law, normal = world.contact, world.ground_normal
+        self.sharpness_per_m = law.sharpness_per_m if isinstance(law, PublishedLaw) else None
+        self.ground_axes = None if normal is None else tangent_axes(normal)
+
+    def resolve(
+        self, placed: Sequence[Placed], step_s: Tensor, before: Sequence[PairImpulses] = ()
+    ) -> list[PairImpulses]:
+        """Return the impulses of a step.
+
+        Args:
+            placed: The bodies with their free velocities; B items each.
+            step_s: Step [s], shape (B,).
+            before: The impulses of the step before, from which the sweeps begin.
+        """
+        self._batch = placed[0].reference.shape[0] if placed else 0
+        candidates = self._candidates(placed, step_s)
+        if not candidates:
+            return []
+        items = _union([touching for touching, _ in candidates.values()])
+        some = [_select(body, items) for body in placed]
+        h = take(step_s, items)
+        found: list[tuple[int, Points, Touch, Tensor]] = []
+        for number, (_, depth) in candidates.items():
+            a, b = self.pairs[number]
+            if b == GROUND:
+                assert depth is not None
+                near = take(depth, items)
+                most = int((near < ROUNDING_M).sum(1).max())
+                slots = near.topk(most, dim=1, largest=False, sorted=False).indices
+                points = ground_points(_on(self.world, items), some[a], slots)
+            else:
+                points = body_points(some[a], some[b], h, self.sharpness_per_m)
+            if points is not None:
+                touch, axes = self._touch(points, some[a], None if b == GROUND else some[b], h, items)
+                found.append((number, points, touch, axes))
+        if not found:
+            return []
+        impulses = self._impulses(found, some, items, before)
+        results = []
+        for (number, points, touch, axes), impulse in zip(found, impulses, strict=True):
+            a, b = self.pairs[number]
+            free = (True, b != GROUND and self.world.bodies[b].free)
+            world_impulse = (impulse.linear[..., None, :] @ axes).squeeze(-2)
+            angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
+            results.append(
+                PairImpulses(number, a, b, free, items, points, world_impulse, impulse.linear, angular, touch.friction)
+            )
+        return results
+
+    def _candidates(self, placed: Sequence[Placed], step_s: Tensor) -> dict[int, tuple[Tensor, Tensor | None]]:
+        """Return by pair which items (B,) may touch and, for the ground, how deep each slot (B, S) is."""
+        found: dict[int, tuple[Tensor, Tensor | None]] = {}
+        for number, (a, b) in enumerate(self.pairs):
+            if b == GROUND:
+                depth = near_ground(self.world, placed[a], step_s)
+                touching = (depth < ROUNDING_M).any(1)
+            else:
+                depth, touching = None, near_body(placed[a], placed[b], step_s, self.sharpness_per_m)
+            if bool(touching.any()):
+                found[number] = (touching, depth)
+        return found
+
+    def _touch(
+        self, points: Points, a: Placed, b: Placed | None, h: Tensor, items: Tensor | None
+    ) -> tuple[Touch, Tensor]:
+        velocity, spin = a.point_velocity(points.position), a.omega
+        if b is not None:
+            velocity, spin = velocity - b.point_velocity(points.position), spin - b.omega
+            axes = tangent_axes(points.normal)
+        else:
+            assert self.ground_axes is not None
+            axes = self.ground_axes.expand(*points.gap.shape, 3, 3)
+        law = self.world.contact
+        friction = take(law.friction, items)[:, None]
+        if isinstance(law, ContactLaw):
+            time, ratio = (take(x, items)[:, None] for x in (law.contact_time_s, law.damping_ratio))
+        else:
+            time = ratio = torch.full_like(friction, torch.nan)  # the published law has others
+        touch = Touch(
+            b is None, points.position, points.normal, points.gap, velocity, spin, h[:, None], friction, time, ratio
+        )
+        for active in self.effects:
+            changed = active.effect.contact(active.at(items), touch)
+            if isinstance(law, PublishedLaw) and not _only_friction(touch, changed):
+                raise UsageError(
+                    f"the effect '{active.effect.name}' changes what the published contact law does not have.",
+                    "effects on the friction coefficient.",
+                    "use the contact law closed_form with this effect.",
+                )
+            touch = changed
+        if self.effects:
+            touch = replace(touch, friction=touch.friction.clamp_min(0.0))  # no sum of effects pushes a slider on
+        return touch, axes
+
+    def _impulses(
+        self,
+        found: list[tuple[int, Points, Touch, Tensor]],
+        placed: Sequence[Placed],
+        items: Tensor | None,
+        before: Sequence[PairImpulses],
+    ) -> list[Impulses]:
+        law = self.world.contact
+        if isinstance(law, PublishedLaw):
+            law = replace(
+                law, stiffness_n_m=take(law.stiffness_n_m, items), damping_n_s_m=take(law.damping_n_s_m, items)
+            )
+            return [Impulses(published_impulses(law, touch, axes)) for _, _, touch, axes in found]
+        groups = []
+        for number, points, touch, axes in found:
+            sides = []
+            for index, sign in zip(self.pairs[number], (1.0, -1.0), strict=True):
+                if index != GROUND and self.world.bodies[index].free:
+                    inertia, body = self.inertias[index], placed[index]
+                    arms = points.position - body.reference[:, None]
+                    root = body.rotation @ take(inertia.root, items)
+                    sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
+            groups.append(ContactGroup.of(touch, axes, tuple(sides)))
+        if self.world.sweeps == 1:  # the closed form begins from nothing
+            return settle(groups, 1)
+        old = {pair.pair: pair for pair in before}
+        batch = placed[0].reference.shape[0] if items is None else self._batch
+        warm = [
+            old[number].at(points.slot, items, slot_count(self.world, self.pairs[number]), batch)
+            if number in old
+            else None
+            for number, points, _, _ in found
+        ]
+        return settle(groups, self.world.sweeps, warm)
+
+
+def _only_friction(before: Touch, after: Touch) -> bool:
+    """Tell whether an effect changed nothing of a contact but its friction."""
+    names = set(Touch.__dataclass_fields__) - {"friction"}
+    return all(getattr(before, name) is getattr(after, name) for name in names)
+
+
+def take(x: Tensor, items: Tensor | None) -> Tensor:
+    """Return some items (n, ...) of a tensor (B, ...); all of it for None, or where it serves all items (1, ...)."""
+    return x if items is None or x.shape[0] == 1 else x.index_select(0, items)
+
+
+def put(x: Tensor, items: Tensor | None, batch: int) -> Tensor:
+    """Return a tensor (B, ...) with x (n, ...) at the items, zero elsewhere."""
+    if items is None:
+        return x
+    return torch.zeros(batch, *x.shape[1:], dtype=x.dtype, device=x.device).index_copy(0, items, x)
+
+
+def _union(touching: Sequence[Tensor]) -> Tensor | None:
+    """Return the items (n,) that touch anywhere; None where most do, so that picking them would not pay."""
+    found = torch.stack(list(touching)).any(0)
+    items = found.nonzero().squeeze(1)
+    return None if len(items) > 0.8 * len(found) else items
+
+
+def _select(placed: Placed, items: Tensor | None) -> Placed:
+    if items is None:
+        return placed
+    body = placed.body
+    names = ("mass", "inertia", "com", "centers", "radii")
+    some = replace(body, **{name: take(getattr(body, name), items) for name in names})
+    return Placed(some, *(take(x, items) for x in (placed.reference, placed.rotation, placed.velocity, placed.omega)))
+
+
+def _on(world: World, items: Tensor | None) -> World:
+    assert world.ground_offset is not None
+    return replace(world, ground_offset=take(world.ground_offset, items))

@@ -1,0 +1,264 @@
+"""Which spheres of which bodies touch in a step, and where: broad phase, then the smooth distance of the few.
+
+A sphere that stays apart gets no impulse and has no part in the sharing of mass, so that leaving it out changes
+nothing. What is left out is decided without derivatives; what remains is computed with them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from .distance import log_sum_exp_distance, smooth_min
+from .rotation import cross
+from .world import Body, World
+
+PAIR_SMOOTHING_M = 1e-3
+"""Width of the smooth minimum in distances between two bodies of spheres [m]."""
+ROUNDING_M = 1e-9
+"""Spheres this near to touching are kept in double precision: their distance is computed anew, in other order."""
+GROUND = -1
+"""The ground's index as second body of a pair."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A body where it is in a step, world frame.
+
+    reference (n, 3) [m]: the centre of mass of a free body, the frame's origin of another; rotation (n, 3, 3), body to
+    world; velocity (n, 3) [m/s] of the reference point; omega (n, 3) [rad/s].
+    """
+
+    body: Body
+    reference: Tensor
+    rotation: Tensor
+    velocity: Tensor
+    omega: Tensor
+
+    def arms(self, chosen: Tensor | None = None) -> Tensor:
+        """Return the spheres (n, N or K, 3) [m] relative to the reference point, world axes."""
+        origin = self.body.com if self.body.free else torch.zeros_like(self.body.com)
+        return pick(self.body.centers - origin[:, None], chosen) @ self.rotation.transpose(-1, -2)
+
+    def centers(self, chosen: Tensor | None = None) -> Tensor:
+        """Return the centres (n, N or K, 3) [m] of its spheres, or of the chosen ones (n, K)."""
+        return self.reference[:, None] + self.arms(chosen)
+
+    def radii(self, chosen: Tensor | None = None) -> Tensor:
+        """Return the radii (1 or n, N or K) [m]."""
+        return pick(self.body.radii, chosen)
+
+    def point_velocity(self, position: Tensor) -> Tensor:
+        """Return the velocity (n, C, 3) [m/s] of its material points at `position` (n, C, 3)."""
+        return self.velocity[:, None] + cross(self.omega[:, None], position - self.reference[:, None])
+
+    def plain(self) -> Placed:
+        """Return it without derivatives."""
+        return Placed(self.body, *(plain(x) for x in (self.reference, self.rotation, self.velocity, self.omega)))
+
+    def reach(self) -> Tensor:
+        """Return the radius (n or 1,) [m] of a ball about the reference point that holds all spheres."""
+        origin = plain(self.body.com) if self.body.free else torch.zeros_like(plain(self.body.com))
+        arms = plain(self.body.centers) - origin[:, None]
+        return (arms.square().sum(-1).sqrt() + plain(self.body.radii)).amax(-1)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where two bodies touch: slot (n, C), the number of each point in the pair's fixed list; gap, normal, position."""
+
+    slot: Tensor
+    gap: Tensor
+    normal: Tensor
+    position: Tensor
+
+
+def pairs_of(world: World) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that can touch: each free body with the ground (-1) and with every other body."""
+    bodies = world.bodies
+    pairs = [(i, GROUND) for i, body in enumerate(bodies) if body.free and world.ground_normal is not None]
+    for i, first in enumerate(bodies):
+        for j in range(i + 1, len(bodies)):
+            if first.free or bodies[j].free:
+                pairs.append((i, j) if first.free else (j, i))
+    return pairs
+
+
+def slot_count(world: World, pair: tuple[int, int]) -> int:
+    """Return how many points a pair can have: the ground's spheres, or all spheres of both bodies."""
+    first = world.bodies[pair[0]]
+    if pair[1] == GROUND:
+        return first.radii.shape[-1] if first.on_plane is None else len(first.on_plane)
+    return first.radii.shape[-1] + world.bodies[pair[1]].radii.shape[-1]
+
+
+def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
+    """Return how deep (n, S) [m] each slot of a body is in the ground now or at the end of the step; negative: in it.
+
+    Heights and their rates are products in the body frame: n . (R r) = (R^T n) . r and
+    n . (omega x R r) = (R^T (n x omega)) . r.
+    """
+    normal, offset, body = world.ground_normal, world.ground_offset, placed.body
+    assert normal is not None and offset is not None  # a pair with the ground exists only with one
+    with torch.no_grad():
+        still = placed.plain()
+        centers, radii = plain(body.centers), plain(body.radii)
+        if body.on_plane is not None:
+            centers, radii = centers[:, body.on_plane], radii[:, body.on_plane]
+        axes = torch.stack((normal.expand_as(still.omega), cross(normal.expand_as(still.omega), still.omega)), -1)
+        height, rate = _along(centers - plain(body.com)[:, None], still.rotation.transpose(-1, -2) @ axes).unbind(-1)
+        gap = height + (still.reference @ normal - plain(offset))[:, None] - radii
+        return torch.minimum(gap, gap + plain(step_s)[:, None] * (rate + (still.velocity @ normal)[:, None]))
+
+
+def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | None = None) -> Tensor:
+    """Return whether (n,) the balls around two bodies meet within a step; see :func:`body_points`."""
+    with torch.no_grad():
+        soft = max(_softness(x, sharpness_per_m) for x in (a, b))
+        apart = (plain(a.reference) - plain(b.reference)).square().sum(-1).sqrt()
+        return apart < a.reach() + b.reach() + plain(step_s) * _speed_bound(a, b) + soft
+
+
+def ground_points(world: World, placed: Placed, slot: Tensor) -> Points:
+    """Return the points by which the spheres in the given slots (n, C) face the ground."""
+    normal, offset, body = world.ground_normal, world.ground_offset, placed.body
+    assert normal is not None and offset is not None
+    chosen = slot if body.on_plane is None else body.on_plane[slot]
+    centers, radii = placed.centers(chosen), placed.radii(chosen)
+    gap = centers @ normal - offset[:, None] - radii
+    position = centers - radii[..., None] * normal
+    return Points(slot, gap, normal.expand_as(position), position)
+
+
+def body_points(a: Placed, b: Placed, step_s: Tensor | None, sharpness_per_m: float | None = None) -> Points | None:
+    """Return the points where two bodies touch, or will by the end of the step, both ways; None for none.
+
+    The spheres of b against the union of a come first, then those of a against the union of b.
+
+    Args:
+        a: The first body.
+        b: The second body; normals point from it.
+        step_s: Step [s], shape (n,); None for all points, touching or not.
+        sharpness_per_m: beta [1/m] of the published log-sum-exp distance; None for the simplex smooth minimum.
+    """
+    on_a, on_b = (_against_union(*order, step_s, sharpness_per_m) for order in ((a, b), (b, a)))
+    count = b.body.radii.shape[-1]
+    parts = []
+    if on_a is not None:
+        parts.append(Points(on_a.slot, on_a.gap, -on_a.normal, on_a.position))
+    if on_b is not None:
+        parts.append(Points(on_b.slot + count, on_b.gap, on_b.normal, on_b.position))
+    if not parts:
+        return None
+    return Points(*(torch.cat([getattr(part, name) for part in parts], 1) for name in Points.__dataclass_fields__))
+
+
+def _against_union(
+    union: Placed, spheres: Placed, step_s: Tensor | None, sharpness_per_m: float | None
+) -> Points | None:
+    """Return the points of `spheres` at the surface of `union`; normals point out of the union."""
+    softness = _softness(union, sharpness_per_m)
+    with torch.no_grad():
+        surface, queries = union.plain(), spheres.plain()
+        near = None if step_s is None else _within(queries, surface, step_s, softness)
+        if near is not None and not near.shape[1]:
+            return None
+        distance = torch.cdist(queries.centers(near), surface.centers(), compute_mode="donot_use_mm_for_euclid_dist")
+        distance = distance - surface.radii()[:, None]
+        least = distance.amin(-1)
+        slot = _all(spheres, least) if near is None else near
+        if step_s is not None:
+            depth = least - queries.radii(near) - plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
+            kept = _lowest(depth, ROUNDING_M + softness)
+            if kept is None:
+                return None
+            slot, least = near.gather(1, kept), least.gather(1, kept)
+            distance = distance.gather(1, kept[..., None].expand(-1, -1, distance.shape[-1]))
+        most = distance.shape[-1]
+        if sharpness_per_m is None:  # only spheres within the width of the nearest one have a weight in the minimum
+            most = int((distance < least[..., None] + PAIR_SMOOTHING_M + ROUNDING_M).sum(-1).max())
+        members = distance.topk(most, dim=-1, largest=False, sorted=False).indices
+    points = spheres.centers(slot)
+    radii = spheres.radii(slot)
+    gathered = union.centers(members.flatten(1)).unflatten(1, members.shape[1:])
+    offset = points[:, :, None] - gathered
+    length2 = offset.square().sum(-1)
+    length = torch.where(length2 > 0, length2, torch.ones_like(length2)).sqrt() * (length2 > 0)
+    distances = length - union.radii(members.flatten(1)).unflatten(1, members.shape[1:])
+    if sharpness_per_m is None:
+        value, weights = smooth_min(distances, PAIR_SMOOTHING_M)
+    else:
+        value, weights = log_sum_exp_distance(distances, sharpness_per_m)
+    gradient = (weights[..., None] * offset / length.clamp_min(1e-12)[..., None]).sum(-2)
+    normal = unit_or_up(gradient)
+    gap = value - radii
+    return Points(slot, gap, normal, points - (radii + 0.5 * gap)[..., None] * normal)
+
+
+def unit_or_up(gradient: Tensor) -> Tensor:
+    """Return vectors (..., 3) scaled to unit length; upwards where they vanish.
+
+    Exactly between opposite spheres the direction is undefined; any unit vector serves, and upwards is stable.
+    """
+    norm2 = gradient.square().sum(-1, keepdim=True)
+    known = norm2 > 1e-16
+    up = torch.zeros_like(gradient)
+    up[..., 2] = 1.0
+    return torch.where(known, gradient / torch.where(known, norm2, torch.ones_like(norm2)).sqrt(), up)
+
+
+def _softness(union: Placed, sharpness_per_m: float | None) -> float:
+    """Return how far [m] the smooth distance may lie below that of the nearest sphere, and a little more."""
+    if sharpness_per_m is None:
+        return PAIR_SMOOTHING_M
+    return math.log(union.body.radii.shape[-1]) / sharpness_per_m
+
+
+def _within(queries: Placed, surface: Placed, step_s: Tensor, softness_m: float) -> Tensor:
+    """Return the slots (n, K) of the spheres near the ball around the other body."""
+    centers = queries.centers()
+    apart = (centers - surface.reference[:, None]).square().sum(-1).sqrt() - queries.radii()
+    margin = surface.reach() + plain(step_s) * _speed_bound(queries, surface) + softness_m
+    kept = _lowest(apart - margin[:, None], 0.0)
+    return apart.new_zeros((apart.shape[0], 0), dtype=torch.int64) if kept is None else kept
+
+
+def _speed_bound(a: Placed, b: Placed) -> Tensor:
+    """Return a bound (n,) [m/s] on the relative speed of any two points of two bodies."""
+    spinning = [plain(x.omega).square().sum(-1).sqrt() * x.reach() for x in (a, b)]
+    return (plain(a.velocity) - plain(b.velocity)).square().sum(-1).sqrt() + spinning[0] + spinning[1]
+
+
+def _lowest(depth: Tensor, limit: float) -> Tensor | None:
+    """Return the slots (n, K) with values below the limit, as many for each item as any has; None for none."""
+    most = int((depth < limit).sum(1).max()) if depth.numel() else 0
+    return depth.topk(most, dim=1, largest=False, sorted=False).indices if most else None
+
+
+def _all(placed: Placed, like: Tensor) -> Tensor:
+    return torch.arange(placed.body.radii.shape[-1], device=like.device).expand(like.shape[0], -1)
+
+
+def plain(value: Tensor) -> Tensor:
+    """Return a tensor without its derivatives, forward or backward."""
+    return forward_ad.unpack_dual(value).primal.detach()
+
+
+def pick(values: Tensor, chosen: Tensor | None) -> Tensor:
+    """Return the chosen spheres (n, K, ...) of values (1 or n, N, ...); all for None."""
+    if chosen is None:
+        return values
+    if values.ndim == 3:
+        chosen = chosen[..., None].expand(-1, -1, values.shape[-1])
+    return values.expand(chosen.shape[0], *values.shape[1:]).gather(1, chosen)
+
+
+def _along(arms: Tensor, axes: Tensor) -> Tensor:
+    """Return the components (n, N, 2) of arms (1 or n, N, 3) along axes (n, 3, 2)."""
+    if arms.shape[0] > 1:
+        return arms @ axes
+    return (arms[0] @ axes.transpose(0, 1).flatten(1)).unflatten(1, (-1, 2)).transpose(0, 1)

@@ -1,0 +1,32 @@
+"""Physical and measurement effects: one file each, and the interface for one's own."""
+
+from .effect import (
+    ActiveEffect,
+    BodyMotion,
+    Effect,
+    EffectConstant,
+    EffectParameter,
+    Poses,
+    Values,
+    Wrench,
+    horizontal,
+    length,
+    vector,
+)
+from .registry import effect_names, load_effect
+
+__all__ = [
+    "ActiveEffect",
+    "BodyMotion",
+    "Effect",
+    "EffectConstant",
+    "EffectParameter",
+    "Poses",
+    "Values",
+    "Wrench",
+    "effect_names",
+    "horizontal",
+    "length",
+    "load_effect",
+    "vector",
+]

@@ -1,0 +1,21 @@
+"""Buoyancy in air or in a liquid."""
+
+from __future__ import annotations
+
+from .effect import BodyMotion, Effect, EffectParameter, Values, Wrench
+
+
+class Buoyancy(Effect):
+    """a = b upwards."""
+
+    name = "buoyancy"
+    summary = "Lift of the displaced air or liquid; its added mass is left out."
+    formula = "a = +b upwards"
+    parameters = (EffectParameter("b", "m/s2", scale=0.2, limit=20.0, nonnegative=True),)
+    phase = "flight"
+    reveals = "slow drops of a light body, beside a heavy one of the same size"
+    source = "Archimedes; b = g rho_fluid / rho_body"
+
+    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
+        """Return the lift."""
+        return Wrench(force=(values["b"] * motion.mass)[:, None] * motion.up)

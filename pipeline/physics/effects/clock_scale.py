@@ -1,0 +1,23 @@
+"""A clock that runs fast or slow."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from .effect import Effect, EffectParameter, Values
+
+
+class ClockScale(Effect):
+    """t_measured = (1 + s) t_true."""
+
+    name = "clock_scale"
+    summary = "Times on a wrong scale, as from a camera with another frame rate than given."
+    formula = "t_measured = (1 + s) t_true"
+    parameters = (EffectParameter("s", "1", scale=0.01, limit=0.3),)
+    phase = "measurement"
+    reveals = "long free flight, beside a clock in the picture"
+    source = "definition"
+
+    def times(self, values: Values, times_s: Tensor) -> Tensor:
+        """Return the true times."""
+        return times_s / (1 + values["s"])[:, None]

@@ -1,0 +1,24 @@
+"""Gravity that is stronger or weaker than it was thought to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ..world import World
+from .effect import Effect, EffectParameter, Values
+
+
+class GravityScale(Effect):
+    """g (1 + s)."""
+
+    name = "gravity_scale"
+    summary = "Gravity of another strength."
+    formula = "g becomes (1 + s) g"
+    parameters = (EffectParameter("s", "1", scale=0.02, limit=0.9),)
+    phase = "flight"
+    reveals = "drops from great heights, beside a length and a clock that were checked"
+    source = "definition"
+
+    def world(self, values: Values, world: World) -> World:
+        """Return the world with gravity scaled."""
+        return replace(world, gravity=world.gravity * (1 + values["s"])[:, None])

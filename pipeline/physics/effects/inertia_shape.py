@@ -1,0 +1,59 @@
+"""An inertia that is not what the shape says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..world import World
+from .effect import Effect, EffectParameter, Values, vector
+
+_AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+class InertiaShape(Effect):
+    """The mass of every free body stretched by exp(S / 2), S symmetric: C becomes exp(S/2) C exp(S/2).
+
+    C is the second moment of the mass about the centre of mass, C = tr(I) / 2 - I. So the inertia I = tr(C) - C stays
+    symmetric and positive definite, and keeps the triangle inequality, which exp(S) on I itself would break.
+    S = s 1 multiplies the inertia by exp(s).
+    """
+
+    name = "inertia_shape"
+    summary = "Mass that lies otherwise than evenly in the shape."
+    formula = "C becomes exp(S/2) C exp(S/2), C = tr(I)/2 - I the second moment of the mass, S symmetric, body axes"
+    parameters = tuple(EffectParameter(f"s_{axes}", "1", scale=0.1, limit=1.0) for axes in _AXES)
+    phase = "flight"
+    needs = ("spin",)
+    reveals = "free flight with fast spin about axes that are no principal ones, and off-centre impacts"
+    source = "second moments as in Wensing, Kim and Slotine 2018; the exponential map of symmetric matrices"
+
+    def world(self, values: Values, world: World) -> World:
+        """Return the world with other inertias."""
+        stretch = torch.linalg.matrix_exp(0.5 * _symmetric(vector(values, *(f"s_{axes}" for axes in _AXES))))
+        bodies = (
+            replace(body, inertia=_stretched(body.inertia, stretch)) if body.free else body for body in world.bodies
+        )
+        return replace(world, bodies=tuple(bodies))
+
+
+def _stretched(inertia: Tensor, stretch: Tensor) -> Tensor:
+    """Return the inertia (n, 3, 3) of a mass stretched by symmetric matrices (n, 3, 3)."""
+    eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
+    moment = 0.5 * _trace(inertia) * eye - inertia
+    # the change is added, so that no stretch changes nothing bit for bit
+    change = stretch @ moment @ stretch - moment
+    change = 0.5 * (change + change.transpose(-1, -2))
+    return inertia + _trace(change) * eye - change
+
+
+def _trace(matrix: Tensor) -> Tensor:
+    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+
+
+def _symmetric(six: Tensor) -> Tensor:
+    """Return symmetric matrices (n, 3, 3) of (xx, yy, zz, xy, xz, yz), shape (n, 6)."""
+    xx, yy, zz, xy, xz, yz = six.unbind(-1)
+    return torch.stack((xx, xy, xz, xy, yy, yz, xz, yz, zz), -1).unflatten(-1, (3, 3))

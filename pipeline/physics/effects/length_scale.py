@@ -1,0 +1,23 @@
+"""A measured length unit that is not the metre."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from .effect import Effect, EffectParameter, Poses, Values
+
+
+class LengthScale(Effect):
+    """p_measured = (1 + s) p_true."""
+
+    name = "length_scale"
+    summary = "Positions measured on a wrong scale, as from a marker of another size than given."
+    formula = "p_measured = (1 + s) p_true"
+    parameters = (EffectParameter("s", "1", scale=0.01, limit=0.3),)
+    phase = "measurement"
+    reveals = "flight of a body whose size is known, down to its impact; a known distance"
+    source = "definition"
+
+    def observe(self, values: Values, poses: Poses) -> Poses:
+        """Return the poses on the measured scale."""
+        return replace(poses, position_m=poses.position_m * (1 + values["s"])[:, None, None, None])

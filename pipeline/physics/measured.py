@@ -1,0 +1,44 @@
+"""What a measurement sees of a rollout: effects of the measurement come between the motion and its record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from .effects.effect import Poses
+from .rollout import Rollout, simulate
+from .world import State, World
+
+if TYPE_CHECKING:
+    from ...datasets.tracks import Track
+    from .driven import Drive
+
+
+def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive] | None = None) -> Rollout:
+    """Roll the world out and return the poses as they would be measured at the recorded times.
+
+    Args:
+        world: The world; its effects may change times and poses.
+        state: The true state at the true first time.
+        times_s: Recorded times [s], shape (T,) or (B, T).
+        driven: The command of each driven body, in true time.
+
+    Returns:
+        The rollout at the recorded times; poses as measured, velocities true.
+
+    Raises:
+        InputDataError: See :func:`simulate`.
+    """
+    true_times = times_s
+    for active in world.effects:
+        if active.effect.has("times"):
+            true_times = active.effect.times(active.values, true_times if true_times.ndim == 2 else true_times[None])
+    rollout = simulate(world, state, true_times, driven)
+    poses = Poses(rollout.position_m, rollout.quat_wxyz, up=world.up)
+    for active in world.effects:
+        if active.effect.has("observe"):
+            poses = active.effect.observe(active.values, poses)
+    return replace(rollout, times_s=times_s, position_m=poses.position_m, quat_wxyz=poses.quat_wxyz)

@@ -1,0 +1,101 @@
+"""The contacts of a rollout, frame by frame: labels for datasets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .contacts import PairImpulses, put
+from .detection import GROUND, Placed, Points, body_points, ground_points, pairs_of, slot_count
+from .world import World
+
+SLIDES = 0.99
+"""A contact whose tangential impulse has this share of the friction limit slides."""
+
+
+@dataclass(frozen=True)
+class ContactRecord:
+    """The contacts of a rollout, summed over the steps since the previous frame.
+
+    body_a (C,), body_b (C,) int, -1 for the ground; impulse_n_s (B, T, C, 3) on body a; position_m (B, T, C, 3);
+    normal (B, T, C, 3) from b to a; distance_m (B, T, C), negative where they overlap; sliding (B, T, C) bool. World
+    frame.
+    """
+
+    body_a: Tensor
+    body_b: Tensor
+    impulse_n_s: Tensor
+    position_m: Tensor
+    normal: Tensor
+    distance_m: Tensor
+    sliding: Tensor
+
+
+class Recorder:
+    """Sums impulses from step to step, and closes a frame with the geometry at its end."""
+
+    def __init__(self, world: World, placed: Sequence[Placed]) -> None:
+        self.world = world
+        self.pairs = pairs_of(world)
+        self.frames: list[tuple[Tensor, ...]] = []
+        self.batch = placed[0].reference.shape[0] if placed else 1
+        self.like = world.gravity
+        self.steps: list[PairImpulses] = []
+        self.close_frame(placed)
+
+    def add(self, touched: Sequence[PairImpulses]) -> None:
+        """Add the impulses of a step."""
+        self.steps.extend(touched)
+
+    def close_frame(self, placed: Sequence[Placed]) -> None:
+        """Sum the impulses since the last frame; where none acted, tell the geometry of now."""
+        columns = []
+        for number, (a, b) in enumerate(self.pairs):
+            points = self._points(a, b, placed)
+            total, weighted = torch.zeros_like(points.position), torch.zeros_like(points.position)
+            weight, sliding = torch.zeros_like(points.gap), torch.zeros_like(points.gap)
+            for step in (step for step in self.steps if step.pair == number):
+                normal = step.points.normal
+                along = (step.impulse_n_s * normal).sum(-1)
+                across = (step.impulse_n_s - along[..., None] * normal).square().sum(-1).sqrt()
+                slides = (across > SLIDES * step.friction * along).to(along.dtype)
+                total = total + self._spread(step, step.impulse_n_s)
+                weighted = weighted + self._spread(step, along[..., None] * step.points.position)
+                weight, sliding = weight + self._spread(step, along), sliding + self._spread(step, along * slides)
+            acted = weight > 0
+            place = torch.where(acted[..., None], weighted / weight.clamp_min(1e-30)[..., None], points.position)
+            columns.append((total, place, points.normal, points.gap, (sliding > 0.5 * weight) & acted))
+        self.steps = []
+        if columns:
+            self.frames.append(tuple(torch.cat([column[k] for column in columns], 1) for k in range(5)))
+        else:
+            empty = self.like.new_zeros((self.batch, 0))
+            vector = self.like.new_zeros((self.batch, 0, 3))
+            self.frames.append((vector, vector, vector, empty, empty.bool()))
+
+    def _spread(self, step: PairImpulses, values: Tensor) -> Tensor:
+        """Return values (n, C, ...) of a step's points in the pair's fixed slots (B, S, ...)."""
+        slots = slot_count(self.world, self.pairs[step.pair])
+        index = step.points.slot
+        if values.ndim == 3:
+            index = index[..., None].expand_as(values)
+        wide = values.new_zeros((values.shape[0], slots, *values.shape[2:])).scatter_add(1, index, values)
+        return put(wide, step.items, self.batch)
+
+    def _points(self, a: int, b: int, placed: Sequence[Placed]) -> Points:
+        if b == GROUND:
+            slots = torch.arange(slot_count(self.world, (a, b)), device=placed[a].reference.device)
+            return ground_points(self.world, placed[a], slots.expand(self.batch, -1))
+        points = body_points(placed[a], placed[b], None)
+        assert points is not None  # asked for all
+        return points
+
+    def record(self) -> ContactRecord:
+        """Return the record of all frames."""
+        counts = [slot_count(self.world, pair) for pair in self.pairs]
+        bodies = [[pair[k] for pair, n in zip(self.pairs, counts, strict=True) for _ in range(n)] for k in (0, 1)]
+        columns = (torch.stack([frame[k] for frame in self.frames], 1) for k in range(5))
+        return ContactRecord(torch.tensor(bodies[0]), torch.tensor(bodies[1]), *columns)
