@@ -25,6 +25,7 @@ from cgwm.pipeline import nvrtc
 from cgwm.pipeline.estimation.forward import batched_jacobian
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, simulate
 from cgwm.pipeline.physics.distance import plane_contacts
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
 from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
@@ -200,10 +201,7 @@ def mujoco_warp(count: int) -> dict[str, Any]:
 
 
 def fitting(device: str) -> dict[str, Any]:
-    """Measure value and Jacobian of poses by 12 numbers of the state, contact, ground, centre of mass and one more.
-
-    The last parameter is linear drag for the kernel; the torch engine of `simulate` takes gravity's size in its place.
-    """
+    """Measure value and Jacobian of poses by 12 numbers of the state, contact, ground, centre of mass and drag."""
     dtype = torch.float64
     world = world_of(device, dtype)
     named = (*CONTACT_PARAMETERS, GROUND_SHIFT, *(replace(GROUND_SHIFT, name=f"cube.com_{axis}_m") for axis in "xyz"))
@@ -217,11 +215,9 @@ def fitting(device: str) -> dict[str, Any]:
         turned = quat_multiply(quat_exp(values[:, 3:6]), quat.repeat(repeats, 1))
         state = State(*(part[:, None] for part in (values[:, :3], turned, values[:, 6:9], values[:, 9:12])))
         changed = apply_parameters(world, named, values[:, 12:19])
-        if device == "cuda":
-            rollout = simulate_fused(changed, state, times, wrenches={"linear_drag": values[:, 19:]})
-        else:
-            pull = torch.tensor([0.0, 0.0, -98.1], dtype=dtype)
-            rollout = simulate(replace(changed, gravity=values[:, 19:] * pull), state, times)
+        drag = ActiveEffect.of(load_effect("linear_drag"), {"c": values[:, 19]}, values)
+        engine = simulate_fused if device == "cuda" else simulate
+        rollout = engine(replace(changed, effects=(drag,)), state, times)
         return torch.cat((rollout.position_m, rollout.quat_wxyz), -1).flatten(1)
 
     jacobian = batched_jacobian(rolled, inputs)[1]

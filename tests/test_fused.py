@@ -13,15 +13,17 @@ import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline import nvrtc
 from cgwm.pipeline.estimation.forward import batched_jacobian
-from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, simulate
+from cgwm.pipeline.physics import Body, ContactLaw, PublishedLaw, Rollout, State, World, dispatch, simulate
 from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
 from cgwm.pipeline.physics.fused import simulate_fused, unsupported
+from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
-from cgwm.pipeline.physics.motion import Inertia, advance, finish, start
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
-from cgwm.pipeline.physics.rotation import cross, quat_exp, quat_multiply, quat_rotate, quat_to_matrix
+from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply, quat_rotate
 from cgwm.schemas import InputDataError, UsageError
 from torch import Tensor
 from worlds import F64, ball_body, batch, box_body, state_of, times, world_of
@@ -41,7 +43,8 @@ def on(device: str, dtype: torch.dtype, value: Any) -> Any:
     if isinstance(value, Tensor):
         return value.to(device, dtype) if value.is_floating_point() else value.to(device)
     if isinstance(value, World):
-        value = replace(value, bodies=tuple(on(device, dtype, body) for body in value.bodies))
+        effects = tuple(replace(e, values=on(device, dtype, e.values)) for e in value.effects)
+        value = replace(value, bodies=tuple(on(device, dtype, body) for body in value.bodies), effects=effects)
     if isinstance(value, World | Body | State | Drive | ContactLaw):
         fields = {name: getattr(value, name) for name in value.__dataclass_fields__}
         moved = {k: on(device, dtype, v) for k, v in fields.items() if isinstance(v, Tensor | ContactLaw)}
@@ -219,10 +222,10 @@ def test_everything_may_differ_in_a_batch(fused: Fused) -> None:
 
 def test_a_tilted_ground(fused: Fused) -> None:
     normal = torch.tensor([0.3, -0.2, 0.9], dtype=F64)
-    for n in (normal / normal.norm(), torch.tensor([0.0, 0.0, -1.0], dtype=F64)):
+    for n, offset in ((normal / normal.norm(), -0.1), (torch.tensor([0.0, 0.0, -1.0], dtype=F64), -0.17)):
         world, state, driven = crowd()
         world = replace(
-            world, ground_normal=n, ground_offset=batch(-0.1), gravity=batch([0.5, 0.0, -9.0 * float(n[2])])
+            world, ground_normal=n, ground_offset=batch(offset), gravity=batch([0.5, 0.0, -9.0 * float(n[2])])
         )
         agree(simulate(world, state, times(0.15), driven, True), fused(world, state, times(0.15), driven, True), 1e-9)
 
@@ -317,85 +320,91 @@ def test_derivatives_of_bodies_that_touch(fused: Fused) -> None:
     agree_with_derivatives(fused, world, first, times(0.08), driven, 0.0)
 
 
-def coefficients() -> dict[str, Tensor]:
-    """Return every wrench of two bodies, of which the second takes other values."""
-    given = {
-        "linear_drag": [0.4, 0.1], "quadratic_drag": [0.7, 0.2], "magnus": [0.02, -0.01], "spin_damping": [0.8, 0.3],
-        "acceleration": [[0.3, -0.2, 0.5], [0.0, 0.1, 0.0]], "wind": [[1.0, -2.0], [0.5, 0.5]], "magnet": [4.0, 1.0],
-        "magnet_range": [0.3, 0.2],
-    }  # fmt: skip
-    return {name: batch(value) for name, value in given.items()}
+def active(name: str, **values: float | list[float]) -> ActiveEffect:
+    return ActiveEffect.of(load_effect(name), {k: torch.as_tensor(v, dtype=F64) for k, v in values.items()})
 
 
-def flown(world: World, state: State, times_s: Tensor, wrenches: dict[str, Tensor]) -> list[Tensor]:
-    """Return the last frame of bodies in flight (B, bodies, 13), written down anew from the formulas."""
-    h, steps = torch.full((1,), world.step_s, dtype=F64), round(float(times_s[-1]) / world.step_s)
-    rows = []
-    for index, body in enumerate(world.bodies):
-        inertia = Inertia.of(body)
-        w = {name: value[:, index] for name, value in wrenches.items()}
-        motion = start(body, *(getattr(state, name)[:, index] for name in POSES))
-        wind = torch.cat((w["wind"], torch.zeros_like(w["wind"][:, :1])), -1)
-        for _ in range(steps):
-            rotation = quat_to_matrix(motion.quat_wxyz)
-            omega = (rotation @ inertia.inverse @ rotation.transpose(-1, -2) @ motion.spin[..., None]).squeeze(-1)
-            u = motion.velocity - wind
-            drag = w["linear_drag"] + w["quadratic_drag"] * u.norm(dim=-1)
-            acceleration = world.gravity + w["acceleration"] - drag[:, None] * u
-            acceleration = acceleration + w["magnus"][:, None] * cross(omega, motion.velocity)
-            assert world.ground_offset is not None and world.ground_normal is not None
-            height = motion.com @ world.ground_normal - world.ground_offset
-            pull = w["magnet"] * torch.exp(-height / w["magnet_range"])
-            velocity = motion.velocity + h * (acceleration - pull[:, None] * world.ground_normal)
-            spin = motion.spin * (1 - h * w["spin_damping"])[:, None]
-            motion = advance(inertia, motion, velocity, spin, h)
-        rows.append(finish(body, inertia, motion))
-    return [torch.stack([row[k] for row in rows], 1) for k in range(4)]
+def every_effect() -> tuple[ActiveEffect, ...]:
+    """Return every effect that the kernel has, one by which the items of a batch differ, and some of the world's."""
+    return (
+        active("linear_drag", c=[0.4, 0.1]), active("quadratic_drag", k=0.7), active("magnus_lift", s=0.2),
+        active("spin_damping", d=0.8), active("constant_force", f_x=0.3, f_y=-0.2, f_z=0.5), active("buoyancy", b=0.6),
+        active("wind", w_x=1.0, w_y=-2.0), active("ground_magnet", A=4.0, l=0.1), active("gravity_scale", s=0.05),
+        active("gravity_tilt", tilt_x=0.05, tilt_y=0.1), active("com_offset", d_x=0.003, d_y=-0.002),
+        active("inertia_shape", s_xx=0.1, s_xy=0.05),
+    )  # fmt: skip
 
 
 def flight() -> tuple[World, State]:
+    """Return a box and a ball that fall and touch the ground, 0.1 s after their start."""
     world = world_of(replace(box_body(), com=batch([0.003, 0.001, -0.002])), ball_body())
     state = state_of(
-        ((0, 0, 1), (1, 0.3, 0.2, 0.1), (2, 1, 0.5), (3, 5, -2)), ((1, 0, 1.2), UPRIGHT, (1, -1, 0.1), (9, 2, 3))
+        ((0, 0, 0.2), (1, 0.3, 0.2, 0.1), (2, 1, -0.9), (3, 5, -2)),
+        ((1, 0, 0.1), UPRIGHT, (1, -1, -0.2), (9, 2, 3)),
+        count=2,
     )
     return world, state
 
 
-@pytest.mark.parametrize("tilted", [False, True])
-def test_wrenches_in_flight(fused: Fused, tilted: bool) -> None:
+@pytest.mark.parametrize("ground", ["level", "tilted", "none"])
+def test_effects(fused: Fused, ground: str) -> None:
     world, state = flight()
-    if tilted:
-        turn = quat_exp(torch.tensor([0.4, -0.3, 0.0], dtype=F64))
+    effects = every_effect()
+    if ground == "tilted":
+        turn = quat_exp(torch.tensor([0.1, -0.2, 0.0], dtype=F64))
         world = replace(world, ground_normal=quat_rotate(turn, torch.tensor([0.0, 0, 1], dtype=F64)))
-    found = fused(world, state, times(0.2), wrenches=coefficients())
-    without = fused(world, state, times(0.2))
-    for name, expected in zip(POSES, flown(world, state, times(0.2), coefficients()), strict=True):
-        torch.testing.assert_close(getattr(found, name)[:, -1].cpu(), expected, rtol=1e-11, atol=1e-11)
-        assert (getattr(without, name)[:, -1].cpu() - expected).abs().max() > 1e-3
+    if ground == "none":
+        world = replace(world, ground_normal=None, ground_offset=None)
+        effects = tuple(e for e in effects if e.effect.name != "ground_magnet")
+    acting = replace(world, effects=effects)
+    expected = simulate(acting, state, times(0.2), None, True)
+    agree(expected, fused(acting, state, times(0.2), None, True), 1e-9)
+    for left_out in effects:
+        other = replace(world, effects=tuple(e for e in effects if e is not left_out))
+        if left_out.effect.name.endswith("_drag") or ground == "level":
+            found = simulate(other, state, times(0.1)).position_m
+            assert (found - expected.position_m[:, : found.shape[1]]).abs().max() > 1e-6, left_out.effect.name
 
 
-def test_derivatives_of_wrenches(fused: Fused) -> None:
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_the_pull_of_the_ground_on_one_body(fused: Fused, lanes: int) -> None:
+    """Its lowest sphere is one of several threads'."""
+    world = replace(world_of(cube(), step_s=0.002), effects=(active("ground_magnet", A=30.0, l=0.02),))
+    agree(simulate(world, tossed(2), times(0.2)), fused(world, tossed(2), times(0.2), lanes=lanes), 1e-9)
+
+
+def zeros(name: str, values: Tensor) -> dict[str, Tensor]:
+    """Return neutral values of an effect's parameters, for as many items."""
+    return {parameter.name: 0.0 * values[:, 0] for parameter in load_effect(name).parameters}
+
+
+def test_derivatives_of_effects(fused: Fused) -> None:
     world, state = flight()
-    given = coefficients()
-    inputs = torch.cat([value.flatten(1) for value in given.values()], 1)
+    names = [
+        ("linear_drag", "c"), ("quadratic_drag", "k"), ("magnus_lift", "s"), ("spin_damping", "d"),
+        ("constant_force", "f_x"), ("buoyancy", "b"), ("wind", "w_x"), ("ground_magnet", "A"), ("com_offset", "d_x"),
+        ("gravity_tilt", "tilt_x"),
+    ]  # fmt: skip
+    inputs = batch([0.4, 0.7, 0.2, 0.8, 0.3, 0.6, 1.0, 4.0, 0.003, 0.05])
+    first = State(*(getattr(state, name)[:1] for name in POSES))
 
     def function(engine: Any) -> Callable[[Tensor, int], Tensor]:
         def rolled(values: Tensor, repeats: int) -> Tensor:
-            parts = values.split([value.numel() for value in given.values()], 1)
-            shaped = {k: part.unflatten(1, v.shape[1:]) for (k, v), part in zip(given.items(), parts, strict=True)}
-            return torch.cat([x.flatten(1) for x in engine(shaped)], 1)
+            effects = tuple(
+                ActiveEffect.of(load_effect(name), zeros(name, values) | {key: values[:, k]}, values)
+                for k, (name, key) in enumerate(names)
+            )
+            rollout = engine(replace(world, effects=effects), first, times(0.1))
+            return torch.cat([getattr(rollout, name)[:, -1].flatten(1) for name in POSES], 1)
 
         return rolled
 
-    def mine(shaped: dict[str, Tensor]) -> list[Tensor]:
-        rollout = fused(world, state, times(0.1), wrenches=shaped)
-        return [getattr(rollout, name)[:, -1] for name in POSES]
-
-    value, jacobian = batched_jacobian(function(lambda shaped: flown(world, state, times(0.1), shaped)), inputs)
-    found, its = batched_jacobian(function(mine), inputs)
-    torch.testing.assert_close(found.cpu(), value, rtol=1e-11, atol=1e-11)
-    assert jacobian.abs().amax((0, 1)).min() > 1e-5
-    torch.testing.assert_close(its.cpu(), jacobian, rtol=1e-9, atol=1e-11)
+    value, jacobian = batched_jacobian(function(simulate), inputs)
+    found, its = batched_jacobian(function(fused), inputs)
+    torch.testing.assert_close(found.cpu(), value, rtol=1e-9, atol=1e-9)
+    scale = jacobian.abs().amax((0, 1))
+    assert scale.min() > 1e-5
+    torch.testing.assert_close(its.cpu() / scale, jacobian / scale, rtol=1e-7, atol=1e-7)
 
 
 @NEEDS_COMPILER
@@ -408,14 +417,17 @@ def test_refusals() -> None:
         on_host(world, replace(state, position_m=state.position_m.requires_grad_()), times(0.1))
     with pytest.raises(UsageError, match=r"several kinds: torch.float32 on cpu, torch.float64 on cpu"):
         on_host(on("cpu", torch.float32, world), tossed(1), times(0.1))
+    with pytest.raises(InputDataError, match="body 'box': mass"):
+        on_host(world.with_body(0, mass=-world.bodies[0].mass), state, times(0.1))
+    with pytest.raises(InputDataError, match="position_m of body 'box' is not finite"):
+        on_host(world, replace(state, position_m=state.position_m * torch.nan), times(0.1))
+    with pytest.raises(UsageError, match="'ground_magnet' needs a ground"):
+        magnet = replace(world_of(box_body(), ground=False), effects=(active("ground_magnet", A=1.0),))
+        on_host(magnet, state, times(0.1))
     with torch.no_grad():
         assert not on_host(world, state, times(0.01)).position_m.requires_grad
     with pytest.raises(InputDataError, match="the driven body 'pusher' has no track"):
         on_host(*crowd()[:2], times(0.1))
-    with pytest.raises(UsageError, match=r"no wrench 'linear_drga'. Did you mean 'linear_drag'"):
-        on_host(world, tossed(1), times(0.1), wrenches={"linear_drga": batch([1.0])})
-    with pytest.raises(UsageError, match=r"the wrench 'wind' has the shape \(1, 1\).\nAllowed: \(B, 1, 2\)"):
-        on_host(world, tossed(1), times(0.1), wrenches={"wind": batch([1.0])})
     body = world.bodies[0]
 
     def recorded(com: Tensor, repeats: int) -> Tensor:
@@ -423,6 +435,90 @@ def test_refusals() -> None:
 
     with pytest.raises(UsageError, match="no derivatives of the contact record"):
         batched_jacobian(recorded, body.com)
+
+
+def test_what_the_kernel_does_not_have() -> None:
+    world = world_of(box_body())
+    measured = replace(world, effects=(active("clock_scale", s=0.01), active("frame_tilt", tilt_x=0.1)))
+    assert reason_against(world) is None and reason_against(measured) is None
+    for name in ("rolling_resistance", "adhesion", "velocity_restitution"):
+        reason = reason_against(replace(world, effects=(active("linear_drag", c=0.1), active(name))))
+        assert reason == f"the kernel does not have its effect '{name}'"
+
+    class Other(LinearDrag):
+        name = "other"
+
+    assert "'other'" in (reason_against(replace(world, effects=(ActiveEffect.of(Other()),))) or "")
+    twice = (active("ground_magnet", A=1.0, l=0.1), active("ground_magnet", A=2.0, l=0.2))
+    assert "several" in (reason_against(replace(world, effects=twice)) or "")
+    published = PublishedLaw(batch(0.3), batch(1e4), batch(10.0))
+    assert "'published'" in (reason_against(replace(world, contact=published)) or "")
+    assert "its bodies may have 4104 contacts" in (reason_against(crowded(2044)) or "")
+
+
+def crowded(count: int) -> World:
+    """Return two balls of so many spheres each, and 8 contacts more."""
+    one, two = ball_body(copies=count), ball_body(copies=count, name="two")
+    chosen = torch.arange(8)
+    return world_of(replace(one, on_plane=chosen), replace(two, on_plane=chosen))
+
+
+def test_the_torch_engine_is_taken_on_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
+    world, state = world_of(box_body()), tossed(1)
+    with caplog.at_level("INFO", "cgwm"):
+        agree(
+            simulate(world, state, times(0.05), None, True),
+            dispatch.rollout(world, state, times(0.05), None, True),
+            0.0,
+        )
+    assert not caplog.records
+
+
+def test_which_derivatives_want_the_torch_engine() -> None:
+    world, state, driven = crowd()
+    commands = {name: Drive.of([track], state.position_m) for name, track in driven.items() if isinstance(track, Track)}
+    assert dispatch.lacking_derivatives(world, state, times(0.1), commands, True) is None
+    for number, change in enumerate(("com", "effect", "law", "drive")):
+        wanted = batch([0.1, 0.0, 0.0]).requires_grad_()
+        value = wanted[:, 0]
+        other, given = world, commands
+        if change == "com":
+            other = world.with_body(0, com=wanted)
+        elif change == "effect":
+            other = replace(world, effects=(ActiveEffect.of(load_effect("linear_drag"), {"c": value}),))
+        elif change == "law":
+            other = replace(world, contact=replace(world.contact, friction=value))
+        else:
+            given = {"pusher": replace(commands["pusher"], position_m=commands["pusher"].position_m + value)}
+        arguments = (other, state, times(0.1), given, False)
+        assert dispatch.lacking_derivatives(*arguments) == "derivatives in reverse are asked for", number
+        with torch.no_grad():
+            assert dispatch.lacking_derivatives(*arguments) is None
+
+    def rolled(com: Tensor, repeats: int) -> Tensor:
+        changed = world.with_body(0, com=com)
+        assert dispatch.lacking_derivatives(changed, state, times(0.1), commands, False) is None
+        reason = dispatch.lacking_derivatives(changed, state, times(0.1), commands, True)
+        assert reason == "derivatives of the contact record are asked for"
+        return com
+
+    batched_jacobian(rolled, world.bodies[0].com)
+
+
+@NEEDS_GPU
+def test_the_kernel_is_taken_on_cuda(caplog: pytest.LogCaptureFixture) -> None:
+    world, state, frames = (on("cuda", F64, x) for x in (world_of(box_body()), tossed(1), times(0.1)))
+    with caplog.at_level("INFO", "cgwm"):
+        found = dispatch.rollout(world, state, frames)
+        assert torch.equal(found.position_m, simulate_fused(world, state, frames).position_m)
+        assert not caplog.records
+        rolling = on("cuda", F64, replace(world_of(box_body()), effects=(active("rolling_resistance"),)))
+        for _ in range(2):
+            agree(simulate(world_of(box_body()), tossed(1), times(0.1)), dispatch.rollout(rolling, state, frames), 1e-9)
+        assert [record.getMessage() for record in caplog.records] == [
+            "rollouts run in the torch engine, not in the fused kernel: "
+            "the kernel does not have its effect 'rolling_resistance'"
+        ]
 
 
 @NEEDS_GPU

@@ -231,6 +231,24 @@ struct Lanes {
 #endif
         return mine;
     }
+    __device__ Real least(Real mine) const {
+#if LANES > 1
+#pragma unroll
+        for (int apart = LANES / 2; apart > 0; apart /= 2) {
+            Real other = swapped(mine, apart);
+            if (plain(other) < plain(mine)) mine = other;
+        }
+#endif
+        return mine;
+    }
+#if LANES > 1
+    __device__ Number swapped(Number mine, int apart) const { return __shfl_xor_sync(FULL, mine, apart, LANES); }
+#if DUAL
+    __device__ Real swapped(Real mine, int apart) const {
+        return Real(swapped(mine.value, apart), swapped(mine.tangent, apart));
+    }
+#endif
+#endif
 #if DUAL
     __device__ Real from(Real mine, int source) const {
         return Real(from(mine.value, source), from(mine.tangent, source));

@@ -1,6 +1,6 @@
 """CUDA source: contacts of spheres with the ground and with unions of spheres, and their closed-form impulses.
 
-Its formulas are those of `physics/contact.py` and `physics/distance.py`, where they are derived.
+Its formulas are those of `physics/contact.py`, `physics/sweeps.py` and `physics/distance.py`, where they are derived.
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inver
     return true;
 }
 
-// Shares the mass out among `total` touching contacts that do the same work, itself counted by `weight`.
+// Shares the mass out among contacts whose weights times how far they do the same work add up to `total`.
 INLINE void share_out(Contact& c, Real total, Real weight) {
-    Real share = reciprocal(Real(1) + at_least(total - weight, Number(0)));
+    const Real tiny = Real(Number(1e-9));
+    Real share = (weight + tiny) * reciprocal((plain(total) > plain(weight) ? total : weight) + tiny);
     c.stop_t = share * reciprocal(c.stop_t);
     c.stop_n = share * c.stop_n;
 }
@@ -136,11 +137,13 @@ INLINE Number gap_to(const Union& spheres, int i, const Number* point) {
     return root(x * x + y * y + z * z) - s[3];
 }
 
-// Returns whether the union is nearer than `limit`; then also its smooth distance, and the outward normal. Where that
-// is undefined, between opposite spheres, it is `up`. All in the frame of the union.
-__device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec up, Real& distance, Vec& outward) {
+// Returns whether the union is nearer than `limit`; then also its smooth distance, that of the nearest sphere, and the
+// outward normal. Where that is undefined, between opposite spheres, it is `up`. All in the frame of the union.
+__device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec up, Real& distance, Number& nearest,
+                               Vec& outward) {
     const Number width = Number(SMOOTHING_M);
-    Number point[3] = {plain(at.x), plain(at.y), plain(at.z)}, nearest = Number(1e30);
+    Number point[3] = {plain(at.x), plain(at.y), plain(at.z)};
+    nearest = Number(1e30);
     for (int i = 0; i < spheres.count; i++) nearest = lesser(nearest, gap_to(spheres, i, point));
     if (nearest - width > limit) return false;
     // t with sum over spheres of max(0, t - x)^2 = width^2: Newton from above, where the sum is convex and rising

@@ -26,8 +26,8 @@ struct Body {
     Vec velocity, spin;  // spin: angular momentum; angular velocity where the body is not free
 };
 
-// Accelerations of a free body in flight: a = -(c + k |u|) u + s omega x v + f - A exp(-height / l) n with
-// u = v - wind, and angular acceleration -d omega.
+// Accelerations of the free bodies in flight: a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with
+// u = v - wind and the height of the lowest sphere, and angular acceleration -d omega.
 struct Wrenches {
     Real linear_drag, quadratic_drag, magnus, spin_damping, magnet, magnet_range;
     Vec acceleration, wind;
@@ -38,9 +38,6 @@ struct Constants {
     Sym inverse_inertia;  // body axes
     Vec com;              // in the body frame
     Number reach;         // of its spheres from the centre of mass
-#if EFFECTS
-    Wrenches wrenches;
-#endif
 };
 
 struct Tally {  // contacts summed since the last frame
@@ -54,6 +51,12 @@ struct Environment {
     Vec gravity;
     Real ground;
     Law law;
+#if EFFECTS
+    Wrenches wrenches;
+#endif
+#if TURNED
+    Mat turn;  // from the world's frame, in which tangents are chosen, into the kernel's
+#endif
     Body bodies[BODIES];
     Constants constants[BODIES];
     int cursors[BODIES];
@@ -61,6 +64,9 @@ struct Environment {
     Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
     Real radii[SLOTS];
 #endif
+    // of this lane's contacts in the step before: with the ground in the kernel's frame, else along their axes
+    Vec before[SLOTS];
+    bool warm;  // whether any of them is not zero
 #if RECORD
     Tally tallies[SLOTS];
 #endif
@@ -73,6 +79,23 @@ INLINE void load(const Problem& problem, Environment& env) {
     env.ground = table.at(at + 3);
     env.law.friction = table.at(at + 4);
     at += 5;
+#if TURNED
+    Quat turn = {table.at(at), table.at(at + 1), table.at(at + 2), table.at(at + 3)};
+    env.turn = matrix(turn);
+    at += 4;
+#endif
+#if EFFECTS
+    Wrenches& w = env.wrenches;
+    w.linear_drag = table.at(at);
+    w.quadratic_drag = table.at(at + 1);
+    w.magnus = table.at(at + 2);
+    w.spin_damping = table.at(at + 3);
+    w.acceleration = table.vector(at + 4);
+    w.wind = table.vector(at + 7);
+    w.magnet = table.at(at + 10);
+    w.magnet_range = table.at(at + 11);
+    at += 12;
+#endif
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
         Body& body = env.bodies[b];
@@ -88,18 +111,6 @@ INLINE void load(const Problem& problem, Environment& env) {
         body.velocity = table.vector(at + 17);
         body.spin = table.vector(at + 20);
         at += 23;
-#if EFFECTS
-        Wrenches& w = c.wrenches;
-        w.linear_drag = table.at(at);
-        w.quadratic_drag = table.at(at + 1);
-        w.magnus = table.at(at + 2);
-        w.spin_damping = table.at(at + 3);
-        w.acceleration = table.vector(at + 4);
-        w.wind = table.vector(at + 7);
-        w.magnet = table.at(at + 10);
-        w.magnet_range = table.at(at + 11);
-        at += 12;
-#endif
         c.reach = Number(0);
         const Number* sphere = problem.geometry.value + env.geometry + 4LL * sphere_start(b);
         for (int i = 0; i < sphere_count(b); i++, sphere += 4) {
@@ -108,6 +119,9 @@ INLINE void load(const Problem& problem, Environment& env) {
         }
         env.cursors[b] = 0;
     }
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) env.before[i] = none();
+    env.warm = false;
 #if HELD
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {

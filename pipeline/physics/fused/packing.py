@@ -10,23 +10,19 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ....schemas import InputDataError, UsageError, did_you_mean
-from ..contact import ContactLaw
+from ....schemas import InputDataError
+from ..contact import ContactLaw, coefficients
+from ..detection import GROUND, pairs_of, slot_count
 from ..driven import Drive
 from ..motion import start
-from ..detection import pairs_of
 from ..rotation import quat_multiply, quat_normalize, quat_rotate
 from ..world import Body, State, World
-from .structure import WRENCH_COLUMNS, Structure
+from . import wrenches
+from .structure import Structure
 
 if TYPE_CHECKING:
     from ....datasets.tracks import Track
 
-WRENCHES = {
-    "linear_drag": (0, 1), "quadratic_drag": (1, 1), "magnus": (2, 1), "spin_damping": (3, 1), "acceleration": (4, 3),
-    "wind": (7, 2), "magnet": (10, 1), "magnet_range": (11, 1),
-}  # fmt: skip
-"""Column and width of each coefficient of the accelerations in flight."""
 MOST_CONTACTS = 4096
 
 
@@ -54,13 +50,15 @@ class Packed:
 def reason_against(world: World) -> str | None:
     """Return why no kernel can take a world, on any device; None where one can."""
     tensors = [world.gravity, *(getattr(body, name) for body in world.bodies for name in ("mass", "com", "centers"))]
-    if any(tensor.dtype not in (torch.float32, torch.float64) for tensor in tensors):
-        return "its numbers are neither float32 nor float64"
-    if len({tensor.dtype for tensor in tensors}) > 1:
-        return "its numbers have several types"
+    kinds = {tensor.dtype for tensor in tensors}
+    if len(kinds) > 1 or kinds - {torch.float32, torch.float64}:
+        return "its numbers have several types" if len(kinds) > 1 else "its numbers are neither float32 nor float64"
     if not world.bodies:
         return "it has no bodies"
-    contacts = sum(_contact_count(world, a, b) for a, b in pairs_of(world))
+    reason = wrenches.reason_against(world)
+    if reason is not None:
+        return reason
+    contacts = sum(slot_count(world, pair) for pair in pairs_of(world))
     if contacts > MOST_CONTACTS:
         return f"its bodies may have {contacts} contacts, more than {MOST_CONTACTS}"
     return None
@@ -71,36 +69,37 @@ def pack(
     state: State,
     times_s: Tensor,
     driven: Mapping[str, Track | Drive],
-    wrenches: Mapping[str, Tensor],
     record: bool,
 ) -> Packed:
     """Lay out the arguments of `simulate_fused`, for one thread and no derivative; derivatives flow through.
 
+    The effects have changed the world already.
+
     Raises:
         InputDataError: If a driven body has no track.
-        UsageError: If a wrench has an unknown name or another shape.
     """
     turn = None if world.ground_normal is None else _upright(world.ground_normal)
     times = times_s if times_s.ndim == 2 else times_s[None]
     rows = {index: _drive_rows(_command(body, driven, state), turn) for index, body in enumerate(world.bodies)
             if body.motion == "driven"}  # fmt: skip
-    coefficients = _coefficients(world, wrenches, turn)
-    columns = _columns(world, state, turn)
+    effects = wrenches.coefficients(world)
+    turned = turn is not None and len(world.bodies) > 1
+    columns = _columns(world, state, turn, turned, effects)
     spheres = [torch.cat((body.centers, body.radii[..., None]), -1) for body in world.bodies]
     law, substeps = world.contact, _substeps(times, world.step_s)
+    assert isinstance(law, ContactLaw)  # see reason_against
     numbers = torch.tensor(substeps, dtype=torch.int32, device=times.device)
     steps = _steps(law, times, numbers)
     batch = max(
         x.shape[0]
-        for x in (*columns, *spheres, steps, *(x for row in rows.values() for x in row), *coefficients)
+        for x in (*columns, *spheres, steps, *(x for row in rows.values() for x in row))
     )  # fmt: skip
-    for index, extra in enumerate(coefficients):
-        columns.insert(3 + 7 * (index + 1) + index, extra)
-    pairs = tuple((a, b, _contact_count(world, a, b)) for a, b in pairs_of(world))
+    pairs = tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world))
     single = world.gravity.dtype == torch.float32
     starts = [sum(body.radii.shape[-1] for body in world.bodies[:index]) for index in range(len(world.bodies))]
     structure = Structure(
-        single, False, 1, record, bool(coefficients), tuple(body.free for body in world.bodies),
+        single, False, 1, record, bool(effects), wrenches.has_magnet(world), turned,
+        tuple(body.free for body in world.bodies),
         tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
         tuple(body.radii.shape[-1] for body in world.bodies), pairs,
     )  # fmt: skip
@@ -130,16 +129,18 @@ def _steps(law: ContactLaw, times: Tensor, substeps: Tensor) -> Tensor:
     if times.shape[1] == 1:
         return torch.cat((torch.zeros_like(times).expand(times.shape[0], 3), times), -1)[:, None]
     h = times.diff(dim=1) / substeps
-    rows = ContactLaw(*(value[:, None] for value in (law.friction, law.contact_time_s, law.damping_ratio)))
-    stiffness, damping = rows.coefficients(h)
+    stiffness, damping = coefficients(law.contact_time_s[:, None], law.damping_ratio[:, None], h)
     return torch.stack(torch.broadcast_tensors(h, stiffness, damping, times[:, :-1]), -1)
 
 
-def _columns(world: World, state: State, turn: Tensor | None) -> list[Tensor]:
-    """Return the columns of the table without wrenches: 3 of the world, then 7 of each body."""
+def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effects: list[Tensor]) -> list[Tensor]:
+    """Return the columns of the table: those of the world, then those of each body."""
     zero = torch.zeros_like(world.gravity[:, :1])
     offset = zero if world.ground_offset is None else world.ground_offset[:, None]
     columns = [_turned(turn, world.gravity), offset, world.contact.friction[:, None]]
+    if turned and turn is not None:
+        columns.append(turn[None])
+    columns += [_turned(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
     for index, body in enumerate(world.bodies):
         position, quat, velocity = (x[:, index] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
         still = torch.zeros_like(position)
@@ -154,36 +155,6 @@ def _columns(world: World, state: State, turn: Tensor | None) -> list[Tensor]:
             columns += [zero, zero.expand(-1, 6), zero.expand(-1, 3)]
         columns += [_turned(turn, position), _turned_quat(turn, quat), _turned(turn, velocity), _turned(turn, spin)]
     return columns
-
-
-def _coefficients(world: World, wrenches: Mapping[str, Tensor], turn: Tensor | None) -> list[Tensor]:
-    """Return the coefficients (1 or B, 12) of each body; none where no wrench is given."""
-    if not wrenches:
-        return []
-    count = len(world.bodies)
-    for name, value in wrenches.items():
-        if name not in WRENCHES:
-            raise UsageError(f"no wrench '{name}'.{did_you_mean(name, WRENCHES)}", f"{', '.join(WRENCHES)}.")
-        width = WRENCHES[name][1]
-        if value.shape[1:] != ((count,) if width == 1 else (count, width)):
-            shape = f"(B, {count})" if width == 1 else f"(B, {count}, {width})"
-            raise UsageError(f"the wrench '{name}' has the shape {tuple(value.shape)}.", f"{shape}.")
-    tables = []
-    for index in range(count):
-        parts: list[Tensor] = []
-        for name, (_, width) in WRENCHES.items():
-            given = wrenches.get(name)
-            part = torch.zeros_like(world.gravity[:1, :1]).expand(1, width) if given is None else given[:, index]
-            part = part.reshape(part.shape[0], width)
-            if name == "magnet_range" and given is None:
-                part = part + 1.0
-            if name == "wind":
-                part = torch.cat((part, torch.zeros_like(part[:, :1])), -1)
-            parts.append(_turned(turn, part) if name in ("wind", "acceleration") else part)
-        batch = max(part.shape[0] for part in parts)
-        tables.append(torch.cat([part.expand(batch, part.shape[-1]) for part in parts], -1))
-        assert tables[-1].shape[-1] == WRENCH_COLUMNS
-    return tables
 
 
 def _command(body: Body, driven: Mapping[str, Track | Drive], state: State) -> Drive:
@@ -214,20 +185,14 @@ def _drive_starts(rows: Mapping[int, tuple[Tensor, Tensor]], like: Tensor) -> Te
 
 def _contact_spheres(world: World, starts: list[int]) -> Tensor:
     """Return for each contact (C,) the row of its sphere."""
-    parts = []
+    parts = [torch.zeros(0, dtype=torch.int64, device=world.gravity.device)]
     for a, b in pairs_of(world):
-        index = a if b < 0 else b
-        body = world.bodies[index]
-        every = torch.arange(body.radii.shape[-1], device=body.radii.device)
-        parts.append((every if b >= 0 or body.on_plane is None else body.on_plane) + starts[index])
-    if not parts:
-        return torch.zeros(0, dtype=torch.int32, device=world.gravity.device)
+        on_plane = world.bodies[a].on_plane if b == GROUND else None
+        for index in (a,) if b == GROUND else (b, a):
+            radii = world.bodies[index].radii
+            every = torch.arange(radii.shape[-1], device=radii.device)
+            parts.append((every if on_plane is None else on_plane) + starts[index])
     return torch.cat(parts).to(torch.int32)
-
-
-def _contact_count(world: World, a: int, b: int) -> int:
-    body = world.bodies[a if b < 0 else b]
-    return body.radii.shape[-1] if b >= 0 or body.on_plane is None else len(body.on_plane)
 
 
 def _joined(parts: list[Tensor], batch: int) -> Tensor:

@@ -12,7 +12,9 @@ from torch.autograd import forward_ad
 
 from ....schemas import UsageError
 from ... import nvrtc
+from ..checks import require_physical, require_state
 from ..driven import Drive
+from ..effects.effect import changed_by_effects
 from ..records import ContactRecord
 from ..rollout import Rollout
 from ..rotation import quat_conjugate, quat_multiply, quat_rotate
@@ -44,7 +46,6 @@ def simulate_fused(
     times_s: Tensor,
     driven: Mapping[str, Track | Drive] | None = None,
     record_contacts: bool = False,
-    wrenches: Mapping[str, Tensor] | None = None,
     lanes: int | None = None,
 ) -> Rollout:
     """Roll the world out from `state` in one kernel, as `simulate` does; all tensors on one CUDA device.
@@ -58,23 +59,19 @@ def simulate_fused(
         times_s: Frame times [s], increasing, shape (T,) or (B, T).
         driven: The command of each driven body: a track, or a prepared `Drive`.
         record_contacts: Whether to keep the contacts of every frame.
-        wrenches: Coefficients of accelerations in flight, each (1 or B, bodies) or (1 or B, bodies, width), only of
-            free bodies: linear_drag c [1/s], quadratic_drag k [1/m], wind w (2) [m/s], magnus s [1], acceleration f (3)
-            [m/s2], magnet A [m/s2] and magnet_range l [m], spin_damping d [1/s]:
-            a = -(c + k |v - w|) (v - w) + s omega x v + f - A exp(-height / l) n, alpha = -d omega.
         lanes: Threads that share an environment, a power of two up to 32; None chooses.
 
     Returns:
         The rollout at the frame times.
 
     Raises:
-        InputDataError: If a driven body has no track.
+        InputDataError: As `simulate` does.
         UsageError: If the kernel cannot take the world, or a reverse derivative is asked for.
     """
     reason = unsupported(world)
     if reason is not None:
         raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use simulate, which can.")
-    return roll(launch, world, state, times_s, driven, record_contacts, wrenches, lanes)
+    return roll(launch, world, state, times_s, driven, record_contacts, lanes)
 
 
 def roll(
@@ -84,12 +81,14 @@ def roll(
     times_s: Tensor,
     driven: Mapping[str, Track | Drive] | None = None,
     record_contacts: bool = False,
-    wrenches: Mapping[str, Tensor] | None = None,
     lanes: int | None = None,
 ) -> Rollout:
     """Do the work of `simulate_fused` with the given way to run the kernel."""
     _check_kinds(world.gravity, state.position_m, state.quat_wxyz, state.velocity_m_s, state.omega_body_rad_s, times_s)
-    packed = pack(world, state, times_s, driven or {}, wrenches or {}, record_contacts)
+    require_physical(world)
+    require_state(state, world.body_names)
+    world = changed_by_effects(world)
+    packed = pack(world, state, times_s, driven or {}, record_contacts)
     inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
     _check_kinds(*inputs)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):

@@ -22,7 +22,7 @@ INLINE void step(const Problem& problem, Environment& env, Real time_after) {
             motions[b].omega = rotations[b] * starts[b];
             velocities[b] = body.velocity + env.law.step_s * env.gravity;
 #if EFFECTS
-            apply(c.wrenches, env, body, motions[b].omega, velocities[b], spins[b]);
+            apply(problem, env, b, rotations[b], motions[b].omega, velocities[b], spins[b]);
             motions[b].omega = rotations[b] * (c.inverse_inertia * transposed(rotations[b], spins[b]));
 #endif
             motions[b].inverse_mass = c.inverse_mass;
@@ -96,37 +96,35 @@ INLINE void write_label(const Problem& problem, Environment& env, int frame, int
 // Writes what each contact passed on since the last frame, and the geometry now; and starts the sums anew.
 INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
     if (env.lanes.idle) return;
+    Mat rotations[BODIES];
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) rotations[b] = matrix(env.bodies[b].quat);
     EACH_PAIR
     for (int p = 0; p < PAIRS; p++) {
-        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
-        int a = pair_a(p), b = pair_b(p) < 0 ? a : pair_b(p);
-        Vec position_b = env.bodies[b].position;
-        Mat rotation_b = matrix(env.bodies[b].quat);
-#if PAIRED
-        Vec position_a = env.bodies[a].position;
-        Mat rotation_a = matrix(env.bodies[a].quat);
-#endif
+        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, a = pair_a(p);
         EACH_SLOT
         for (int s = 0; s < SLOTS; s++) {
             int k = behind + s * LANES;
             if (k >= contact_count(p)) continue;
-            long long row = env.geometry + 4LL * problem.spheres[start + k];
-            Real radius = problem.geometry.at(row + 3);
-            Vec center = position_b + rotation_b * (problem.geometry.vector(row) - env.constants[b].com);
-            Vec normal = vec(Real(0), Real(0), Real(1));
-            Real gap = center.z - env.ground - radius;
-            Vec point = vec(center.x, center.y, center.z - radius);
+            Vec normal = vec(Real(0), Real(0), Real(1)), point;
+            Real gap;
 #if PAIRED
             if (pair_b(p) >= 0) {
-                Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(a), sphere_count(a)};
-                Vec up = transposed(rotation_a, normal), outward;
-                Vec local = transposed(rotation_a, center - position_a) + env.constants[a].com;
-                Real distance;
-                union_distance(spheres, local, Number(1e30), up, distance, outward);
-                gap = distance - radius;
-                normal = -(rotation_a * outward);
-                point = center + (radius + Number(0.5) * gap) * normal;
+                Facing facing;
+                face(problem, env, p, k, rotations, Number(1e30), facing);
+                gap = facing.gap;
+                normal = facing.normal;
+                point = facing.point;
+            } else
+#endif
+            {
+                long long row = env.geometry + 4LL * problem.spheres[start + k];
+                Real radius = problem.geometry.at(row + 3);
+                Vec arm = rotations[a] * (problem.geometry.vector(row) - env.constants[a].com);
+                point = env.bodies[a].position + arm - vec(Real(0), Real(0), radius);
+                gap = point.z - env.ground;
             }
+#if PAIRED
             Tally& tally = env.tallies[(start + k) / LANES];
 #else
             Tally& tally = env.tallies[s];

@@ -15,7 +15,7 @@ from .rollout_source import ROLLOUT
 
 THREADS = 32
 """Of a block: one warp, so that few environments still spread over all multiprocessors."""
-BODY_COLUMNS, WRENCH_COLUMNS, WORLD_COLUMNS = 23, 12, 5
+BODY_COLUMNS, WRENCH_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 4, 5
 _BUSY_THREADS = 32_768
 """With so many threads an H200 is busy; more environments need fewer threads each."""
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
@@ -47,7 +47,8 @@ class Structure:
     """The constants of a kernel.
 
     single: float32, else float64; dual: with a derivative in one direction; lanes: threads of an environment, a power
-    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; free (bodies,); drives
+    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnet: one of them by the
+    ground's pull; turned: whether the frame of bodies that touch each other is not the world's; free (bodies,); drives
     (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
     ground, each with its number of contacts.
     """
@@ -57,6 +58,8 @@ class Structure:
     lanes: int
     record: bool
     effects: bool
+    magnet: bool
+    turned: bool
     free: tuple[bool, ...]
     drives: tuple[int, ...]
     spheres: tuple[int, ...]
@@ -75,16 +78,20 @@ class Structure:
     @property
     def table_width(self) -> int:
         """Numbers of an environment."""
-        return WORLD_COLUMNS + len(self.free) * (BODY_COLUMNS + self.effects * WRENCH_COLUMNS)
+        world = WORLD_COLUMNS + self.turned * TURN_COLUMNS + self.effects * WRENCH_COLUMNS
+        return world + len(self.free) * BODY_COLUMNS
 
     def source(self, host: bool = False) -> str:
         """Return the program; for the host, without the kernel's entry."""
         paired = len(self.free) > 1
         unrolled = self.slots <= _FREE_SLOTS[True, False]
+        # the sums of labels take the registers of eight spheres
+        held = unrolled and not paired and not (self.record and self.slots > _FREE_SLOTS[False, False])
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
-            "RECORD": self.record, "EFFECTS": self.effects, "BODIES": len(self.free), "PAIRS": len(self.pairs),
-            "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": unrolled and not paired,
+            "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "TURNED": self.turned,
+            "BODIES": len(self.free), "PAIRS": len(self.pairs),
+            "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
@@ -94,6 +101,7 @@ class Structure:
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
             "contact_start": _starts([count for _, _, count in self.pairs]),
+            "plane_pair": [_plane_pair(self.pairs, index) for index in range(len(self.free))],
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]
         return "\n".join((*lines, _LANGUAGE, *functions, ARITHMETIC, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT))
@@ -107,6 +115,11 @@ def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired
     while lanes < min(wanted, 32):
         lanes *= 2
     return lanes
+
+
+def _plane_pair(pairs: Sequence[tuple[int, int, int]], body: int) -> int:
+    """Return the number of the pair of a body with the ground, -1 without."""
+    return next((number for number, (a, b, _) in enumerate(pairs) if a == body and b < 0), -1)
 
 
 def _starts(counts: Sequence[int]) -> list[int]:
