@@ -179,7 +179,7 @@ def _against_union(
         least = distance.amin(-1)
         slot = _all(spheres, least) if near is None else near
         own = torch.ones_like(least, dtype=torch.bool)
-        if step_s is not None:
+        if step_s is not None and near is not None:
             depth = least - queries.radii(near) - plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
             kept = _lowest(depth, ROUNDING_M + softness)
             if kept is None:
