@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..datasets.tracks import Track
 from ..schemas import Parameter as FittedParameter
@@ -128,7 +129,7 @@ def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> Wo
     values = torch.stack([p.decode(z) for p, z in zip(names, coordinates, strict=True)])[None]
     moved = apply_parameters(world, names, values)
     bodies = [replace(b, com=b.com.clone(), inertia=b.inertia.clone()) for b in moved.bodies]
-    return replace(world, bodies=tuple(bodies))
+    return replace(moved, bodies=tuple(bodies))
 
 
 def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
@@ -137,7 +138,9 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
         float(parameter.decode(torch.tensor(min(max(z, low), high), dtype=torch.float64)))
         for z in (coordinate, coordinate - 1.96 * std, coordinate + 1.96 * std)
     )
-    on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
+    state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
+    if std > UNOBSERVABLE_SHARE * parameter.prior[1]:
+        state = "not_observable"
     factor = "factor of the second moment of mass given or derived before; " if ".moment_" in parameter.name else ""
     return FittedParameter(
         name=parameter.name,
@@ -146,10 +149,6 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
         std_error=std * (estimate if parameter.logarithmic else 1.0),
         interval_95=(interval[0], interval[1]),
         bounds=parameter.bounds,
-        state="not_observable"
-        if std > UNOBSERVABLE_SHARE * parameter.prior[1]
-        else "on_bound"
-        if on_bound
-        else "fitted",
+        state=state,
         note=f"{factor}{parameter.reveals} would reveal it",
     )

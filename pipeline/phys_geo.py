@@ -182,7 +182,7 @@ def _fit_effects(
 ) -> FirstContacts:
     """Fit the world's effects to flight and first contacts, from neutral values; the contact's numbers beside them.
 
-    The open-loop search is for few numbers: with every effect its valley gets narrower, while windows show effects well.
+    The open-loop search is for few numbers: with every effect its valley gets narrower; windows show effects well.
     """
     wanted = [(parameter, 0.0) for parameter in effect_parameters(world)]
     return fit_first_contacts(world, episodes, wanted, [(p, p.prior[0]) for p in contact], sigma, whole_flight=True)

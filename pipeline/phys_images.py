@@ -126,12 +126,8 @@ def fit_physics_from_images(
         for p in found.parameters
     )
     effects = () if start.effects is None else start.effects.parameters
-    return replace(
-        found,
-        parameters=(*parameters, *effects),
-        effects=start.effects,
-        warnings=(*found.warnings, *_warnings(episodes)),
-    )
+    warnings = (*found.warnings, *_warnings(episodes))
+    return replace(found, parameters=(*parameters, *effects), effects=start.effects, warnings=warnings)
 
 
 def _episode(world: World, model: Model, capture: Capture, name: str, tracks_too: bool) -> _Episode:

@@ -15,12 +15,12 @@ CUDA = torch.cuda.is_available()
 if not CUDA:
     os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are imported
 pytest.importorskip("triton", reason="Triton has wheels for Linux only")
-from cgwm.pipeline.splats import cuda  # noqa: E402
+from cgwm.pipeline import nvrtc  # noqa: E402
 from cgwm.pipeline.splats.rasterize import Raster, rasterize  # noqa: E402
 
 DEVICE = "cuda" if CUDA else "cpu"
 SIZE = (21, 11)  # two tiles, of which one is cut
-NEEDS_GPU = pytest.mark.skipif(not (CUDA and cuda.available()), reason="needs a CUDA device and cuda.core")
+NEEDS_GPU = pytest.mark.skipif(not (CUDA and nvrtc.available()), reason="needs a CUDA device and cuda.core")
 KERNELS = ["triton", pytest.param("cuda", marks=NEEDS_GPU)]
 
 

@@ -110,7 +110,8 @@ class Contacts:
                 near = take(depth, items)
                 most = int((near < ROUNDING_M).sum(1).max())
                 slots = near.topk(most, dim=1, largest=False, sorted=False).indices
-                points = ground_points(_on(self.world, items), some[a], slots)
+                own = near.gather(1, slots) < ROUNDING_M
+                points = ground_points(_on(self.world, items), some[a], slots, own)
             else:
                 points = body_points(some[a], some[b], h, self.sharpness_per_m)
             if points is not None:
@@ -203,7 +204,8 @@ class Contacts:
         old = {pair.pair: pair for pair in before}
         batch = placed[0].reference.shape[0] if items is None else self._batch
         warm = [
-            old[number].at(points.slot, items, slot_count(self.world, self.pairs[number]), batch)
+            points.near[..., None]
+            * old[number].at(points.slot, items, slot_count(self.world, self.pairs[number]), batch)
             if number in old
             else None
             for number, points, _, _ in found

@@ -7,7 +7,7 @@ nothing. What is left out is decided without derivatives; what remains is comput
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -58,7 +58,9 @@ class Placed:
 
     def plain(self) -> Placed:
         """Return it without derivatives."""
-        return Placed(self.body, *(plain(x) for x in (self.reference, self.rotation, self.velocity, self.omega)))
+        names = ("com", "centers", "radii")
+        body = replace(self.body, **{name: plain(getattr(self.body, name)) for name in names})
+        return Placed(body, *(plain(x) for x in (self.reference, self.rotation, self.velocity, self.omega)))
 
     def reach(self) -> Tensor:
         """Return the radius (n or 1,) [m] of a ball about the reference point that holds all spheres."""
@@ -69,9 +71,13 @@ class Placed:
 
 @dataclass(frozen=True)
 class Points:
-    """Where two bodies touch: slot (n, C), the number of each point in the pair's fixed list; gap, normal, position."""
+    """Where two bodies touch: slot (n, C), the number of each point in the pair's fixed list; gap, normal, position.
+
+    near (n, C): whether the item has the point itself; the others are there only because another item has as many.
+    """
 
     slot: Tensor
+    near: Tensor
     gap: Tensor
     normal: Tensor
     position: Tensor
@@ -123,15 +129,16 @@ def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | Non
         return apart < a.reach() + b.reach() + plain(step_s) * _speed_bound(a, b) + soft
 
 
-def ground_points(world: World, placed: Placed, slot: Tensor) -> Points:
-    """Return the points by which the spheres in the given slots (n, C) face the ground."""
+def ground_points(world: World, placed: Placed, slot: Tensor, near: Tensor | None = None) -> Points:
+    """Return the points by which the spheres in the given slots (n, C) face the ground; `near` as in `Points`."""
     normal, offset, body = world.ground_normal, world.ground_offset, placed.body
     assert normal is not None and offset is not None
     chosen = slot if body.on_plane is None else body.on_plane[slot]
     centers, radii = placed.centers(chosen), placed.radii(chosen)
     gap = centers @ normal - offset[:, None] - radii
     position = centers - radii[..., None] * normal
-    return Points(slot, gap, normal.expand_as(position), position)
+    near = torch.ones_like(gap, dtype=torch.bool) if near is None else near
+    return Points(slot, near, gap, normal.expand_as(position), position)
 
 
 def body_points(a: Placed, b: Placed, step_s: Tensor | None, sharpness_per_m: float | None = None) -> Points | None:
@@ -149,9 +156,9 @@ def body_points(a: Placed, b: Placed, step_s: Tensor | None, sharpness_per_m: fl
     count = b.body.radii.shape[-1]
     parts = []
     if on_a is not None:
-        parts.append(Points(on_a.slot, on_a.gap, -on_a.normal, on_a.position))
+        parts.append(Points(on_a.slot, on_a.near, on_a.gap, -on_a.normal, on_a.position))
     if on_b is not None:
-        parts.append(Points(on_b.slot + count, on_b.gap, on_b.normal, on_b.position))
+        parts.append(Points(on_b.slot + count, on_b.near, on_b.gap, on_b.normal, on_b.position))
     if not parts:
         return None
     return Points(*(torch.cat([getattr(part, name) for part in parts], 1) for name in Points.__dataclass_fields__))
@@ -171,12 +178,14 @@ def _against_union(
         distance = distance - surface.radii()[:, None]
         least = distance.amin(-1)
         slot = _all(spheres, least) if near is None else near
+        own = torch.ones_like(least, dtype=torch.bool)
         if step_s is not None and near is not None:
             depth = least - queries.radii(near) - plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
             kept = _lowest(depth, ROUNDING_M + softness)
             if kept is None:
                 return None
             slot, least = near.gather(1, kept), least.gather(1, kept)
+            own = depth.gather(1, kept) < ROUNDING_M + softness
             distance = distance.gather(1, kept[..., None].expand(-1, -1, distance.shape[-1]))
         most = distance.shape[-1]
         if sharpness_per_m is None:  # only spheres within the width of the nearest one have a weight in the minimum
@@ -196,7 +205,7 @@ def _against_union(
     gradient = (weights[..., None] * offset / length.clamp_min(1e-12)[..., None]).sum(-2)
     normal = unit_or_up(gradient)
     gap = value - radii
-    return Points(slot, gap, normal, points - (radii + 0.5 * gap)[..., None] * normal)
+    return Points(slot, own, gap, normal, points - (radii + 0.5 * gap)[..., None] * normal)
 
 
 def unit_or_up(gradient: Tensor) -> Tensor:

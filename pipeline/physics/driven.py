@@ -109,5 +109,5 @@ def _prepare(track: Track, longest: int, like: Tensor) -> tuple[Tensor, ...]:
         torch.cat((quat, quat[-1:].expand(padding, 4))),
         torch.cat((velocity, still.expand(padding + 1, 3))),
         torch.cat((omega, still.expand(padding + 1, 3))),
-        torch.tensor(len(times) - 2),
+        torch.tensor(len(times) - 2, device=times.device),
     )

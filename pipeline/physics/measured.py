@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from .dispatch import rollout as rolled_out
 from .effects.effect import Poses
-from .rollout import Rollout, simulate
+from .rollout import Rollout
 from .world import State, World
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Tr
     for active in world.effects:
         if active.effect.has("times"):
             true_times = active.effect.times(active.values, true_times if true_times.ndim == 2 else true_times[None])
-    rollout = simulate(world, state, true_times, driven)
+    rollout = rolled_out(world, state, true_times, driven)
     poses = Poses(rollout.position_m, rollout.quat_wxyz, up=world.up)
     for active in world.effects:
         if active.effect.has("observe"):

@@ -15,7 +15,7 @@ from .checks import require_physical, require_state
 from .contacts import Contacts, PairImpulses
 from .detection import Placed
 from .driven import Drive
-from .effects.effect import BodyMotion, check_needs
+from .effects.effect import BodyMotion, changed_by_effects
 from .motion import Inertia, Motion, advance, finish, start
 from .records import ContactRecord, Recorder
 from .rotation import quat_to_matrix
@@ -83,10 +83,7 @@ class _Engine:
     """The constants of one rollout, and its step."""
 
     def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
-        check_needs(world.effects, world.ground_normal is not None)
-        for active in world.effects:
-            world = active.effect.world(active.values, world)
-        self.world = world
+        world = self.world = changed_by_effects(world)
         self.inertias = [Inertia.of(body) for body in world.bodies]
         self.times = times_s if times_s.ndim == 2 else times_s[None]
         self.lengths = self.times.diff(dim=1)

@@ -1,4 +1,4 @@
-"""CUDA kernels that composite tiles, compiled at run time by NVRTC (no toolkit: it comes with torch's CUDA wheels).
+"""CUDA kernels that composite tiles, compiled at run time by NVRTC.
 
 They do what the Triton kernels of the same names do, faster: a warp takes 8 x 8 pixels, leaves out what cannot reach
 them before anything is computed, and adds up eight derivatives at a time in the way of a transposition.
@@ -6,13 +6,13 @@ them before anything is computed, and adds up eight derivatives at a time in the
 
 from __future__ import annotations
 
-import importlib
 from functools import cache
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
+
+from .. import nvrtc
 
 CHANNELS = 8
 """Channels that one launch composites."""
@@ -322,20 +322,6 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
 """
 
 
-@cache
-def _core() -> Any:
-    try:
-        core = importlib.import_module("cuda.core")
-    except ImportError:
-        return None
-    return core if hasattr(core, "Program") else None  # before 1.0 it was experimental by name
-
-
-def available() -> bool:
-    """Tell whether cuda.core is installed, which compiles and launches these kernels."""
-    return _core() is not None
-
-
 def gradient_width(channels: int) -> int:
     """Return the numbers in a row of the backward kernel's result: centre, k, log opacity, features, filled to 8."""
     return -(-(5 + channels) // 8) * 8
@@ -343,23 +329,9 @@ def gradient_width(channels: int) -> int:
 
 @cache
 def _kernel(name: str, device: int, channels: int, first: int, rays: bool) -> Any:
-    core = _core()
-    core.Device(device).set_current()
-    major, minor = torch.cuda.get_device_capability(device)
     defines = {"F": channels, "FIRST": first, "COUNT": min(CHANNELS, channels - first), "RAYS": int(rays)}
     source = "".join(f"#define {key} {value}\n" for key, value in defines.items()) + SOURCE
-    options = core.ProgramOptions(std="c++17", arch=f"sm_{major}{minor}")
-    return core.Program(source, "c++", options).compile("cubin").get_kernel(name)
-
-
-@cache
-def _config(blocks: int) -> Any:
-    return _core().LaunchConfig(grid=blocks, block=THREADS)
-
-
-@cache
-def _stream(handle: int) -> Any:
-    return _core().Stream.from_handle(handle)
+    return nvrtc.compiled(source, name, device)
 
 
 def launch(
@@ -378,6 +350,4 @@ def launch(
     assert features is not None
     kernel = _kernel(name, features.device.index or 0, features.shape[1], first, tensors[7] is not None)
     words = [np.int32(number) if isinstance(number, int) else np.float32(number) for number in numbers]
-    pointers = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
-    stream = _stream(torch.cuda.current_stream(features.device).cuda_stream)
-    _core().launch(stream, _config(blocks), kernel, *pointers, *words)
+    nvrtc.launch(kernel, features.device, blocks, THREADS, tensors, *words)

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from .. import nvrtc
 from . import binning, cuda, kernels
 from .rays import LEAST_DETERMINANT, UNDISTORT_STEPS
 
@@ -67,7 +68,7 @@ class Raster:
     @property
     def compiled(self) -> bool:
         """Tell whether the CUDA kernels composite."""
-        return self.kernels == "cuda" or (self.kernels == "auto" and cuda.available())
+        return self.kernels == "cuda" or (self.kernels == "auto" and nvrtc.available())
 
 
 class _Lists(NamedTuple):

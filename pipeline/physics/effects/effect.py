@@ -239,6 +239,18 @@ def check_needs(effects: Sequence[ActiveEffect], ground: bool) -> None:
             )
 
 
+def changed_by_effects(world: World) -> World:
+    """Return the world with the masses, geometry, gravity and ground that its effects give it.
+
+    Raises:
+        UsageError: See :func:`check_needs`.
+    """
+    check_needs(world.effects, world.ground_normal is not None)
+    for active in world.effects:
+        world = active.effect.world(active.values, world)
+    return world
+
+
 def vector(values: Values, *names: str) -> Tensor:
     """Return values stacked as vectors (n, len(names))."""
     return torch.stack([values[name] for name in names], -1)

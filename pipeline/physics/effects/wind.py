@@ -24,4 +24,9 @@ class Wind(Effect):
 
     def flow(self, values: Values, motion: BodyMotion) -> Tensor:
         """Return the velocity of the air."""
-        return horizontal(vector(values, "w_x", "w_y"), motion.up)
+        return self.along(values, motion.up)
+
+    @staticmethod
+    def along(values: Values, up: Tensor) -> Tensor:
+        """Return the same for the upward direction (n or 1, 3)."""
+        return horizontal(vector(values, "w_x", "w_y"), up)

@@ -1,0 +1,70 @@
+"""Rollouts by the fused kernel where it can take them, by the torch engine elsewhere."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from .driven import Drive
+from .fused import simulate_fused, unsupported
+from .rollout import Rollout, simulate
+from .world import State, World
+
+if TYPE_CHECKING:
+    from ...datasets.tracks import Track
+
+
+def rollout(
+    world: World,
+    state: State,
+    times_s: Tensor,
+    driven: Mapping[str, Track | Drive] | None = None,
+    record_contacts: bool = False,
+) -> Rollout:
+    """Do what `simulate` does, on CUDA in one kernel where that can take the world.
+
+    Where it cannot, the log says so once for each reason; on the CPU there is no choice, and nothing to say.
+
+    Raises:
+        InputDataError, UsageError: See :func:`simulate`.
+    """
+    if world.gravity.device.type != "cuda":
+        return simulate(world, state, times_s, driven, record_contacts)
+    reason = unsupported(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
+    if reason is None:
+        return simulate_fused(world, state, times_s, driven, record_contacts)
+    _note(reason)
+    return simulate(world, state, times_s, driven, record_contacts)
+
+
+def lacking_derivatives(
+    world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive], record_contacts: bool
+) -> str | None:
+    """Return which derivatives are asked for that the kernel does not have; None for none."""
+    tensors = list(_tensors(world, state, times_s, driven))
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return "derivatives in reverse are asked for"
+    if record_contacts and any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+        return "derivatives of the contact record are asked for"
+    return None
+
+
+def _tensors(world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> Iterator[Tensor]:
+    """Yield all tensors of a rollout's arguments."""
+    drives = [command for command in driven.values() if isinstance(command, Drive)]
+    for holder in (world, world.contact, state, *world.bodies, *drives):
+        yield from (value for value in vars(holder).values() if isinstance(value, Tensor) and value.is_floating_point())
+    for active in world.effects:
+        yield from active.values.values()
+    yield times_s
+
+
+@cache
+def _note(reason: str) -> None:
+    logging.getLogger("cgwm").info("rollouts run in the torch engine, not in the fused kernel: %s", reason)

@@ -1,0 +1,387 @@
+"""CUDA source: flight, and the contacts of a step with their impulses.
+
+Its formulas are those of `physics/motion.py`, `physics/detection.py`, `physics/sweeps.py` and `physics/effects`.
+"""
+
+from __future__ import annotations
+
+COLLISION = r"""
+// Moves a free body over a step in which its velocity and angular momentum went to the given ones: positions follow
+// the mean velocity, the rotation what the mean angular momentum gives half-way through.
+INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
+    Real half_h = Number(0.5) * h;
+    Quat half = normalized(multiply(body.quat, quat_exp(half_h * omega_start)));
+    Vec mean = Real(Number(0.5)) * (body.spin + spin);
+    Vec omega = c.inverse_inertia * transposed(matrix(half), mean);
+    body.quat = normalized(multiply(body.quat, quat_exp(h * omega)));
+    body.position = body.position + half_h * (body.velocity + velocity);
+    body.velocity = velocity;
+    body.spin = spin;
+}
+
+#if EFFECTS
+#if MAGNET
+// Height of the lowest sphere of a body that the ground can touch, at least 0.
+__device__ Real height_of(const Problem& problem, const Environment& env, int b, const Mat& rotation) {
+    int p = plane_pair(b), start = contact_start(p);
+    Real lowest = Real(Number(1e30));
+    for (int k = env.lanes.lane; k < contact_count(p); k += LANES) {
+        long long row = env.geometry + 4LL * problem.spheres[start + k];
+        Vec arm = problem.geometry.vector(row) - env.constants[b].com;
+        Real low = dot(rotation.z, arm) - problem.geometry.at(row + 3);
+        if (plain(low) < plain(lowest)) lowest = low;
+    }
+    return at_least(env.bodies[b].position.z - env.ground + env.lanes.least(lowest), Number(0));
+}
+#endif
+
+INLINE void apply(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec omega,
+                  Vec& velocity, Vec& spin) {
+    const Wrenches& w = env.wrenches;
+    const Body& body = env.bodies[b];
+    Real h = env.law.step_s;
+    Vec u = body.velocity - w.wind;
+    // the tiny number keeps the derivative finite at rest
+    Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
+    Vec a = w.acceleration - drag * u + w.magnus * cross(omega, u);
+#if MAGNET
+    a.z = a.z - w.magnet * exponential(-height_of(problem, env, b, rotation) * reciprocal(w.magnet_range));
+#endif
+    velocity = velocity + h * a;
+    spin = spin - h * w.spin_damping * body.spin;
+}
+#endif
+
+#if RECORD
+// Adds a contact's impulse and where it acted to its sums.
+INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
+#if PAIRED
+    Number along = plain(dot(c.impulse, c.normal)), across = size(c.impulse - Real(along) * c.normal);
+#else
+    Number along = plain(c.impulse.z), x = plain(c.impulse.x), y = plain(c.impulse.y), across = root(x * x + y * y);
+#endif
+    Vec point = com + c.arm;
+    tally.impulse[0] += plain(c.impulse.x);
+    tally.impulse[1] += plain(c.impulse.y);
+    tally.impulse[2] += plain(c.impulse.z);
+    tally.weighted[0] += along * plain(point.x);
+    tally.weighted[1] += along * plain(point.y);
+    tally.weighted[2] += along * plain(point.z);
+    tally.weight += along;
+    if (across > Number(0.99) * plain(friction_of(law)) * along) tally.sliding += along;
+}
+#endif
+
+// Whether a body may touch the ground in this step, by the sphere around its centre of mass.
+INLINE bool near_ground(const Environment& env, int b, const Motion& m) {
+    Number low = plain(env.bodies[b].position.z - env.ground) - env.constants[b].reach;
+    Number rate = plain(m.velocity.z) - size(m.omega) * env.constants[b].reach;
+    return low < Number(1e-6) || low + plain(env.law.step_s) * rate < Number(1e-6);
+}
+
+#if PAIRED
+// Two unit vectors across a contact's normal, chosen in the world's frame.
+INLINE void tangents(const Environment& env, Vec normal, Vec& first, Vec& second) {
+#if TURNED
+    Vec n = transposed(env.turn, normal);
+#else
+    Vec n = normal;
+#endif
+    Number sign = plain(n.z) >= Number(0) ? Number(1) : Number(-1);
+    Real a = -reciprocal(Real(sign) + n.z), b = n.x * n.y * a;
+    first = vec(Real(1) + sign * (n.x * n.x * a), sign * b, -sign * n.x);
+    second = vec(b, Real(sign) + n.y * n.y * a, -n.y);
+#if TURNED
+    first = env.turn * first;
+    second = env.turn * second;
+#endif
+}
+
+struct Facing {
+    Vec normal, point;  // world frame; the normal points from body b of the pair to body a
+    Real gap;
+    Number sharp_gap;  // to the nearest sphere, without smoothing
+};
+
+// Finds how a slot of a pair of bodies faces the other body: first the spheres of b against the union of a, then those
+// of a against the union of b. Returns false where it is further than `limit`.
+__device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
+                     Facing& facing) {
+    bool second = k >= sphere_count(pair_b(p));
+    int mine = second ? pair_a(p) : pair_b(p), other = second ? pair_b(p) : pair_a(p);
+    Vec position = env.bodies[other].position;
+    long long row = env.geometry + 4LL * problem.spheres[contact_start(p) + k];
+    Vec center = env.bodies[mine].position + rotations[mine] * (problem.geometry.vector(row) - env.constants[mine].com);
+    Real radius = problem.geometry.at(row + 3);
+    Number around = size(center - position) - env.constants[other].reach - plain(radius) - Number(SMOOTHING_M);
+    if (!(around < limit)) return false;
+    Vec up = vec(Real(0), Real(0), Real(1));
+#if TURNED
+    up = env.turn * up;
+#endif
+    Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(other), sphere_count(other)};
+    Vec local = transposed(rotations[other], center - position) + env.constants[other].com, outward;
+    Real distance;
+    Number nearest;
+    up = transposed(rotations[other], up);
+    if (!union_distance(spheres, local, limit + plain(radius), up, distance, nearest, outward)) return false;
+    outward = rotations[other] * outward;
+    facing.gap = distance - radius;
+    facing.sharp_gap = nearest - plain(radius);
+    facing.normal = second ? outward : -outward;
+    facing.point = center - (radius + Number(0.5) * facing.gap) * outward;
+    return true;
+}
+
+// Finds the contacts of two bodies, and shares the mass out among them; returns how many touch. With them are those
+// that just opened: their impulses of the step before act until the first sweep.
+__device__ int touch_pair(const Problem& problem, const Environment& env, int p, const Mat* rotations,
+                          const Motion* motions, Contact* list, Real* weights, int& count) {
+    int a = pair_a(p), b = pair_b(p), first = count, touching = 0;
+    const Constants &ca = env.constants[a], &cb = env.constants[b];
+    const Motion &ma = motions[a], &mb = motions[b];
+    Vec com_a = env.bodies[a].position, com_b = env.bodies[b].position;
+    // no point of a gap g nears faster than V + W g / 2, so what is further than h V / (1 - h W / 2) cannot touch
+    Number spins = size(ma.omega) + size(mb.omega), h = plain(env.law.step_s);
+    Number V = size(ma.velocity - mb.velocity) + size(ma.omega) * (ca.reach + Number(SMOOTHING_M)) +
+               size(mb.omega) * (cb.reach + Number(SMOOTHING_M));
+    Number near = Number(1e-9 + SMOOTHING_M) + h * (size(ma.velocity - mb.velocity) + size(ma.omega) * ca.reach +
+                                                    size(mb.omega) * cb.reach);
+    Number left = Number(1) - Number(0.5) * h * spins;
+    Number limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
+    if (size(com_a - com_b) - ca.reach - cb.reach - Number(SMOOTHING_M) < limit) {
+        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+        for (int k = behind; k < contact_count(p); k += LANES) {
+            Facing facing;
+            Real weight;
+            if (!face(problem, env, p, k, rotations, limit, facing)) continue;
+            Contact& c = list[count];
+            c.normal = facing.normal;
+            c.arm = facing.point - com_a;
+            c.arm_b = facing.point - com_b;
+            c.a = a;
+            c.b = b;
+            c.slot = (start + k) / LANES;
+            Real speed = dot(relative_velocity(c, motions), c.normal);
+            Vec turn_a = cross(c.arm, c.normal), turn_b = cross(c.arm_b, c.normal);
+            Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
+                                dot(turn_b, mb.inverse_inertia * turn_b);
+            Real mobility = mobility_trace(ma, c.arm) + mobility_trace(mb, c.arm_b);
+            if (prepare(c, env.law, facing.gap, speed, inverse_mass, mobility, weight)) {
+                touching++;
+            } else {
+                if (!env.warm || !(plain(env.before[c.slot].x) > Number(0)) || !(facing.sharp_gap < near)) continue;
+                c.target = Real(Number(-1e30));
+                c.stop_n = c.stop_t = Real(1);
+            }
+            if (env.warm) {
+                Vec along = env.before[c.slot], one, two;
+                tangents(env, c.normal, one, two);
+                c.impulse = along.x * c.normal + along.y * one + along.z * two;
+            }
+            weights[count++] = weight;
+        }
+    }
+    if (env.lanes.any(count > first)) share_out_pair(env.lanes, list, weights, first, count, motions);
+    return touching;
+}
+
+// Lets each group of contacts move its share of a body that others touch too; `groups` counts them by body.
+INLINE void split(Contact* list, int count, const int* groups) {
+    for (int i = 0; i < count; i++) {
+        Contact& c = list[i];
+        int most = groups[c.a];
+        if (c.b >= 0 && groups[c.b] > most) most = groups[c.b];
+        Number share = most > 1 ? Number(1) / Number(most) : Number(1);
+        c.stop_n = share * c.stop_n;
+        c.stop_t = share * c.stop_t;
+    }
+}
+#endif
+
+// Forgets the impulses of the step before.
+INLINE void forget(Environment& env) {
+    if (!env.warm) return;
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) env.before[i] = none();
+    env.warm = false;
+}
+
+// Keeps the impulses of a step, from which the sweeps of the next one begin; one sweep begins from nothing.
+INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
+    if (sweeps < 2) return;
+#if PAIRED
+    forget(env);
+    for (int i = 0; i < count; i++) {
+        const Contact& c = list[i];
+        Vec one, two;
+        tangents(env, c.normal, one, two);
+        Vec along = vec(dot(c.impulse, c.normal), dot(c.impulse, one), dot(c.impulse, two));
+        env.before[c.slot] = c.b < 0 ? c.impulse : along;
+    }
+#else
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) env.before[i] = list[i].on ? list[i].impulse : none();
+#endif
+    env.warm = count > 0;
+}
+
+// Finds the contacts of a body with the ground; they go to the list, or to their slot where that is the only pair.
+INLINE void touch_plane(const Problem& problem, const Environment& env, int p, const Mat& rotation,
+                        const Motion& motion, Contact* list, Real* weights, int& count) {
+    int a = pair_a(p), first = count;
+    Moments moments = {Real(0), Real(0), Real(0), Real(0), Real(0), Real(0)};
+    Real height = env.bodies[a].position.z - env.ground;
+#if PAIRED
+    int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+    for (int k = behind; k < contact_count(p); k += LANES) {
+        int contact = start + k, i = count;
+#else
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        int contact = i * LANES + env.lanes.lane;
+        list[i].on = false;
+        weights[i] = Real(0);
+        if (contact >= CONTACTS) continue;
+#endif
+#if HELD
+        Vec arm = rotation * env.arms[i];
+        Real radius = env.radii[i];
+#else
+        long long row = env.geometry + 4LL * problem.spheres[contact];
+        Vec arm = rotation * (problem.geometry.vector(row) - env.constants[a].com);
+        Real radius = problem.geometry.at(row + 3);
+#endif
+        bool touches = touch_ground(list[i], env.law, motion, arm, height, radius, weights[i]);
+        if (touches) {
+            add_row(moments, list[i], weights[i]);
+            count++;
+        }
+#if PAIRED
+        if (touches) {
+            list[i].normal = vec(Real(0), Real(0), Real(1));
+            list[i].arm_b = none();
+            list[i].a = a;
+            list[i].b = -1;
+            list[i].slot = contact / LANES;
+            list[i].impulse = env.before[contact / LANES];
+        }
+#else
+        list[i].on = touches;
+        list[i].impulse = env.before[i];
+#endif
+    }
+    if (!env.lanes.any(count > first)) return;
+    moments = sum_rows(env.lanes, moments);
+#if PAIRED
+    for (int i = first; i < count; i++) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
+#else
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        if (list[i].on) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
+    }
+#endif
+}
+
+// Finds the contacts of a step and their impulses, and adds these to the bodies' velocities and angular momenta.
+INLINE void collide(const Problem& problem, Environment& env, const Mat* rotations, Motion* motions, Vec* velocities,
+                    Vec* spins) {
+    Contact list[SLOTS];
+    Real weights[SLOTS];
+    int count = 0;
+#if PAIRED
+    int groups[BODIES] = {};
+    for (int p = 0; p < PAIRS; p++) {
+        int a = pair_a(p), b = pair_b(p), touching = 0;
+        if (b >= 0) {
+            touching = touch_pair(problem, env, p, rotations, motions, list, weights, count);
+        } else if (env.lanes.any(near_ground(env, a, motions[a]))) {
+            touching = -count;
+            touch_plane(problem, env, p, rotations[a], motions[a], list, weights, count);
+            touching += count;
+        }
+        if (env.lanes.any(touching > 0) && env.lanes.sum(Number(touching)) > Number(0)) {
+            groups[a]++;
+            if (b >= 0 && is_free(b)) groups[b]++;
+        }
+    }
+    split(list, count, groups);
+    if (!env.lanes.any(count > 0)) {
+        forget(env);
+        return;
+    }
+#else
+    if (!env.lanes.any(near_ground(env, 0, motions[0]))) {
+        forget(env);
+        return;
+    }
+    motions[0].inverse_inertia = turned(rotations[0], env.constants[0].inverse_inertia);
+    touch_plane(problem, env, 0, rotations[0], motions[0], list, weights, count);
+    if (!env.lanes.any(count > 0)) {
+        forget(env);
+        return;
+    }
+#endif
+    Vec free_velocities[BODIES], free_omegas[BODIES], linear[BODIES], angular[BODIES];
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        free_velocities[b] = motions[b].velocity;
+        free_omegas[b] = motions[b].omega;
+    }
+    // the impulses of the step before act first
+    int sweep = env.lanes.any(env.warm) ? -1 : 0;
+    do {
+        EACH_BODY
+        for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
+#if PAIRED
+        for (int i = 0; i < count; i++) {
+            Contact& c = list[i];
+            if (sweep >= 0) c.impulse = swept(c, env.law, relative_velocity(c, motions));
+            linear[c.a] = linear[c.a] + c.impulse;
+            angular[c.a] = angular[c.a] + cross(c.arm, c.impulse);
+            if (c.b >= 0) {
+                linear[c.b] = linear[c.b] - c.impulse;
+                angular[c.b] = angular[c.b] - cross(c.arm_b, c.impulse);
+            }
+        }
+#else
+        EACH_SLOT
+        for (int i = 0; i < SLOTS; i++) {
+            Contact& c = list[i];
+            if (!c.on) continue;
+            if (sweep >= 0) c.impulse = swept(c, env.law, motions[0].velocity + cross(motions[0].omega, c.arm));
+            linear[0] = linear[0] + c.impulse;
+            angular[0] = angular[0] + cross(c.arm, c.impulse);
+        }
+#endif
+        EACH_BODY
+        for (int b = 0; b < BODIES; b++) {
+            if (!is_free(b)) continue;
+            linear[b] = env.lanes.sum(linear[b]);
+            angular[b] = env.lanes.sum(angular[b]);
+            motions[b].velocity = free_velocities[b] + motions[b].inverse_mass * linear[b];
+            motions[b].omega = free_omegas[b] + motions[b].inverse_inertia * angular[b];
+        }
+    } while (++sweep < problem.sweeps);
+    keep(env, list, count, problem.sweeps);
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        if (!is_free(b)) continue;
+        velocities[b] = motions[b].velocity;
+        spins[b] = spins[b] + angular[b];
+    }
+#if RECORD
+#if PAIRED
+    for (int i = 0; i < count; i++) {
+        const Contact& c = list[i];
+        note(env.tallies[c.slot], c, env.law, env.bodies[c.a].position);
+    }
+#else
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        if (list[i].on) note(env.tallies[i], list[i], env.law, env.bodies[0].position);
+    }
+#endif
+#endif
+}
+"""

@@ -1,0 +1,233 @@
+"""CUDA source: contacts of spheres with the ground and with unions of spheres, and their closed-form impulses.
+
+Its formulas are those of `physics/contact.py`, `physics/sweeps.py` and `physics/distance.py`, where they are derived.
+"""
+
+from __future__ import annotations
+
+CONTACTS = r"""
+struct Law {
+    Real step_s, inverse_step, stiffness, damping, friction;
+};
+
+// Where laws of friction go that depend on the place, the direction or the speed of a contact.
+INLINE Real friction_of(const Law& law) { return law.friction; }
+
+struct Motion {  // free velocities of a body, and what a unit of impulse does to them; 0 where it is not free
+    Vec velocity, omega;
+    Real inverse_mass;
+    Sym inverse_inertia;  // world axes
+};
+
+struct Contact {  // world frame, impulse on body a
+    Vec arm, impulse;
+    Real target, stop_n, stop_t;
+#if PAIRED
+    Vec normal, arm_b;
+    int a, b, slot;
+#else
+    bool on;
+#endif
+};
+
+INLINE Real mobility_trace(const Motion& m, Vec arm) {
+    return Number(3) * m.inverse_mass + trace(m.inverse_inertia) * dot(arm, arm) - dot(arm, m.inverse_inertia * arm);
+}
+
+// Sets the target of a contact, and for now its effective mass and tangential mobility in the place of the stops;
+// returns whether it touches. `weight` is how much it counts in the crowding.
+INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inverse_mass, Real mobility, Real& weight) {
+    Real ahead = gap + law.step_s * speed;
+    weight = Real(0);
+    if (!(plain(gap) < Number(0) || plain(ahead) < Number(0))) return false;
+    Real depth = plain(ahead) < plain(gap) ? -ahead : -gap;
+    weight = at_most(at_least(Number(1.0 / ONSET_M) * depth, Number(0)), Number(1));
+    Real closed = Real(1);
+    if (plain(gap) > Number(0)) {
+        Real along = law.step_s * (plain(speed) < Number(0) ? -speed : speed);
+        closed = -ahead * reciprocal(at_least(along, Number(1e-12)));
+        closed = at_most(at_least(closed, Number(0)), Number(1));
+    }
+    Real demand = -law.damping * closed * speed - law.stiffness * at_most(ahead, Number(0)) * law.inverse_step;
+    c.target = speed + demand;
+    c.stop_n = reciprocal(inverse_mass);
+    c.stop_t = mobility - inverse_mass;
+    c.impulse = none();
+    return true;
+}
+
+// Shares the mass out among contacts whose weights times how far they do the same work add up to `total`.
+INLINE void share_out(Contact& c, Real total, Real weight) {
+    const Real tiny = Real(Number(1e-9));
+    Real share = (weight + tiny) * reciprocal((plain(total) > plain(weight) ? total : weight) + tiny);
+    c.stop_t = share * reciprocal(c.stop_t);
+    c.stop_n = share * c.stop_n;
+}
+
+// Returns the impulse of a contact after one projected sweep, under the relative velocity of its points.
+INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
+#if PAIRED
+    Real speed = dot(relative, c.normal), before = dot(c.impulse, c.normal);
+    Vec wanted = (c.impulse - before * c.normal) - c.stop_t * (relative - speed * c.normal);
+    Real wanted2 = dot(wanted, wanted);
+#else
+    Real speed = relative.z, before = c.impulse.z;
+    Real x = c.impulse.x - c.stop_t * relative.x, y = c.impulse.y - c.stop_t * relative.y;
+    Real wanted2 = x * x + y * y;
+#endif
+    Real along = at_least(before + c.stop_n * (c.target - speed), Number(0));
+    // the tiny number keeps the derivative of a contact without impulses finite
+    Real scale = friction_of(law) * along * inverse_root(wanted2 + Real(Number(1e-24)));
+    scale = at_most(scale, Number(1));
+#if PAIRED
+    return along * c.normal + scale * wanted;
+#else
+    return vec(scale * x, scale * y, along);
+#endif
+}
+
+// Moments of the rows of contacts with one plane: a row is (1, arm_y, -arm_x) in the metric (1/m, inverse inertia).
+struct Moments {
+    Real w, x, y, xx, xy, yy;
+};
+INLINE void add_row(Moments& m, const Contact& c, Real weight) {
+    Real w = weight * c.stop_n, x = c.arm.y, y = -c.arm.x, wx = w * x, wy = w * y;
+    m.w += w;
+    m.x += wx;
+    m.y += wy;
+    m.xx += wx * x;
+    m.xy += wx * y;
+    m.yy += wy * y;
+}
+INLINE Moments sum_rows(const Lanes& lanes, const Moments& m) {
+    Moments s = {lanes.sum(m.w), lanes.sum(m.x), lanes.sum(m.y), lanes.sum(m.xx), lanes.sum(m.xy), lanes.sum(m.yy)};
+    return s;
+}
+INLINE Real crowd(const Moments& m, const Motion& a, const Contact& c) {
+    const Sym& J = a.inverse_inertia;
+    Real x = c.arm.y, y = -c.arm.x;
+    Real w = a.inverse_mass, u = J.xx * x + J.xy * y, v = J.xy * x + J.yy * y;
+    Real linear = w * m.w + Number(2) * (u * m.x + v * m.y);
+    return c.stop_n * (w * linear + u * u * m.xx + Number(2) * u * v * m.xy + v * v * m.yy);
+}
+
+// Prepares a contact with the ground, whose normal is z; `arm` is that of the sphere's centre.
+INLINE bool touch_ground(Contact& c, const Law& law, const Motion& a, Vec arm, Real height, Real radius,
+                         Real& weight) {
+    const Sym& J = a.inverse_inertia;
+    c.arm = vec(arm.x, arm.y, arm.z - radius);
+    Real gap = height + c.arm.z, speed = a.velocity.z + a.omega.x * c.arm.y - a.omega.y * c.arm.x;
+    Real x = c.arm.y, y = -c.arm.x;
+    Real inverse_mass = a.inverse_mass + J.xx * x * x + Number(2) * J.xy * x * y + J.yy * y * y;
+    return prepare(c, law, gap, speed, inverse_mass, mobility_trace(a, c.arm), weight);
+}
+
+#if PAIRED
+struct Union {  // the spheres of a body, in its frame
+    Input geometry;
+    long long first;
+    int count;
+    INLINE Vec center(int i) const { return geometry.vector(first + 4LL * i); }
+    INLINE Real radius(int i) const { return geometry.at(first + 4LL * i + 3); }
+};
+
+INLINE Number gap_to(const Union& spheres, int i, const Number* point) {
+    const Number* s = spheres.geometry.value + spheres.first + 4LL * i;
+    Number x = point[0] - s[0], y = point[1] - s[1], z = point[2] - s[2];
+    return root(x * x + y * y + z * z) - s[3];
+}
+
+// Returns whether the union is nearer than `limit`; then also its smooth distance, that of the nearest sphere, and the
+// outward normal. Where that is undefined, between opposite spheres, it is `up`. All in the frame of the union.
+__device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec up, Real& distance, Number& nearest,
+                               Vec& outward) {
+    const Number width = Number(SMOOTHING_M);
+    Number point[3] = {plain(at.x), plain(at.y), plain(at.z)};
+    nearest = Number(1e30);
+    for (int i = 0; i < spheres.count; i++) nearest = lesser(nearest, gap_to(spheres, i, point));
+    if (nearest - width > limit) return false;
+    // t with sum over spheres of max(0, t - x)^2 = width^2: Newton from above, where the sum is convex and rising
+    Number t = width;
+    for (int round = 0; round < 40; round++) {
+        Number squares = Number(0), sum = Number(0);
+        for (int i = 0; i < spheres.count; i++) {
+            Number below = t - (gap_to(spheres, i, point) - nearest);
+            if (below > Number(0)) {
+                squares += below * below;
+                sum += below;
+            }
+        }
+        Number down = (squares - width * width) / (Number(2) * sum);
+        if (!(down > Number(SINGLE ? 1e-6 : 1e-13) * width)) break;
+        t -= down;
+    }
+    // with the spheres known that count, the closed form and its derivative
+    Real first = Real(0), second = Real(0);
+    Number count = Number(0);
+    for (int i = 0; i < spheres.count; i++) {
+        if (!(gap_to(spheres, i, point) - nearest < t)) continue;
+        Vec away = at - spheres.center(i);
+        Real x = root(dot(away, away)) - spheres.radius(i) - Real(nearest);
+        first += x;
+        second += x * x;
+        count += Number(1);
+    }
+    Real inside = at_least(first * first - count * (second - Real(width * width)), Number(0));
+    Real solved = reciprocal(Real(count)) * (first + root(inside));
+    Real cubes = Real(0);
+    Vec gradient = none();
+    for (int i = 0; i < spheres.count; i++) {
+        if (!(gap_to(spheres, i, point) - nearest < t)) continue;
+        Vec away = at - spheres.center(i);
+        Real length = root(dot(away, away));
+        Real a = Number(1 / SMOOTHING_M) * (solved - (length - spheres.radius(i) - Real(nearest)));
+        a = at_least(a, Number(0));
+        cubes += a * a * a;
+        gradient = gradient + a * a * reciprocal(at_least(length, Number(1e-12))) * away;
+    }
+    distance = Real(nearest) + solved - Number(SMOOTHING_M / 3) * (cubes + Real(2));
+    Real norm2 = dot(gradient, gradient);
+    outward = plain(norm2) > Number(1e-16) ? inverse_root(norm2) * gradient : up;
+    return true;
+}
+
+INLINE Vec relative_velocity(const Contact& c, const Motion* bodies) {
+    Vec velocity = bodies[c.a].velocity + cross(bodies[c.a].omega, c.arm);
+    if (c.b >= 0) velocity = velocity - bodies[c.b].velocity - cross(bodies[c.b].omega, c.arm_b);
+    return velocity;
+}
+
+// Shares the mass out among the touching contacts of two bodies: those from `first` on in every lane's list.
+__device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* weights, int first, int end,
+                               const Motion* bodies) {
+    Real totals[SLOTS];
+    for (int i = first; i < end; i++) totals[i] = Real(0);
+    for (int source = 0; source < LANES; source++) {
+        int theirs = lanes.from(end - first, source);
+        for (int j = 0; lanes.any(j < theirs); j++) {
+            Vec normal = none(), turn_a = none(), turn_b = none();
+            Real weight = Real(0);
+            if (source == lanes.lane && j < theirs) {
+                const Contact& c = list[first + j];
+                normal = c.normal;
+                turn_a = bodies[c.a].inverse_inertia * cross(c.arm, normal);
+                turn_b = bodies[c.b].inverse_inertia * cross(c.arm_b, normal);
+                weight = weights[first + j] * c.stop_n;
+            }
+            normal = lanes.from(normal, source);
+            turn_a = lanes.from(turn_a, source);
+            turn_b = lanes.from(turn_b, source);
+            weight = lanes.from(weight, source);
+            for (int i = first; i < end; i++) {
+                const Contact& c = list[i];
+                Real mass = bodies[c.a].inverse_mass + bodies[c.b].inverse_mass;
+                Real along = mass * dot(c.normal, normal) + dot(cross(c.arm, c.normal), turn_a) +
+                             dot(cross(c.arm_b, c.normal), turn_b);
+                totals[i] += weight * along * along;
+            }
+        }
+    }
+    for (int i = first; i < end; i++) share_out(list[i], list[i].stop_n * totals[i], weights[i]);
+}
+#endif
+"""

@@ -1,0 +1,158 @@
+"""CUDA source: what a kernel is given, and the state of an environment read from it."""
+
+from __future__ import annotations
+
+ENVIRONMENT = r"""
+struct Problem {
+    Input table;     // (environments, TABLE_WIDTH): numbers of each environment, in the order in which `load` reads
+    Input steps;     // (1 or environments, intervals, 4): step, stiffness, damping, time at the start
+    Input geometry;  // (1 or environments, spheres, 4): centres in the body frame, radii
+    Input drives;    // (1 or environments, samples, 14): time, position, quaternion, velocity, angular velocity
+    const int* __restrict__ substeps;      // of each interval
+    const int* __restrict__ spheres;       // of each contact: row of the geometry
+    const int* __restrict__ drive_starts;  // of each driven body: row of its first sample
+    const int* __restrict__ drive_last;    // (1 or environments, driven bodies): index of the last interval
+    Number* __restrict__ frames;           // (environments, frames, bodies, 16)
+    Number* __restrict__ frame_tangents;
+    Number* __restrict__ labels;           // (environments, frames, contacts, 12)
+    int environments, frame_count, sweeps;
+    long long steps_stride, geometry_stride, drive_stride;
+    int drive_last_stride;
+};
+
+struct Body {
+    Vec position;  // of the centre of mass; of the frame's origin where the body is not free
+    Quat quat;
+    Vec velocity, spin;  // spin: angular momentum; angular velocity where the body is not free
+};
+
+// Accelerations of the free bodies in flight: a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with
+// u = v - wind and the height of the lowest sphere, and angular acceleration -d omega.
+struct Wrenches {
+    Real linear_drag, quadratic_drag, magnus, spin_damping, magnet, magnet_range;
+    Vec acceleration, wind;
+};
+
+struct Constants {
+    Real inverse_mass;
+    Sym inverse_inertia;  // body axes
+    Vec com;              // in the body frame
+    Number reach;         // of its spheres from the centre of mass
+};
+
+struct Tally {  // contacts summed since the last frame
+    Number impulse[3], weighted[3], weight, sliding;
+};
+
+struct Environment {
+    long long index, geometry, steps, drives;
+    int drive_last;
+    Lanes lanes;
+    Vec gravity;
+    Real ground;
+    Law law;
+#if EFFECTS
+    Wrenches wrenches;
+#endif
+#if TURNED
+    Mat turn;  // from the world's frame, in which tangents are chosen, into the kernel's
+#endif
+    Body bodies[BODIES];
+    Constants constants[BODIES];
+    int cursors[BODIES];
+#if HELD
+    Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
+    Real radii[SLOTS];
+#endif
+    // of this lane's contacts in the step before: with the ground in the kernel's frame, else along their axes
+    Vec before[SLOTS];
+    bool warm;  // whether any of them is not zero
+#if RECORD
+    Tally tallies[SLOTS];
+#endif
+};
+
+INLINE void load(const Problem& problem, Environment& env) {
+    const Input& table = problem.table;
+    long long at = env.index * TABLE_WIDTH;
+    env.gravity = table.vector(at);
+    env.ground = table.at(at + 3);
+    env.law.friction = table.at(at + 4);
+    at += 5;
+#if TURNED
+    Quat turn = {table.at(at), table.at(at + 1), table.at(at + 2), table.at(at + 3)};
+    env.turn = matrix(turn);
+    at += 4;
+#endif
+#if EFFECTS
+    Wrenches& w = env.wrenches;
+    w.linear_drag = table.at(at);
+    w.quadratic_drag = table.at(at + 1);
+    w.magnus = table.at(at + 2);
+    w.spin_damping = table.at(at + 3);
+    w.acceleration = table.vector(at + 4);
+    w.wind = table.vector(at + 7);
+    w.magnet = table.at(at + 10);
+    w.magnet_range = table.at(at + 11);
+    at += 12;
+#endif
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        Body& body = env.bodies[b];
+        Constants& c = env.constants[b];
+        c.inverse_mass = table.at(at);
+        Sym inertia = {table.at(at + 1), table.at(at + 2), table.at(at + 3),
+                       table.at(at + 4), table.at(at + 5), table.at(at + 6)};
+        c.inverse_inertia = inertia;
+        c.com = table.vector(at + 7);
+        body.position = table.vector(at + 10);
+        Quat quat = {table.at(at + 13), table.at(at + 14), table.at(at + 15), table.at(at + 16)};
+        body.quat = quat;
+        body.velocity = table.vector(at + 17);
+        body.spin = table.vector(at + 20);
+        at += 23;
+        c.reach = Number(0);
+        const Number* sphere = problem.geometry.value + env.geometry + 4LL * sphere_start(b);
+        for (int i = 0; i < sphere_count(b); i++, sphere += 4) {
+            Number x = sphere[0] - plain(c.com.x), y = sphere[1] - plain(c.com.y), z = sphere[2] - plain(c.com.z);
+            c.reach = greater(c.reach, root(x * x + y * y + z * z) + sphere[3]);
+        }
+        env.cursors[b] = 0;
+    }
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) env.before[i] = none();
+    env.warm = false;
+#if HELD
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        int contact = i * LANES + env.lanes.lane;
+        long long row = env.geometry + 4LL * (contact < CONTACTS ? problem.spheres[contact] : 0);
+        env.arms[i] = problem.geometry.vector(row) - env.constants[0].com;
+        env.radii[i] = problem.geometry.at(row + 3);
+    }
+#endif
+}
+
+#if DRIVEN
+// The commanded motion of a driven body at a time that never falls.
+__device__ void drive(const Problem& problem, Environment& env, int b, Real time) {
+    int number = drive_number(b), last = problem.drive_last[env.drive_last + number];
+    long long start = env.drives + 14LL * problem.drive_starts[number];
+    const Input& rows = problem.drives;
+    int& cursor = env.cursors[b];
+    while (cursor < last && rows.value[start + 14LL * (cursor + 1)] <= plain(time)) cursor++;
+    Real first = rows.at(start), final = rows.at(start + 14LL * (last + 1));
+    bool moving = plain(time) >= plain(first) && plain(time) <= plain(final);
+    long long at = start + 14LL * cursor;
+    Real held = plain(time) < plain(first) ? first : (plain(time) > plain(final) ? final : time);
+    Real since = held - rows.at(at);
+    Vec velocity = rows.vector(at + 8), omega = rows.vector(at + 11);
+    Quat quat = {rows.at(at + 4), rows.at(at + 5), rows.at(at + 6), rows.at(at + 7)};
+    Body& body = env.bodies[b];
+    body.position = rows.vector(at + 1) + since * velocity;
+    body.quat = multiply(quat_exp(since * omega), quat);
+    body.velocity = moving ? velocity : none();
+    body.spin = moving ? omega : none();
+}
+#endif
+"""

@@ -1,0 +1,144 @@
+"""Rollouts by the fused kernel: what `simulate` does, for CUDA tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ....schemas import UsageError
+from ... import nvrtc
+from ..checks import require_physical, require_state
+from ..driven import Drive
+from ..effects.effect import changed_by_effects
+from ..records import ContactRecord
+from ..rollout import Rollout
+from ..rotation import quat_conjugate, quat_multiply, quat_rotate
+from ..world import State, World
+from .launch import launch
+from .packing import Packed, pack, reason_against
+from .structure import Structure, lanes_for
+
+if TYPE_CHECKING:
+    from ....datasets.tracks import Track
+
+Launch = Callable[[Structure, tuple[Tensor | None, ...], tuple[int, ...]], None]
+
+_FRAME_WIDTH, _LABEL_WIDTH = 16, 12
+
+
+def unsupported(world: World) -> str | None:
+    """Return why the fused kernel cannot take a world; None where it can."""
+    if world.gravity.device.type != "cuda":
+        return f"its tensors are on the device '{world.gravity.device.type}', not on CUDA"
+    if not nvrtc.available():
+        return "cuda.core is not installed, which compiles the kernel (pip install 'cgwm[gpu]')"
+    return reason_against(world)
+
+
+def simulate_fused(
+    world: World,
+    state: State,
+    times_s: Tensor,
+    driven: Mapping[str, Track | Drive] | None = None,
+    record_contacts: bool = False,
+    lanes: int | None = None,
+) -> Rollout:
+    """Roll the world out from `state` in one kernel, as `simulate` does; all tensors on one CUDA device.
+
+    Forward derivatives (`forward_ad`, `batched_jacobian`) of poses and velocities are exact: the same program runs on
+    dual numbers. There are none of the contact record, and none in reverse.
+
+    Args:
+        world: The world; its tensors and the state's broadcast over the batch B.
+        state: The state at the first time; driven and fixed bodies take theirs from `driven` or keep it.
+        times_s: Frame times [s], increasing, shape (T,) or (B, T).
+        driven: The command of each driven body: a track, or a prepared `Drive`.
+        record_contacts: Whether to keep the contacts of every frame.
+        lanes: Threads that share an environment, a power of two up to 32; None chooses.
+
+    Returns:
+        The rollout at the frame times.
+
+    Raises:
+        InputDataError: As `simulate` does.
+        UsageError: If the kernel cannot take the world, or a reverse derivative is asked for.
+    """
+    reason = unsupported(world)
+    if reason is not None:
+        raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use simulate, which can.")
+    return roll(launch, world, state, times_s, driven, record_contacts, lanes)
+
+
+def roll(
+    run: Launch,
+    world: World,
+    state: State,
+    times_s: Tensor,
+    driven: Mapping[str, Track | Drive] | None = None,
+    record_contacts: bool = False,
+    lanes: int | None = None,
+) -> Rollout:
+    """Do the work of `simulate_fused` with the given way to run the kernel."""
+    _check_kinds(world.gravity, state.position_m, state.quat_wxyz, state.velocity_m_s, state.omega_body_rad_s, times_s)
+    require_physical(world)
+    require_state(state, world.body_names)
+    world = changed_by_effects(world)
+    packed = pack(world, state, times_s, driven or {}, record_contacts)
+    inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
+    _check_kinds(*inputs)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        raise UsageError(
+            "the fused kernel has no reverse derivatives.",
+            "forward ones (batched_jacobian), or none (torch.no_grad()).",
+            "use simulate for derivatives in reverse.",
+        )
+    duals = [forward_ad.unpack_dual(tensor) for tensor in inputs]
+    values = [dual.primal.contiguous() for dual in duals]
+    tangents = [None if dual.tangent is None else dual.tangent.contiguous() for dual in duals]
+    dual = any(tangent is not None for tangent in tangents)
+    if dual and record_contacts:
+        raise UsageError("the fused kernel has no derivatives of the contact record.", "record_contacts=False.")
+    batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
+    structure = packed.structure
+    chosen = lanes or lanes_for(structure.contacts, batch, structure.single, dual, bodies > 1)
+    structure = replace(structure, dual=dual, lanes=chosen)
+    frames = values[0].new_empty(batch, count, bodies, _FRAME_WIDTH)
+    frame_tangents = torch.empty_like(frames) if dual else None
+    labels = values[0].new_empty(batch, count, structure.contacts, _LABEL_WIDTH) if record_contacts else None
+    strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
+    pointers = [x for pair in zip(values, tangents, strict=True) for x in pair]
+    pointers += [packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last]
+    run(structure, (*pointers, frames, frame_tangents, labels), (batch, count, world.sweeps, *strides))
+    if frame_tangents is not None:
+        frames = forward_ad.make_dual(frames, frame_tangents)
+    return _rollout(world, times_s, packed, frames, labels)
+
+
+def _check_kinds(*tensors: Tensor) -> None:
+    kinds = {(tensor.dtype, tensor.device) for tensor in tensors}
+    if len(kinds) > 1:
+        found = ", ".join(sorted(f"{dtype} on {device}" for dtype, device in kinds))
+        raise UsageError(f"the world, the state, the times and the commands are of several kinds: {found}.", "one.")
+
+
+def _rollout(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labels: Tensor | None) -> Rollout:
+    position, quat, velocity = frames[..., :3], frames[..., 4:8], frames[..., 8:11]
+    back = None if packed.turn is None else quat_conjugate(packed.turn)
+    if back is not None:
+        position, velocity = quat_rotate(back, position), quat_rotate(back, velocity)
+        quat = quat_multiply(back, quat)
+    contacts = None
+    if labels is not None:
+        impulse, place, normal = labels[..., :3], labels[..., 4:7], labels[..., 8:11]
+        if back is not None:
+            impulse, place, normal = (quat_rotate(back, vector) for vector in (impulse, place, normal))
+        pairs = packed.structure.pairs
+        body_a = torch.tensor([a for a, _, count in pairs for _ in range(count)])
+        body_b = torch.tensor([b for _, b, count in pairs for _ in range(count)])
+        contacts = ContactRecord(body_a, body_b, impulse, place, normal, labels[..., 3], labels[..., 7] > 0.5)
+    return Rollout(times_s, position, quat, velocity, frames[..., 12:15], contacts)

@@ -1,0 +1,204 @@
+"""CUDA source: an environment from its first frame to its last, and what is written of it."""
+
+from __future__ import annotations
+
+ROLLOUT = r"""
+INLINE void step(const Problem& problem, Environment& env, Real time_after) {
+    Mat rotations[BODIES];
+    Motion motions[BODIES];
+    Vec starts[BODIES], velocities[BODIES], spins[BODIES];
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        const Body& body = env.bodies[b];
+        const Constants& c = env.constants[b];
+        rotations[b] = matrix(body.quat);
+        velocities[b] = body.velocity;
+        spins[b] = starts[b] = body.spin;
+        motions[b].omega = body.spin;
+        motions[b].inverse_mass = Real(0);
+        motions[b].inverse_inertia = no_inertia();
+        if (is_free(b)) {
+            starts[b] = c.inverse_inertia * transposed(rotations[b], body.spin);
+            motions[b].omega = rotations[b] * starts[b];
+            velocities[b] = body.velocity + env.law.step_s * env.gravity;
+#if EFFECTS
+            apply(problem, env, b, rotations[b], motions[b].omega, velocities[b], spins[b]);
+            motions[b].omega = rotations[b] * (c.inverse_inertia * transposed(rotations[b], spins[b]));
+#endif
+            motions[b].inverse_mass = c.inverse_mass;
+#if PAIRED
+            motions[b].inverse_inertia = turned(rotations[b], c.inverse_inertia);
+#endif
+        }
+        motions[b].velocity = velocities[b];
+    }
+#if PAIRS
+    collide(problem, env, rotations, motions, velocities, spins);
+#endif
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        if (is_free(b)) advance(env.bodies[b], env.constants[b], starts[b], velocities[b], spins[b], env.law.step_s);
+#if DRIVEN
+        if (drive_number(b) >= 0) drive(problem, env, b, time_after);
+#endif
+    }
+}
+
+INLINE void write_vector(const Problem& problem, long long at, Vec v) {
+    write_row(problem.frames + at, plain(v.x), plain(v.y), plain(v.z), Number(0));
+#if DUAL
+    write_row(problem.frame_tangents + at, v.x.tangent, v.y.tangent, v.z.tangent, Number(0));
+#endif
+}
+
+// Writes position, quaternion, velocity (of the body frame's origin) and angular velocity (body frame).
+INLINE void write_frame(const Problem& problem, const Environment& env, int frame) {
+    if (env.lanes.lane != 0 || env.lanes.idle) return;
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        const Body& body = env.bodies[b];
+        const Constants& c = env.constants[b];
+        Mat R = matrix(body.quat);
+        Vec position = body.position, velocity = body.velocity, omega = transposed(R, body.spin);
+        if (is_free(b)) {
+            omega = c.inverse_inertia * omega;
+            Vec arm = R * c.com;
+            position = position - arm;
+            velocity = velocity - cross(R * omega, arm);
+        }
+        long long at = 16 * ((env.index * problem.frame_count + frame) * BODIES + b);
+        Quat q = body.quat;
+        write_vector(problem, at, position);
+        write_row(problem.frames + at + 4, plain(q.w), plain(q.x), plain(q.y), plain(q.z));
+#if DUAL
+        write_row(problem.frame_tangents + at + 4, q.w.tangent, q.x.tangent, q.y.tangent, q.z.tangent);
+#endif
+        write_vector(problem, at + 8, velocity);
+        write_vector(problem, at + 12, omega);
+    }
+}
+
+#if RECORD
+INLINE void write_label(const Problem& problem, Environment& env, int frame, int contact, Tally& t, Vec normal,
+                        Number gap, Vec point) {
+    Number* to = problem.labels + 12 * ((env.index * problem.frame_count + frame) * CONTACTS + contact);
+    bool acted = t.weight > Number(0);
+    Number each = acted ? Number(1) / t.weight : Number(0);
+    Number slides = acted && t.sliding > Number(0.5) * t.weight ? Number(1) : Number(0);
+    write_row(to, t.impulse[0], t.impulse[1], t.impulse[2], gap);
+    write_row(to + 4, acted ? each * t.weighted[0] : plain(point.x), acted ? each * t.weighted[1] : plain(point.y),
+              acted ? each * t.weighted[2] : plain(point.z), slides);
+    write_row(to + 8, plain(normal.x), plain(normal.y), plain(normal.z), Number(0));
+    Tally zero = {};
+    t = zero;
+}
+
+// Writes what each contact passed on since the last frame, and the geometry now; and starts the sums anew.
+INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
+    if (env.lanes.idle) return;
+    Mat rotations[BODIES];
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) rotations[b] = matrix(env.bodies[b].quat);
+    EACH_PAIR
+    for (int p = 0; p < PAIRS; p++) {
+        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, a = pair_a(p);
+        EACH_SLOT
+        for (int s = 0; s < SLOTS; s++) {
+            int k = behind + s * LANES;
+            if (k >= contact_count(p)) continue;
+            Vec normal = vec(Real(0), Real(0), Real(1)), point;
+            Real gap;
+#if PAIRED
+            if (pair_b(p) >= 0) {
+                Facing facing;
+                face(problem, env, p, k, rotations, Number(1e30), facing);
+                gap = facing.gap;
+                normal = facing.normal;
+                point = facing.point;
+            } else
+#endif
+            {
+                long long row = env.geometry + 4LL * problem.spheres[start + k];
+                Real radius = problem.geometry.at(row + 3);
+                Vec arm = rotations[a] * (problem.geometry.vector(row) - env.constants[a].com);
+                point = env.bodies[a].position + arm - vec(Real(0), Real(0), radius);
+                gap = point.z - env.ground;
+            }
+#if PAIRED
+            Tally& tally = env.tallies[(start + k) / LANES];
+#else
+            Tally& tally = env.tallies[s];
+#endif
+            write_label(problem, env, frame, start + k, tally, normal, plain(gap), point);
+        }
+    }
+}
+#endif
+
+INLINE void write(const Problem& problem, Environment& env, int frame) {
+    write_frame(problem, env, frame);
+#if RECORD
+    write_labels(problem, env, frame);
+#endif
+}
+
+// Rolls one environment out; called by all of its lanes.
+INLINE void roll(const Problem& problem, int index, Lanes lanes) {
+    Environment env;
+    env.index = index;
+    env.lanes = lanes;
+    env.steps = index * problem.steps_stride;
+    env.geometry = index * problem.geometry_stride;
+    env.drives = index * problem.drive_stride;
+    env.drive_last = index * problem.drive_last_stride;
+    load(problem, env);
+#if DRIVEN
+    for (int b = 0; b < BODIES; b++) {
+        if (drive_number(b) >= 0) drive(problem, env, b, problem.steps.at(env.steps + 3));
+    }
+#endif
+#if RECORD
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        Tally zero = {};
+        env.tallies[i] = zero;
+    }
+#endif
+    write(problem, env, 0);
+    KEEP_LOOP
+    for (int frame = 1; frame < problem.frame_count; frame++) {
+        long long row = env.steps + 4LL * (frame - 1);
+        env.law.step_s = problem.steps.at(row);
+        env.law.inverse_step = reciprocal(env.law.step_s);
+        env.law.stiffness = problem.steps.at(row + 1);
+        env.law.damping = problem.steps.at(row + 2);
+        Real start = problem.steps.at(row + 3);
+        int substeps = problem.substeps[frame - 1];
+        KEEP_LOOP
+        for (int s = 1; s <= substeps; s++) step(problem, env, start + Number(s) * env.law.step_s);
+        write(problem, env, frame);
+    }
+}
+
+#define PARAMETERS                                                                                                   \
+    const Number *table, const Number *table_t, const Number *steps, const Number *steps_t, const Number *geometry,  \
+        const Number *geometry_t, const Number *drives, const Number *drives_t, const int *substeps,                 \
+        const int *spheres, const int *drive_starts, const int *drive_last, Number *frames, Number *frame_tangents,  \
+        Number *labels, int environments, int frame_count, int sweeps, int steps_stride, int geometry_stride,        \
+        int drive_stride, int drive_last_stride
+#define PROBLEM                                                                                                      \
+    {                                                                                                                \
+        {table, table_t}, {steps, steps_t}, {geometry, geometry_t}, {drives, drives_t}, substeps, spheres,           \
+            drive_starts, drive_last, frames, frame_tangents, labels, environments, frame_count, sweeps,             \
+            steps_stride, geometry_stride, drive_stride, drive_last_stride                                           \
+    }
+
+#if !HOST
+extern "C" __global__ void __launch_bounds__(THREADS) rollout(PARAMETERS) {
+    Problem problem = PROBLEM;
+    int thread = blockIdx.x * THREADS + threadIdx.x, index = thread / LANES;
+    Lanes lanes = {(int)threadIdx.x % LANES, index >= environments};
+    roll(problem, lanes.idle ? environments - 1 : index, lanes);
+}
+#endif
+"""

@@ -1,0 +1,132 @@
+"""What a fused kernel is compiled for: the constants of one kind of world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from ..detection import PAIR_SMOOTHING_M
+from ..sweeps import CONTACT_ONSET_M
+from .arithmetic_source import ARITHMETIC
+from .collision_source import COLLISION
+from .contact_source import CONTACTS
+from .environment_source import ENVIRONMENT
+from .rollout_source import ROLLOUT
+
+THREADS = 32
+"""Of a block: one warp, so that few environments still spread over all multiprocessors."""
+BODY_COLUMNS, WRENCH_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 4, 5
+_BUSY_THREADS = 32_768
+"""With so many threads an H200 is busy; more environments need fewer threads each."""
+_FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
+"""How many contacts fit into a thread's registers, by (single precision, with derivatives)."""
+
+_LANGUAGE = """
+#if HOST
+#define INLINE inline
+#define EACH_BODY
+#define EACH_SLOT
+#define EACH_PAIR
+#define KEEP_LOOP
+#else
+#define INLINE __device__ __forceinline__
+#define EACH_BODY _Pragma("unroll")
+#define EACH_PAIR _Pragma("unroll 1")
+#if UNROLLED
+#define EACH_SLOT _Pragma("unroll")
+#else
+#define EACH_SLOT _Pragma("unroll 1")
+#endif
+#define KEEP_LOOP _Pragma("unroll 1")
+#endif
+"""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """The constants of a kernel.
+
+    single: float32, else float64; dual: with a derivative in one direction; lanes: threads of an environment, a power
+    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnet: one of them by the
+    ground's pull; turned: whether the frame of bodies that touch each other is not the world's; free (bodies,); drives
+    (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
+    ground, each with its number of contacts.
+    """
+
+    single: bool
+    dual: bool
+    lanes: int
+    record: bool
+    effects: bool
+    magnet: bool
+    turned: bool
+    free: tuple[bool, ...]
+    drives: tuple[int, ...]
+    spheres: tuple[int, ...]
+    pairs: tuple[tuple[int, int, int], ...]
+
+    @property
+    def contacts(self) -> int:
+        """How many contacts an environment may have."""
+        return sum(count for _, _, count in self.pairs)
+
+    @property
+    def slots(self) -> int:
+        """How many of them each thread takes."""
+        return max(1, -(-self.contacts // self.lanes))
+
+    @property
+    def table_width(self) -> int:
+        """Numbers of an environment."""
+        world = WORLD_COLUMNS + self.turned * TURN_COLUMNS + self.effects * WRENCH_COLUMNS
+        return world + len(self.free) * BODY_COLUMNS
+
+    def source(self, host: bool = False) -> str:
+        """Return the program; for the host, without the kernel's entry."""
+        paired = len(self.free) > 1
+        unrolled = self.slots <= _FREE_SLOTS[True, False]
+        # the sums of labels take the registers of eight spheres
+        held = unrolled and not paired and not (self.record and self.slots > _FREE_SLOTS[False, False])
+        constants = {
+            "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
+            "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "TURNED": self.turned,
+            "BODIES": len(self.free), "PAIRS": len(self.pairs),
+            "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
+            "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
+        }  # fmt: skip
+        lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
+        lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define ONSET_M {CONTACT_ONSET_M!r}"]
+        lists = {
+            "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
+            "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
+            "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
+            "contact_start": _starts([count for _, _, count in self.pairs]),
+            "plane_pair": [_plane_pair(self.pairs, index) for index in range(len(self.free))],
+        }  # fmt: skip
+        functions = [_function(name, values) for name, values in lists.items()]
+        return "\n".join((*lines, _LANGUAGE, *functions, ARITHMETIC, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT))
+
+
+def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool) -> int:
+    """Return how many threads should share an environment."""
+    wanted = min(contacts, 32) if paired else min(contacts, _BUSY_THREADS // max(1, environments))
+    wanted = max(wanted, -(-contacts // _FREE_SLOTS[single, dual]), 1)
+    lanes = 1
+    while lanes < min(wanted, 32):
+        lanes *= 2
+    return lanes
+
+
+def _plane_pair(pairs: Sequence[tuple[int, int, int]], body: int) -> int:
+    """Return the number of the pair of a body with the ground, -1 without."""
+    return next((number for number, (a, b, _) in enumerate(pairs) if a == body and b < 0), -1)
+
+
+def _starts(counts: Sequence[int]) -> list[int]:
+    return [sum(counts[:index]) for index in range(len(counts))]
+
+
+def _function(name: str, values: Iterable[int]) -> str:
+    """Return a list as a function, which the compiler resolves where the index is known."""
+    cases = "".join(f"i == {index} ? {int(value)} : " for index, value in enumerate(values))
+    return f"INLINE int {name}(int i) {{ return {cases}0; }}"

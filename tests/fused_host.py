@@ -1,0 +1,129 @@
+"""The fused kernel's source built with g++ and run on the CPU: every line of it is tested without a GPU.
+
+The lanes of an environment are fibres that take turns: each runs to its next exchange with the others.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from cgwm.pipeline.physics.fused.structure import Structure
+from torch import Tensor
+
+COMPILER = shutil.which("g++")
+
+SHIM = r"""
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <ucontext.h>
+#define __device__
+#define __restrict__ __restrict
+
+struct Fibres {  // the lanes of one environment
+    ucontext_t home, contexts[32];
+    double slots[2][32];
+    long exchanges[32];
+    bool done[32];
+    int count, current;
+};
+static Fibres fibres;
+
+static void next_fibre() {
+    int from = fibres.current;
+    fibres.current = (from + 1) % fibres.count;
+    swapcontext(&fibres.contexts[from], &fibres.contexts[fibres.current]);
+}
+
+static const double* exchange(double mine) {
+    int lane = fibres.current;
+    double* slots = fibres.slots[fibres.exchanges[lane]++ % 2];
+    slots[lane] = mine;
+    next_fibre();
+    for (int other = 0; other < fibres.count; other++) {  // all lanes must take part in each exchange
+        long ahead = fibres.exchanges[other] - fibres.exchanges[lane];
+        if (ahead < 0 || ahead > 1) { fprintf(stderr, "lanes part ways\n"); abort(); }
+    }
+    return slots;
+}
+template <class T> T __shfl_xor_sync(unsigned, T mine, int apart, int) {
+    int lane = fibres.current;
+    return T(exchange(mine)[lane ^ apart]);
+}
+template <class T> T __shfl_sync(unsigned, T mine, int source, int) { return T(exchange(mine)[source]); }
+static bool __any_sync(unsigned, bool mine) {
+    const double* all = exchange(mine);
+    for (int lane = 0; lane < fibres.count; lane++) if (all[lane] != 0) return true;
+    return false;
+}
+"""
+
+ENTRY = r"""
+static const Problem* shared_problem;
+static int shared_index;
+
+static void lane_main() {
+    Lanes lanes = {fibres.current, false};
+    roll(*shared_problem, shared_index, lanes);
+    fibres.done[fibres.current] = true;
+    if (fibres.current + 1 < LANES) next_fibre();  // the others end one after the other
+    setcontext(&fibres.home);
+}
+
+extern "C" void run(PARAMETERS) {
+    Problem problem = PROBLEM;
+    for (int index = 0; index < environments; index++) {
+#if LANES == 1
+        Lanes lanes = {0, false};
+        roll(problem, index, lanes);
+#else
+        static char stacks[LANES][1 << 20];
+        shared_problem = &problem;
+        shared_index = index;
+        fibres.count = LANES;
+        fibres.current = 0;
+        for (int lane = 0; lane < LANES; lane++) {
+            fibres.exchanges[lane] = 0;
+            fibres.done[lane] = false;
+            getcontext(&fibres.contexts[lane]);
+            fibres.contexts[lane].uc_stack.ss_sp = stacks[lane];
+            fibres.contexts[lane].uc_stack.ss_size = sizeof stacks[lane];
+            fibres.contexts[lane].uc_link = nullptr;
+            makecontext(&fibres.contexts[lane], lane_main, 0);
+        }
+        swapcontext(&fibres.home, &fibres.contexts[0]);
+        for (int lane = 0; lane < LANES; lane++) {
+            if (!fibres.done[lane]) { fprintf(stderr, "lane %d waits for others that ended\n", lane); abort(); }
+        }
+#endif
+    }
+}
+"""
+
+
+@cache
+def library(structure: Structure, flags: tuple[str, ...] = ("-O2",)) -> ctypes.CDLL:
+    """Build the kernel of a structure."""
+    assert COMPILER is not None
+    folder = Path(tempfile.mkdtemp(prefix="fused"))
+    (folder / "rollout.cpp").write_text(SHIM + structure.source(host=True) + ENTRY)
+    command = [COMPILER, "-std=c++17", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]
+    command += ["-Wno-clobbered", "-Wno-unused-function", "-Wno-unused-parameter", "-Wno-unused-variable", *flags]
+    done = subprocess.run(
+        [*command, "rollout.cpp", "-o", "rollout.so"], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = ctypes.CDLL(str(folder / "rollout.so"))
+    shutil.rmtree(folder)
+    return loaded
+
+
+def run(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
+    """Do what `fused.launch.launch` does, on the CPU."""
+    pointers = [ctypes.c_void_p(None if tensor is None else tensor.data_ptr()) for tensor in tensors]
+    library(structure).run(*pointers, *(ctypes.c_int(number) for number in numbers))

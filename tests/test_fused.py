@@ -1,0 +1,539 @@
+"""The fused kernel against the torch engine: on a GPU where there is one, and built for the CPU by g++."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import fused_host
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.tracks import Track
+from cgwm.pipeline import nvrtc
+from cgwm.pipeline.estimation.forward import batched_jacobian
+from cgwm.pipeline.physics import Body, ContactLaw, PublishedLaw, Rollout, State, World, dispatch, simulate
+from cgwm.pipeline.physics.distance import plane_contacts
+from cgwm.pipeline.physics.driven import Drive
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
+from cgwm.pipeline.physics.fused import simulate_fused, unsupported
+from cgwm.pipeline.physics.fused.packing import reason_against
+from cgwm.pipeline.physics.fused.rollout import roll
+from cgwm.pipeline.physics.fused.structure import lanes_for
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
+from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply, quat_rotate
+from cgwm.schemas import InputDataError, UsageError
+from torch import Tensor
+from worlds import F64, ball_body, batch, box_body, state_of, times, world_of
+
+CUDA = torch.cuda.is_available() and nvrtc.available()
+NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
+NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
+POSES = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
+CONTACTS = ("impulse_n_s", "position_m", "normal", "distance_m")
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+Fused = Callable[..., Rollout]
+
+
+def on(device: str, dtype: torch.dtype, value: Any) -> Any:
+    """Return a world, a state, a command or a tensor on a device, in a precision."""
+    if isinstance(value, Tensor):
+        return value.to(device, dtype) if value.is_floating_point() else value.to(device)
+    if isinstance(value, World):
+        effects = tuple(replace(e, values=on(device, dtype, e.values)) for e in value.effects)
+        value = replace(value, bodies=tuple(on(device, dtype, body) for body in value.bodies), effects=effects)
+    if isinstance(value, World | Body | State | Drive | ContactLaw):
+        fields = {name: getattr(value, name) for name in value.__dataclass_fields__}
+        moved = {k: on(device, dtype, v) for k, v in fields.items() if isinstance(v, Tensor | ContactLaw)}
+        return replace(value, **moved)
+    return {k: on(device, dtype, v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+def on_cuda(
+    world: World, state: State, times_s: Tensor, driven: Any = None, record: bool = False, **more: Any
+) -> Rollout:
+    """Return the rollout of the GPU."""
+    dtype = world.gravity.dtype
+    more = {name: on("cuda", dtype, value) for name, value in more.items()}
+    driven = {k: on("cuda", dtype, v) for k, v in (driven or {}).items()}
+    return simulate_fused(*(on("cuda", dtype, x) for x in (world, state, times_s)), driven, record, **more)
+
+
+def on_host(*arguments: Any, **more: Any) -> Rollout:
+    """Return the rollout of the same source on the CPU."""
+    return roll(fused_host.run, *arguments, **more)
+
+
+@pytest.fixture(params=[pytest.param(on_host, marks=NEEDS_COMPILER), pytest.param(on_cuda, marks=NEEDS_GPU)])
+def fused(request: pytest.FixtureRequest) -> Fused:
+    return request.param
+
+
+def cube(side: int = 4, half: float = 0.05, mass: float = 0.4, name: str = "cube") -> Body:
+    """Return a cube of side x side x side overlapping spheres, of which the corners touch a plane."""
+    spacing = torch.linspace(-1, 1, side, dtype=F64)
+    radius = 1.2 * half / side
+    centers = torch.cartesian_prod(spacing, spacing, spacing) * (half - radius)
+    radii = torch.full((len(centers),), radius, dtype=F64)
+    body = box_body((half, half, half), mass)
+    chosen = plane_contacts(centers, radii)
+    return replace(body, name=name, centers=centers[None], radii=radii[None], on_plane=chosen)
+
+
+def agree(expected: Rollout, found: Rollout, tolerance: float) -> None:
+    def close(name: str, its: Tensor, mine: Tensor) -> None:
+        mine = mine.cpu()
+        torch.testing.assert_close(
+            mine, its.expand_as(mine), rtol=tolerance, atol=tolerance, msg=lambda text: f"{name}: {text}"
+        )
+
+    for name in POSES:
+        close(name, getattr(expected, name), getattr(found, name))
+    assert (expected.contacts is None) == (found.contacts is None)
+    if expected.contacts is not None and found.contacts is not None:
+        for name in CONTACTS:
+            close(f"contact {name}", getattr(expected.contacts, name), getattr(found.contacts, name))
+        for name in ("body_a", "body_b", "sliding"):
+            assert torch.equal(getattr(found.contacts, name).cpu(), getattr(expected.contacts, name)), name
+
+
+def tossed(count: int = 3, height: float = 0.08) -> State:
+    """Return boxes that tumble onto the ground, each another way."""
+    generator = torch.Generator().manual_seed(5)
+    state = state_of(((0, 0, height), (1, 0.3, 0.2, 0.1), (0.5, 0.2, -0.3), (3, 5, -2)), count=count)
+    noise = torch.randn(count, 1, 3, generator=generator, dtype=F64)
+    return replace(state, omega_body_rad_s=state.omega_body_rad_s + noise)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 8, 32])
+def test_a_tumbling_box(fused: Fused, lanes: int) -> None:
+    world, state = world_of(box_body()), tossed()
+    expected = simulate(world, state, times(0.3), record_contacts=True)
+    assert expected.contacts is not None and expected.contacts.sliding.any() and not expected.contacts.sliding.all()
+    agree(expected, fused(world, state, times(0.3), None, True, lanes=lanes), 1e-9)
+
+
+@pytest.mark.parametrize("lanes", [1, 8, None])
+def test_a_cube_of_64_spheres_with_a_shifted_mass(fused: Fused, lanes: int | None) -> None:
+    body = replace(cube(), com=batch([0.004, -0.003, 0.006]))
+    assert body.on_plane is not None and len(body.on_plane) == 8
+    world, state = world_of(body, step_s=0.002), tossed(2)
+    agree(
+        simulate(world, state, times(0.3), None, True), fused(world, state, times(0.3), None, True, lanes=lanes), 1e-9
+    )
+
+
+def test_many_spheres_on_the_plane(fused: Fused) -> None:
+    """More contacts than a thread has room for in registers, and without a choice of those that touch."""
+    world, state = world_of(replace(cube(), on_plane=None)), tossed(2)
+    agree(simulate(world, state, times(0.2), None, True), fused(world, state, times(0.2), None, True, lanes=2), 1e-9)
+
+
+def crowd() -> tuple[World, State, dict[str, Track | Drive]]:
+    """Return two free bodies, a pusher that turns, and a fixed ball, all of which touch others within 0.16 s."""
+    pusher = replace(ball_body(0.02, name="pusher", copies=3), motion="driven")
+    pusher = replace(pusher, centers=batch([[0.0, -0.02, 0.0], [0.0, 0.0, 0.0], [0.0, 0.015, 0.005]]))
+    post = replace(ball_body(0.03, name="post"), motion="fixed")
+    top = replace(box_body((0.03, 0.03, 0.02), 0.15, 0.004), name="top", com=batch([0.002, 0.0, -0.001]))
+    world = world_of(cube(3), top, pusher, post)
+    state = state_of(
+        ((0, 0, 0.05), UPRIGHT, (0, 0, 0), (0, 0, 0)),
+        ((0.01, 0.005, 0.14), (1, 0.1, 0.2, 0.05), (0, 0, -0.5), (2, 1, 3)),
+        ((-0.08, 0, 0.04), UPRIGHT, (0, 0, 0), (0, 0, 0)),
+        ((0.083, 0.01, 0.03), UPRIGHT, (0, 0, 0), (0, 0, 0)),
+        count=2,
+    )
+    time = np.array([0.0, 0.02, 0.12, 0.2])
+    along = np.stack((np.array([-0.08, -0.075, -0.065, -0.09]), 0 * time, 0.04 + 0 * time), -1)
+    angles = np.array([0.0, 0.05, 0.4, 0.3])
+    quat = np.stack((np.cos(angles / 2), 0 * time, 0 * time, np.sin(angles / 2)), -1)
+    return world, state, {"pusher": Track(time, along, quat)}
+
+
+@pytest.mark.parametrize("lanes", [1, 4, None])
+def test_bodies_that_touch_each_other(fused: Fused, lanes: int | None) -> None:
+    world, state, driven = crowd()
+    like = state.position_m
+    driven = {name: Drive.of([track], like) for name, track in driven.items() if isinstance(track, Track)}
+    state.position_m[1, 1, 0] += 0.004
+    expected = simulate(world, state, times(0.16), driven, True)
+    assert expected.contacts is not None
+    pairs = set(zip(expected.contacts.body_a.tolist(), expected.contacts.body_b.tolist(), strict=True))
+    acted = expected.contacts.impulse_n_s.abs().amax((0, 1, 3)) > 0
+    touched = {
+        (int(a), int(b))
+        for a, b, yes in zip(expected.contacts.body_a, expected.contacts.body_b, acted, strict=True)
+        if yes
+    }
+    assert {(0, -1), (0, 1), (0, 2), (0, 3)} <= touched <= pairs
+    agree(expected, fused(world, state, times(0.16), driven, True, lanes=lanes), 1e-9)
+
+
+def test_commands_of_several_lengths(fused: Fused) -> None:
+    world, state, driven = crowd()
+    track = driven["pusher"]
+    assert isinstance(track, Track) and track.quat_wxyz is not None
+    short = Track(track.time_s[1:3], track.position_m[1:3], track.quat_wxyz[1:3])
+    commands = {"pusher": Drive.of([track, short], state.position_m)}
+    agree(simulate(world, state, times(0.2), commands), fused(world, state, times(0.2), commands, lanes=4), 1e-9)
+
+
+def test_balls_of_coincident_spheres(fused: Fused) -> None:
+    """The smooth minimum of equal distances, and the crowding of equal contacts."""
+    world = world_of(ball_body(0.04, 0.3, "low", 3), ball_body(0.03, 0.1, "high", 2))
+    state = state_of(
+        ((0, 0, 0.04), UPRIGHT, (0, 0, 0), (0, 0, 0)), ((0.004, 0, 0.12), UPRIGHT, (0, 0, -0.4), (1, 2, 3))
+    )
+    agree(simulate(world, state, times(0.1), None, True), fused(world, state, times(0.1), None, True), 1e-9)
+
+
+def varied(count: int) -> tuple[World, State, Tensor]:
+    """Return a world of which everything that may differ between the items of a batch does, and frames that do."""
+    generator = torch.Generator().manual_seed(1)
+
+    def about(value: Tensor, spread: float = 0.1) -> Tensor:
+        wide = value.expand(count, *value.shape[1:])
+        return wide * (1 + spread * torch.rand(wide.shape, generator=generator, dtype=F64))
+
+    body = box_body()
+    shift = torch.randn(count, 3, generator=generator, dtype=F64)
+    lever = 0.01 * shift
+    turned = torch.eye(3, dtype=F64) * lever.square().sum(-1)[:, None, None] - lever[:, :, None] * lever[:, None]
+    body = replace(
+        body, mass=about(body.mass), inertia=about(body.inertia.diagonal(dim1=-2, dim2=-1)).diag_embed() + turned,
+        com=0.003 * shift, centers=about(body.centers), radii=about(body.radii, 1.0),
+    )  # fmt: skip
+    contact = ContactLaw(about(batch(0.3)), about(batch(0.004)), about(batch(0.3), 5.0))
+    world = replace(
+        world_of(body), gravity=about(batch([0.5, -0.4, -9.0])), ground_offset=about(batch(0.01)), contact=contact
+    )
+    frames = torch.stack([times(0.3) * (1 + 0.01 * index) + 0.1 * index for index in range(count)])
+    return world, tossed(count), frames
+
+
+def test_everything_may_differ_in_a_batch(fused: Fused) -> None:
+    world, state, frames = varied(3)
+    assert (world.contact.damping_ratio > 1).any() and (world.contact.damping_ratio < 1).any()
+    agree(simulate(world, state, frames, None, True), fused(world, state, frames, None, True, lanes=4), 1e-9)
+
+
+def test_a_tilted_ground(fused: Fused) -> None:
+    normal = torch.tensor([0.3, -0.2, 0.9], dtype=F64)
+    for n, offset in ((normal / normal.norm(), -0.1), (torch.tensor([0.0, 0.0, -1.0], dtype=F64), -0.17)):
+        world, state, driven = crowd()
+        world = replace(
+            world, ground_normal=n, ground_offset=batch(offset), gravity=batch([0.5, 0.0, -9.0 * float(n[2])])
+        )
+        agree(simulate(world, state, times(0.15), driven, True), fused(world, state, times(0.15), driven, True), 1e-9)
+
+
+def test_no_ground_one_frame_and_a_single_fixed_body(fused: Fused) -> None:
+    world, state = world_of(box_body(), ground=False), tossed()
+    agree(simulate(world, state, times(0.1), None, True), fused(world, state, times(0.1), None, True), 1e-12)
+    still = world_of(replace(box_body(), motion="fixed"))
+    agree(simulate(still, state, times(0.05)), fused(still, state, times(0.05)), 1e-12)
+    drop = world_of(box_body())
+    agree(simulate(drop, state, times(0.0), None, True), fused(drop, state, times(0.0), None, True), 1e-12)
+
+
+def test_a_fast_spin_and_one_sweep(fused: Fused) -> None:
+    state = tossed()
+    state = replace(state, omega_body_rad_s=state.omega_body_rad_s * 50)
+    world = replace(world_of(box_body()), sweeps=1)
+    agree(simulate(world, state, times(0.05)), fused(world, state, times(0.05)), 1e-9)
+
+
+def test_single_precision(fused: Fused) -> None:
+    """Rounding: over an impact both are as far from double precision, and nearer to each other."""
+    world, state = world_of(cube(), step_s=0.002), tossed(4, 0.075)
+    exact = simulate(world, state, times(0.1), None, True)
+    assert exact.contacts is not None and exact.contacts.impulse_n_s.abs().amax() > 0
+    single = [on("cpu", torch.float32, x) for x in (world, state, times(0.1))]
+    theirs, ours = simulate(*single), fused(*single, lanes=2)
+    for name, scale in zip(POSES, (0.1, 1.0, 1.0, 10.0), strict=True):
+        truth, mine, its = (getattr(rollout, name).cpu() for rollout in (exact, ours, theirs))
+        assert (mine - its).abs().amax() / scale < 3e-5, name
+        assert (mine - truth).abs().amax() < 2 * (its - truth).abs().amax() + 1e-6 * scale, name
+
+
+def test_single_precision_of_a_fast_spin(fused: Fused) -> None:
+    """Beyond the angles of a step for which the kernel's rotation is a series."""
+    state = tossed(2, 1.0)
+    state = replace(state, omega_body_rad_s=state.omega_body_rad_s * 200)
+    single = [on("cpu", torch.float32, x) for x in (world_of(box_body(), step_s=0.002), state, times(0.02))]
+    mine, its = fused(*single), simulate(*single)
+    assert (mine.omega_body_rad_s * 0.002).norm(dim=-1).amin() > 1
+    torch.testing.assert_close(mine.quat_wxyz.cpu(), its.quat_wxyz, rtol=0, atol=1e-4)
+
+
+def of_parameters(engine: Any, world: World, frames: Tensor, driven: Any = None) -> Callable[[Tensor, int], Tensor]:
+    """Return the rollout as a function of 12 numbers of the state, the contact, the ground, and the centre of mass."""
+    names = [replace(GROUND_SHIFT, name=f"{world.bodies[0].name}.com_{axis}_m") for axis in "xyz"]
+    named = (*CONTACT_PARAMETERS, GROUND_SHIFT, *names)
+
+    def function(values: Tensor, repeats: int) -> Tensor:
+        state, size = tossed(1, 0.07), len(values)
+        others = len(world.bodies) - 1
+
+        def column(first: Tensor, key: str) -> Tensor:
+            mine = first[:, None]
+            if not others:
+                return mine
+            base = getattr(crowd()[1], key)[:1, 1:].expand(size, others, -1).contiguous()
+            return torch.cat((mine, base), 1)
+
+        quat = quat_multiply(quat_exp(values[:, 3:6]), state.quat_wxyz[:, 0].expand(size, 4).contiguous())
+        moved = State(
+            column(values[:, :3], "position_m"), column(quat, "quat_wxyz"),
+            column(values[:, 6:9], "velocity_m_s"), column(values[:, 9:12], "omega_body_rad_s"),
+        )  # fmt: skip
+        rollout = engine(apply_parameters(world, named, values[:, 12:]), moved, frames, driven)
+        return torch.cat([getattr(rollout, name).flatten(1) for name in POSES], 1)
+
+    return function
+
+
+def agree_with_derivatives(
+    fused: Fused, world: World, first: list[float], frames: Tensor, driven: Any, spread: float
+) -> None:
+    inputs = torch.tensor([[*first, 0.3, 0.004, 0.4, 0.001, 0.002, -0.001, 0.003]], dtype=F64)
+    inputs = inputs * (1 + spread * torch.arange(1 if driven else 2, dtype=F64)[:, None])
+    value, jacobian = batched_jacobian(of_parameters(simulate, world, frames, driven), inputs)
+    mine, its = batched_jacobian(of_parameters(fused, world, frames, driven), inputs)
+    assert jacobian.abs().amax((0, 1)).min() > 1e-4  # every parameter acts
+    torch.testing.assert_close(mine.cpu(), value, rtol=1e-9, atol=1e-9)
+    scale = jacobian.abs().amax((0, 1))
+    torch.testing.assert_close(its.cpu() / scale, jacobian / scale, rtol=1e-7, atol=1e-7)
+
+
+def test_derivatives_of_a_toss(fused: Fused) -> None:
+    first = [0, 0, 0.065, 0.1, 0.2, 0.1, 0.5, 0.2, -0.3, 3, 5, -2]
+    agree_with_derivatives(fused, world_of(box_body()), first, times(0.2), None, 0.02)
+
+
+def test_derivatives_of_bodies_that_touch(fused: Fused) -> None:
+    world, _, driven = crowd()
+    first = [0, 0, 0.053, 0.01, 0.02, 0.01, 0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
+    agree_with_derivatives(fused, world, first, times(0.08), driven, 0.0)
+
+
+def active(name: str, **values: float | list[float]) -> ActiveEffect:
+    return ActiveEffect.of(load_effect(name), {k: torch.as_tensor(v, dtype=F64) for k, v in values.items()})
+
+
+def every_effect() -> tuple[ActiveEffect, ...]:
+    """Return every effect that the kernel has, one by which the items of a batch differ, and some of the world's."""
+    return (
+        active("linear_drag", c=[0.4, 0.1]), active("quadratic_drag", k=0.7), active("magnus_lift", s=0.2),
+        active("spin_damping", d=0.8), active("constant_force", f_x=0.3, f_y=-0.2, f_z=0.5), active("buoyancy", b=0.6),
+        active("wind", w_x=1.0, w_y=-2.0), active("ground_magnet", A=4.0, l=0.1), active("gravity_scale", s=0.05),
+        active("gravity_tilt", tilt_x=0.05, tilt_y=0.1), active("com_offset", d_x=0.003, d_y=-0.002),
+        active("inertia_shape", s_xx=0.1, s_xy=0.05),
+    )  # fmt: skip
+
+
+def flight() -> tuple[World, State]:
+    """Return a box and a ball that fall and touch the ground, 0.1 s after their start."""
+    world = world_of(replace(box_body(), com=batch([0.003, 0.001, -0.002])), ball_body())
+    state = state_of(
+        ((0, 0, 0.2), (1, 0.3, 0.2, 0.1), (2, 1, -0.9), (3, 5, -2)),
+        ((1, 0, 0.1), UPRIGHT, (1, -1, -0.2), (9, 2, 3)),
+        count=2,
+    )
+    return world, state
+
+
+@pytest.mark.parametrize("ground", ["level", "tilted", "none"])
+def test_effects(fused: Fused, ground: str) -> None:
+    world, state = flight()
+    effects = every_effect()
+    if ground == "tilted":
+        turn = quat_exp(torch.tensor([0.1, -0.2, 0.0], dtype=F64))
+        world = replace(world, ground_normal=quat_rotate(turn, torch.tensor([0.0, 0, 1], dtype=F64)))
+    if ground == "none":
+        world = replace(world, ground_normal=None, ground_offset=None)
+        effects = tuple(e for e in effects if e.effect.name != "ground_magnet")
+    acting = replace(world, effects=effects)
+    expected = simulate(acting, state, times(0.2), None, True)
+    agree(expected, fused(acting, state, times(0.2), None, True), 1e-9)
+    for left_out in effects:
+        other = replace(world, effects=tuple(e for e in effects if e is not left_out))
+        if left_out.effect.name.endswith("_drag") or ground == "level":
+            found = simulate(other, state, times(0.1)).position_m
+            assert (found - expected.position_m[:, : found.shape[1]]).abs().max() > 1e-6, left_out.effect.name
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_the_pull_of_the_ground_on_one_body(fused: Fused, lanes: int) -> None:
+    """Its lowest sphere is one of several threads'."""
+    world = replace(world_of(cube(), step_s=0.002), effects=(active("ground_magnet", A=30.0, l=0.02),))
+    agree(simulate(world, tossed(2), times(0.2)), fused(world, tossed(2), times(0.2), lanes=lanes), 1e-9)
+
+
+def zeros(name: str, values: Tensor) -> dict[str, Tensor]:
+    """Return neutral values of an effect's parameters, for as many items."""
+    return {parameter.name: 0.0 * values[:, 0] for parameter in load_effect(name).parameters}
+
+
+def test_derivatives_of_effects(fused: Fused) -> None:
+    world, state = flight()
+    names = [
+        ("linear_drag", "c"), ("quadratic_drag", "k"), ("magnus_lift", "s"), ("spin_damping", "d"),
+        ("constant_force", "f_x"), ("buoyancy", "b"), ("wind", "w_x"), ("ground_magnet", "A"), ("com_offset", "d_x"),
+        ("gravity_tilt", "tilt_x"),
+    ]  # fmt: skip
+    inputs = batch([0.4, 0.7, 0.2, 0.8, 0.3, 0.6, 1.0, 4.0, 0.003, 0.05])
+    first = State(*(getattr(state, name)[:1] for name in POSES))
+
+    def function(engine: Any) -> Callable[[Tensor, int], Tensor]:
+        def rolled(values: Tensor, repeats: int) -> Tensor:
+            effects = tuple(
+                ActiveEffect.of(load_effect(name), zeros(name, values) | {key: values[:, k]}, values)
+                for k, (name, key) in enumerate(names)
+            )
+            rollout = engine(replace(world, effects=effects), first, times(0.1))
+            return torch.cat([getattr(rollout, name)[:, -1].flatten(1) for name in POSES], 1)
+
+        return rolled
+
+    value, jacobian = batched_jacobian(function(simulate), inputs)
+    found, its = batched_jacobian(function(fused), inputs)
+    torch.testing.assert_close(found.cpu(), value, rtol=1e-9, atol=1e-9)
+    scale = jacobian.abs().amax((0, 1))
+    assert scale.min() > 1e-5
+    torch.testing.assert_close(its.cpu() / scale, jacobian / scale, rtol=1e-7, atol=1e-7)
+
+
+@NEEDS_COMPILER
+def test_refusals() -> None:
+    world, state = world_of(box_body()), tossed(1)
+    assert "'cpu'" in (unsupported(world) or "")
+    with pytest.raises(UsageError, match=r"cannot take this world.*'cpu'.*\nNext: use simulate"):
+        simulate_fused(world, state, times(0.1))
+    with pytest.raises(UsageError, match="no reverse derivatives"):
+        on_host(world, replace(state, position_m=state.position_m.requires_grad_()), times(0.1))
+    with pytest.raises(UsageError, match=r"several kinds: torch.float32 on cpu, torch.float64 on cpu"):
+        on_host(on("cpu", torch.float32, world), tossed(1), times(0.1))
+    with pytest.raises(InputDataError, match="body 'box': mass"):
+        on_host(world.with_body(0, mass=-world.bodies[0].mass), state, times(0.1))
+    with pytest.raises(InputDataError, match="position_m of body 'box' is not finite"):
+        on_host(world, replace(state, position_m=state.position_m * torch.nan), times(0.1))
+    with pytest.raises(UsageError, match="'ground_magnet' needs a ground"):
+        magnet = replace(world_of(box_body(), ground=False), effects=(active("ground_magnet", A=1.0),))
+        on_host(magnet, state, times(0.1))
+    with torch.no_grad():
+        assert not on_host(world, state, times(0.01)).position_m.requires_grad
+    with pytest.raises(InputDataError, match="the driven body 'pusher' has no track"):
+        on_host(*crowd()[:2], times(0.1))
+    body = world.bodies[0]
+
+    def recorded(com: Tensor, repeats: int) -> Tensor:
+        return on_host(world.with_body(0, com=com), state, times(0.1), None, True).position_m.flatten(1)
+
+    with pytest.raises(UsageError, match="no derivatives of the contact record"):
+        batched_jacobian(recorded, body.com)
+
+
+def test_what_the_kernel_does_not_have() -> None:
+    world = world_of(box_body())
+    measured = replace(world, effects=(active("clock_scale", s=0.01), active("frame_tilt", tilt_x=0.1)))
+    assert reason_against(world) is None and reason_against(measured) is None
+    for name in ("rolling_resistance", "adhesion", "velocity_restitution"):
+        reason = reason_against(replace(world, effects=(active("linear_drag", c=0.1), active(name))))
+        assert reason == f"the kernel does not have its effect '{name}'"
+
+    class Other(LinearDrag):
+        name = "other"
+
+    assert "'other'" in (reason_against(replace(world, effects=(ActiveEffect.of(Other()),))) or "")
+    twice = (active("ground_magnet", A=1.0, l=0.1), active("ground_magnet", A=2.0, l=0.2))
+    assert "several" in (reason_against(replace(world, effects=twice)) or "")
+    published = PublishedLaw(batch(0.3), batch(1e4), batch(10.0))
+    assert "'published'" in (reason_against(replace(world, contact=published)) or "")
+    assert "its bodies may have 4104 contacts" in (reason_against(crowded(2044)) or "")
+
+
+def crowded(count: int) -> World:
+    """Return two balls of so many spheres each, and 8 contacts more."""
+    one, two = ball_body(copies=count), ball_body(copies=count, name="two")
+    chosen = torch.arange(8)
+    return world_of(replace(one, on_plane=chosen), replace(two, on_plane=chosen))
+
+
+def test_the_torch_engine_is_taken_on_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
+    world, state = world_of(box_body()), tossed(1)
+    with caplog.at_level("INFO", "cgwm"):
+        agree(
+            simulate(world, state, times(0.05), None, True),
+            dispatch.rollout(world, state, times(0.05), None, True),
+            0.0,
+        )
+    assert not caplog.records
+
+
+def test_which_derivatives_want_the_torch_engine() -> None:
+    world, state, driven = crowd()
+    commands = {name: Drive.of([track], state.position_m) for name, track in driven.items() if isinstance(track, Track)}
+    assert dispatch.lacking_derivatives(world, state, times(0.1), commands, True) is None
+    for number, change in enumerate(("com", "effect", "law", "drive")):
+        wanted = batch([0.1, 0.0, 0.0]).requires_grad_()
+        value = wanted[:, 0]
+        other, given = world, commands
+        if change == "com":
+            other = world.with_body(0, com=wanted)
+        elif change == "effect":
+            other = replace(world, effects=(ActiveEffect.of(load_effect("linear_drag"), {"c": value}),))
+        elif change == "law":
+            other = replace(world, contact=replace(world.contact, friction=value))
+        else:
+            given = {"pusher": replace(commands["pusher"], position_m=commands["pusher"].position_m + value)}
+        arguments = (other, state, times(0.1), given, False)
+        assert dispatch.lacking_derivatives(*arguments) == "derivatives in reverse are asked for", number
+        with torch.no_grad():
+            assert dispatch.lacking_derivatives(*arguments) is None
+
+    def rolled(com: Tensor, repeats: int) -> Tensor:
+        changed = world.with_body(0, com=com)
+        assert dispatch.lacking_derivatives(changed, state, times(0.1), commands, False) is None
+        reason = dispatch.lacking_derivatives(changed, state, times(0.1), commands, True)
+        assert reason == "derivatives of the contact record are asked for"
+        return com
+
+    batched_jacobian(rolled, world.bodies[0].com)
+
+
+@NEEDS_GPU
+def test_the_kernel_is_taken_on_cuda(caplog: pytest.LogCaptureFixture) -> None:
+    world, state, frames = (on("cuda", F64, x) for x in (world_of(box_body()), tossed(1), times(0.1)))
+    with caplog.at_level("INFO", "cgwm"):
+        found = dispatch.rollout(world, state, frames)
+        assert torch.equal(found.position_m, simulate_fused(world, state, frames).position_m)
+        assert not caplog.records
+        rolling = on("cuda", F64, replace(world_of(box_body()), effects=(active("rolling_resistance"),)))
+        for _ in range(2):
+            agree(simulate(world_of(box_body()), tossed(1), times(0.1)), dispatch.rollout(rolling, state, frames), 1e-9)
+        assert [record.getMessage() for record in caplog.records] == [
+            "rollouts run in the torch engine, not in the fused kernel: "
+            "the kernel does not have its effect 'rolling_resistance'"
+        ]
+
+
+@NEEDS_GPU
+def test_refusals_on_cuda() -> None:
+    world = on("cuda", F64, world_of(box_body()))
+    assert unsupported(world) is None
+    assert "several types" in (unsupported(replace(world, gravity=world.gravity.float())) or "")
+    half = on("cuda", torch.float16, world_of(box_body()))
+    assert "float16" not in (unsupported(half) or "") and "neither float32 nor float64" in (unsupported(half) or "")
+
+
+def test_threads_of_an_environment() -> None:
+    assert lanes_for(8, 4096, single=True, dual=False, paired=False) == 8
+    assert lanes_for(8, 65_536, single=True, dual=False, paired=False) == 1
+    assert lanes_for(64, 65_536, single=True, dual=False, paired=False) == 8
+    assert lanes_for(8, 10**6, single=False, dual=True, paired=False) == 8
+    assert lanes_for(500, 1, single=True, dual=False, paired=True) == 32
+    assert lanes_for(0, 1, single=True, dual=False, paired=False) == 1
