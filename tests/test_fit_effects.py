@@ -17,7 +17,12 @@ from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig
 from small_model import write_small_model
 from worlds import F64, box_body, state_of, times, world_of
 
-BRIEF = PhysConfig(generations=5, population=24)
+BRIEF = PhysConfig(generations=4, population=24)
+
+
+def boxes(ground: bool = True) -> World:
+    """A box, in steps that are long enough for the tests to be short."""
+    return world_of(box_body(), ground=ground, step_s=0.002)
 
 
 def thrown(world: World, count: int, noise_m: float = 5e-4) -> list[tuple[str, dict[str, Track]]]:
@@ -40,9 +45,9 @@ def active(name: str, **values: float) -> ActiveEffect:
 
 
 def test_drag_is_found_with_the_contact_and_lowers_the_error() -> None:
-    episodes = thrown(replace(world_of(box_body()), effects=(active("quadratic_drag", k=0.2),)), 4)
-    plain = fit_with_constants(world_of(box_body()), episodes, BRIEF, (5e-4, 1e-3))
-    world = replace(world_of(box_body()), effects=(active("quadratic_drag"),))
+    episodes = thrown(replace(boxes(), effects=(active("quadratic_drag", k=0.2),)), 4)
+    plain = fit_with_constants(boxes(), episodes, BRIEF, (5e-4, 1e-3))
+    world = replace(boxes(), effects=(active("quadratic_drag"),))
     found = fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
     drag = next(p for p in found.parameters if p.name == "quadratic_drag.k")
     assert drag.interval_95 is not None and drag.interval_95[0] < 0.2 < drag.interval_95[1]
@@ -55,9 +60,9 @@ def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pyt
     effect = load_effect("ground_magnet")
     (constant,) = effect.constants
     truth = {effect.parameters[0].name: 6.0, constant.name: constant.grid[-1]}
-    episodes = thrown(replace(world_of(box_body()), effects=(active("ground_magnet", **truth),)), 1)
+    episodes = thrown(replace(boxes(), effects=(active("ground_magnet", **truth),)), 1)
     brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "iterations": 1})
-    world = replace(world_of(box_body()), effects=(active("ground_magnet"),))
+    world = replace(boxes(), effects=(active("ground_magnet"),))
     found = fit_with_constants(world, episodes, brief, (5e-4, 1e-3))
     tried = found.record["constants_tried"]
     assert [row[f"ground_magnet.{constant.name}"] for row in tried] == list(constant.grid)
@@ -66,8 +71,8 @@ def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pyt
 
 
 def test_an_effect_that_lacks_what_it_needs_is_refused() -> None:
-    episodes = thrown(world_of(box_body(), ground=False), 1)
-    world = replace(world_of(box_body(), ground=False), effects=(active("ground_magnet"),))
+    episodes = thrown(boxes(ground=False), 1)
+    world = replace(boxes(ground=False), effects=(active("ground_magnet"),))
     with pytest.raises(InputDataError, match="'ground_magnet' needs a ground in the manifest, and this capture has"):
         fit_with_constants(world, episodes, BRIEF, (None, None))
 
@@ -102,7 +107,7 @@ def test_a_models_effects_act_in_its_world_and_a_wrong_parameter_is_refused(tmp_
 
 
 def test_a_measurement_effect_changes_what_is_seen_and_not_what_happens() -> None:
-    world = replace(world_of(box_body()), effects=(active("length_scale", s=0.02),))
+    world = replace(boxes(), effects=(active("length_scale", s=0.02),))
     start = state_of(((0.5, 0, 1.0), (1, 0, 0, 0), (1.0, 0, 0), (0, 0, 0)))
     true, seen = simulate(world, start, times(0.3)), measure(world, start, times(0.3))
     torch.testing.assert_close(seen.position_m, 1.02 * true.position_m, atol=1e-12, rtol=0)

@@ -532,7 +532,7 @@ def test_refusals_on_cuda() -> None:
 
 def test_threads_of_an_environment() -> None:
     assert lanes_for(8, 4096, single=True, dual=False, paired=False) == 8
-    assert lanes_for(8, 65_536, single=True, dual=False, paired=False) == 1
+    assert lanes_for(8, 65_536, single=True, dual=False, paired=False) == 4
     assert lanes_for(64, 65_536, single=True, dual=False, paired=False) == 8
     assert lanes_for(8, 10**6, single=False, dual=True, paired=False) == 8
     assert lanes_for(500, 1, single=True, dual=False, paired=True) == 32

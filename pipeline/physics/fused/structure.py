@@ -16,7 +16,7 @@ from .rollout_source import ROLLOUT
 THREADS = 32
 """Of a block: one warp, so that few environments still spread over all multiprocessors."""
 BODY_COLUMNS, WRENCH_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 4, 5
-_BUSY_THREADS = 32_768
+_BUSY_THREADS = 262_144
 """With so many threads an H200 is busy; more environments need fewer threads each."""
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
 """How many contacts fit into a thread's registers, by (single precision, with derivatives)."""
