@@ -28,7 +28,7 @@ import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.estimation.observations import Observations
 from cgwm.pipeline.estimation.search import Prior, importance_search
-from cgwm.pipeline.phys_geo import PRIOR, _open_loop
+from cgwm.pipeline.phys_geo import _open_loop
 from cgwm.pipeline.physics import Body, ContactLaw, State, World, simulate
 from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
@@ -174,7 +174,7 @@ def state_of(tosses: Tosses) -> State:
 
 def world_of(body: Body) -> World:
     """Return the world with the prior's contact law."""
-    law = ContactLaw(*(torch.tensor([PRIOR[p.name][0]], dtype=torch.float64) for p in CONTACT_PARAMETERS))
+    law = ContactLaw(*(torch.tensor([p.prior[0]], dtype=torch.float64) for p in CONTACT_PARAMETERS))
     gravity = torch.tensor([[0.0, 0.0, -9.81]], dtype=torch.float64)
     up, zero = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
     return World((body,), gravity, up, zero, law)
@@ -191,8 +191,8 @@ def fitted(world: World, tosses: Tosses, seed: int) -> tuple[Array, World]:
     observations = Observations(**{**vars(observations), "state": state_of(tosses)})
     warm = torch.zeros_like(observations.times_s, dtype=torch.bool)
     prior = Prior(
-        np.array([p.encode(PRIOR[p.name][0]) for p in names]),
-        np.array([PRIOR[p.name][1] for p in names]),
+        np.array([p.encode(p.prior[0]) for p in names]),
+        np.array([p.prior[1] for p in names]),
         np.array([p.limits for p in names]),
     )
     found = importance_search(
