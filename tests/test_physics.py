@@ -108,6 +108,8 @@ def test_derivatives_of_a_rollout_match_finite_differences(until: float) -> None
     torch.testing.assert_close(value, end(x, 1), atol=1e-13, rtol=0)
     numeric = (ends[:5] - ends[5:]).T / (2 * step)
     torch.testing.assert_close(jacobian[0], numeric, atol=2e-5, rtol=2e-4)
+    reverse = torch.autograd.functional.jacobian(lambda y: end(y, 1)[0], x)[:, 0]
+    torch.testing.assert_close(jacobian[0], reverse, atol=1e-8, rtol=1e-8)
 
 
 def test_rollouts_of_a_batch_do_not_see_each_other() -> None:

@@ -95,7 +95,6 @@ class Contacts:
             step_s: Step [s], shape (B,).
             before: The impulses of the step before, from which the sweeps begin.
         """
-        self._batch = placed[0].reference.shape[0] if placed else 0
         candidates = self._candidates(placed, step_s)
         if not candidates:
             return []
@@ -119,7 +118,8 @@ class Contacts:
                 found.append((number, points, touch, axes))
         if not found:
             return []
-        impulses = self._impulses(found, some, items, before)
+        warm = self._warm(found, items, before, step_s.shape[0])
+        impulses = self._impulses(found, some, items, warm)
         results = []
         for (number, points, touch, axes), impulse in zip(found, impulses, strict=True):
             a, b = self.pairs[number]
@@ -181,7 +181,7 @@ class Contacts:
         found: list[tuple[int, Points, Touch, Tensor]],
         placed: Sequence[Placed],
         items: Tensor | None,
-        before: Sequence[PairImpulses],
+        warm: Sequence[Tensor | None],
     ) -> list[Impulses]:
         law = self.world.contact
         if isinstance(law, PublishedLaw):
@@ -199,18 +199,26 @@ class Contacts:
                     root = body.rotation @ take(inertia.root, items)
                     sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
             groups.append(ContactGroup.of(touch, axes, tuple(sides)))
-        if self.world.sweeps == 1:  # the closed form begins from nothing
-            return settle(groups, 1)
-        old = {pair.pair: pair for pair in before}
-        batch = placed[0].reference.shape[0] if items is None else self._batch
-        warm = [
-            points.near[..., None]
-            * old[number].at(points.slot, items, slot_count(self.world, self.pairs[number]), batch)
-            if number in old
-            else None
-            for number, points, _, _ in found
-        ]
         return settle(groups, self.world.sweeps, warm)
+
+    def _warm(
+        self,
+        found: list[tuple[int, Points, Touch, Tensor]],
+        items: Tensor | None,
+        before: Sequence[PairImpulses],
+        batch: int,
+    ) -> list[Tensor | None]:
+        """Return the impulses of the step before (n, C, 3), along the axes, for each pair; None from nothing."""
+        old = {pair.pair: pair for pair in before} if self.world.sweeps > 1 else {}  # one sweep is the closed form
+        warm: list[Tensor | None] = []
+        for number, points, _, _ in found:
+            if number in old:
+                slots = slot_count(self.world, self.pairs[number])
+                given = old[number].at(points.slot, items, slots, batch)
+                warm.append(points.near[..., None] * given)
+            else:
+                warm.append(None)
+        return warm
 
 
 def _only_friction(before: Touch, after: Touch) -> bool:

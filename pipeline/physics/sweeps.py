@@ -1,7 +1,8 @@
 """Impulses of contacts that act at once: the closed form of every contact, then projected sweeps over all of them.
 
 One sweep is the closed form alone. Further ones let contacts that touch at once agree: each takes back what it gave,
-sees the velocity that all the others leave, and is projected anew on its own admissible set.
+sees the velocity that all the others leave, and is projected anew on its own admissible set. They begin from the
+impulses of the step before, so that over the steps even slow modes of contacts come to rest.
 
 Everything is expressed by mass-weighted Jacobian rows (n, 3 C, nv), |row|^2 = 1/m_eff, of the generalised velocity
 of a body: nv = 6 for a free one, rows [d/sqrt(m), (arm x d) S] with inverse inertia S S^T. A chain of links needs only
@@ -153,20 +154,19 @@ class Impulses:
     angular: Tensor | None = None
 
 
-def settle(groups: Sequence[ContactGroup], sweeps: int, warm: Sequence[Tensor | None] | None = None) -> list[Impulses]:
+def settle(groups: Sequence[ContactGroup], sweeps: int, warm: Sequence[Tensor | None]) -> list[Impulses]:
     """Return the impulses of all groups after the given number of sweeps; one from nothing is the closed form.
 
     Args:
         groups: The contacts of a step.
         sweeps: How often every contact is projected anew.
-        warm: Impulses (n, C, 3) [N s] along the axes from which each group begins, those of the step before: what a few
-            sweeps leave of slow modes is then made up for in the following steps, and bodies at rest do not creep.
+        warm: Impulses (n, C, 3) [N s] along the axes from which each group begins, None for nothing: those of the step
+            before, so that what a few sweeps leave of slow modes is made up for in the following steps.
     """
     groups = _splitting(groups)
-    begin = warm if warm is not None else [None] * len(groups)
     found = [
         Impulses(torch.zeros_like(group.relative) if old is None else old)
-        for group, old in zip(groups, begin, strict=True)
+        for group, old in zip(groups, warm, strict=True)
     ]
     for _ in range(sweeps):
         seen = _all_seen(groups, found)
