@@ -151,7 +151,7 @@ def test_two_fits_with_one_seed_are_identical() -> None:
 
 def test_friction_of_a_body_that_never_touches_is_not_observable() -> None:
     world = world_of(box_body())
-    flight = toss(1, duration_s=0.3, height=2.0)
+    flight = toss(1, duration_s=0.15, height=2.0)
     fit = fit_physics(world, [("000", {"box": flight})], PhysConfig(population=48, generations=3), NOISE)
     assert {p.name: p.state for p in fit.parameters}["friction"] == "not_observable"
     assert any("friction is not observable" in warning and "sliding" in warning for warning in fit.warnings)
