@@ -7,7 +7,7 @@ shown to the model. Errors are averaged within an episode first, then over episo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +133,8 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
         names = [name.decode() for name in reader.group(0)["bodies/names"][()]]
         _check_bodies(model, names, str(dataset))
         world = World.from_model(model)
+        # what a dataset stores are true states, not measured ones
+        world = replace(world, effects=tuple(a for a in world.effects if a.effect.phase != "measurement"))
         found = [(info.demo, _stored_tracks(reader, number)) for number, info in enumerate(reader.rollouts)]
     finally:
         reader.close()

@@ -30,6 +30,8 @@ LEAD_FRAMES = 6
 """Frames of flight before the first contact that give the velocities with which it begins."""
 AFTER_S = 0.1
 """How long a window goes on after the first contact: about one tumble of a thrown body."""
+CONTACT_S = 1.5
+"""How long it goes on where what is wanted acts in contact: a roll or a slide to rest shows it best."""
 MODEL_ERROR = (0.0005, 0.01)
 """What a rigid body and this contact law miss in such a window (position [m], rotation [rad]) beside the tracks' noise.
 Only their ratio matters much; the residuals are weighed robustly, and intervals come from the episodes' scatter."""
@@ -59,6 +61,7 @@ def fit_first_contacts(
     along: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
     whole_flight: bool = False,
+    after_s: float = AFTER_S,
 ) -> FirstContacts:
     """Fit parameters to a window about the first contact of each episode, with the windows' states.
 
@@ -69,11 +72,12 @@ def fit_first_contacts(
         along: What is fitted along, and found again later, open loop: the contact's numbers.
         noise: Of the tracks (position [m], rotation [rad]).
         whole_flight: Whether a window holds all frames before the contact, not the last few.
+        after_s: How long a window goes on after the first contact [s].
 
     Raises:
         NotConvergedError: If the rollouts diverge at the start.
     """
-    observations = _windows(world, episodes, None if whole_flight else LEAD_FRAMES)
+    observations = _windows(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
     start = [*wanted, *along]
     names = [parameter for parameter, _ in start]
     std = [float(np.hypot(error, sigma)) for error, sigma in zip(MODEL_ERROR, noise, strict=True)]
@@ -112,7 +116,9 @@ def _pinv(information: Array) -> Array:
     return np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
 
 
-def _windows(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lead_frames: int | None) -> Observations:
+def _windows(
+    world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lead_frames: int | None, after_s: float
+) -> Observations:
     """Return a window about the first contact of each episode, of at most `MAX_WINDOWS` evenly spread ones."""
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_WINDOWS)).round().astype(int)
     picked = [episodes[i] for i in chosen]
@@ -121,7 +127,7 @@ def _windows(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lea
     windows = []
     for times, count in zip(whole.times_s, flying.tolist(), strict=True):
         first = times[0] if lead_frames is None else times[max(0, count - lead_frames)]
-        windows.append((float(first) - 1e-9, float(times[min(count, len(times) - 1)]) + AFTER_S))
+        windows.append((float(first) - 1e-9, float(times[min(count, len(times) - 1)]) + after_s))
     return Observations.of(world, picked, windows)
 
 

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -22,6 +23,7 @@ from ..schemas import (
     Body,
     BodyModel,
     ContactParameters,
+    EffectModel,
     FitFile,
     InputDataError,
     ModelFile,
@@ -84,8 +86,11 @@ def fit(
     """
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
     refuse_existing(out, overwrite)
-    for name in phys_config.effects:
-        load_effect(name)  # a name that is wrong is told before hours of work
+    with_effects((), phys_config.effects)  # a name that is wrong is told before hours of work
+    if phys_config.effects and stage == "sg-gs":
+        raise UsageError(
+            "--effects with --stage sg-gs: effects are fitted to motion.", "--stage phys-geo or all.", "leave one out."
+        )
     opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
     started = time.perf_counter()
     config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
@@ -97,9 +102,14 @@ def fit(
     if stage == "phys-geo" or (stage == "all" and _has_motion(opened, split)):
         with enough_memory(*_needs(phys_config)):
             model = _with_physics(model, opened, split, phys_config)
+    elif phys_config.effects:
+        raise InputDataError(
+            f"{opened.root}: --effects, but split '{split}' has no motion to fit them to.",
+            "tracks or videos of its episodes.",
+        )
     provenance = Provenance(
         capture=opened.root.resolve().name,
-        input_sha256=_input_hashes(opened, split),
+        input_sha256=_input_hashes(opened, split, model.file.effects),
         versions=_versions(),
         seed=phys_config.seed,
         # relative, so that models which are moved together still know each other
@@ -151,7 +161,10 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
                 f"{parent}: its bodies are {names}, those of {capture.root} are {capture.body_names}.",
                 "a model of this capture's bodies.",
             )
-        return model if stage == "phys-geo" else _from_scene(capture, fit_scene(capture, config, checkpoint))
+        if stage == "phys-geo":
+            return model
+        fresh = _from_scene(capture, fit_scene(capture, config, checkpoint))
+        return replace(fresh, file=fresh.file.model_copy(update={"effects": model.file.effects}))
     if stage == "phys-geo":
         lacking = [body.name for body in capture.manifest.bodies if body.shape is None]
         if lacking:
@@ -337,11 +350,13 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     )
 
 
-def _input_hashes(capture: Capture, split: str) -> dict[str, str]:
+def _input_hashes(capture: Capture, split: str, effects: Sequence[EffectModel]) -> dict[str, str]:
     names = ["capture.toml", "cameras.json"]
     if split in capture.manifest.splits:
         names += [f"tracks/{episode}.csv" for episode in capture.episodes(split)]
-    return {name: sha256(capture.root / name) for name in names if (capture.root / name).is_file()}
+    files = {name: capture.root / name for name in names}
+    files |= {effect.name: Path(effect.name.partition(":")[0]) for effect in effects if ".py:" in effect.name}
+    return {name: sha256(path) for name, path in files.items() if path.is_file()}
 
 
 def _versions() -> dict[str, str]:

@@ -5,22 +5,40 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
 from ..datasets.tracks import Track
-from ..schemas import EffectModel, InputDataError, PhysConfig
+from ..schemas import EffectModel, InputDataError, PhysConfig, UsageError
 from ..schemas import Parameter as FittedParameter
 from .phys_geo import PhysicsFit, fit_physics
-from .physics.effects import ActiveEffect
+from .physics.effects import ActiveEffect, load_effect
 from .physics.world import World
 
 
 def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple[EffectModel, ...]:
-    """Return the effects of a model and the wanted ones that it does not have yet, at their neutral values."""
-    names = [effect.name for effect in present]
-    fresh = dict.fromkeys(name for name in wanted if name not in names)
-    return (*present, *(EffectModel(name=name) for name in fresh))
+    """Return the effects of a model and the wanted ones that it does not have yet, at their neutral values.
+
+    Raises:
+        UsageError: If an effect cannot be loaded, or two have one name.
+    """
+    effects = [*present, *(EffectModel(name=_absolute(name)) for name in wanted)]
+    unique: dict[str, EffectModel] = {}
+    for effect in effects:
+        own = load_effect(effect.name).name
+        if own in unique and unique[own].name != effect.name:
+            raise UsageError(
+                f"two effects are called '{own}': {unique[own].name} and {effect.name}.", todo="rename one of them."
+            )
+        unique.setdefault(own, effect)
+    return tuple(unique.values())
+
+
+def _absolute(name: str) -> str:
+    """Return the name of an effect, a user's file by its whole path, so that the model finds it from anywhere."""
+    file, _, rest = name.partition(":")
+    return f"{Path(file).resolve()}:{rest}" if file.endswith(".py") else name
 
 
 def fitted_effects(
@@ -103,9 +121,23 @@ def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
         "driven": "a driven body",
     }
     for active in world.effects:
-        for need in active.effect.needs:
+        effect = active.effect
+        for need in effect.needs:
             if not has.get(need, True):
                 raise InputDataError(
-                    f"the effect '{active.effect.name}' needs {words[need]}, and this capture has none.",
+                    f"the effect '{effect.name}' needs {words[need]}, and this capture has none.",
                     todo="add it to the capture, or leave the effect out of --effects.",
+                )
+        if has["driven"] and effect.phase == "measurement" and "driven" not in effect.needs:
+            raise InputDataError(
+                f"the effect '{effect.name}' with a driven body: its track is its command and was measured alike, "
+                "which a fit cannot undo yet.",
+                "effects of the measurement for captures without driven bodies.",
+                "leave it out of --effects.",
+            )
+        for number in effect.parameters:
+            if number.shared != "all":
+                raise InputDataError(
+                    f"{effect.name}.{number.name} is one value for each {number.shared}; a fit finds one for all.",
+                    'shared = "all".',
                 )

@@ -33,11 +33,18 @@ from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
-from .first_contacts import FirstContacts, fit_first_contacts
+from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
-from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
+from .physics.parameters import (
+    CONTACT_PARAMETERS,
+    CONTACT_TIME,
+    GROUND_SHIFT,
+    Parameter,
+    apply_parameters,
+    effect_parameters,
+)
 from .physics.rotation import geodesic_angle
 from .physics.world import State, World
 
@@ -124,6 +131,13 @@ def fit_physics(
         NotConvergedError: If the rollouts diverge everywhere.
         InputDataError: If the tracks do not show where the mass is, and that is asked for.
     """
+    longest = math.pi * CONTACT_TIME.bounds[0]
+    if config.step_s > longest:
+        raise InputDataError(
+            f"phys-geo.step_s is {1e3 * config.step_s:g} ms: contacts of {1e3 * CONTACT_TIME.bounds[0]:g} ms, the "
+            "shortest that the search looks at, would end within the step in which they begin.",
+            f"up to {1e3 * longest:.2g} ms.",
+        )
     free_tracks = [
         tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
     ]
@@ -180,12 +194,15 @@ def _fit_effects(
     contact: Sequence[Parameter],
     sigma: tuple[float, float],
 ) -> FirstContacts:
-    """Fit the world's effects to flight and first contacts, from neutral values; the contact's numbers beside them.
+    """Fit the world's effects to flight and first contacts; the contact's numbers beside them.
 
     The open-loop search is for few numbers: with every effect its valley gets narrower; windows show effects well.
     """
-    wanted = [(parameter, 0.0) for parameter in effect_parameters(world)]
-    return fit_first_contacts(world, episodes, wanted, [(p, p.prior[0]) for p in contact], sigma, whole_flight=True)
+    start = {f"{a.effect.name}.{name}": float(value) for a in world.effects for name, value in a.values.items()}
+    wanted = [(parameter, start[parameter.name]) for parameter in effect_parameters(world)]
+    touching = any(active.effect.phase == "contact" for active in world.effects)
+    along = [(p, p.prior[0]) for p in contact]
+    return fit_first_contacts(world, episodes, wanted, along, sigma, True, CONTACT_S if touching else AFTER_S)
 
 
 def _noise_floor(world: World, observations: Observations, sigma: tuple[float, float]) -> float:

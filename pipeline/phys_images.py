@@ -29,12 +29,13 @@ from .estimation.least_squares import Residuals, minimise
 from .estimation.observations import Observations
 from .estimation.trajectory import TrajectoryResiduals, retract, state_prior
 from .estimation.warmup import estimate_states, warmup_frames
+from .fit_effects import fit_with_constants
 from .imaging.coarse import coarse_model
 from .imaging.footage import Footage, load_footage
 from .imaging.image_loss import ImageLoss
 from .imaging.pose_tracks import PoseTrack, PoseTracker
 from .imaging.refinement import ImageObjective, Refined, TrackTerm, refine_end_to_end
-from .phys_geo import MAX_SPAN_S, PhysicsFit, fit_physics, physics_fit
+from .phys_geo import MAX_SPAN_S, PhysicsFit, physics_fit
 from .physics.driven import Drive
 from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
@@ -98,7 +99,7 @@ def fit_physics_from_images(
     seconds = {"pose_tracks": round(time.perf_counter() - started, 2)}
     noise = _noise(capture, episodes)
     brief = config.model_copy(update={"iterations": min(config.iterations, TRACK_ITERATIONS)})
-    start = fit_physics(world, [(episode.name, episode.tracks) for episode in episodes], brief, noise)
+    start = fit_with_constants(world, [(episode.name, episode.tracks) for episode in episodes], brief, noise)
     seconds["dynamics"] = round(time.perf_counter() - started - seconds["pose_tracks"], 2)
 
     names: list[Parameter] = list(CONTACT_PARAMETERS)
@@ -127,7 +128,13 @@ def fit_physics_from_images(
     )
     effects = () if start.effects is None else start.effects.parameters
     warnings = (*found.warnings, *_warnings(episodes))
-    return replace(found, parameters=(*parameters, *effects), effects=start.effects, warnings=warnings)
+    return replace(
+        found,
+        parameters=(*parameters, *effects),
+        effects=start.effects,
+        constants=start.constants,
+        warnings=warnings,
+    )
 
 
 def _episode(world: World, model: Model, capture: Capture, name: str, tracks_too: bool) -> _Episode:

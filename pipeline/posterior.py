@@ -8,7 +8,8 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from ..datasets.rollouts import RolloutParameter
-from ..schemas import BodyModel, InputDataError, ModelFile, Parameter
+from ..schemas import BodyModel, EffectModel, InputDataError, ModelFile, Parameter
+from .physics.effects.registry import load_effect
 
 
 def draw_parameters(
@@ -61,10 +62,15 @@ def can_vary(file: ModelFile, name: str) -> bool:
     if file.contact is not None and name in type(file.contact).model_fields:
         return True
     owner, _, number = name.partition(".")
-    if any(effect.name == owner and number in effect.parameters for effect in file.effects):
+    if any(_own_name(effect) == owner and number in effect.parameters for effect in file.effects):
         return True
     legal = ("mass_kg", "com_x_m", "com_y_m", "com_z_m")
     return number in legal and any(body.name == owner for body in file.bodies)
+
+
+def _own_name(effect: EffectModel) -> str:
+    """Return the name that an effect gives itself, which its parameters carry."""
+    return load_effect(effect.name).name if ":" in effect.name else effect.name
 
 
 def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
@@ -82,7 +88,7 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
     owner, _, number = name.partition(".")
     effects = tuple(
         effect.model_copy(update={"parameters": {**effect.parameters, number: value}})
-        if effect.name == owner
+        if _own_name(effect) == owner
         else effect
         for effect in file.effects
     )

@@ -194,7 +194,9 @@ class _Batch:
         padded = np.stack([_padded(grid, longest) for grid, _ in grids])
         with torch.no_grad():
             rollout = measure(self.world, seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
-        require_finite(rollout, self.world, seen.state, [f"episode '{name}'" for name in seen.names])
+        require_finite(
+            rollout, self.world, seen.state, [f"episode '{name}'" for name in seen.names], [len(g) for g, _ in grids]
+        )
         return [self._prediction(k, time, *grids[k], rollout) for k, time in enumerate(times)]
 
     def _prediction(

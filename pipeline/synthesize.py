@@ -37,8 +37,8 @@ from ..schemas import (
 from .labels import LabelRenderer
 from .memory import enough_memory
 from .physics.checks import require_apart, require_finite
+from .physics.dispatch import rollout as roll_out
 from .physics.records import ContactRecord
-from .physics.rollout import simulate
 from .physics.world import State, World
 from .posterior import draw_parameters, not_varied
 from .sampling import Start, draw_start, look_at_cameras, resolve_plan
@@ -150,7 +150,7 @@ def simulate_rollout(job: _Job, index: int) -> RolloutLabels:
     times = torch.as_tensor(job.times_s, dtype=torch.float64, device=job.device)
     require_apart(world, state)
     with torch.no_grad():
-        rollout = simulate(world, state, times, start.driven, record_contacts=True)
+        rollout = roll_out(world, state, times, start.driven, record_contacts=True)
     require_finite(rollout, world, state, [f"rollout {index} (seed {job.config.seed})"])
     poses = tuple(
         values[0].cpu().numpy()

@@ -14,7 +14,7 @@ class EffectParameterCard(FileModel):
     unit: str
     sign: Literal["nonnegative", "any"]
     scale: float
-    """A magnitude that matters, in the unit: the width of the prior."""
+    """A magnitude that matters, in the unit: what changes a motion of one second visibly."""
     limit: float
     """The largest magnitude admitted."""
     shared: Literal["all", "group", "episode"] = "all"

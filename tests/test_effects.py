@@ -277,7 +277,7 @@ def motion_at(world: World, state: State) -> BodyMotion:
     body = world.bodies[0]
     eye, zero = torch.eye(3, dtype=F64)[None], torch.zeros(1, 3, dtype=F64)
     position = state.position_m[:, 0]
-    return BodyMotion(body, body.mass, body.inertia, position, eye, zero, zero, world.up, world.ground_offset)
+    return BodyMotion(body, body.mass, body.inertia, position, eye, zero, zero, world.up, world.up, world.ground_offset)
 
 
 # In contact

@@ -13,9 +13,9 @@ from cgwm.pipeline.fit_effects import fit_with_constants, fitted_effects, with_e
 from cgwm.pipeline.physics import World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.measured import measure
-from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig
+from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig, UsageError
 from small_model import write_small_model
-from worlds import F64, box_body, state_of, times, world_of
+from worlds import F64, ball_body, box_body, state_of, times, world_of
 
 BRIEF = PhysConfig(generations=4, population=24)
 
@@ -112,3 +112,42 @@ def test_a_measurement_effect_changes_what_is_seen_and_not_what_happens() -> Non
     true, seen = simulate(world, start, times(0.3)), measure(world, start, times(0.3))
     torch.testing.assert_close(seen.position_m, 1.02 * true.position_m, atol=1e-12, rtol=0)
     torch.testing.assert_close(seen.velocity_m_s, true.velocity_m_s, atol=0, rtol=0)
+
+
+def test_a_users_effect_is_named_by_its_whole_path_and_names_may_not_meet(tmp_path: Path) -> None:
+    source = (
+        'from cgwm.pipeline.physics.effects.linear_drag import LinearDrag\nclass Mine(LinearDrag):\n    name = "{}"\n'
+    )
+    (tmp_path / "mine.py").write_text(source.format("mine"))
+    (effect,) = with_effects((), [f"{tmp_path}/../{tmp_path.name}/mine.py:Mine"])
+    assert effect.name == f"{tmp_path}/mine.py:Mine"
+    assert with_effects([effect], [f"{tmp_path}/mine.py:Mine"]) == (effect,)
+    (tmp_path / "other.py").write_text(source.format("linear_drag"))
+    with pytest.raises(UsageError, match=r"two effects are called 'linear_drag': linear_drag and .*other.py:Mine"):
+        with_effects((), ["linear_drag", f"{tmp_path}/other.py:Mine"])
+
+
+def test_what_a_fit_cannot_find_is_refused(tmp_path: Path) -> None:
+    episodes = thrown(boxes(), 1)
+    driven = replace(ball_body(name="tip"), motion="driven")
+    world = replace(world_of(box_body(), driven), effects=(active("length_scale"),))
+    with pytest.raises(InputDataError, match="'length_scale' with a driven body: its track is its command"):
+        fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
+    with pytest.raises(InputDataError, match=r"phys-geo.step_s is 5 ms(.|\n)*up to 3.1 ms"):
+        fit_with_constants(boxes(), episodes, BRIEF.model_copy(update={"step_s": 0.005}), (5e-4, 1e-3))
+    model = read_model(write_small_model(tmp_path / "model"))
+    for name, values, found in (
+        ("linear_drag", {"c": -5.0}, "linear_drag.c is -5 1/s"),
+        ("gone.py:Mine", {}, "gone.py"),
+    ):
+        file = model.file.model_copy(update={"effects": (EffectModel(name=name, parameters=values),)})
+        with pytest.raises(InputDataError, match=rf"model: .*{found}"):
+            World.from_model(replace(model, file=file))
+
+
+def test_up_is_against_gravity_on_a_slope_too() -> None:
+    world = replace(boxes(), effects=(active("buoyancy", b=1.0),))
+    slope = torch.tensor([0.6, 0.0, 0.8], dtype=F64)
+    start = state_of(((0, 0, 5.0), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
+    rollout = simulate(replace(world, ground_normal=slope), start, times(0.1))
+    assert rollout.velocity_m_s[0, -1, 0].tolist() == pytest.approx([0, 0, -0.881], abs=1e-9)

@@ -101,8 +101,8 @@ def test_a_failure_leaves_nothing(
         rollout = simulate(*arguments, **options)  # pyright: ignore
         return replace(rollout, position_m=rollout.position_m * torch.nan)
 
-    simulate = stage.simulate
-    monkeypatch.setattr(stage, "simulate", diverge)
+    simulate = stage.roll_out
+    monkeypatch.setattr(stage, "roll_out", diverge)
     with pytest.raises(NotConvergedError, match=r"rollout 0 \(seed 5\) diverged by step 0(.|\n)*Its start is in"):
         synthesize(model_path, tmp_path / "out", CONFIG.model_copy(update={"shards": shards}))
     assert list(tmp_path.iterdir()) == []

@@ -37,6 +37,13 @@ def require_physical(world: World) -> None:
         if not body.free:
             continue
         _require(plain(body.mass) > 0, plain(body.mass), f"body '{body.name}': mass", "kg", "above 0 kg")
+        _require(
+            torch.isfinite(plain(body.inertia)).flatten(1).all(-1),
+            plain(body.inertia).flatten(1).sum(-1),
+            f"body '{body.name}': the sum of its inertia",
+            "kg m2",
+            "finite",
+        )
         moments = torch.linalg.eigvalsh(plain(body.inertia))
         _require(
             moments[..., 0] > 0, moments[..., 0], f"body '{body.name}': smallest moment of inertia", "kg m2", "above 0"
@@ -66,7 +73,7 @@ def require_physical(world: World) -> None:
         raise InputDataError(
             f"the step of {1e3 * world.step_s:g} ms is beyond the bound of its contacts, {1e3 * bound:.3g} ms.",
             f"a step above 0 and up to {1e3 * bound:.3g} ms.",
-            "take a smaller --step-s, or a softer contact.",
+            "take a smaller step (--set phys-geo.step_s=...), or a softer contact.",
         )
 
 
@@ -131,7 +138,9 @@ def require_apart(world: World, state: State) -> None:
                 )
 
 
-def require_finite(rollout: Rollout, world: World, state: State, names: Sequence[str] = ()) -> None:
+def require_finite(
+    rollout: Rollout, world: World, state: State, names: Sequence[str] = (), frames: Sequence[int] = ()
+) -> None:
     """Check that a rollout stayed finite; where it did not, save the start so that it can be replayed.
 
     Args:
@@ -139,12 +148,16 @@ def require_finite(rollout: Rollout, world: World, state: State, names: Sequence
         world: The world it was made of.
         state: The state it began in.
         names: What the environments are called; by their numbers where left out.
+        frames: How many frames of each count; all where left out.
 
     Raises:
         NotConvergedError: If it did not, with the environment, the step and the file with its start.
     """
     poses = torch.cat((rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s), -1)
-    wrong = (~torch.isfinite(poses).flatten(2).all(-1)).nonzero()
+    finite = torch.isfinite(poses).flatten(2).all(-1)
+    for item, count in enumerate(frames):
+        finite[item, count:] = True
+    wrong = (~finite).nonzero()
     if not len(wrong):
         return
     item, frame = (int(k) for k in wrong[0])
@@ -155,7 +168,7 @@ def require_finite(rollout: Rollout, world: World, state: State, names: Sequence
     raise NotConvergedError(
         f"{names[item] if names else f'environment {item}'} diverged by step {math.ceil(since / world.step_s - 1e-6)}, "
         f"{since:.4g} s after its start: its state is not finite. Its start is in {path}.",
-        todo="fit again with a smaller --step-s, or check masses, units and the sampling plan.",
+        todo="fit again with a smaller step (--set phys-geo.step_s=...), or check masses, units and the sampling plan.",
     )
 
 

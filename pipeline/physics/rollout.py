@@ -178,7 +178,8 @@ class _Engine:
         omega = inertia.omega(rotation, motion.spin)
         turned = rotation @ inertia.matrix @ rotation.transpose(-1, -2)
         up, offset = world.up, world.ground_offset
-        seen = BodyMotion(body, inertia.mass, turned, motion.com, rotation, motion.velocity, omega, up, offset)
+        normal = up if world.ground_normal is None else world.ground_normal[None]
+        seen = BodyMotion(body, inertia.mass, turned, motion.com, rotation, motion.velocity, omega, up, normal, offset)
         for active in self.flows:
             flow = active.effect.flow(active.values, seen)
             seen = replace(seen, air=flow if seen.air is None else seen.air + flow)

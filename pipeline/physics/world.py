@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...schemas import InputDataError
+from ...schemas import InputDataError, UsageError
 from .contact import ContactLaw
 from .distance import plane_contacts
 from .effects.effect import ActiveEffect
@@ -75,10 +75,11 @@ class World:
 
     @property
     def up(self) -> Tensor:
-        """Unit vector (1 or B, 3): the ground's normal, against gravity where there is no ground."""
-        if self.ground_normal is not None:
-            return self.ground_normal[None]
-        return -self.gravity / self.gravity.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-12)
+        """Unit vector (1 or B, 3) against gravity; without gravity the ground's normal, or the world's z."""
+        size = self.gravity.square().sum(-1, keepdim=True)
+        other = torch.eye(3).to(self.gravity)[2] if self.ground_normal is None else self.ground_normal
+        safe = torch.where(size > 0, size, torch.ones_like(size))
+        return torch.where(size > 0, -self.gravity / safe.sqrt(), other)
 
     @staticmethod
     def from_model(model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu") -> World:
@@ -151,11 +152,21 @@ class State:
 
 
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
-    effect = load_effect(entry.name)
     try:
-        return ActiveEffect.of(effect, entry.parameters, like)
+        effect = load_effect(entry.name)
+        active = ActiveEffect.of(effect, entry.parameters, like)
+    except UsageError as error:
+        raise InputDataError(f"{where}: its effect: {error.found}", error.allowed, error.todo) from error
     except KeyError as error:
         raise InputDataError(f"{where}: {error.args[0]}.", todo="fit the model again with this effect.") from error
+    for number in effect.parameters:
+        value = float(active.values[number.name])
+        low = 0.0 if number.nonnegative else -number.limit
+        if not low <= value <= number.limit:
+            raise InputDataError(
+                f"{where}: {effect.name}.{number.name} is {value:g} {number.unit}.", f"{low:g} to {number.limit:g}."
+            )
+    return active
 
 
 def symmetric(six: tuple[float, ...]) -> np.ndarray:

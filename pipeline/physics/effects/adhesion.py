@@ -25,5 +25,5 @@ class Adhesion(Effect):
         near = (1 - (heights / values["g"][:, None]).clamp(0.0, 1.0).square()).square()
         # the weights add up to that of the lowest sphere, so that more spheres do not pull more
         share = near * (near.amax(-1) / near.sum(-1).clamp_min(1e-12))[:, None]
-        pulls = -(values["F"][:, None] * share)[..., None] * motion.up[:, None]
+        pulls = -(values["F"][:, None] * share)[..., None] * motion.normal[:, None]
         return Wrench(force=pulls.sum(1), torque=cross(arms, pulls).sum(1))

@@ -31,7 +31,7 @@ Need = Literal["ground", "drag", "contact", "spin", "driven"]
 class EffectParameter:
     """A number of an effect; 0 is neutral.
 
-    scale: a magnitude that matters, in its unit, as the width of the prior and the step of searches; limit: the largest
+    scale: a magnitude that matters, in its unit: what changes a motion of one second visibly; limit: the largest
     magnitude admitted; nonnegative: whether it may not be negative; shared: whether one value serves all episodes, or
     each group of episodes, or each episode, has its own.
     """
@@ -63,9 +63,9 @@ class BodyMotion:
     """A free body in a step, world frame.
 
     body; mass (n,) [kg]; inertia (n, 3, 3) [kg m2] about the centre of mass, world axes; com (n, 3) [m]; rotation
-    (n, 3, 3), body to world; velocity (n, 3) [m/s] of the centre of mass; omega (n, 3) [rad/s]; up (n or 1, 3): the
-    ground's normal, against gravity where there is no ground; ground_offset (n or 1,) [m] along it, None where there is
-    no ground; air (n or 1, 3) [m/s]: velocity of the air, None where it stands still.
+    (n, 3, 3), body to world; velocity (n, 3) [m/s] of the centre of mass; omega (n, 3) [rad/s]; up (n or 1, 3):
+    against gravity; normal (n or 1, 3): of the ground, up where there is none; ground_offset (n or 1,) [m] along it,
+    None where there is no ground; air (n or 1, 3) [m/s]: velocity of the air, None where it stands still.
     """
 
     body: Body
@@ -76,6 +76,7 @@ class BodyMotion:
     velocity: Tensor
     omega: Tensor
     up: Tensor
+    normal: Tensor
     ground_offset: Tensor | None = None
     air: Tensor | None = None
 
@@ -98,9 +99,9 @@ class BodyMotion:
         centers, radii = body.centers, body.radii
         if body.on_plane is not None:
             centers, radii = centers[:, body.on_plane], radii[:, body.on_plane]
-        up = self.up[:, None]
-        arms = (centers - body.com[:, None]) @ self.rotation.transpose(-1, -2) - radii[..., None] * up
-        over = ((self.com[:, None] + arms) * up).sum(-1)
+        normal = self.normal[:, None]
+        arms = (centers - body.com[:, None]) @ self.rotation.transpose(-1, -2) - radii[..., None] * normal
+        over = ((self.com[:, None] + arms) * normal).sum(-1)
         if self.ground_offset is None:
             return arms, torch.full_like(over, math.inf)
         return arms, over - self.ground_offset[:, None]

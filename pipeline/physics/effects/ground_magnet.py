@@ -22,4 +22,4 @@ class GroundMagnet(Effect):
         """Return the pull."""
         # a contact lets spheres sink in by a little, where the pull shall not go on growing
         fading = (-motion.height.clamp_min(0.0) / values["l"]).exp()
-        return Wrench(force=-(values["A"] * motion.mass * fading)[:, None] * motion.up)
+        return Wrench(force=-(values["A"] * motion.mass * fading)[:, None] * motion.normal)

@@ -176,14 +176,23 @@ def _fault(kind: type[Effect]) -> str:
         text = getattr(kind, field, None)
         if not isinstance(text, str) or not text.strip():
             return f"its {field} is {'missing' if text is None else repr(text)}; it is a text"
-    if getattr(kind, "phase", None) not in get_args(Phase):
-        return f"its phase is {getattr(kind, 'phase', None)!r}; legal are {', '.join(get_args(Phase))}"
-    unknown = [need for need in kind.needs if need not in get_args(Need)]
-    if unknown:
-        return f"it needs {unknown[0]!r}; legal are {', '.join(get_args(Need))}"
+    fault = _word_fault(kind)
+    if fault:
+        return fault
     if all(getattr(kind, hook) is getattr(Effect, hook) for hook in _HOOKS):
         return f"it has none of the methods {', '.join(_HOOKS)}"
     return _number_fault(kind)
+
+
+def _word_fault(kind: type[Effect]) -> str:
+    if not kind.name.isidentifier():
+        return f"its name is {kind.name!r}; it is one word of letters, digits and _"
+    if getattr(kind, "phase", None) not in get_args(Phase):
+        return f"its phase is {getattr(kind, 'phase', None)!r}; legal are {', '.join(get_args(Phase))}"
+    if not isinstance(kind.needs, tuple):
+        return f"its needs are {kind.needs!r}; they are a tuple of texts"
+    unknown = [need for need in kind.needs if need not in get_args(Need)]
+    return f"it needs {unknown[0]!r}; legal are {', '.join(get_args(Need))}" if unknown else ""
 
 
 def _number_fault(kind: type[Effect]) -> str:

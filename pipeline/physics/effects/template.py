@@ -18,7 +18,8 @@ class MyEffect(Effect):
     name = "my_effect"
     summary = "A pull towards the middle of the table."
     formula = "a = -w x exp(-(x^2 + y^2) / r^2), and the same for y"
-    # Scale: a magnitude that changes a motion of 1 s visibly; it is the width of the prior. A parameter that is
+    # Scale: a magnitude that changes a motion of 1 s visibly; four of them are
+    # what a fit calls not observable. A parameter that is
     # physically never negative says nonnegative=True.
     parameters = (EffectParameter("w", "1/s2", scale=0.5, limit=50.0),)
     # A number that means nothing where all parameters are 0 is no parameter, but is tried on a grid.
