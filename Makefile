@@ -23,8 +23,9 @@ install: $(VENV)/linked
 demo: install
 	$(BIN)/cgwm demo $(OUT) --overwrite
 
+# One thread a worker: the tensors of tests are too small to share out, and the workers share the cores.
 test: lint
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
 
 lint: install
 	$(BIN)/ruff check
