@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from cgwm.pipeline.physics import PublishedLaw, State, simulate
+from cgwm.pipeline.physics import PublishedLaw, State, World, simulate
 from cgwm.pipeline.physics.checks import largest_step, require_apart, require_finite
+from cgwm.pipeline.physics.effects import ActiveEffect, Effect, EffectParameter, Values
 from cgwm.schemas import InputDataError, NotConvergedError
 from worlds import F64, ball_body, box_body, law, state_of, times, world_of
 
@@ -90,3 +91,20 @@ def test_the_default_law_is_stable_up_to_its_bound(zeta: float) -> None:
     rollout = simulate(world, state_of(((0, 0, 0.05), (0.99, 0.1, 0.05, 0), (0.1, 0, 0), (0, 0, 0))), times(6.0, 5.0))
     assert float(rollout.position_m[..., 2].max()) <= 0.0501
     assert float(rollout.velocity_m_s[0, -1].norm()) < 0.02
+
+
+class Emptied(Effect):
+    """A mass that loses more than there is: what a user's effect may do by mistake."""
+
+    name = summary = formula = reveals = source = "emptied"
+    parameters = (EffectParameter("m", "kg", scale=0.1, limit=10.0),)
+    phase = "flight"
+
+    def world(self, values: Values, world: World) -> World:
+        return world.with_body(0, mass=world.bodies[0].mass - values["m"])
+
+
+def test_a_body_that_an_effect_makes_impossible_is_refused() -> None:
+    world = replace(world_of(box_body()), effects=(ActiveEffect.of(Emptied(), {"m": 1.0}),))
+    with pytest.raises(InputDataError, match=r"body 'box': mass is -0.6 kg"):
+        simulate(world, HIGH, times(0.02))

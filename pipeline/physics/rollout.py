@@ -84,6 +84,8 @@ class _Engine:
 
     def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
         world = self.world = changed_by_effects(world)
+        if world.effects:
+            require_physical(world)  # an effect may have made a body that cannot be
         self.inertias = [Inertia.of(body) for body in world.bodies]
         self.times = times_s if times_s.ndim == 2 else times_s[None]
         self.lengths = self.times.diff(dim=1)

@@ -88,6 +88,8 @@ def roll(
     require_physical(world)
     require_state(state, world.body_names)
     world = changed_by_effects(world)
+    if world.effects:
+        require_physical(world)  # an effect may have made a body that cannot be
     packed = pack(world, state, times_s, driven or {}, record_contacts)
     inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
     _check_kinds(*inputs)
