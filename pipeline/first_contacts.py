@@ -42,7 +42,7 @@ ITERATIONS = 16
 ENOUGH_EPISODES = 8
 """From so many episodes on their scatter gives the intervals."""
 UNOBSERVABLE_SHARE = 0.8
-"""A parameter that the windows leave with more than this share of its prior's width is called not observable."""
+"""A parameter that the data leave with more than this share of its prior's width is called not observable."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def fit_first_contacts(
     record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
     return FirstContacts(
         _placed(world, found, coordinates),
-        tuple(_parameter(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
+        tuple(described(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
         record,
     )
 
@@ -138,11 +138,12 @@ def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> Wo
     return replace(moved, bodies=tuple(bodies))
 
 
-def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
+def described(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
+    """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates."""
     low, high = parameter.limits
     estimate, *interval = (
-        float(parameter.decode(torch.tensor(min(max(z, low), high), dtype=torch.float64)))
-        for z in (coordinate, coordinate - 1.96 * std, coordinate + 1.96 * std)
+        float(parameter.decode(torch.tensor(z, dtype=torch.float64)))
+        for z in (coordinate, *(min(max(coordinate + k * 1.96 * std, low), high) for k in (-1, 1)))
     )
     state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
     if std > UNOBSERVABLE_SHARE * parameter.prior[1]:

@@ -33,7 +33,7 @@ from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.trajectory import TrajectoryResiduals, state_prior
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
-from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, fit_first_contacts
+from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
@@ -71,8 +71,6 @@ long."""
 ENOUGH_EPISODES = 8
 """From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
 without trusting the model."""
-UNOBSERVABLE_SHARE = 0.8
-"""A parameter that the data leave with more than this share of its prior's width is called not observable."""
 
 
 @dataclass(frozen=True)
@@ -452,28 +450,9 @@ def _absolute(shift: FittedParameter, offset: float) -> FittedParameter:
 
 
 def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
-    low, high = parameter.limits
-    estimate = float(parameter.decode(torch.tensor(coordinate, dtype=torch.float64)))
-    reach = [min(max(coordinate + k * 1.96 * std, low), high) for k in (-1, 1)]
-    interval = tuple(float(parameter.decode(torch.tensor(x, dtype=torch.float64))) for x in reach)
-    slope = estimate if parameter.logarithmic else 1.0
-    on_bound = min(coordinate - low, high - coordinate) < 1e-6 * (high - low)
-    state = "on_bound" if on_bound else "fitted"
     centre, width = parameter.prior
-    if std > UNOBSERVABLE_SHARE * width:
-        state = "not_observable"
-    note = f"{parameter.reveals} would reveal it"
-    return FittedParameter(
-        name=parameter.name,
-        unit=parameter.unit,
-        estimate=estimate,
-        std_error=float(slope * std),
-        interval_95=(interval[0], interval[1]),
-        bounds=parameter.bounds,
-        prior=f"normal{' in its logarithm' if parameter.logarithmic else ''} about {centre:g}, std {width:g}",
-        state=state,
-        note=note,
-    )
+    prior = f"normal{' in its logarithm' if parameter.logarithmic else ''} about {centre:g}, std {width:g}"
+    return described(parameter, coordinate, std).model_copy(update={"prior": prior})
 
 
 def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:

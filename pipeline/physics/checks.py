@@ -125,7 +125,7 @@ def require_apart(world: World, state: State) -> None:
             placed.append(Placed(body, position + com, rotation, zero, zero))
         for a, b in pairs_of(world):
             depth = _depth(world, placed[a], None if b == GROUND else placed[b])
-            size = placed[a].reach() if b == GROUND else torch.minimum(placed[a].reach(), placed[b].reach())
+            size = placed[a].reach if b == GROUND else torch.minimum(placed[a].reach, placed[b].reach)
             deepest = int((depth - DEEPEST_SHARE * size).argmax())
             limit = float(DEEPEST_SHARE * size.expand_as(depth)[deepest])
             if float(depth[deepest]) > limit:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from .distance import log_sum_exp_distance, smooth_min
+from .distance import blended, log_sum_exp_distance, smooth_min
 from .rotation import cross
 from .world import Body, World
 
@@ -62,8 +63,9 @@ class Placed:
         body = replace(self.body, **{name: plain(getattr(self.body, name)) for name in names})
         return Placed(body, *(plain(x) for x in (self.reference, self.rotation, self.velocity, self.omega)))
 
+    @cached_property
     def reach(self) -> Tensor:
-        """Return the radius (n or 1,) [m] of a ball about the reference point that holds all spheres."""
+        """The radius (n or 1,) [m] of a ball about the reference point that holds all spheres, without derivatives."""
         origin = plain(self.body.com) if self.body.free else torch.zeros_like(plain(self.body.com))
         arms = plain(self.body.centers) - origin[:, None]
         return (arms.square().sum(-1).sqrt() + plain(self.body.radii)).amax(-1)
@@ -126,7 +128,7 @@ def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | Non
     with torch.no_grad():
         soft = max(_softness(x, sharpness_per_m) for x in (a, b))
         apart = (plain(a.reference) - plain(b.reference)).square().sum(-1).sqrt()
-        return apart < a.reach() + b.reach() + plain(step_s) * _speed_bound(a, b) + soft
+        return apart < a.reach + b.reach + plain(step_s) * _speed_bound(a, b) + soft
 
 
 def ground_points(world: World, placed: Placed, slot: Tensor, near: Tensor | None = None) -> Points:
@@ -195,29 +197,14 @@ def _against_union(
     radii = spheres.radii(slot)
     gathered = union.centers(members.flatten(1)).unflatten(1, members.shape[1:])
     offset = points[:, :, None] - gathered
-    length2 = offset.square().sum(-1)
-    length = torch.where(length2 > 0, length2, torch.ones_like(length2)).sqrt() * (length2 > 0)
-    distances = length - union.radii(members.flatten(1)).unflatten(1, members.shape[1:])
+    member_radii = union.radii(members.flatten(1)).unflatten(1, members.shape[1:])
     if sharpness_per_m is None:
-        value, weights = smooth_min(distances, PAIR_SMOOTHING_M)
+        minimum = partial(smooth_min, width=PAIR_SMOOTHING_M)
     else:
-        value, weights = log_sum_exp_distance(distances, sharpness_per_m)
-    gradient = (weights[..., None] * offset / length.clamp_min(1e-12)[..., None]).sum(-2)
-    normal = unit_or_up(gradient)
+        minimum = partial(log_sum_exp_distance, per_m=sharpness_per_m)
+    value, normal = blended(offset, member_radii, minimum)
     gap = value - radii
     return Points(slot, own, gap, normal, points - (radii + 0.5 * gap)[..., None] * normal)
-
-
-def unit_or_up(gradient: Tensor) -> Tensor:
-    """Return vectors (..., 3) scaled to unit length; upwards where they vanish.
-
-    Exactly between opposite spheres the direction is undefined; any unit vector serves, and upwards is stable.
-    """
-    norm2 = gradient.square().sum(-1, keepdim=True)
-    known = norm2 > 1e-16
-    up = torch.zeros_like(gradient)
-    up[..., 2] = 1.0
-    return torch.where(known, gradient / torch.where(known, norm2, torch.ones_like(norm2)).sqrt(), up)
 
 
 def _softness(union: Placed, sharpness_per_m: float | None) -> float:
@@ -231,14 +218,14 @@ def _within(queries: Placed, surface: Placed, step_s: Tensor, softness_m: float)
     """Return the slots (n, K) of the spheres near the ball around the other body."""
     centers = queries.centers()
     apart = (centers - surface.reference[:, None]).square().sum(-1).sqrt() - queries.radii()
-    margin = surface.reach() + plain(step_s) * _speed_bound(queries, surface) + softness_m
+    margin = surface.reach + plain(step_s) * _speed_bound(queries, surface) + softness_m
     kept = _lowest(apart - margin[:, None], 0.0)
     return apart.new_zeros((apart.shape[0], 0), dtype=torch.int64) if kept is None else kept
 
 
 def _speed_bound(a: Placed, b: Placed) -> Tensor:
     """Return a bound (n,) [m/s] on the relative speed of any two points of two bodies."""
-    spinning = [plain(x.omega).square().sum(-1).sqrt() * x.reach() for x in (a, b)]
+    spinning = [plain(x.omega).square().sum(-1).sqrt() * x.reach for x in (a, b)]
     return (plain(a.velocity) - plain(b.velocity)).square().sum(-1).sqrt() + spinning[0] + spinning[1]
 
 

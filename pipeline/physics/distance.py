@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -63,9 +66,23 @@ def union_distance(points: Tensor, centers: Tensor, radii: Tensor, width: float)
         Distance [m], shape (B, Q), negative inside; and normal, shape (B, Q, 3), pointing out of the union.
     """
     offset = points[:, :, None, :] - centers[:, None, :, :]
+    return blended(offset, radii[:, None, :], partial(smooth_min, width=width))
+
+
+def blended(offset: Tensor, radii: Tensor, minimum: Callable[[Tensor], tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Return the distance and the outward normal of points to unions of spheres, each point with its own spheres.
+
+    Args:
+        offset: From the spheres' centres to the point [m], shape (..., N, 3).
+        radii: The spheres' radii [m], shape (..., N).
+        minimum: The smooth minimum: distances (..., N) to the value (...) and the weights (..., N).
+
+    Returns:
+        Distance [m], shape (...), and unit normal, shape (..., 3).
+    """
     length2 = offset.square().sum(-1)
     length = torch.where(length2 > 0, length2, torch.ones_like(length2)).sqrt() * (length2 > 0)
-    value, weights = smooth_min(length - radii[:, None, :], width)
+    value, weights = minimum(length - radii)
     gradient = (weights[..., None] * offset / length.clamp_min(1e-12)[..., None]).sum(-2)
     norm2 = gradient.square().sum(-1, keepdim=True)
     # exactly between opposite spheres the direction is undefined; any unit vector serves, and upwards is stable

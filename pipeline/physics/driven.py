@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from ...schemas import InputDataError
 from .motion import Motion
 from .rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
 
@@ -37,6 +38,21 @@ class Drive:
         longest = max(len(track.time_s) for track in tracks)
         rows = [_prepare(track, longest, like) for track in tracks]
         return Drive(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+    @staticmethod
+    def command(body: str, driven: Mapping[str, Track | Drive], like: Tensor) -> Drive:
+        """Return the command of a driven body, prepared where it is a track.
+
+        Raises:
+            InputDataError: If it has none.
+        """
+        if body not in driven:
+            raise InputDataError(
+                f"the driven body '{body}' has no track in this episode; its track is its command.",
+                todo=f"add rows for '{body}' to the episode's tracks file.",
+            )
+        command = driven[body]
+        return command if isinstance(command, Drive) else Drive.of([command], like)
 
     @staticmethod
     def from_velocities(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .world import World
+from .world import World, stretched_inertia
 
 
 @dataclass(frozen=True)
@@ -125,13 +125,5 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
 
 
 def scaled_inertia(inertia: Tensor, factors: Tensor) -> Tensor:
-    """Return the inertia (B, 3, 3) of a body whose second moments of mass along its axes are scaled by factors (B, 3).
-
-    With C = tr(I)/2 - I the second moments (Wensing et al., "Linear matrix inequalities for physically consistent
-    inertial parameter identification", 2018) and S the square roots of the factors: C' = S C S, I' = tr(C') - C'.
-    """
-    eye = torch.eye(3).to(inertia)
-    trace = inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    root = factors.sqrt()
-    moments = root[..., :, None] * (0.5 * trace * eye - inertia) * root[..., None, :]
-    return moments.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * eye - moments
+    """Return the inertia (B, 3, 3) of a body whose second moments along its axes are scaled by factors (B, 3)."""
+    return stretched_inertia(inertia, torch.diag_embed(factors.sqrt()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ...schemas import InputDataError
 from .checks import require_physical, require_state
 from .contacts import Contacts, PairImpulses
 from .detection import Placed
@@ -89,21 +87,15 @@ class _Engine:
         self.inertias = [Inertia.of(body) for body in world.bodies]
         self.times = times_s if times_s.ndim == 2 else times_s[None]
         self.lengths = self.times.diff(dim=1)
-        longest = self.lengths.amax(0).tolist()
-        self.substeps = [max(1, math.ceil(length / world.step_s - 1e-6)) for length in longest]
+        self.substeps = world.substeps(self.times)
         self.wrenches = [active for active in world.effects if active.effect.has("wrench")]
         self.flows = [active for active in world.effects if active.effect.has("flow")]
-        self.drives: dict[int, Drive] = {}
-        for index, body in enumerate(world.bodies):
-            if body.motion == "driven":
-                if body.name not in driven:
-                    raise InputDataError(
-                        f"the driven body '{body.name}' has no track in this episode; its track is its command.",
-                        todo=f"add rows for '{body.name}' to the episode's tracks file.",
-                    )
-                command = driven[body.name]
-                like = state.position_m.detach()
-                self.drives[index] = command if isinstance(command, Drive) else Drive.of([command], like)
+        like = state.position_m.detach()
+        self.drives = {
+            index: Drive.command(body.name, driven, like)
+            for index, body in enumerate(world.bodies)
+            if body.motion == "driven"
+        }
         self.batch = self._batch(state)
         self.contacts = Contacts(world, self.inertias)
         self.touched: list[PairImpulses] = []

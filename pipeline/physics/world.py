@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -72,6 +73,11 @@ class World:
     def free(self) -> list[int]:
         """Indices of the free bodies."""
         return [index for index, body in enumerate(self.bodies) if body.free]
+
+    def substeps(self, times_s: Tensor) -> list[int]:
+        """Return the number of steps in each interval of times (B, T) [s], none of them longer than `step_s`."""
+        longest = times_s.detach().diff(dim=1).amax(0).tolist()
+        return [max(1, math.ceil(length / self.step_s - 1e-6)) for length in longest]
 
     @property
     def up(self) -> Tensor:
@@ -167,6 +173,24 @@ def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
                 f"{where}: {effect.name}.{number.name} is {value:g} {number.unit}.", f"{low:g} to {number.limit:g}."
             )
     return active
+
+
+def stretched_inertia(inertia: Tensor, stretch: Tensor) -> Tensor:
+    """Return the inertia (n, 3, 3) of a mass stretched by symmetric matrices S (n, 3, 3).
+
+    With C = tr(I)/2 - I the second moments (Wensing et al., "Linear matrix inequalities for physically consistent
+    inertial parameter identification", 2018): C' = S C S, I' = tr(C') - C'.
+    """
+    eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
+    moment = 0.5 * _trace(inertia) * eye - inertia
+    # the change is added, so that no stretch changes nothing bit for bit
+    change = stretch @ moment @ stretch - moment
+    change = 0.5 * (change + change.transpose(-1, -2))
+    return inertia + _trace(change) * eye - change
+
+
+def _trace(matrix: Tensor) -> Tensor:
+    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
 
 
 def symmetric(six: tuple[float, ...]) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..world import World
+from ..world import World, stretched_inertia
 from .effect import Effect, EffectParameter, Values, vector
 
 _AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -34,23 +34,10 @@ class InertiaShape(Effect):
         """Return the world with other inertias."""
         stretch = torch.linalg.matrix_exp(0.5 * _symmetric(vector(values, *(f"s_{axes}" for axes in _AXES))))
         bodies = (
-            replace(body, inertia=_stretched(body.inertia, stretch)) if body.free else body for body in world.bodies
+            replace(body, inertia=stretched_inertia(body.inertia, stretch)) if body.free else body
+            for body in world.bodies
         )
         return replace(world, bodies=tuple(bodies))
-
-
-def _stretched(inertia: Tensor, stretch: Tensor) -> Tensor:
-    """Return the inertia (n, 3, 3) of a mass stretched by symmetric matrices (n, 3, 3)."""
-    eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
-    moment = 0.5 * _trace(inertia) * eye - inertia
-    # the change is added, so that no stretch changes nothing bit for bit
-    change = stretch @ moment @ stretch - moment
-    change = 0.5 * (change + change.transpose(-1, -2))
-    return inertia + _trace(change) * eye - change
-
-
-def _trace(matrix: Tensor) -> Tensor:
-    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
 
 
 def _symmetric(six: Tensor) -> Tensor:

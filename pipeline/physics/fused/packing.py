@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -10,13 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ....schemas import InputDataError
 from ..contact import ContactLaw, coefficients
 from ..detection import GROUND, pairs_of, slot_count
 from ..driven import Drive
 from ..motion import start
 from ..rotation import quat_multiply, quat_normalize, quat_rotate
-from ..world import Body, State, World
+from ..world import State, World
 from . import wrenches
 from .structure import Structure
 
@@ -80,13 +78,14 @@ def pack(
     """
     turn = None if world.ground_normal is None else _upright(world.ground_normal)
     times = times_s if times_s.ndim == 2 else times_s[None]
-    rows = {index: _drive_rows(_command(body, driven, state), turn) for index, body in enumerate(world.bodies)
+    like = state.position_m.detach()
+    rows = {index: _drive_rows(Drive.command(body.name, driven, like), turn) for index, body in enumerate(world.bodies)
             if body.motion == "driven"}  # fmt: skip
     effects = wrenches.coefficients(world)
     turned = turn is not None and len(world.bodies) > 1
     columns = _columns(world, state, turn, turned, effects)
     spheres = [torch.cat((body.centers, body.radii[..., None]), -1) for body in world.bodies]
-    law, substeps = world.contact, _substeps(times, world.step_s)
+    law, substeps = world.contact, world.substeps(times)
     assert isinstance(law, ContactLaw)  # see reason_against
     numbers = torch.tensor(substeps, dtype=torch.int32, device=times.device)
     steps = _steps(law, times, numbers)
@@ -117,11 +116,6 @@ def pack(
         else numbers.new_zeros(1, 0),
         turn,
     )
-
-
-def _substeps(times: Tensor, step_s: float) -> list[int]:
-    longest = times.detach().diff(dim=1).amax(0).tolist()
-    return [max(1, math.ceil(length / step_s - 1e-6)) for length in longest]
 
 
 def _steps(law: ContactLaw, times: Tensor, substeps: Tensor) -> Tensor:
@@ -155,16 +149,6 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
             columns += [zero, zero.expand(-1, 6), zero.expand(-1, 3)]
         columns += [_turned(turn, position), _turned_quat(turn, quat), _turned(turn, velocity), _turned(turn, spin)]
     return columns
-
-
-def _command(body: Body, driven: Mapping[str, Track | Drive], state: State) -> Drive:
-    if body.name not in driven:
-        raise InputDataError(
-            f"the driven body '{body.name}' has no track in this episode; its track is its command.",
-            todo=f"add rows for '{body.name}' to the episode's tracks file.",
-        )
-    command = driven[body.name]
-    return command if isinstance(command, Drive) else Drive.of([command], state.position_m.detach())
 
 
 def _drive_rows(drive: Drive, turn: Tensor | None) -> tuple[Tensor, Tensor]:
