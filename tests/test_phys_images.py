@@ -14,7 +14,8 @@ from cgwm.pipeline.estimation.observations import Observations
 from cgwm.pipeline.imaging.coarse import coarse_model, merged
 from cgwm.pipeline.imaging.footage import Footage, Video, load_footage
 from cgwm.pipeline.imaging.image_loss import ImageLoss
-from cgwm.pipeline.imaging.pose_tracks import PoseTracker, rotation_grid
+from cgwm.pipeline.imaging.pose_search import rotation_grid
+from cgwm.pipeline.imaging.pose_tracks import PoseTracker
 from cgwm.pipeline.imaging.refinement import ImageObjective, TrackTerm, refine_end_to_end
 from cgwm.pipeline.phys_images import fit_physics_from_images
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION, apply_parameters
@@ -30,6 +31,8 @@ FRAMES, RATE = 8, 30.0
 WIDTH, HEIGHT = 64, 48
 GAIN = {"left": (0.9, 1.0, 1.1), "right": (1.1, 1.05, 0.95)}
 NAMES = [FRICTION, DAMPING_RATIO]
+LIFT = torch.tensor([0.01, 0.01, 0.08], dtype=torch.float64)
+"""So far above the table none of its spheres reaches before the cube."""
 TRUTH = torch.tensor([math.log(0.4), math.log(0.3)], dtype=torch.float64)
 
 
@@ -167,10 +170,10 @@ def test_window_and_constant_give_the_loss_of_the_whole_picture(scene: tuple[Mod
     model, _, rollout = scene
     footage = film(model, rollout)
     loss = ImageLoss(model, footage, [0])
-    position, quat = rollout.position_m[0] + 0.01, rollout.quat_wxyz[0]
+    position, quat = rollout.position_m[0] + LIFT, rollout.quat_wxyz[0]
     parts = loss.parts(torch.arange(FRAMES), position, quat)
 
-    shown = film(model, replace(rollout, position_m=rollout.position_m + 0.01), noise=0.0)
+    shown = film(model, replace(rollout, position_m=rollout.position_m + LIFT), noise=0.0)
     expected = torch.zeros(FRAMES, 2)
     for number, (video, mine) in enumerate(zip(footage.videos, shown.videos, strict=True)):
         assert video.covers is not None

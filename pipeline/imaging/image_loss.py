@@ -2,9 +2,11 @@
 
     L = mean over frames of  L1(gain * render, frame)  +  MASK_WEIGHT * L1(visible body, mask)
 
-Both over the whole picture. What does not move is rendered once a camera; then only a window around the moving bodies
-is rendered for each frame, with everything in it, and the rest of the sum is a constant of the window. Appearance and
-geometry are constants here: poses get a gradient from the renderer, {c, s} none (contact model notes, section 7).
+Both over the whole picture. What does not move is rendered once a camera, colours and depths: the plate. For each frame
+only the moving bodies are rendered, in a window around them, over the plate; the rest of the sum is a constant of the
+window. A pixel in which the plate is nearer than the bodies by more than its spheres are rough shows the plate.
+Appearance and geometry are constants here: poses get a gradient from the renderer, {c, s} none (contact model notes,
+section 7).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from torch import Tensor
 from ...datasets.models import Model
 from ...schemas import InputDataError
 from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
-from ..splats.render import MIN_ALPHA, render
+from ..splats.render import MIN_ALPHA, RenderOutput, render
 from ..splats.spheres import Spheres
 from ..splats.views import camera_center
 from .footage import Footage, Video
@@ -35,6 +37,9 @@ MIN_IOU = 0.5
 MAX_ERROR_RATIO = 0.7
 """Without masks: a body in the right place explains its pixels at least this much better than the background does."""
 MIN_AREA_PX = 12.0
+OCCLUDER_RADII = 0.5
+"""What does not move hides a body where it is nearer by this much of the body's radius: a ground of spheres is rough,
+and must not swallow the rim of what stands on it."""
 _MAX_RENDERS = 128
 
 
@@ -74,11 +79,13 @@ class PoseQuality:
 class _Backdrop:
     """What a video shows where nothing moves.
 
-    plates (P, H, W, 3): renders of the static scene; plate_of (T,): the frame's plate; gain (3,): exposure of the
-    camera against the model; unexplained (T,): sum of |gain plate - frame| / 3.
+    plates (P, H, W, 3): renders of the static scene; depths (P, H, W): its median depth [m], infinite where it is not
+    seen; plate_of (T,): the frame's plate; gain (3,): exposure of the camera against the model; unexplained (T,): sum
+    of |gain plate - frame| / 3.
     """
 
     plates: Tensor
+    depths: Tensor
     plate_of: Tensor
     gain: Tensor
     unexplained: Tensor
@@ -115,9 +122,14 @@ class ImageLoss:
         assert model.scene is not None
         static.append(Spheres.from_numpy(model.scene, like.dtype, like.device))
         self._static = Spheres.joined(static)
-        self._features = self._labelled(torch.zeros(3).to(like))
-        self._reach = _reach(Spheres.joined([spheres for _, spheres in self._moving]), min_alpha or MIN_ALPHA)
+        moving = Spheres.joined([spheres for _, spheres in self._moving])
+        label = torch.cat([torch.full((len(spheres),), index) for index, spheres in self._moving])
+        one_hot = torch.nn.functional.one_hot(label, self._count).to(moving.colors)
+        self._features = torch.cat([moving.colors, one_hot], 1)
+        self._scales, self._opacities = moving.scales, moving.opacities
+        self._reach = _reach(moving, min_alpha or MIN_ALPHA)
         self.radii = {index: _radius(spheres) for index, spheres in self._moving}
+        self._roughness = OCCLUDER_RADII * max(self.radii.values())
         self.centers = {index: spheres.means.mean(0) for index, spheres in self._moving}
         self._backdrops = [self._backdrop(video) for video in footage.videos]
 
@@ -203,7 +215,7 @@ class ImageLoss:
             for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
                 means = self._place(position_m[rows], quat_wxyz[rows])
                 window = window_of(video, frames[rows], means, self._reach)
-                picture = self._render(video, window, means)
+                picture = self._render(number, window, means)
                 shown = picture[..., 3:][..., free]
                 body = shown.sum(-1)
                 error[rows] += (self._color(number, window, picture).abs().mean(-1) * body).sum((1, 2))
@@ -260,7 +272,7 @@ class ImageLoss:
     def _residuals(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
         """Return colour (S, h, w, 3) and mask (S, h, w, nb, or 0 without masks) residuals in the window."""
         video = self.footage.videos[number]
-        picture = self._render(video, window, self._place(position_m, quat_wxyz))
+        picture = self._render(number, window, self._place(position_m, quat_wxyz))
         color = self._color(number, window, picture)
         if video.covers is None:
             return color, picture[..., :0]
@@ -292,62 +304,29 @@ class ImageLoss:
             parts.append(spheres.means @ rotation.transpose(1, 2) + position_m[:, index, None].to(like))
         return torch.cat(parts, 1)
 
-    def _labelled(self, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return scales, opacities, features (colour seen from `eye`, one-hot body) of moving, then static spheres."""
-        everything = Spheres.joined([*(spheres for _, spheres in self._moving), self._static.seen_from(eye)])
-        label = torch.zeros(len(everything), self._count).to(everything.means)
-        first = 0
-        for index, spheres in self._moving:
-            label[first : first + len(spheres), index] = 1.0
-            first += len(spheres)
-        return everything.scales, everything.opacities, torch.cat([everything.colors, label], 1)
-
-    def _render(self, video: Video, window: Window, means: Tensor) -> Tensor:
+    def _render(self, number: int, window: Window, means: Tensor) -> Tensor:
         """Return colours and visible bodies in the window, shape (S, h, w, 3 + nb)."""
+        video, drop = self.footage.videos[number], self._backdrops[number]
         K = video.K.repeat(len(means), 1, 1)
         K[:, :2, 2] -= window.corners.to(K)
-        near = self._near(video, window)
-        everything = torch.cat([means, self._static.means[near].expand(len(means), -1, -1)], 1)
-        chosen = torch.cat([torch.arange(means.shape[1]).to(near), means.shape[1] + near])
-        viewmats = video.viewmats[window.frames]
-        whole = self._features
-        if self._static.harmonics is not None:  # cameras of one window are close together
-            whole = self._labelled(torch.stack([camera_center(viewmat) for viewmat in viewmats]).mean(0))
-        scales, opacities, features = (values[chosen] for values in whole)
-        return render(
-            everything, scales, opacities, features, viewmats, K, *window.size, min_alpha=self._min_alpha
-        ).features
-
-    def _near(self, video: Video, window: Window) -> Tensor:
-        """Return which static spheres may reach into the windows: a few, where all windows are about one place."""
-        static = self._static
-        if self._min_alpha <= 0:
-            return torch.arange(len(static), device=static.means.device)
-        near = torch.zeros(len(static), dtype=torch.bool, device=static.means.device)
-        reach = _reach(static, self._min_alpha)
-        moving = len(torch.unique(video.viewmats.flatten(1), dim=0)) > 1
-        for frame in torch.unique(window.frames).tolist() if moving else [int(window.frames[0])]:
-            corners = window.corners[window.frames == frame] if moving else window.corners
-            local = static.means @ video.viewmats[frame, :3, :3].T + video.viewmats[frame, :3, 3]
-            # a cone from the eye around the rectangle of all corners, widened by the spheres' reach
-            low = (corners.amin(0) - video.K[:2, 2] - 1) / video.K.diagonal()[:2]
-            size = torch.tensor(window.size).to(low)
-            high = (corners.amax(0) + size - video.K[:2, 2] + 1) / video.K.diagonal()[:2]
-            x, depth = local[:, :2], local[:, 2:]
-            inside = (x - low * depth) / (1 + low**2).sqrt() > -reach[:, None]
-            inside &= (high * depth - x) / (1 + high**2).sqrt() > -reach[:, None]
-            near |= inside.all(1) & (local[:, 2] > -reach)
-        return near.nonzero()[:, 0]
+        spheres = (means, self._scales, self._opacities, self._features)
+        shown = render(*spheres, video.viewmats[window.frames], K, *window.size, min_alpha=self._min_alpha)
+        plate_of = drop.plate_of[window.frames]
+        near = window.cut(drop.depths[..., None], plate_of)[..., 0] + self._roughness < shown.depth.detach()
+        seen = (~near).to(means)[..., None]
+        behind = window.cut(drop.plates, plate_of) * (1 - seen * shown.alpha[..., None])
+        return seen * shown.features + torch.nn.functional.pad(behind, (0, self._count))
 
     @torch.no_grad()
     def _backdrop(self, video: Video) -> _Backdrop:
         poses, plate_of = torch.unique(video.viewmats.flatten(1), dim=0, return_inverse=True)
-        plates = []
+        views = []
         for pose in poses.view(-1, 1, 4, 4):
             seen = self._static.seen_from(camera_center(pose[0]))
             spheres = (seen.means, seen.scales, seen.opacities, seen.colors)
-            plates.append(render(*spheres, pose, video.K[None], *video.size, min_alpha=self._min_alpha).features)
-        plates = torch.cat(plates)
+            views.append(render(*spheres, pose, video.K[None], *video.size, min_alpha=self._min_alpha, median=True))
+        plates = torch.cat([view.features for view in views])
+        depths = torch.cat([_median(view) for view in views])
         gain = _gain(video, plates, plate_of)
         unexplained = torch.stack(
             [
@@ -355,7 +334,13 @@ class ImageLoss:
                 for plate, frame in zip(plate_of, video.frames, strict=True)
             ]
         )
-        return _Backdrop(plates, plate_of, gain, unexplained)
+        return _Backdrop(plates, depths, plate_of, gain, unexplained)
+
+
+def _median(view: RenderOutput) -> Tensor:
+    """Return the median depth (1, H, W) [m], infinite where more than half of the light gets through."""
+    assert view.median_depth is not None
+    return torch.where(view.median_depth > 0, view.median_depth, torch.inf)
 
 
 def _rows(color: Tensor, mask: Tensor, blur: int) -> Tensor:

@@ -1,0 +1,208 @@
+"""Looking for the pose of bodies in one instant of a video: by silhouettes, over all orientations, by descent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..physics.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
+from .footage import Video
+from .image_loss import ImageLoss
+
+ROTATIONS = 72
+"""Orientations that a search scores: about 35 degrees apart, within what the descent bridges."""
+NEARBY_DEG = (20.0, 40.0)
+"""Turns from an expected orientation that a search also scores, about fourteen axes each."""
+KEPT = 6
+"""Best orientations of a search that are refined."""
+SAME_POSE = (0.15, math.radians(8.0))
+"""Poses closer than this (radii of the body, radians) are one."""
+MIN_SILHOUETTE_PX = 6.0
+DIFFERENCE_FLOOR = 0.08
+"""Without masks a pixel shows a body if it differs from the background by this, and by 4 times the median."""
+STEP_LIMIT = 0.5
+"""Longest step of the descent, in radii of the body and radians."""
+SMALL_STEP = 1e-3
+"""The descent ends with a step below this, in the same units."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of all bodies: position_m (K, nb, 3), quat_wxyz (K, nb, 4), and the image loss at them, value (K,)."""
+
+    position_m: Tensor
+    quat_wxyz: Tensor
+    value: Tensor
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def at(self, rows: Tensor) -> Poses:
+        """Return some of them."""
+        return Poses(self.position_m[rows], self.quat_wxyz[rows], self.value[rows])
+
+    @staticmethod
+    def joined(parts: list[Poses]) -> Poses:
+        """Return all poses of several groups."""
+        return Poses(
+            torch.cat([part.position_m for part in parts]),
+            torch.cat([part.quat_wxyz for part in parts]),
+            torch.cat([part.value for part in parts]),
+        )
+
+
+def search(loss: ImageLoss, instant: int, position_m: Tensor, quat_wxyz: Tensor, blur: int) -> Poses:
+    """Try many orientations of each free body in turn, about its silhouettes, or about the given place.
+
+    Args:
+        loss: The loss on small pictures.
+        instant: Which instant of its footage.
+        position_m: Expected places of all bodies [m], world, shape (nb, 3).
+        quat_wxyz: Expected orientations, shape (nb, 4).
+        blur: As in `ImageLoss.expand`.
+
+    Returns:
+        The best few, refined; of several free bodies all but the last stand as in the best.
+    """
+    position, quat = position_m.clone(), quat_wxyz.clone()
+    found: Poses | None = None
+    globe = rotation_grid(ROTATIONS).to(quat)
+    for index in loss.free:
+        place = located(loss, instant, index)
+        turns = torch.cat([_nearby(quat[index]), globe])
+        center = loss.centers[index]
+        middle = place if place is not None else position[index] + quat_to_matrix(quat[index]) @ center
+        positions, quats = position.repeat(len(turns), 1, 1), quat.repeat(len(turns), 1, 1)
+        quats[:, index] = turns
+        positions[:, index] = middle - quat_to_matrix(turns) @ center
+        values = loss.values(torch.full((len(turns),), instant), positions, quats)
+        order = values.argsort(stable=True)[:KEPT]
+        found = distinct(loss, descend(loss, instant, positions[order], quats[order], 6, blur), KEPT)
+        position, quat = found.position_m[0].clone(), found.quat_wxyz[0].clone()
+    assert found is not None  # a model without a free body has no pose to find
+    return found
+
+
+def descend(loss: ImageLoss, instant: int, position: Tensor, quat: Tensor, iterations: int, blur: int) -> Poses:
+    """Levenberg-Marquardt on the image loss of one instant from several poses (K, nb, ...) at once."""
+    return descend_all(loss, torch.full((len(position),), instant), position, quat, iterations, blur)
+
+
+def descend_all(loss: ImageLoss, instants: Tensor, position: Tensor, quat: Tensor, iterations: int, blur: int) -> Poses:
+    """Levenberg-Marquardt on the image loss, each pose (K, nb, ...) at its instant (K,)."""
+    model = loss.expand(instants, position, quat, blur)
+    damping = torch.full_like(model.value, 1e-2)
+    for _ in range(iterations):
+        diagonal = model.curvature.diagonal(dim1=1, dim2=2)
+        system = model.curvature + torch.diag_embed(damping[:, None] * diagonal + 1e-9)
+        step = -torch.linalg.solve(system.double(), model.slope.double()).to(position)
+        scale = torch.cat([step.new_tensor([loss.radii[index]] * 3 + [1.0] * 3) for index in loss.free])
+        step = step * (STEP_LIMIT / (step.abs() / scale).amax(1)).clamp_max(1.0)[:, None]
+        moved = loss.moved(position, quat, step)
+        trial = loss.expand(instants, *moved, blur)
+        better = trial.value < model.value
+        position = torch.where(better[:, None, None], moved[0], position)
+        quat = torch.where(better[:, None, None], quat_normalize(moved[1]), quat)
+        model = type(model)(
+            torch.where(better, trial.value, model.value),
+            torch.where(better[:, None], trial.slope, model.slope),
+            torch.where(better[:, None, None], trial.curvature, model.curvature),
+        )
+        damping = torch.where(better, damping / 5, damping * 10)
+        if bool(((step.abs() / scale).amax(1) < SMALL_STEP).all()):
+            break
+    return Poses(position, quat, model.value)
+
+
+def distinct(loss: ImageLoss, poses: Poses, most: int) -> Poses:
+    """Return the best poses, at most so many, without those that are all but equal to a better one."""
+    kept: list[int] = []
+    for row in poses.value.argsort(stable=True).tolist():
+        if len(kept) < most and not any(_same(loss, poses, row, other) for other in kept):
+            kept.append(row)
+    return poses.at(torch.tensor(kept))
+
+
+def _same(loss: ImageLoss, poses: Poses, a: int, b: int) -> bool:
+    for index in loss.free:
+        shift = float((poses.position_m[a, index] - poses.position_m[b, index]).norm())
+        cosine = float((poses.quat_wxyz[a, index] * poses.quat_wxyz[b, index]).sum().abs().clamp_max(1.0))
+        if shift > SAME_POSE[0] * loss.radii[index] or 2 * math.acos(cosine) > SAME_POSE[1]:
+            return False
+    return True
+
+
+def located(loss: ImageLoss, instant: int, index: int) -> Tensor | None:
+    """Return the middle of a body (3,), world, from its silhouettes, or None where too little of it is seen."""
+    rays, distances = [], []
+    for number, video in enumerate(loss.footage.videos):
+        frame = int(loss.footage.frame_at[number, instant])
+        if frame < 0:
+            continue
+        cover = _silhouette(loss, number, frame, index)
+        area = float(cover.sum())
+        if area < MIN_SILHOUETTE_PX:
+            continue
+        rays.append(_ray(video, frame, cover))
+        # a disc of the body's mean radius would cover as many pixels at this distance
+        distances.append(loss.radii[index] * float(video.K[0, 0]) * math.sqrt(math.pi / area))
+    if not rays:
+        return None
+    origins, directions = (torch.stack(column) for column in zip(*rays, strict=True))
+    if len(rays) == 1:
+        return origins[0] + distances[0] * directions[0]
+    across = torch.eye(3).to(directions) - directions[:, :, None] * directions[:, None]
+    return torch.linalg.solve(across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0])
+
+
+def _silhouette(loss: ImageLoss, number: int, frame: int, index: int) -> Tensor:
+    """Return where a body is seen (H, W): its mask, or the largest region that differs from the background."""
+    video = loss.footage.videos[number]
+    if video.covers is not None:
+        return video.covers[frame, index]
+    difference = cv2.blur(loss.difference(number, frame).cpu().numpy(), (3, 3))
+    threshold = max(DIFFERENCE_FLOOR, 4 * float(np.median(difference)))
+    _, regions, table, _ = cv2.connectedComponentsWithStats((difference > threshold).astype(np.uint8))
+    if len(table) < 2:
+        return torch.zeros_like(video.frames[frame, ..., 0])
+    largest = 1 + int(table[1:, cv2.CC_STAT_AREA].argmax())
+    return torch.as_tensor((regions == largest).astype(np.float32)).to(video.frames)
+
+
+def rotation_grid(count: int) -> Tensor:
+    """Return evenly spread rotations, quaternions wxyz (count, 4).
+
+    Source: super-Fibonacci spirals (M. Alexa, CVPR 2022).
+    """
+    phi, psi = math.sqrt(2.0), 1.533751168755204288118041
+    s = torch.arange(count, dtype=torch.float64) + 0.5
+    near, far = (s / count).sqrt(), (1 - s / count).sqrt()
+    alpha, beta = 2 * math.pi * s / phi, 2 * math.pi * s / psi
+    return torch.stack([near * alpha.sin(), near * alpha.cos(), far * beta.sin(), far * beta.cos()], -1)
+
+
+def _nearby(quat_wxyz: Tensor) -> Tensor:
+    """Return a rotation and its neighbours, shape (1 + 14 * angles, 4)."""
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3) / math.sqrt(3)
+    axes = torch.cat([torch.eye(3), -torch.eye(3), corners]).to(quat_wxyz)
+    turns = torch.cat([math.radians(angle) * axes for angle in NEARBY_DEG])
+    return quat_multiply(quat_wxyz[None], quat_exp(torch.cat([torch.zeros(1, 3).to(turns), turns])))
+
+
+def _ray(video: Video, frame: int, cover: Tensor) -> tuple[Tensor, Tensor]:
+    """Return origin and unit direction (world) of the ray through the middle of a silhouette (H, W)."""
+    rows = torch.arange(cover.shape[0]).to(cover) + 0.5
+    columns = torch.arange(cover.shape[1]).to(cover) + 0.5
+    area = cover.sum()
+    pixel = torch.stack(
+        [(cover.sum(0) * columns).sum() / area, (cover.sum(1) * rows).sum() / area, torch.ones(()).to(cover)]
+    )
+    viewmat = video.viewmats[frame]
+    rotation = viewmat[:3, :3]
+    direction = rotation.T @ torch.linalg.solve(video.K, pixel)
+    return -rotation.T @ viewmat[:3, 3], direction / direction.norm()
