@@ -33,11 +33,19 @@ def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Tr
     Raises:
         InputDataError: See :func:`simulate`.
     """
-    true_times = times_s
+    return as_measured(world, rolled_out(world, state, true_times(world, times_s), driven), times_s)
+
+
+def true_times(world: World, times_s: Tensor) -> Tensor:
+    """Return the true times of recorded ones [s], shape (T,) or (B, T)."""
     for active in world.effects:
         if active.effect.has("times"):
-            true_times = active.effect.times(active.values, true_times if true_times.ndim == 2 else true_times[None])
-    rollout = rolled_out(world, state, true_times, driven)
+            times_s = active.effect.times(active.values, times_s if times_s.ndim == 2 else times_s[None])
+    return times_s
+
+
+def as_measured(world: World, rollout: Rollout, times_s: Tensor) -> Rollout:
+    """Return a rollout over true times as it is recorded: at the recorded times, poses as measured."""
     poses = Poses(rollout.position_m, rollout.quat_wxyz, up=world.up)
     for active in world.effects:
         if active.effect.has("observe"):
