@@ -39,6 +39,7 @@ from .phys_geo import MAX_SPAN_S, PhysicsFit, physics_fit
 from .physics.driven import Drive
 from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
+from .video_checks import examine_tracks
 
 COARSE_SIZE, FINE_SIZE = 80, 144
 """Longer side [px] of the pictures for searching poses, and for everything else."""
@@ -98,6 +99,8 @@ def fit_physics_from_images(
     episodes = [_episode(world, model, capture, name, tracks_too) for name in capture.episodes(split)]
     seconds = {"pose_tracks": round(time.perf_counter() - started, 2)}
     noise = _noise(capture, episodes)
+    known = noise[0] or 0.0, noise[1] or 0.0
+    doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
     brief = config.model_copy(update={"iterations": min(config.iterations, TRACK_ITERATIONS)})
     start = fit_with_constants(world, [(episode.name, episode.tracks) for episode in episodes], brief, noise)
     seconds["dynamics"] = round(time.perf_counter() - started - seconds["pose_tracks"], 2)
@@ -127,7 +130,7 @@ def fit_physics_from_images(
         for p in found.parameters
     )
     effects = () if start.effects is None else start.effects.parameters
-    warnings = (*found.warnings, *_warnings(episodes))
+    warnings = (*found.warnings, *doubts, *_warnings(episodes))
     return replace(
         found,
         parameters=(*parameters, *effects),

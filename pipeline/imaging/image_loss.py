@@ -9,7 +9,7 @@ geometry are constants here: poses get a gradient from the renderer, {c, s} none
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -146,7 +146,7 @@ class ImageLoss:
         shots = torch.zeros(len(instants)).to(total)
         for number, video in enumerate(self.footage.videos):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
-            for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
+            for rows in _filmed(frames, _MAX_RENDERS):
                 window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
                 color, mask = self._residuals(number, window, position_m[rows], quat_wxyz[rows])
                 photometric = color.abs().sum((1, 2, 3)) / 3 + self._outside(number, window)
@@ -185,7 +185,7 @@ class ImageLoss:
         )
         for number in range(len(self.footage.videos)):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
-            for rows in (frames >= 0).nonzero()[:, 0].split(max(1, _MAX_RENDERS // (size + 1))):
+            for rows in _filmed(frames, max(1, _MAX_RENDERS // (size + 1))):
                 pair = self._shot_model(number, frames[rows], position_m[rows], quat_wxyz[rows], steps, blur)
                 for target, part in zip((value, slope, curvature), pair, strict=True):
                     target.index_add_(0, rows, part)
@@ -200,7 +200,7 @@ class ImageLoss:
         inside, union, error, blank, area = (torch.zeros(count).to(self._static.means) for _ in range(5))
         for number, video in enumerate(self.footage.videos):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
-            for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
+            for rows in _filmed(frames, _MAX_RENDERS):
                 means = self._place(position_m[rows], quat_wxyz[rows])
                 window = window_of(video, frames[rows], means, self._reach)
                 picture = self._render(video, window, means)
@@ -356,6 +356,13 @@ class ImageLoss:
             ]
         )
         return _Backdrop(plates, plate_of, gain, unexplained)
+
+
+def _filmed(frames: Tensor, most: int) -> Iterator[Tensor]:
+    """Yield the indices of poses (K,) whose instant the camera saw, at most so many at once."""
+    rows = (frames >= 0).nonzero()[:, 0]
+    if len(rows):
+        yield from rows.split(most)
 
 
 def _rows(color: Tensor, mask: Tensor, blur: int) -> Tensor:
