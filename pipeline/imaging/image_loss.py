@@ -71,7 +71,7 @@ class PoseQuality:
 
 
 @dataclass(frozen=True, eq=False)
-class _Backdrop:
+class Backdrop:
     """What a video shows where nothing moves.
 
     plates (P, H, W, 3): renders of the static scene; plate_of (T,): the frame's plate; gain (3,): exposure of the
@@ -96,7 +96,7 @@ class ImageLoss:
 
     def __init__(self, model: Model, footage: Footage, free: Sequence[int], min_alpha: float = MIN_ALPHA) -> None:
         _check(model, free)
-        self.footage, self.free, self._min_alpha = footage, tuple(free), min_alpha
+        self.footage, self.free, self._min_alpha, self._step_m = footage, tuple(free), min_alpha, DIFFERENCE_M
         like = footage.videos[0].frames
         self._count = len(model.file.bodies)
         self._moving: list[tuple[int, Spheres]] = []
@@ -120,6 +120,11 @@ class ImageLoss:
         self.radii = {index: _radius(spheres) for index, spheres in self._moving}
         self.centers = {index: spheres.means.mean(0) for index, spheres in self._moving}
         self._backdrops = [self._backdrop(video) for video in footage.videos]
+
+    @property
+    def photometric(self) -> bool:
+        """Whether colours are compared."""
+        return True
 
     @property
     def gains(self) -> dict[str, list[float]]:
@@ -181,7 +186,7 @@ class ImageLoss:
         value, slope = torch.zeros(count).to(like), torch.zeros(count, size).to(like)
         curvature, shots = torch.zeros(count, size, size).to(like), torch.zeros(count).to(like)
         steps = torch.cat(
-            [like.new_tensor([DIFFERENCE_M] * 3 + [DIFFERENCE_M / self.radii[index]] * 3) for index in self.free]
+            [like.new_tensor([self._step_m] * 3 + [self._step_m / self.radii[index]] * 3) for index in self.free]
         )
         for number in range(len(self.footage.videos)):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
@@ -201,9 +206,8 @@ class ImageLoss:
         for number, video in enumerate(self.footage.videos):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
             for rows in _filmed(frames, _MAX_RENDERS):
-                means = self._place(position_m[rows], quat_wxyz[rows])
-                window = window_of(video, frames[rows], means, self._reach)
-                picture = self._render(video, window, means)
+                window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
+                picture = self._picture(video, window, position_m[rows], quat_wxyz[rows])
                 shown = picture[..., 3:][..., free]
                 body = shown.sum(-1)
                 error[rows] += (self._color(number, window, picture).abs().mean(-1) * body).sum((1, 2))
@@ -260,7 +264,7 @@ class ImageLoss:
     def _residuals(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
         """Return colour (S, h, w, 3) and mask (S, h, w, nb, or 0 without masks) residuals in the window."""
         video = self.footage.videos[number]
-        picture = self._render(video, window, self._place(position_m, quat_wxyz))
+        picture = self._picture(video, window, position_m, quat_wxyz)
         color = self._color(number, window, picture)
         if video.covers is None:
             return color, picture[..., :0]
@@ -302,8 +306,9 @@ class ImageLoss:
             first += len(spheres)
         return everything.scales, everything.opacities, torch.cat([everything.colors, label], 1)
 
-    def _render(self, video: Video, window: Window, means: Tensor) -> Tensor:
+    def _picture(self, video: Video, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
         """Return colours and visible bodies in the window, shape (S, h, w, 3 + nb)."""
+        means = self._place(position_m, quat_wxyz)
         K = video.K.repeat(len(means), 1, 1)
         K[:, :2, 2] -= window.corners.to(K)
         near = self._near(video, window)
@@ -340,7 +345,7 @@ class ImageLoss:
         return near.nonzero()[:, 0]
 
     @torch.no_grad()
-    def _backdrop(self, video: Video) -> _Backdrop:
+    def _backdrop(self, video: Video) -> Backdrop:
         poses, plate_of = torch.unique(video.viewmats.flatten(1), dim=0, return_inverse=True)
         plates = []
         for pose in poses.view(-1, 1, 4, 4):
@@ -355,7 +360,7 @@ class ImageLoss:
                 for plate, frame in zip(plate_of, video.frames, strict=True)
             ]
         )
-        return _Backdrop(plates, plate_of, gain, unexplained)
+        return Backdrop(plates, plate_of, gain, unexplained)
 
 
 def _filmed(frames: Tensor, most: int) -> Iterator[Tensor]:
