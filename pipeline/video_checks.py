@@ -30,6 +30,8 @@ MIN_CHANGED_PX = 6
 """Fewer changed pixels are noise: an edge of a moving body has more."""
 STILL_SIGMA = 6.0
 """A body that stays within this many standard errors of its first pose has not moved: twenty poses scatter by four."""
+MOVED_SHARE, MOVED_RAD = 0.25, 0.5
+"""A shift of this share of a body's size, or such a turn, is a motion, however uncertain the poses are."""
 DEEP_M, DEEP_SIGMA = 0.002, 3.0
 """A start may be this deep inside something, and so many standard errors of its position deeper."""
 REFUSED_SHARE = 0.1
@@ -88,12 +90,12 @@ def examine_tracks(world: World, episodes: Sequence[tuple[str, Mapping[str, Trac
     Raises:
         InputDataError: If no body moves in any episode, or one begins deep inside another or the ground.
     """
-    shifts = {name: _shift(world, tracks, noise) for name, tracks, noise in episodes}
-    if all(moved < limit for moved, limit in shifts.values()):
-        name, (moved, limit) = max(shifts.items(), key=lambda item: item[1][0])
+    if not any(_moves(world, tracks, noise) for _, tracks, noise in episodes):
+        free = [world.bodies[index].name for index in world.free]
+        largest = max(_largest_shift(tracks[name]) for _, tracks, _ in episodes for name in free if name in tracks)
         raise InputDataError(
-            f"no free body moves in any of the {len(shifts)} episode(s): at most by {1e3 * moved:.2f} mm "
-            f"('{name}'), which is what the noise of its poses alone does (up to {1e3 * limit:.2f} mm).",
+            f"no free body moves in any of the {len(episodes)} episode(s): at most by {1e3 * largest:.2f} mm, which is "
+            f"what the noise of its poses alone does ({1e3 * episodes[0][2][0]:.2f} mm).",
             "a motion with contact: a drop, a throw or a push. What rests shows no friction, stiffness or damping.",
             "film the motion; if the body does move, check that the masks and the cameras are those of these videos.",
         )
@@ -138,22 +140,31 @@ def _changed(before: NDArray[np.float32], after: NDArray[np.float32]) -> int:
     return int((difference > max(CHANGE_FLOOR, CHANGE_FACTOR * float(np.median(difference)))).sum())
 
 
-def _shift(world: World, tracks: Mapping[str, Track], noise: Noise) -> tuple[float, float]:
-    """Return how far [m] the surface of any free body gets from its first pose, and what noise alone may do [m]."""
-    moved, limit = 0.0, 0.0
+def _moves(world: World, tracks: Mapping[str, Track], noise: Noise) -> bool:
+    """Tell whether any free body leaves its first pose by more than noise does, or by a share of its size."""
     for index in world.free:
         body = world.bodies[index]
         track = tracks.get(body.name)
         if track is None:
             continue
         size = float((body.centers[0] - body.com[0]).norm(dim=-1).mean() + body.radii[0].mean())
-        shift = np.linalg.norm(track.position_m - track.position_m[0], axis=1)
-        if track.quat_wxyz is not None:
-            cosine = np.abs(track.quat_wxyz @ track.quat_wxyz[0]).clip(max=1.0)
-            shift = np.hypot(shift, size * 2 * np.arccos(cosine))
-        moved = max(moved, float(shift.max()))
-        limit = max(limit, STILL_SIGMA * math.sqrt(3 * noise[0] ** 2 + 3 * (size * noise[1]) ** 2))
-    return moved, limit
+        far = min(STILL_SIGMA * math.sqrt(3) * noise[0], MOVED_SHARE * size)
+        turned = min(STILL_SIGMA * math.sqrt(3) * noise[1], MOVED_RAD)
+        if _largest_shift(track) > far or _largest_turn(track) > turned:
+            return True
+    return False
+
+
+def _largest_shift(track: Track) -> float:
+    """Return how far a track gets from its first position [m]."""
+    return float(np.linalg.norm(track.position_m - track.position_m[0], axis=1).max())
+
+
+def _largest_turn(track: Track) -> float:
+    """Return by how much a track turns from its first orientation [rad]; 0 where none was measured."""
+    if track.quat_wxyz is None:
+        return 0.0
+    return float(2 * np.arccos(np.abs(track.quat_wxyz @ track.quat_wxyz[0]).clip(max=1.0)).max())
 
 
 def _overlap(world: World, name: str, tracks: Mapping[str, Track], noise: Noise) -> list[str]:

@@ -202,6 +202,9 @@ def test_poses_that_only_scatter_are_no_motion() -> None:
     with pytest.raises(InputDataError, match=r"no free body moves(.|\n)*film the motion"):
         examine_tracks(world, scattered(0.0))
     assert examine_tracks(world, scattered(0.1)) == []
+    # poses of coarse pictures may be uncertain, and the motion plain all the same
+    ((name, tracks, _),) = scattered(0.1)
+    assert examine_tracks(world, [(name, tracks, (1e-3, 1.0))]) == []
 
 
 def test_a_time_offset_of_a_camera_gives_its_instants(root: Path) -> None:
