@@ -31,6 +31,7 @@ _PUBLIC = {
     "evaluate": ".pipeline.eval",
     "fit": ".pipeline.fit",
     "import_contactnets": ".datasets.contactnets",
+    "import_pinwm": ".datasets.pinwm",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "synthesize": ".pipeline.synthesize",
@@ -41,6 +42,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .datasets.capture import Capture  # pyright: ignore[reportMissingImports]
     from .datasets.contactnets import import_contactnets  # pyright: ignore[reportMissingImports]
     from .datasets.models import Model, read_model  # pyright: ignore[reportMissingImports]
+    from .datasets.pinwm import import_pinwm  # pyright: ignore[reportMissingImports]
     from .pipeline.calibrate import calibrate  # pyright: ignore[reportMissingImports]
     from .pipeline.demo import run_demo  # pyright: ignore[reportMissingImports]
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
@@ -80,6 +82,7 @@ __all__ = [
     "evaluate",
     "fit",
     "import_contactnets",
+    "import_pinwm",
     "read_model",
     "run_demo",
     "synthesize",

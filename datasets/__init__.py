@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .meshes import Mesh, SolidProperties, mass_properties, read_mesh
     from .mjcf import write_mjcf
     from .models import Model, read_model, write_model
+    from .pinwm import import_pinwm
     from .ply import Splats, read_splats, write_splats
     from .progress import progress
     from .tracks import Track, read_tracks, write_tracks
@@ -39,6 +40,7 @@ _HOMES = {
     "meshes": ("Mesh", "SolidProperties", "mass_properties", "read_mesh"),
     "mjcf": ("write_mjcf",),
     "models": ("Model", "read_model", "write_model"),
+    "pinwm": ("import_pinwm",),
     "ply": ("Splats", "read_splats", "write_splats"),
     "progress": ("progress",),
     "tracks": ("Track", "read_tracks", "write_tracks"),
@@ -60,6 +62,7 @@ __all__ = [
     "camera_of",
     "check_capture",
     "import_contactnets",
+    "import_pinwm",
     "kind_of",
     "manifest_toml",
     "mass_properties",

@@ -344,4 +344,5 @@ def _check_video_camera(capture: Capture, camera: str, episode: str, path: Path,
             f"{path}: {info.width}x{info.height} px, but its camera '{entry.camera}' has "
             f"{intrinsics.width}x{intrinsics.height} px.",
             "the image size that the camera was calibrated for.",
+            f"give the video in that size, or run 'cgwm calibrate {capture.root} --overwrite'.",
         )

@@ -50,6 +50,18 @@ def read_label(path: Path | str) -> NDArray[np.uint8]:
     return image
 
 
+def read_alpha(path: Path | str) -> NDArray[np.uint8]:
+    """Return the opacity of a picture with four channels, uint8, shape (height, width).
+
+    Raises:
+        InputDataError: If it is missing, truncated, or has no opacity.
+    """
+    image = _decode(Path(path), cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
+        raise InputDataError(f"{path}: a picture without opacity.", "four channels of 8 bits.")
+    return image[..., 3]
+
+
 def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -> None:
     """Write RGB (height, width, 3) or labels (height, width), uint8, as PNG or JPEG by the suffix.
 

@@ -159,3 +159,19 @@ def described(parameter: Parameter, coordinate: float, std: float) -> FittedPara
         state=state,
         note=f"{factor}{parameter.reveals} would reveal it",
     )
+
+
+def bound_warnings(parameters: Sequence[Parameter], fitted: Sequence[FittedParameter]) -> list[str]:
+    """Say of each parameter that ended on a bound which one it is, and what that means."""
+    meaning = {parameter.name: parameter.at_bounds for parameter in parameters}
+    texts = []
+    for found in fitted:
+        if found.state != "on_bound" or found.bounds is None:
+            continue
+        upper = found.estimate - found.bounds[0] > found.bounds[1] - found.estimate
+        side, unit = ("upper" if upper else "lower"), "" if found.unit == "1" else f" {found.unit}"
+        texts.append(
+            f"{found.name} ended on its {side} bound ({found.estimate:.3g}{unit}), which is no estimate: "
+            f"{meaning[found.name][upper]}."
+        )
+    return texts

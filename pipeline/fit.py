@@ -43,6 +43,7 @@ from .physics.effects.registry import load_effect
 from .physics.world import World, symmetric
 from .sfm.points import POINTS_NAME
 from .sg_gs import SgGsResult, fit_scene, resolve_device
+from .video_checks import examine_videos
 
 Stage = Literal["all", "sg-gs", "phys-geo"]
 
@@ -97,11 +98,20 @@ def fit(
     # phys-geo alone makes no spheres, so that the photos need not be read for their hashes
     made_of = {} if stage == "phys-geo" else _made_of(opened, splat_config)
     checkpoint = Checkpoint.beside(Path(out), made_of, resume, overwrite)
+    moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
+    # what videos cannot teach is told before hours of work
+    warnings = (
+        examine_videos(opened, split, phys_config.supervise == "both")
+        if moves and phys_config.supervise != "tracks"
+        else []
+    )
     with enough_memory(*_needs(splat_config)):
         model = _start(opened, stage, parent, splat_config, checkpoint)
-    if stage == "phys-geo" or (stage == "all" and _has_motion(opened, split)):
+    if moves:
         with enough_memory(*_needs(phys_config)):
             model = _with_physics(model, opened, split, phys_config)
+        file = model.file.model_copy(update={"warnings": (*model.file.warnings, *warnings)})
+        model = replace(model, file=file)
     elif phys_config.effects:
         raise InputDataError(
             f"{opened.root}: --effects, but split '{split}' has no motion to fit them to.",

@@ -33,7 +33,7 @@ from .estimation.search import Prior, SearchResult, episode_covariance, importan
 from .estimation.shooting import Prior as ShotPrior
 from .estimation.shooting import Shooting
 from .estimation.warmup import estimate_states, warmup_frames
-from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, described, fit_first_contacts
+from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
@@ -44,6 +44,7 @@ from .physics.parameters import (
     Parameter,
     apply_parameters,
     effect_parameters,
+    mass_distribution,
 )
 from .physics.rotation import geodesic_angle
 from .physics.world import State, World
@@ -183,7 +184,14 @@ def fit_physics(
     record["correlation"] = _correlation(covariance).tolist()
     found = physics_fit(world, names, best, covariance, sigma, record)
     more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
-    return replace(found, parameters=(*found.parameters, *more), mass=mass, effects=effects)
+    known = [*effect_parameters(world), *(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
+    return replace(
+        found,
+        parameters=(*found.parameters, *more),
+        warnings=(*found.warnings, *bound_warnings(known, more)),
+        mass=mass,
+        effects=effects,
+    )
 
 
 def _fit_effects(
@@ -356,13 +364,12 @@ def physics_fit(
     """
     std = np.sqrt(np.diag(covariance))
     fitted = [_parameter(p, z, s) for p, z, s in zip(names, best, std, strict=True)]
+    warnings = bound_warnings(names, fitted)
     if GROUND_SHIFT in names and world.ground_offset is not None:
         fitted[-1] = _absolute(fitted[-1], float(world.ground_offset[0]))
     value = {p.name: p.estimate for p in fitted}
     contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
-    warnings = [
-        f"{p.name} is on its bound ({p.estimate:g} {p.unit}): {p.note}" for p in fitted if p.state == "on_bound"
-    ] + [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
+    warnings += [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
     if record.get("episodes", 0) < ENOUGH_EPISODES:
         warnings.append(
             f"with fewer than {ENOUGH_EPISODES} episodes the intervals rest on an assumption: that the errors of the "

@@ -12,7 +12,7 @@ public re-implementation found every weight of it to make things worse than L1 a
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,10 +35,14 @@ from .imaging.footage import Footage, load_footage
 from .imaging.image_loss import ImageLoss
 from .imaging.pose_tracks import PoseTrack, PoseTracker
 from .imaging.refinement import ImageObjective, Refined, TrackTerm, refine_end_to_end
+from .imaging.silhouette_loss import image_loss
+from .imaging.silhouettes import body_outlines
 from .phys_geo import MAX_SPAN_S, PhysicsFit, physics_fit
 from .physics.driven import Drive
 from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
+from .splats.mesh import Mesh
+from .video_checks import examine_tracks
 
 COARSE_SIZE, FINE_SIZE = 80, 144
 """Longer side [px] of the pictures for searching poses, and for everything else."""
@@ -95,9 +99,12 @@ def fit_physics_from_images(
     started = time.perf_counter()
     if capture.cameras is not None:
         require_metric(capture.cameras)
-    episodes = [_episode(world, model, capture, name, tracks_too) for name in capture.episodes(split)]
+    outlines, left_out = body_outlines(model, capture, capture.episodes(split))
+    episodes = [_episode(world, model, capture, name, tracks_too, outlines) for name in capture.episodes(split)]
     seconds = {"pose_tracks": round(time.perf_counter() - started, 2)}
     noise = _noise(capture, episodes)
+    known = noise[0] or 0.0, noise[1] or 0.0
+    doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
     brief = config.model_copy(update={"iterations": min(config.iterations, TRACK_ITERATIONS)})
     start = fit_with_constants(world, [(episode.name, episode.tracks) for episode in episodes], brief, noise)
     seconds["dynamics"] = round(time.perf_counter() - started - seconds["pose_tracks"], 2)
@@ -113,7 +120,7 @@ def fit_physics_from_images(
     refined, chosen = _refine(objective, shared, covariance, config)
     seconds["images"] = round(time.perf_counter() - started - sum(seconds.values()), 2)
     record = start.record | {
-        "image_loss": _loss_record(objective, refined),
+        "image_loss": _loss_record(objective, refined) | {"photometric": not outlines},
         "pose_tracks": {episode.name: _track_record(episode) for episode in episodes},
         "exposure_gain": {e.name: e.loss.gains for e in filmed if e.loss is not None},
         "start_state": chosen,
@@ -127,7 +134,7 @@ def fit_physics_from_images(
         for p in found.parameters
     )
     effects = () if start.effects is None else start.effects.parameters
-    warnings = (*found.warnings, *_warnings(episodes))
+    warnings = (*found.warnings, *left_out, *doubts, *_warnings(episodes))
     return replace(
         found,
         parameters=(*parameters, *effects),
@@ -137,7 +144,9 @@ def fit_physics_from_images(
     )
 
 
-def _episode(world: World, model: Model, capture: Capture, name: str, tracks_too: bool) -> _Episode:
+def _episode(
+    world: World, model: Model, capture: Capture, name: str, tracks_too: bool, outlines: Mapping[str, Mesh]
+) -> _Episode:
     """Read an episode and find its tracks."""
     measured = capture.tracks(name)
     drives = _drives(world, capture, name, measured)
@@ -145,7 +154,7 @@ def _episode(world: World, model: Model, capture: Capture, name: str, tracks_too
     if tracks_too and own and not capture.videos(name):
         return _Episode(name, None, None, own | drives, None)
     footage = _within_span(load_footage(capture, name, FINE_SIZE))
-    loss = ImageLoss(model, footage, world.free)
+    loss = image_loss(model, footage, world.free, outlines)
     if tracks_too and own:
         return _Episode(name, footage, loss, own | drives, None)
     if len(world.free) > 1 and any(video.covers is None for video in footage.videos):
@@ -155,7 +164,7 @@ def _episode(world: World, model: Model, capture: Capture, name: str, tracks_too
             "add masks, so that the bodies can be told apart.",
         )
     small = _within_span(load_footage(capture, name, COARSE_SIZE))
-    coarse = ImageLoss(coarse_model(model), small, world.free)
+    coarse = image_loss(coarse_model(model), small, world.free, outlines)
     position, quat = _given_poses(world, drives, footage.times_s)
     found = PoseTracker(coarse, loss, position, quat).run()
     tracks = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +16,8 @@ from ...schemas import InputDataError
 
 MIN_FRAMES = 3
 """Two frames show a velocity and nothing of contact."""
+MIN_SEEN = 0.5
+"""Share of the instants in which some camera must see the free bodies."""
 SAME_INSTANT_S = 1e-6
 
 
@@ -29,6 +32,8 @@ class Video:
         covers: Share of each pixel that each body covers, shape (T, bodies, H, W); None without masks.
         K: Camera matrix at this size [px], shape (3, 3).
         viewmats: T_cam_world of each frame, shape (T, 4, 4).
+        unseen: Frames whose masks lack a free body, shape (T,); None where all show all. The body may be hidden, out
+            of view or missed by the segmentation: such a frame says nothing, not that the body is nowhere.
     """
 
     camera: str
@@ -37,6 +42,12 @@ class Video:
     covers: Tensor | None
     K: Tensor
     viewmats: Tensor
+    unseen: NDArray[np.bool_] | None = None
+
+    @property
+    def shown(self) -> NDArray[np.int64]:
+        """Return the numbers of the frames that count: all but the unseen ones."""
+        return np.arange(len(self.times_s)) if self.unseen is None else np.flatnonzero(~self.unseen)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -51,8 +62,8 @@ class Footage:
     Attributes:
         episode: Its name.
         videos: One for each calibrated camera.
-        times_s: The instants at which any camera took a frame [s], shape (I,).
-        frame_at: Frame of each video at each instant, -1 for none, shape (videos, I).
+        times_s: The instants at which any camera took a frame that counts [s], shape (I,).
+        frame_at: Frame of each video at each instant, -1 for none or an unseen one, shape (videos, I).
     """
 
     episode: str
@@ -63,12 +74,11 @@ class Footage:
     @staticmethod
     def of(episode: str, videos: tuple[Video, ...]) -> Footage:
         """Put videos on one time line; frames of the same time share an instant."""
-        times = np.unique(np.concatenate([video.times_s for video in videos]))
-        times = times[np.concatenate([[True], np.diff(times) > SAME_INSTANT_S])]
+        times = _instants([video.times_s[video.shown] for video in videos])
         frame_at = np.full((len(videos), len(times)), -1)
         for row, video in enumerate(videos):
-            nearest = np.abs(times[:, None] - video.times_s).argmin(0)
-            frame_at[row, nearest] = np.arange(len(video.times_s))
+            nearest = np.abs(times[:, None] - video.times_s[video.shown]).argmin(0)
+            frame_at[row, nearest] = video.shown
         return Footage(episode, videos, times, frame_at)
 
 
@@ -82,7 +92,7 @@ def load_footage(capture: Capture, episode: str, image_size: int, device: torch.
         device: Where the tensors live.
 
     Raises:
-        InputDataError: If there are no cameras, no video, or fewer than three frames.
+        InputDataError: If there are no cameras, no video, fewer than three frames, or the masks are empty in most.
     """
     names = capture.videos(episode)
     if not names:
@@ -106,7 +116,43 @@ def load_footage(capture: Capture, episode: str, image_size: int, device: torch.
             f"a pose under 'videos' in the cameras' file; it has {', '.join(sorted(posed)) or 'none'}.",
             f"run 'cgwm calibrate {capture.root} --overwrite'.",
         )
-    return Footage.of(episode, tuple(_load(capture, name, episode, image_size, device) for name in calibrated))
+    videos = tuple(_load(capture, name, episode, image_size, device) for name in calibrated)
+    _require_seen(capture, episode, videos)
+    return Footage.of(episode, videos)
+
+
+def _instants(times_s: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the different times [s] among several rows, sorted."""
+    times = np.unique(np.concatenate(list(times_s)))
+    return times[np.concatenate([[True], np.diff(times) > SAME_INSTANT_S])] if len(times) else times
+
+
+def _require_seen(capture: Capture, episode: str, videos: Sequence[Video]) -> None:
+    """Refuse an episode in which masks show the free bodies in too few instants."""
+    every, seen = (_instants(rows) for rows in ([v.times_s for v in videos], [v.times_s[v.shown] for v in videos]))
+    if len(seen) >= max(MIN_FRAMES, MIN_SEEN * len(every)):
+        return
+    labels = {k: body.name for k, body in enumerate(capture.manifest.bodies, 1) if body.motion == "free"}
+    bodies = " and ".join(f"'{name}' (label {k})" for k, name in labels.items())
+    where = f"{capture.root / 'video_masks'}: episode '{episode}'"
+    if not len(seen):
+        raise InputDataError(
+            f"{where}: the masks of all {len(videos)} cameras are empty: none shows {bodies}.",
+            "0 for the background, k for the k-th of [[bodies]].",
+            "correct the masks, or take them away: without any the whole picture counts.",
+        )
+    raise InputDataError(
+        f"{where}: {bodies} can be seen in {len(seen)} of {len(every)} instants, last at {seen[-1]:.3f} s "
+        f"({'; '.join(_last_seen(video) for video in videos)}); in all others every camera's mask is empty.",
+        f"masks that show it in half of the instants, and in at least {MIN_FRAMES}.",
+        f"end the episode where the body leaves the view ([episodes] '{episode}' = {{ start_s = {seen[0]:.3f}, "
+        f"end_s = {seen[-1]:.3f} }} in capture.toml), or correct the masks if they missed it.",
+    )
+
+
+def _last_seen(video: Video) -> str:
+    shown = video.shown
+    return f"{video.camera}: frame {shown[-1]} of {len(video.times_s)}" if len(shown) else f"{video.camera}: never"
 
 
 def _load(capture: Capture, name: str, episode: str, image_size: int, device: torch.device | str) -> Video:
@@ -114,7 +160,8 @@ def _load(capture: Capture, name: str, episode: str, image_size: int, device: to
     if len(frames) < MIN_FRAMES:
         raise InputDataError(
             f"{capture.video_path(name, episode)}: {len(frames)} frames between the episode's start and end.",
-            f"at least {MIN_FRAMES}; they should hold an impact.",
+            f"at least {MIN_FRAMES}, which show how a velocity changes; some fifteen about an impact are good.",
+            f"film longer or faster, or correct [episodes] '{episode}' (start_s, end_s) and [video] frame_rate_hz.",
         )
     cameras = [capture.video_camera(name, episode, int(k)) for k in capture.frame_numbers(name, episode)]
     first = cameras[0]
@@ -122,18 +169,21 @@ def _load(capture: Capture, name: str, episode: str, image_size: int, device: to
         raise InputDataError(
             f"{capture.video_path(name, episode)}: frames of {frames.shape[2]}x{frames.shape[1]} pixels.",
             f"{first.width}x{first.height}, the size of its camera.",
-            f"run 'cgwm calibrate {capture.root} --overwrite'.",
+            f"film in the size that was calibrated, or run 'cgwm calibrate {capture.root} --overwrite'.",
         )
     scale = min(1.0, image_size / max(first.width, first.height))
     width, height = round(scale * first.width), round(scale * first.height)
     images = [_reduced(first.undistorted(frame)[0].astype(np.float32) / 255, width, height) for frame in frames]
-    covers = None
+    covers = unseen = None
     if labels is not None:
         flat = [first.undistorted(label, labels=True)[0] for label in labels]
         bodies = range(1, len(capture.manifest.bodies) + 1)
         covers = np.stack(
             [[_reduced((label == k).astype(np.float32), width, height) for k in bodies] for label in flat]
         )
+        free = [k for k in bodies if capture.manifest.bodies[k - 1].motion == "free"]
+        lacking = np.array([any(not (label == k).any() for k in free) for label in flat])
+        unseen = lacking if lacking.any() else None
 
     def tensor(array: NDArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
@@ -145,6 +195,7 @@ def _load(capture: Capture, name: str, episode: str, image_size: int, device: to
         None if covers is None else tensor(covers),
         tensor(first.resized(width, height).K),
         tensor(np.stack([camera.T_cam_world for camera in cameras])),
+        unseen,
     )
 
 

@@ -11,7 +11,7 @@ section 7).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -76,7 +76,7 @@ class PoseQuality:
 
 
 @dataclass(frozen=True, eq=False)
-class _Backdrop:
+class Backdrop:
     """What a video shows where nothing moves.
 
     plates (P, H, W, 3): renders of the static scene; depths (P, H, W): its median depth [m], infinite where it is not
@@ -103,7 +103,7 @@ class ImageLoss:
 
     def __init__(self, model: Model, footage: Footage, free: Sequence[int], min_alpha: float = MIN_ALPHA) -> None:
         _check(model, free)
-        self.footage, self.free, self._min_alpha = footage, tuple(free), min_alpha
+        self.footage, self.free, self._min_alpha, self._step_m = footage, tuple(free), min_alpha, DIFFERENCE_M
         like = footage.videos[0].frames
         self._count = len(model.file.bodies)
         self._moving: list[tuple[int, Spheres]] = []
@@ -134,6 +134,11 @@ class ImageLoss:
         self._backdrops = [self._backdrop(video) for video in footage.videos]
 
     @property
+    def photometric(self) -> bool:
+        """Whether colours are compared."""
+        return True
+
+    @property
     def gains(self) -> dict[str, list[float]]:
         """Exposure of each camera against the model's colours, by channel."""
         return {v.camera: b.gain.tolist() for v, b in zip(self.footage.videos, self._backdrops, strict=True)}
@@ -158,7 +163,7 @@ class ImageLoss:
         shots = torch.zeros(len(instants)).to(total)
         for number, video in enumerate(self.footage.videos):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
-            for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
+            for rows in _filmed(frames, _MAX_RENDERS):
                 window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
                 color, mask = self._residuals(number, window, position_m[rows], quat_wxyz[rows])
                 photometric = color.abs().sum((1, 2, 3)) / 3 + self._outside(number, window)
@@ -193,11 +198,11 @@ class ImageLoss:
         value, slope = torch.zeros(count).to(like), torch.zeros(count, size).to(like)
         curvature, shots = torch.zeros(count, size, size).to(like), torch.zeros(count).to(like)
         steps = torch.cat(
-            [like.new_tensor([DIFFERENCE_M] * 3 + [DIFFERENCE_M / self.radii[index]] * 3) for index in self.free]
+            [like.new_tensor([self._step_m] * 3 + [self._step_m / self.radii[index]] * 3) for index in self.free]
         )
         for number in range(len(self.footage.videos)):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
-            for rows in (frames >= 0).nonzero()[:, 0].split(max(1, _MAX_RENDERS // (size + 1))):
+            for rows in _filmed(frames, max(1, _MAX_RENDERS // (size + 1))):
                 pair = self._shot_model(number, frames[rows], position_m[rows], quat_wxyz[rows], steps, blur)
                 for target, part in zip((value, slope, curvature), pair, strict=True):
                     target.index_add_(0, rows, part)
@@ -212,10 +217,9 @@ class ImageLoss:
         inside, union, error, blank, area = (torch.zeros(count).to(self._static.means) for _ in range(5))
         for number, video in enumerate(self.footage.videos):
             frames = torch.as_tensor(self.footage.frame_at[number])[instants]
-            for rows in (frames >= 0).nonzero()[:, 0].split(_MAX_RENDERS):
-                means = self._place(position_m[rows], quat_wxyz[rows])
-                window = window_of(video, frames[rows], means, self._reach)
-                picture = self._render(number, window, means)
+            for rows in _filmed(frames, _MAX_RENDERS):
+                window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
+                picture = self._picture(number, window, position_m[rows], quat_wxyz[rows])
                 shown = picture[..., 3:][..., free]
                 body = shown.sum(-1)
                 error[rows] += (self._color(number, window, picture).abs().mean(-1) * body).sum((1, 2))
@@ -272,7 +276,7 @@ class ImageLoss:
     def _residuals(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
         """Return colour (S, h, w, 3) and mask (S, h, w, nb, or 0 without masks) residuals in the window."""
         video = self.footage.videos[number]
-        picture = self._render(number, window, self._place(position_m, quat_wxyz))
+        picture = self._picture(number, window, position_m, quat_wxyz)
         color = self._color(number, window, picture)
         if video.covers is None:
             return color, picture[..., :0]
@@ -304,9 +308,10 @@ class ImageLoss:
             parts.append(spheres.means @ rotation.transpose(1, 2) + position_m[:, index, None].to(like))
         return torch.cat(parts, 1)
 
-    def _render(self, number: int, window: Window, means: Tensor) -> Tensor:
+    def _picture(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
         """Return colours and visible bodies in the window, shape (S, h, w, 3 + nb)."""
         video, drop = self.footage.videos[number], self._backdrops[number]
+        means = self._place(position_m, quat_wxyz)
         K = video.K.repeat(len(means), 1, 1)
         K[:, :2, 2] -= window.corners.to(K)
         spheres = (means, self._scales, self._opacities, self._features)
@@ -318,7 +323,7 @@ class ImageLoss:
         return seen * shown.features + torch.nn.functional.pad(behind, (0, self._count))
 
     @torch.no_grad()
-    def _backdrop(self, video: Video) -> _Backdrop:
+    def _backdrop(self, video: Video) -> Backdrop:
         poses, plate_of = torch.unique(video.viewmats.flatten(1), dim=0, return_inverse=True)
         views = []
         for pose in poses.view(-1, 1, 4, 4):
@@ -334,13 +339,20 @@ class ImageLoss:
                 for plate, frame in zip(plate_of, video.frames, strict=True)
             ]
         )
-        return _Backdrop(plates, depths, plate_of, gain, unexplained)
+        return Backdrop(plates, depths, plate_of, gain, unexplained)
 
 
 def _median(view: RenderOutput) -> Tensor:
     """Return the median depth (1, H, W) [m], infinite where more than half of the light gets through."""
     assert view.median_depth is not None
     return torch.where(view.median_depth > 0, view.median_depth, torch.inf)
+
+
+def _filmed(frames: Tensor, most: int) -> Iterator[Tensor]:
+    """Yield the indices of poses (K,) whose instant the camera saw, at most so many at once."""
+    rows = (frames >= 0).nonzero()[:, 0]
+    if len(rows):
+        yield from rows.split(most)
 
 
 def _rows(color: Tensor, mask: Tensor, blur: int) -> Tensor:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -115,27 +116,44 @@ def require_apart(world: World, state: State) -> None:
     Raises:
         InputDataError: If two do, with their names, the depth and the environment.
     """
-    with torch.no_grad():
-        rotations = quat_to_matrix(state.quat_wxyz)
-        zero = torch.zeros_like(state.position_m[:, 0])
-        placed = []
-        for index, body in enumerate(world.bodies):
-            position, rotation = state.position_m[:, index], rotations[:, index]
-            com = (rotation @ body.com[..., None]).squeeze(-1) if body.free else torch.zeros_like(position)
-            placed.append(Placed(body, position + com, rotation, zero, zero))
-        for a, b in pairs_of(world):
-            depth = _depth(world, placed[a], None if b == GROUND else placed[b])
-            size = placed[a].reach if b == GROUND else torch.minimum(placed[a].reach, placed[b].reach)
-            deepest = int((depth - DEEPEST_SHARE * size).argmax())
-            limit = float(DEEPEST_SHARE * size.expand_as(depth)[deepest])
-            if float(depth[deepest]) > limit:
-                other = "the ground" if b == GROUND else f"body '{world.bodies[b].name}'"
-                raise InputDataError(
-                    f"environment {deepest}: body '{world.bodies[a].name}' begins {1e3 * float(depth[deepest]):.1f} mm "
-                    f"deep inside {other}.",
-                    f"up to {1e3 * limit:.1f} mm; deeper, the contact would throw them apart.",
-                    "check the start's poses, the ground's height and the sizes of the bodies.",
-                )
+    for overlap in overlaps(world, state):
+        depth, size = overlap.depth_m, overlap.size_m
+        deepest = int((depth - DEEPEST_SHARE * size).argmax())
+        limit = float(DEEPEST_SHARE * size[deepest])
+        if float(depth[deepest]) > limit:
+            raise InputDataError(
+                f"environment {deepest}: body '{overlap.body}' begins {1e3 * float(depth[deepest]):.1f} mm "
+                f"deep inside {overlap.other}.",
+                f"up to {1e3 * limit:.1f} mm; deeper, the contact would throw them apart.",
+                "check the start's poses, the ground's height and the sizes of the bodies.",
+            )
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How deep a body is in another or in the ground: depth_m (B,), 0 where apart; size_m (B,): the smaller radius."""
+
+    body: str
+    other: str
+    depth_m: Tensor
+    size_m: Tensor
+
+
+@torch.no_grad()
+def overlaps(world: World, state: State) -> Iterator[Overlap]:
+    """Yield how deep bodies that can touch, and bodies and the ground, are in each other."""
+    rotations = quat_to_matrix(state.quat_wxyz)
+    zero = torch.zeros_like(state.position_m[:, 0])
+    placed = []
+    for index, body in enumerate(world.bodies):
+        position, rotation = state.position_m[:, index], rotations[:, index]
+        com = (rotation @ body.com[..., None]).squeeze(-1) if body.free else torch.zeros_like(position)
+        placed.append(Placed(body, position + com, rotation, zero, zero))
+    for a, b in pairs_of(world):
+        depth = _depth(world, placed[a], None if b == GROUND else placed[b])
+        size = placed[a].reach if b == GROUND else torch.minimum(placed[a].reach, placed[b].reach)
+        other = "the ground" if b == GROUND else f"body '{world.bodies[b].name}'"
+        yield Overlap(world.bodies[a].name, other, depth, size.expand_as(depth))
 
 
 def require_finite(

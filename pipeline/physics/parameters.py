@@ -17,7 +17,8 @@ class Parameter:
     """A number to fit: bounded, and fitted as its logarithm where it is positive over decades.
 
     reveals: which motion makes it observable; prior: median and standard deviation before any data, the latter in the
-    fitted coordinate (natural logarithm where the parameter is logarithmic).
+    fitted coordinate (natural logarithm where the parameter is logarithmic); at_bounds: what it means when a fit ends
+    at the lower and at the upper bound.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Parameter:
     logarithmic: bool
     reveals: str
     prior: tuple[float, float]
+    at_bounds: tuple[str, str] = ("the motion asks for less", "the motion asks for more")
 
     def encode(self, value: float) -> float:
         """Return the fitted coordinate of a value."""
@@ -43,13 +45,55 @@ class Parameter:
 
 # One toss hardly shows some of these; their priors keep them plausible. The contact time is that of the real cube
 # tosses: what is called rigid touches for a few milliseconds.
-FRICTION = Parameter("friction", "1", (0.01, 2.0), True, "sliding on the ground", (0.3, 0.5))
-CONTACT_TIME = Parameter(
-    "contact_time_s", "s", (0.001, 0.03), True, "an impact sampled faster than the contact lasts", (0.0033, 0.5)
+FRICTION = Parameter(
+    "friction",
+    "1",
+    (0.01, 2.0),
+    True,
+    "sliding on the ground",
+    (0.3, 0.5),
+    (
+        "the body slides as if on ice. Check the scale, and [world] ground: it may lie too low to be touched",
+        "the body does not slide at all, so that any larger friction fits as well: read it as a lower limit",
+    ),
 )
-DAMPING_RATIO = Parameter("damping_ratio", "1", (0.02, 3.0), True, "an impact and the rebound after it", (0.4, 0.6))
-GROUND_SHIFT = Parameter("ground_shift_m", "m", (-0.02, 0.02), False, "resting on the ground", (0.0, 0.002))
-"""How far the ground lies above where the world has it; it also takes up an error of the body's size."""
+CONTACT_TIME = Parameter(
+    "contact_time_s",
+    "s",
+    (0.001, 0.03),
+    True,
+    "an impact sampled faster than the contact lasts",
+    (0.0033, 0.5),
+    (
+        "contacts are shorter than the engine's shortest, and nothing in the motion tells them apart: read it as rigid",
+        "contacts are as long as those of foam. Check that the body is rigid, the frames are sharp, and [world] "
+        "ground lies where the body rests",
+    ),
+)
+DAMPING_RATIO = Parameter(
+    "damping_ratio",
+    "1",
+    (0.02, 3.0),
+    True,
+    "an impact and the rebound after it",
+    (0.4, 0.6),
+    (
+        "the body bounces without losing speed. Check gravity, the scale and the frame rate",
+        "the body does not bounce at all, so that any larger damping fits as well: read it as a restitution of 0",
+    ),
+)
+GROUND_SHIFT = Parameter(
+    "ground_shift_m",
+    "m",
+    (-0.02, 0.02),
+    False,
+    "resting on the ground",
+    (0.0, 0.002),
+    (
+        "the ground seems to lie 2 cm or more below [world] ground. Check that, the scale and the shape",
+        "the ground seems to lie 2 cm or more above [world] ground. Check that, the scale and the shape",
+    ),
+)
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
 
 
@@ -65,8 +109,17 @@ def effect_parameters(world: World) -> list[Parameter]:
         for number in effect.parameters:
             low = 0.0 if number.nonnegative else -number.limit
             name, prior = f"{effect.name}.{number.name}", (0.0, PRIOR_SCALES * number.scale)
-            found.append(Parameter(name, number.unit, (low, number.limit), False, effect.reveals, prior))
+            beyond = "the effect would be stronger than its formula admits: something else is missing, or in its place"
+            least = "these data do not show the effect: leave it out" if number.nonnegative else beyond
+            bounds = (low, number.limit)
+            found.append(Parameter(name, number.unit, bounds, False, effect.reveals, prior, (least, beyond)))
     return found
+
+
+_OUTSIDE = (
+    "the centre of mass would lie half the body's size away from where it was. Check the shape and the body's frame"
+)
+_SPREAD = "the mass would be spread ten times differently than it was said. Check the shape, or give inertia_kg_m2"
 
 
 def mass_distribution(body: str, size_m: float) -> tuple[Parameter, ...]:
@@ -87,11 +140,20 @@ def mass_distribution(body: str, size_m: float) -> tuple[Parameter, ...]:
             False,
             "spinning flight and impacts",
             (0.0, 0.25 * size_m),
+            (_OUTSIDE, _OUTSIDE),
         )
         for axis in "xyz"
     ]
     moments = [
-        Parameter(f"{body}.moment_{axis}", "1", (0.1, 10.0), True, "impacts that change the spin", (1.0, 0.5))
+        Parameter(
+            f"{body}.moment_{axis}",
+            "1",
+            (0.1, 10.0),
+            True,
+            "impacts that change the spin",
+            (1.0, 0.5),
+            (_SPREAD, _SPREAD),
+        )
         for axis in "xyz"
     ]
     return (*centre, *moments)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from ...schemas import InputDataError
 from .volume import Array, MassProperties, Volume
@@ -70,8 +71,10 @@ def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
     # An irrational shift keeps rays off vertices and edges, where parity is ambiguous.
     origin = low - pitch * (3 + np.array([0.3178, 0.2361, 0.1417]))
     shape = tuple(int(n) for n in np.ceil((high - origin) / pitch).astype(int) + 4)
-    surface = sample_surface(mesh, 0.5 * pitch)
-    return Volume.from_inside(_inside(mesh, origin, pitch, shape), origin, pitch, surface)
+    surface, inside = sample_surface(mesh, 0.5 * pitch), _inside(mesh, origin, pitch, shape)
+    # walls between the parts of a mesh, as convex decompositions have them, are no surface of the solid
+    place = tuple(np.round((surface - origin) / pitch).astype(int).T)
+    return Volume.from_inside(inside, origin, pitch, surface[~binary_erosion(inside, iterations=2)[place]])
 
 
 def sample_surface(mesh: Mesh, spacing: float) -> Array:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from ...datasets.ply import read_splats
 from ...schemas import InputDataError, Shape
 from .collision import spheres_volume
+from .directions import fibonacci_directions
 from .mesh import Mesh, mesh_mass_properties, mesh_volume, read_mesh
 from .volume import MassProperties, Volume
+
+_BALL_POINTS = 500
 
 
 def shape_volume(shape: Shape, capture_root: Path, radius_factor: float = 2.0) -> Volume:
@@ -26,7 +30,7 @@ def shape_volume(shape: Shape, capture_root: Path, radius_factor: float = 2.0) -
     if shape.splats is not None:
         splats = read_splats(capture_root / shape.splats.path)
         return spheres_volume(np.asarray(splats.means, float), radius_factor * np.asarray(splats.scales, float))
-    return mesh_volume(_mesh(shape, capture_root))
+    return mesh_volume(shape_mesh(shape, capture_root))
 
 
 def shape_mass_properties(shape: Shape, capture_root: Path, radius_factor: float = 2.0) -> MassProperties:
@@ -36,14 +40,21 @@ def shape_mass_properties(shape: Shape, capture_root: Path, radius_factor: float
         return MassProperties(4 / 3 * np.pi * radius**3, np.zeros(3), 0.4 * radius**2 * np.eye(3))
     if shape.splats is not None:
         return shape_volume(shape, capture_root, radius_factor).mass_properties()
-    return mesh_mass_properties(_mesh(shape, capture_root))
+    return mesh_mass_properties(shape_mesh(shape, capture_root))
 
 
-def _mesh(shape: Shape, capture_root: Path) -> Mesh:
+def shape_mesh(shape: Shape, capture_root: Path) -> Mesh:
+    """Return the surface of a mesh, a box or a ball (of about a thousand triangles), in the body frame."""
     if shape.mesh is not None:
         return read_mesh(capture_root / shape.mesh.path)
+    if shape.sphere is not None:
+        directions = fibonacci_directions(_BALL_POINTS)
+        faces = ConvexHull(directions).simplices.astype(np.int64)
+        inwards = np.linalg.det(directions[faces]) < 0
+        faces[inwards] = faces[inwards][:, ::-1]
+        return Mesh(shape.sphere.radius_m * directions, faces)
     if shape.box is None:
-        raise InputDataError("a shape without a kind.", "box, sphere, mesh, splats.")
+        raise InputDataError("a shape without a surface of triangles.", "box, sphere, mesh.")
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
     faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]

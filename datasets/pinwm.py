@@ -1,0 +1,282 @@
+"""Import of the simulated pushes of PIN-WM (daihangpku/pin-wm): one camera, masks, poses, and a pusher that is told.
+
+What the files say: the poses of the block at 24 Hz, camera and masks of each frame, meshes, the mass, and where the
+pusher starts and is sent to in the plane. What they do not say, and is assumed here:
+
+- The pusher moves as in the dataset's own `scripts/run.py`: from each frame to the next at `GAIN_HZ` times its distance
+  from the goal, at the height `PUSHER_HEIGHT_M`, without turning. It is in no picture.
+- The simulator (Bullet) keeps `MARGIN_M` of air around every convex part. Two bodies touch at twice that distance; here
+  the ground lies, and the pusher's sides reach, so much further, for the block's own shape is also what is seen.
+- The pusher is the convex hull of its parts: its sides are nearly flat, and what is hollow in it touches nothing.
+- The inertia in the block's URDF (1 kg m2) is a placeholder; it is left out, and comes from the shape.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from ..schemas import (
+    Body,
+    CamerasFile,
+    CaptureManifest,
+    Ground,
+    InputDataError,
+    PosedVideo,
+    Scale,
+    Shape,
+    World,
+    read_json,
+)
+from ..schemas.base import FileModel
+from ..schemas.capture import FileShape, Video
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .cameras import Camera, to_intrinsics
+from .images import image_size, read_alpha, read_rgb, write_image
+from .manifest import write_manifest
+from .meshes import Mesh, read_mesh
+from .progress import progress
+from .tracks import Track, tracks_csv
+
+Array = NDArray[np.float64]
+Row = tuple[float, float, float, float]
+
+RATE_HZ = 24.0
+GAIN_HZ = 5.0
+PUSHER_HEIGHT_M = 0.05
+MARGIN_M = 0.001
+BLOCK, PUSHER, CAMERA = "block", "pusher", "cam"
+FIRST = "-first"
+"""Ending of the name of the episode that holds the first frames of a push alone."""
+_BLOCK_URDF = "envs/asset/cube_t/cube_t_mesh.urdf"
+_PUSHER_URDF = "envs/asset/ee/ee.urdf"
+_TODO = "get dataset/ and envs/ of github.com/daihangpku/pin-wm."
+
+
+class _Frame(FileModel, extra="ignore"):
+    """A picture of a push: where it lies, and from where it was taken (OpenGL's camera axes)."""
+
+    file_path: str
+    c2w: tuple[Row, Row, Row]
+    intrinsic: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+class _Push(FileModel, extra="ignore"):
+    """`dynamic_train0.json`."""
+
+    ee_init_position: tuple[float, float]
+    ee_goal_position: tuple[float, float]
+    image_datas: tuple[_Frame, ...]
+    pose_datas: Annotated[tuple[tuple[float, float, float, float, float, float, float], ...], Field(min_length=2)]
+    """Position [m] and quaternion (x, y, z, w) of the block, one a frame."""
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """A push: its name, what its file says, and its frames with masks by number; none where there are no pictures."""
+
+    name: str
+    push: _Push
+    folder: Path
+    frames: tuple[_Frame, ...]
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """The block's poses, and the pusher's as it is told to move."""
+        poses = np.array(self.push.pose_datas)
+        times = np.arange(len(poses)) / RATE_HZ
+        block = Track(times, poses[:, :3], poses[:, [6, 3, 4, 5]])
+        return {BLOCK: block, PUSHER: pusher_track(self.push.ee_init_position, self.push.ee_goal_position, len(poses))}
+
+
+def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwrite: bool = False) -> ImportResult:
+    """Write the pushes as a capture: block, pusher, camera, frames, masks and tracks.
+
+    Every push is an episode of the split "test", with its track; one whose pictures are there has them as well, and
+    its first frames make another episode, `<push>-first`, of the split "train".
+
+    Args:
+        source: The directory that holds `dataset/` and `envs/`.
+        out: The capture directory to write.
+        n_train: Number of frames in each episode of "train".
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If the source is not such data, or no push has its pictures.
+        UsageError: If `out` exists, before anything is read.
+    """
+    source = Path(source)
+    with new_directory(out, overwrite) as directory:
+        recordings = _recordings(source, n_train)
+        filmed = [recording for recording in recordings if recording.frames]
+        shape, mass_kg, com_m = _link(source / _BLOCK_URDF)
+        write_obj(directory / "block.obj", shape)
+        write_obj(directory / "pusher.obj", widened(hull(_link(source / _PUSHER_URDF)[0]), 2 * MARGIN_M))
+        train = {f"{recording.name}{FIRST}": recording for recording in filmed}
+        manifest = CaptureManifest(
+            format="cgwm-capture/1",
+            world=World(ground=Ground(offset_m=2 * MARGIN_M)),
+            bodies=(
+                Body(name=BLOCK, mass_kg=mass_kg, com_m=com_m, shape=Shape(mesh=FileShape(path="block.obj"))),
+                Body(name=PUSHER, motion="driven", shape=Shape(mesh=FileShape(path="pusher.obj"))),
+            ),
+            splits={"train": tuple(train), "test": tuple(recording.name for recording in recordings)},
+            video=Video(frame_rate_hz=RATE_HZ),
+        )
+        write_manifest(directory / "capture.toml", manifest)
+        (directory / "cameras.json").write_text(_cameras(filmed).model_dump_json(indent=1) + "\n", encoding="utf-8")
+        (directory / "tracks").mkdir()
+        samples = 0
+        for name, recording in [*train.items(), *((recording.name, recording) for recording in recordings)]:
+            count = n_train if name in train else len(recording.push.pose_datas)
+            tracks = {body: track.window(0.0, (count - 0.5) / RATE_HZ) for body, track in recording.tracks.items()}
+            (directory / "tracks" / f"{name}.csv").write_text(tracks_csv(tracks), encoding="utf-8")
+            samples += sum(map(len, tracks.values()))
+            _write_frames(directory, name, recording, recording.frames[:count])
+    return ImportResult(
+        capture=str(out),
+        episodes=len(train) + len(recordings),
+        samples=samples,
+        splits={name: len(episodes) for name, episodes in manifest.splits.items()},
+    )
+
+
+def pusher_track(start_m: tuple[float, float], goal_m: tuple[float, float], count: int) -> Track:
+    """Return where the pusher is at the frames: each takes the same share of the way that is left.
+
+    Args:
+        start_m: Where it begins, x and y [m].
+        goal_m: Where it is sent to.
+        count: Number of frames.
+    """
+    left = (1 - GAIN_HZ / RATE_HZ) ** np.arange(count)[:, None]
+    plane = np.array(goal_m) + left * (np.array(start_m) - np.array(goal_m))
+    position = np.c_[plane, np.full(count, PUSHER_HEIGHT_M)]
+    return Track(np.arange(count) / RATE_HZ, position, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+
+
+def hull(mesh: Mesh) -> Mesh:
+    """Return the convex hull of a mesh."""
+    from scipy.spatial import ConvexHull
+
+    found = ConvexHull(mesh.vertices)
+    vertices = mesh.vertices[found.vertices]
+    place = np.full(len(mesh.vertices), -1)
+    place[found.vertices] = np.arange(len(vertices))
+    faces = place[found.simplices].astype(np.int64)
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
+    inwards = np.einsum("fi,fi->f", np.cross(a, b), c) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return Mesh(vertices, faces)
+
+
+def widened(mesh: Mesh, by_m: float) -> Mesh:
+    """Return a mesh stretched about the middle of its box, so that its sides lie further out in x and y by `by_m`."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    factor = np.array([(half[0] + by_m) / half[0], (half[1] + by_m) / half[1], 1.0])
+    return Mesh(middle + factor * (mesh.vertices - middle), mesh.faces)
+
+
+def write_obj(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as a Wavefront file."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _recordings(source: Path, n_train: int) -> list[_Recording]:
+    files = sorted(source.glob("dataset/*/dynamic_*.json"))
+    if not files:
+        what = "no pushes of PIN-WM" if source.is_dir() else "no such directory"
+        raise InputDataError(
+            f"{source}: {what}.", "a directory with dataset/<push>/dynamic_train0.json, and envs/.", _TODO
+        )
+    recordings = []
+    for file in files:
+        push = read_json(file, _Push)
+        numbered = {_number(file, frame): frame for frame in push.image_datas}
+        wanted = [numbered[k] for k in range(len(push.pose_datas)) if k in numbered]
+        frames = tuple(frame for frame in wanted if (file.parent / frame.file_path).is_file())
+        if frames and len(frames) < len(push.pose_datas):
+            raise InputDataError(
+                f"{file.parent}: {len(frames)} pictures for {len(push.pose_datas)} poses.",
+                "one a pose, or none.",
+                _TODO,
+            )
+        several = len([other for other in files if other.parent == file.parent]) > 1
+        name = f"{file.parent.name}-{file.stem}" if several else file.parent.name
+        recordings.append(_Recording(name, push, file.parent, frames))
+    filmed = [recording for recording in recordings if recording.frames]
+    if not filmed:
+        raise InputDataError(f"{source / 'dataset'}: no push has its pictures (r_0_<frame>.png).", todo=_TODO)
+    shortest = min(len(recording.frames) for recording in filmed)
+    if not 3 <= n_train < shortest:
+        raise InputDataError(
+            f"{n_train} frames to fit on; the shortest push with pictures has {shortest}.", f"3 to {shortest - 1}."
+        )
+    return recordings
+
+
+def _number(file: Path, frame: _Frame) -> int:
+    found = re.fullmatch(r"r_\d+_(-?\d+)", Path(frame.file_path).stem)
+    if found is None:
+        raise InputDataError(f"{file}: the picture '{frame.file_path}' has no frame number.", "r_<camera>_<frame>.png.")
+    return int(found[1])
+
+
+def _link(urdf: Path) -> tuple[Mesh, float, tuple[float, float, float]]:
+    """Return the mesh that collides, the mass [kg] and the centre of mass [m] of the first link that has a mesh."""
+    try:
+        root = ElementTree.parse(urdf).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise InputDataError(f"{urdf}: cannot be read: {error}.", todo=_TODO) from None
+    for link in root.iter("link"):
+        mesh, mass = link.find("collision/geometry/mesh"), link.find("inertial/mass")
+        if mesh is None or mass is None:
+            continue
+        origin = link.find("inertial/origin")
+        com = [float(word) for word in ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split()]
+        x, y, z = com
+        return read_mesh(urdf.parent / mesh.get("filename", "")), float(mass.get("value", "nan")), (x, y, z)
+    raise InputDataError(f"{urdf}: no link with a mesh and a mass.", todo=_TODO)
+
+
+def _cameras(filmed: list[_Recording]) -> CamerasFile:
+    """Return the camera that took all frames of all pushes."""
+    first = filmed[0].frames[0]
+    for recording in filmed:
+        for frame in recording.frames:
+            if (frame.c2w, frame.intrinsic) != (first.c2w, first.intrinsic):
+                raise InputDataError(f"{recording.folder / frame.file_path}: its camera is another one.", "one camera.")
+    width, height = image_size(filmed[0].folder / first.file_path)
+    pose = np.eye(4)
+    pose[:3] = np.array(first.c2w) * [1.0, -1.0, -1.0, 1.0]  # OpenGL's y and z point the other way
+    camera = Camera(width, height, np.array(first.intrinsic), np.zeros(0), pose)
+    rows = [tuple(float(value) for value in row) for row in pose]
+    return CamerasFile(
+        scale=Scale(kind="metric", source="simulated"),
+        cameras={CAMERA: to_intrinsics(camera)},
+        videos={CAMERA: PosedVideo(camera=CAMERA, T_world_cam=tuple(rows))},  # pyright: ignore[reportArgumentType]
+    )
+
+
+def _write_frames(directory: Path, episode: str, recording: _Recording, frames: tuple[_Frame, ...]) -> None:
+    if not frames:
+        return
+    folders = [directory / kind / CAMERA / episode for kind in ("videos", "video_masks")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    for k, frame in enumerate(progress(frames, episode, len(frames))):
+        path = recording.folder / frame.file_path
+        mask = path.with_name(f"m{path.name.removeprefix('r')}")
+        write_image(folders[0] / f"{k:06d}.png", read_rgb(path))
+        write_image(folders[1] / f"{k:06d}.png", (read_alpha(mask) > 127).astype(np.uint8))
