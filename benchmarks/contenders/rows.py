@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+
+from cgwm.datasets.scenes.objects import SolidObject
 
 from .base import Contender
+from .cem_mujoco import CemMujoco
 from .cgwm_default import Cgwm
 from .zeros import Ballistic, Frozen
 
@@ -21,9 +25,24 @@ class Row:
     budget: float | None = None
 
 
+def true_solid(capture: Path) -> SolidObject:
+    """Return the true object of a capture of the benchmark."""
+    from tabletop import read_solid
+
+    return read_solid(capture)
+
+
 ROWS: dict[str, Row] = {
     REFERENCE: Row(Cgwm),
     "cgwm, geometry fixed": Row(lambda: Cgwm("cgwm, geometry fixed", {"geometry": False})),
+    **{
+        f"{name}, {factor}x": Row(lambda name=name, solid=solid: CemMujoco(name, solid), factor)
+        for name, solid in (
+            ("CEM + MuJoCo + R, true mesh", true_solid),
+            ("CEM + MuJoCo + R, learned shape", None),
+        )
+        for factor in (1, 4)
+    },
     "frozen": Row(Frozen),
     "ballistic": Row(Ballistic),
 }

@@ -13,7 +13,7 @@ import torch
 from cgwm.datasets.capture import Capture
 from cgwm.datasets.models import Model, read_model
 from cgwm.datasets.tracks import Track
-from cgwm.pipeline.estimation.observations import Observations
+from cgwm.pipeline.estimation.observations import Observations, first_state
 from cgwm.pipeline.estimation.warmup import estimate_states, warmup_frames
 from cgwm.pipeline.imaging.coarse import coarse_model
 from cgwm.pipeline.imaging.footage import Footage, load_footage
@@ -31,6 +31,10 @@ COARSE_SIZE, FINE_SIZE = 80, 144
 """Longer side [px] of the pictures for searching poses and for the loss: those of `cgwm fit`."""
 WARMUP_S = 0.1
 """The state at the first frame is first estimated from the track over this long, cut at the first contact."""
+
+WIDER, LEAST_STD = 2.0, (1e-3, 0.01, 0.02, 0.1)
+"""A search over the start looks this many standard errors around it, and at least so far (m, rad, m/s, rad/s): the
+track's pixels do not know of errors of shape and looks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +126,27 @@ def find_poses(training: Training, cell: Cell) -> PoseTrack:
     return PoseTracker(coarse, training.loss, training.position_m, training.quat_wxyz).run()
 
 
-def observed(training: Training, found: PoseTrack) -> tuple[Observations, tuple[float, float]]:
-    """Return the track as observations at every instant, with states at the first one estimated from the warm-up.
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the images of the training episode show by themselves.
 
-    Returns:
-        The observations, one item, on the grid of the footage's instants; and the track's noise (position [m],
-        rotation [rad]) as the pixels tell it.
+    observations: the track, one item, on the grid of the footage's instants, its state that of the warm-up; noise: of
+    the track (position [m], rotation [rad]); root (S, S): the factor of the covariance of the start's change, see
+    `estimation.trajectory.retract`.
     """
+
+    observations: Observations
+    noise: tuple[float, float]
+    root: Array
+
+    @property
+    def start(self) -> State:
+        """The state at the first instant as the warm-up has it."""
+        return self.observations.state
+
+
+def observed(training: Training, found: PoseTrack) -> Found:
+    """Return the track as observations, and the state at the first instant with its uncertainty."""
     world, times = training.world, training.times_s
     position, quat = found.position_m.cpu().numpy(), found.quat_wxyz.cpu().numpy()
     tracks = {world.bodies[k].name: Track(times, position[:, k], quat[:, k]) for k in world.free}
@@ -136,11 +154,15 @@ def observed(training: Training, found: PoseTrack) -> tuple[Observations, tuple[
     observations = Observations.of(world, [(TRAIN_EPISODE, tracks | training.drives)], [window])
     seen = found.found.cpu().to(observations.seen)[None, :, None].expand_as(observations.seen)
     observations = replace(observations, seen=seen.clone(), turned=seen.clone())
+    observations = replace(observations, state=first_state(world, observations))  # of what was seen alone
     variance = found.covariance[found.found].diagonal(dim1=1, dim2=2).cpu()
     std = variance.unflatten(1, (-1, 2, 3)).median(0).values.mean((0, 2)).sqrt()
     noise = float(std[0]), float(std[1])
     warm = warmup_frames(world, observations, WARMUP_S)
-    return estimate_states(world, observations, warm, noise)[0], noise
+    observations, solution = estimate_states(world, observations, warm, noise)
+    least = torch.tensor([value**2 for value in LEAST_STD for _ in range(3)] * len(world.free), dtype=torch.float64)
+    covariance = solution.state_cov[0].cpu() * WIDER**2 + torch.diag(least)
+    return Found(observations, noise, torch.linalg.cholesky(covariance).numpy())
 
 
 def rolled_out(world: World, start: State, drives: Mapping[str, Track], times_s: Array) -> Prediction:
@@ -164,3 +186,13 @@ def checked(position_m: Array, quat_wxyz: Array) -> Prediction:
     if not finite.all():
         raise NotConvergedError(f"the prediction diverges at frame {int(np.argmin(finite))} of {len(finite)}.")
     return Prediction(position_m, quat_wxyz)
+
+
+def starts(world: World, found: Observations) -> dict[str, State]:
+    """Return guesses of the state at the first instant: the warm-up's, a straight line's, and at rest.
+
+    The warm-up's is the observations' own; contact from the first frame on spoils it, as of a body that stands.
+    """
+    line = first_state(world, found)
+    still = torch.zeros_like(line.velocity_m_s)
+    return {"warm-up": found.state, "line": line, "rest": State(line.position_m, line.quat_wxyz, still, still)}
