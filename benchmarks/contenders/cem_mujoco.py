@@ -69,7 +69,7 @@ class CemMujoco:
         found = observed(training, find_poses(training, cell))
         tracked = time.perf_counter() - started
         search = _Search(training, _small(training, cell), simulator, found.start, found.root)
-        guesses = starts(training.world, found.observations)
+        guesses = starts(found)
         best, record = search.run(guesses, cell.seed, self.generations, (budget_s or FREE_BUDGET_S) - tracked)
         numbers = ContactNumbers(*np.exp(best[: len(NUMBERS)]).tolist())
         parameters = {name: float(getattr(numbers, name)) for name in NUMBERS}

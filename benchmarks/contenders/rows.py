@@ -11,6 +11,9 @@ from cgwm.datasets.scenes.objects import SolidObject
 from .base import Contender
 from .cem_mujoco import CemMujoco
 from .cgwm_default import Cgwm
+from .floor import Floor
+from .paper import Paper
+from .pinwm import PinWm
 from .zeros import Ballistic, Frozen
 
 REFERENCE = "cgwm"
@@ -32,17 +35,37 @@ def true_solid(capture: Path) -> SolidObject:
     return read_solid(capture)
 
 
-ROWS: dict[str, Row] = {
-    REFERENCE: Row(Cgwm),
-    "cgwm, geometry fixed": Row(lambda: Cgwm("cgwm, geometry fixed", {"geometry": False})),
-    **{
-        f"{name}, {factor}x": Row(lambda name=name, solid=solid: CemMujoco(name, solid), factor)
-        for name, solid in (
-            ("CEM + MuJoCo + R, true mesh", true_solid),
-            ("CEM + MuJoCo + R, learned shape", None),
-        )
-        for factor in (1, 4)
-    },
-    "frozen": Row(Frozen),
-    "ballistic": Row(Ballistic),
-}
+def _mujoco(shape: str, solid: Callable[[Path], SolidObject] | None, budget: float) -> tuple[str, Row]:
+    name = f"CEM + MuJoCo + R, {shape}, {budget:g}x"
+    return name, Row(lambda: CemMujoco(name, solid), budget)
+
+
+def _pinwm(budget: float) -> tuple[str, Row]:
+    name = f"in the manner of PIN-WM, {budget:g}x"
+    return name, Row(lambda: PinWm(name), budget)
+
+
+def _paper(budget: float) -> tuple[str, Row]:
+    name = f"the paper's form, {budget:g}x"
+    return name, Row(lambda: Paper(name), budget)
+
+
+FIXED = f"{REFERENCE}, geometry fixed"
+
+ROWS: dict[str, Row] = dict(
+    (
+        (REFERENCE, Row(Cgwm)),
+        (FIXED, Row(lambda: Cgwm(FIXED, {"geometry": False}))),
+        _paper(4),
+        _mujoco("true mesh", true_solid, 1),
+        _mujoco("true mesh", true_solid, 4),
+        _mujoco("learned shape", None, 1),
+        _mujoco("learned shape", None, 4),
+        _pinwm(1),
+        _pinwm(4),
+        (Frozen.name, Row(Frozen)),
+        (Ballistic.name, Row(Ballistic)),
+        (Floor.name, Row(Floor)),
+    )
+)
+"""By name, in the table's order."""

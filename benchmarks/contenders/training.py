@@ -13,8 +13,8 @@ import torch
 from cgwm.datasets.capture import Capture
 from cgwm.datasets.models import Model, read_model
 from cgwm.datasets.tracks import Track
-from cgwm.pipeline.estimation.observations import Observations, first_state
-from cgwm.pipeline.estimation.warmup import estimate_states, warmup_frames
+from cgwm.pipeline.estimation.observations import START_FRAMES, Observations, first_state
+from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
 from cgwm.pipeline.imaging.coarse import coarse_model
 from cgwm.pipeline.imaging.footage import Footage, load_footage
 from cgwm.pipeline.imaging.image_loss import ImageLoss
@@ -32,6 +32,7 @@ COARSE_SIZE, FINE_SIZE = 80, 144
 WARMUP_S = 0.1
 """The state at the first frame is first estimated from the track over this long, cut at the first contact."""
 
+WARMUP_ITERATIONS = 5
 WIDER, LEAST_STD = 2.0, (1e-3, 0.01, 0.02, 0.1)
 """A search over the start looks this many standard errors around it, and at least so far (m, rad, m/s, rad/s): the
 track's pixels do not know of errors of shape and looks."""
@@ -130,8 +131,8 @@ def find_poses(training: Training, cell: Cell) -> PoseTrack:
 class Found:
     """What the images of the training episode show by themselves.
 
-    observations: the track, one item, on the grid of the footage's instants, its state that of the warm-up; noise: of
-    the track (position [m], rotation [rad]); root (S, S): the factor of the covariance of the start's change, see
+    observations: the track, one item, on the grid of the footage's instants, with the first one's state; noise: of the
+    track (position [m], rotation [rad]); root (S, S): the factor of the covariance of the start's change, see
     `estimation.trajectory.retract`.
     """
 
@@ -141,12 +142,15 @@ class Found:
 
     @property
     def start(self) -> State:
-        """The state at the first instant as the warm-up has it."""
+        """The state at the first instant."""
         return self.observations.state
 
 
 def observed(training: Training, found: PoseTrack) -> Found:
-    """Return the track as observations, and the state at the first instant with its uncertainty."""
+    """Return the track as observations, and the state at the first instant with its uncertainty.
+
+    A body in flight has the state that its flight tells, one that touches something that of a straight line.
+    """
     world, times = training.world, training.times_s
     position, quat = found.position_m.cpu().numpy(), found.quat_wxyz.cpu().numpy()
     tracks = {world.bodies[k].name: Track(times, position[:, k], quat[:, k]) for k in world.free}
@@ -158,11 +162,15 @@ def observed(training: Training, found: PoseTrack) -> Found:
     variance = found.covariance[found.found].diagonal(dim1=1, dim2=2).cpu()
     std = variance.unflatten(1, (-1, 2, 3)).median(0).values.mean((0, 2)).sqrt()
     noise = float(std[0]), float(std[1])
-    warm = warmup_frames(world, observations, WARMUP_S)
-    observations, solution = estimate_states(world, observations, warm, noise)
-    least = torch.tensor([value**2 for value in LEAST_STD for _ in range(3)] * len(world.free), dtype=torch.float64)
-    covariance = solution.state_cov[0].cpu() * WIDER**2 + torch.diag(least)
-    return Found(observations, noise, torch.linalg.cholesky(covariance).numpy())
+    span = float(times[START_FRAMES - 1] - times[0])
+    spread = [std for std in (*noise, noise[0] / span, noise[1] / span) for _ in range(3)] * len(world.free)
+    covariance = torch.diag(torch.tensor(spread, dtype=torch.float64).square())
+    if bool(flight_frames(world, observations)[0, 0]):  # through contact it costs much, and is no better than a line
+        warm = warmup_frames(world, observations, WARMUP_S)
+        observations, solution = estimate_states(world, observations, warm, noise, WARMUP_ITERATIONS)
+        covariance = solution.state_cov[0].cpu()
+    least = torch.tensor([std**2 for std in LEAST_STD for _ in range(3)] * len(world.free), dtype=torch.float64)
+    return Found(observations, noise, torch.linalg.cholesky(WIDER**2 * covariance + torch.diag(least)).numpy())
 
 
 def rolled_out(world: World, start: State, drives: Mapping[str, Track], times_s: Array) -> Prediction:
@@ -188,11 +196,8 @@ def checked(position_m: Array, quat_wxyz: Array) -> Prediction:
     return Prediction(position_m, quat_wxyz)
 
 
-def starts(world: World, found: Observations) -> dict[str, State]:
-    """Return guesses of the state at the first instant: the warm-up's, a straight line's, and at rest.
-
-    The warm-up's is the observations' own; contact from the first frame on spoils it, as of a body that stands.
-    """
-    line = first_state(world, found)
-    still = torch.zeros_like(line.velocity_m_s)
-    return {"warm-up": found.state, "line": line, "rest": State(line.position_m, line.quat_wxyz, still, still)}
+def starts(found: Found) -> dict[str, State]:
+    """Return guesses of the state at the first instant: moving as the track does, and at rest."""
+    state = found.start
+    still = torch.zeros_like(state.velocity_m_s)
+    return {"moving": state, "at rest": State(state.position_m, state.quat_wxyz, still, still)}
