@@ -16,7 +16,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,6 @@ from contenders.rows import REFERENCE, ROWS
 from fall_push_table import table
 from scoring import Judge
 from store import Store, timed
-from tabletop import MATERIALS, OBJECTS, make_capture
 
 TASKS = ("fall", "push")
 TESTS = 10
@@ -76,6 +75,8 @@ class Work:
         """Make a capture where there is none, and calibrate its cameras where it has none."""
         path = self.capture(task, obj, material)
         if not path.exists():
+            from tabletop import make_capture
+
             made = make_capture(self.folder, obj, material, task, self.seed, TESTS, VIDEO_SIZE)
             if made != path:
                 raise RuntimeError(f"the capture was made at {made}, not at {path}")
@@ -109,31 +110,36 @@ def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, An
     return {"fit": record, "parameter_errors": errors, "episodes": judge.episode_errors(fitted)}
 
 
-def run(work: Work, store: Store, names: dict[str, Sequence[str]], workers: int, psnr_every: int) -> None:
-    """Make what is missing of captures, models and results; references first, since they set the others' budgets."""
+def run(work: Work, store: Store, names: dict[str, Sequence[str]], pool: Executor, psnr_every: int) -> None:
+    """Make what is missing of captures, models and results; references first, since they set the others' budgets.
+
+    Args:
+        work: Where things lie.
+        store: Takes the results, as they come.
+        names: Which tasks, objects, materials and rows are wanted.
+        pool: Who works.
+        psnr_every: Compare every so manyth frame of the test videos; 0: none.
+    """
     pairs = [(task, obj) for task in names["tasks"] for obj in names["objects"]]
     cells = [(task, obj, material) for task, obj in pairs for material in names["materials"]]
     jobs = [Job(*cell, row, work.cell(*cell)) for cell in cells for row in names["rows"]]
-    open_jobs = [job for job in jobs if store.known(job.key) is None]
-    wanted = sorted({(job.task, job.object, job.material) for job in open_jobs})
-    first = names["materials"][0]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    jobs = [job for job in jobs if store.known(job.key) is None]
+    wanted = sorted({(job.task, job.object, job.material) for job in jobs})
+    photographed = sorted({(task, obj, names["materials"][0]) for task, obj, _ in wanted})
 
-        def each(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> None:
-            for done in as_completed([pool.submit(function, *one) for one in arguments]):
-                done.result()
+    def each(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> None:
+        for done in as_completed([pool.submit(function, *one) for one in arguments]):
+            done.result()
 
-        def all_of(now: Sequence[Job]) -> None:
-            waiting = {pool.submit(measure, job, _budget(store, job), psnr_every): job for job in now}
-            for done in as_completed(waiting):
-                store.add(waiting[done].key, done.result())
+    def measured(now: Sequence[Job]) -> None:
+        waiting = {pool.submit(measure, job, _budget(store, job), psnr_every): job for job in now}
+        for done in as_completed(waiting):
+            store.add(waiting[done].key, done.result())
 
-        needed = sorted({*wanted, *((task, obj, first) for task, obj, _ in wanted)})
-        each(work.make_capture, needed)
-        each(work.make_splats, sorted({(task, obj, first) for task, obj, _ in wanted}))
-        all_of([job for job in open_jobs if job.row == REFERENCE])
-        all_of([job for job in open_jobs if job.row != REFERENCE])
+    each(work.make_capture, sorted({*wanted, *photographed}))
+    each(work.make_splats, photographed)
+    measured([job for job in jobs if job.row == REFERENCE])
+    measured([job for job in jobs if job.row != REFERENCE])
 
 
 def _budget(store: Store, job: Job) -> float | None:
@@ -149,6 +155,8 @@ def _budget(store: Store, job: Job) -> float | None:
 
 def main() -> int:
     """Measure what is missing, or print the table of what is stored."""
+    from tabletop import MATERIALS, OBJECTS
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", default=",".join(TASKS))
     parser.add_argument("--objects", default=",".join(OBJECTS))
@@ -172,7 +180,9 @@ def main() -> int:
         if unknown:
             parser.error(f"--{key}: {unknown[0]!r} is none of {', '.join(legal)}")
     if not given.table:
-        run(Work(given.folder.resolve(), given.seed, given.device), store, names, given.workers, given.psnr_every)
+        work = Work(given.folder.resolve(), given.seed, given.device)
+        with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            run(work, store, names, pool, given.psnr_every)
     print(table(store.results(), names, given.seed))
     return 0
 
