@@ -21,9 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cgwm.pipeline.calibrate import calibrate
 from cgwm.pipeline.fit import fit
-from cgwm.schemas import CalibrateConfig, CgwmError, SplatConfig
+from cgwm.schemas import CgwmError, SplatConfig
 from contenders.base import Cell
 from contenders.rows import REFERENCE, ROWS
 from fall_push_table import table
@@ -32,7 +31,6 @@ from store import Store, timed
 
 TASKS = ("fall", "push")
 TESTS = 10
-VIDEO_SIZE = (480, 360)
 
 
 @dataclass(frozen=True)
@@ -72,16 +70,12 @@ class Work:
         return Cell(self.capture(task, obj, material), self.splats(task, obj), self.device, self.seed)
 
     def make_capture(self, task: str, obj: str, material: str) -> None:
-        """Make a capture where there is none, and calibrate its cameras where it has none."""
+        """Make a capture where there is none; its cameras are the true ones."""
         path = self.capture(task, obj, material)
         if not path.exists():
             from tabletop import make_capture
 
-            made = make_capture(self.folder, obj, material, task, self.seed, TESTS, VIDEO_SIZE)
-            if made != path:
-                raise RuntimeError(f"the capture was made at {made}, not at {path}")
-        if not (path / "cameras.json").exists():
-            calibrate(path, CalibrateConfig(seed=self.seed))
+            make_capture(path, obj, material, task, self.seed, TESTS)
 
     def make_splats(self, task: str, obj: str, material: str) -> None:
         """Fit the spheres of an object to the photos of one of its captures."""

@@ -10,26 +10,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.capture import Capture
 from cgwm.datasets.scenes.objects import SolidObject
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.estimation.trajectory import retract
-from cgwm.pipeline.imaging.coarse import coarse_model
-from cgwm.pipeline.imaging.footage import load_footage
-from cgwm.pipeline.imaging.image_loss import ImageLoss
 from cgwm.pipeline.physics.world import State
 from cgwm.pipeline.reporting.against_truth import OBJECT
 from cgwm.schemas import NotConvergedError
 
-from .base import TRAIN_EPISODE, Array, Cell, Prediction
+from .base import Array, Cell, Prediction
 from .mujoco_world import ContactNumbers, MujocoWorld
-from .training import COARSE_SIZE, Training, checked, find_poses, observed, open_training, starts
+from .training import Training, checked, find_poses, observed, open_training, small_pictures, starts
 
 NUMBERS = ("friction", "friction_driven", "time_constant_s", "damping_ratio")
 CENTER, SPREAD = np.log([0.3, 0.3, 0.0033 / 0.4, 0.4]), np.array([0.5, 0.5, 0.6, 0.6])
@@ -68,7 +64,7 @@ class CemMujoco:
         simulator = MujocoWorld(training.world, solids)
         found = observed(training, find_poses(training, cell))
         tracked = time.perf_counter() - started
-        search = _Search(training, _small(training, cell), simulator, found.start, found.root)
+        search = _Search(training, small_pictures(training, cell), simulator, found.start, found.root)
         guesses = starts(found)
         best, record = search.run(guesses, cell.seed, self.generations, (budget_s or FREE_BUDGET_S) - tracked)
         numbers = ContactNumbers(*np.exp(best[: len(NUMBERS)]).tolist())
@@ -165,10 +161,3 @@ class _Search:
         change = torch.as_tensor(self.root @ sample[len(NUMBERS) :])[None]
         start = retract(self.start, change, self.training.world.free)
         return self.simulator.rollout(numbers, start, self.training.drives, self.training.times_s)
-
-
-def _small(training: Training, cell: Cell) -> Training:
-    """Return the episode with small pictures and fewer spheres."""
-    capture = Capture.open(cell.capture, check=False, splits=("train",))
-    footage = load_footage(capture, TRAIN_EPISODE, COARSE_SIZE, cell.device)
-    return replace(training, loss=ImageLoss(coarse_model(training.model), footage, training.world.free))

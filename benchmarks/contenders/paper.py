@@ -28,7 +28,7 @@ from cgwm.datasets.tracks import Track
 from cgwm.pipeline.physics.published import PublishedLaw
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State, World
-from cgwm.schemas import NotConvergedError
+from cgwm.schemas import InputDataError, NotConvergedError
 from torch import Tensor
 
 from .base import Array, Cell, Prediction
@@ -194,9 +194,12 @@ class _Form:
         return replace(moved, contact=law)
 
     def loss(self, point: list[Tensor], state: State) -> Tensor:
-        """Return the photometric L1 over the frames; infinite where the rollout diverges."""
+        """Return the photometric L1 over the frames; infinite where the rollout diverges, or would for sure."""
         times = torch.as_tensor(self.training.times_s)
-        rollout = simulate(self.world(point), state, times, self.training.drives)
+        try:
+            rollout = simulate(self.world(point), state, times, self.training.drives)
+        except InputDataError:  # K or D has grown beyond what the step can take
+            return torch.tensor(torch.inf)
         position, quat = rollout.position_m[0], rollout.quat_wxyz[0]
         if not bool(position.isfinite().all()) or not bool(quat.isfinite().all()):
             return torch.tensor(torch.inf)

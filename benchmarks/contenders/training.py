@@ -121,10 +121,15 @@ def find_poses(training: Training, cell: Cell) -> PoseTrack:
     Raises:
         NotConvergedError: If the body is found in fewer than half of the instants.
     """
-    capture = Capture.open(cell.capture, check=False, splits=("train",))
-    small = load_footage(capture, TRAIN_EPISODE, COARSE_SIZE, cell.device)
-    coarse = ImageLoss(coarse_model(training.model), small, training.world.free)
+    coarse = small_pictures(training, cell).loss
     return PoseTracker(coarse, training.loss, training.position_m, training.quat_wxyz).run()
+
+
+def small_pictures(training: Training, cell: Cell) -> Training:
+    """Return the episode with smaller pictures and fewer spheres: coarser, and cheaper to compare."""
+    capture = Capture.open(cell.capture, check=False, splits=("train",))
+    footage = load_footage(capture, TRAIN_EPISODE, COARSE_SIZE, cell.device)
+    return replace(training, loss=ImageLoss(coarse_model(training.model), footage, training.world.free))
 
 
 @dataclass(frozen=True, eq=False)
