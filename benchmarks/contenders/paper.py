@@ -86,7 +86,7 @@ class Paper:
             for part in point:
                 part.requires_grad_()
             loss = form.loss(point, state)
-            history.append(float(loss))
+            history.append(float(loss.detach()))
             if history[-1] < lowest:
                 best, lowest = [part.detach().clone() for part in point], history[-1]
             if not math.isfinite(history[-1]):
