@@ -1,6 +1,7 @@
 """Results of benchmarks on disk, one JSON line each, so that an interrupted run goes on where it stopped.
 
-A result counts for the commit at which it was measured and no other; `out/evidence/` keeps them all.
+A result counts for the commit at which it was measured and no other, unless told otherwise; `out/evidence/` keeps them
+all. Where git is not there (a copy of the files on another machine), `CGWM_COMMIT` names the commit.
 """
 
 from __future__ import annotations
@@ -25,32 +26,59 @@ def shared_data() -> Path | None:
 
 
 class Store:
-    """The results of one benchmark."""
+    """The results of one benchmark.
 
-    def __init__(self, name: str) -> None:
-        self._path = ROOT / "out" / "evidence" / f"{name}.jsonl"
-        self._commit = _commit()
+    Args:
+        name: Of the benchmark.
+        path: Its file, in `out/evidence/` where left out. Files from several machines may be joined line by line.
+        any_commit: Results of other commits count, too.
+    """
+
+    def __init__(self, name: str, path: Path | None = None, any_commit: bool = False) -> None:
+        self._path = path or ROOT / "out" / "evidence" / f"{name}.jsonl"
+        self._commit, self._any = _commit(), any_commit
         lines = self._path.read_text(encoding="utf-8").splitlines() if self._path.is_file() else []
         # a line that was cut off by a kill is measured again
         self._rows = [row for row in map(_parsed, lines) if row is not None]
 
-    def result(self, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the result of `key` at this commit, measured now unless it is already there; print it."""
-        known = [row for row in self._rows if row["key"] == key and row["commit"] == self._commit]
-        if known and not self._commit.endswith("+"):
-            row = known[-1]
-        else:
-            started, cpu = time.perf_counter(), time.process_time()
-            figures = measure()
-            row = {"key": key, "commit": self._commit, "date": date.today().isoformat(), "machine": platform.machine()}
-            row |= {"cpus": os.cpu_count(), "wall_s": round(time.perf_counter() - started, 1)}
-            row |= {"cpu_s": round(time.process_time() - cpu, 1), **figures}
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
-            self._rows.append(row)
+    def known(self, key: str) -> dict[str, Any] | None:
+        """Return the latest result of `key` that counts, or None."""
+        rows = [row for row in self._rows if row["key"] == key and self._counts(row["commit"])]
+        return rows[-1] if rows else None
+
+    def results(self) -> list[dict[str, Any]]:
+        """Return the latest result of every key that counts."""
+        return [row for key in dict.fromkeys(row["key"] for row in self._rows) if (row := self.known(key)) is not None]
+
+    def add(self, key: str, figures: dict[str, Any]) -> dict[str, Any]:
+        """Store a result that was just measured, and print it."""
+        row = {"key": key, "commit": self._commit, "date": date.today().isoformat(), "machine": platform.machine()}
+        row |= {"cpus": os.cpu_count(), **figures}
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        self._rows.append(row)
         print(json.dumps(row), flush=True)
         return row
+
+    def result(self, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return the result of `key`, measured now unless it is already there; print it."""
+        row = self.known(key)
+        if row is None:
+            return self.add(key, timed(measure))
+        print(json.dumps(row), flush=True)
+        return row
+
+    def _counts(self, commit: str) -> bool:
+        return self._any or (commit == self._commit and not commit.endswith("+"))
+
+
+def timed(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what `measure` returns, after its time of the wall's clock and of the processor [s]."""
+    started, cpu = time.perf_counter(), time.process_time()
+    figures = measure()
+    wall_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu
+    return {"wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1), **figures}
 
 
 def _commit() -> str:
@@ -60,7 +88,8 @@ def _commit() -> str:
         done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False)
         return done.stdout.strip()
 
-    return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    given = os.environ.get("CGWM_COMMIT")
+    return given or git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
 
 
 def _parsed(line: str) -> dict[str, Any] | None:

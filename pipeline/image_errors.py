@@ -69,12 +69,14 @@ class VideoErrors:
         capture: With calibrated cameras.
         device: Where to render.
         keep_frames: Keep the frames of the model's prediction beside the real ones.
+        every: Look at every so manyth frame after the warm-up.
     """
 
     model: Model
     capture: Capture
     device: str = "cpu"
     keep_frames: bool = False
+    every: int = 1
     _renderers: dict[bytes, LabelRenderer] = field(default_factory=dict)
 
     def compare(self, prediction: EpisodePrediction, camera: str) -> VideoComparison | None:
@@ -103,6 +105,7 @@ class VideoErrors:
         capture, episode = self.capture, prediction.episode
         times = capture.frame_times(camera, episode)
         chosen = np.flatnonzero((times > prediction.warmup_end_s + 1e-9) & (times <= prediction.grid_s[-1] + 1e-6))
+        chosen = chosen[:: self.every]
         if len(chosen) == 0:
             return None
         frames, numbers = capture.video_frames(camera, episode), capture.frame_numbers(camera, episode)

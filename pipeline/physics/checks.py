@@ -91,7 +91,7 @@ def largest_step(world: World) -> float:
         period = torch.where(swing > 0, math.pi * plain(law.contact_time_s) / swing.clamp_min(1e-12), torch.inf)
         return float(period.min())
     masses = [plain(body.mass) for body in world.bodies if body.free]
-    return min((float(stable_step(law, mass, law.directions).min()) for mass in masses), default=math.inf)
+    return min((float(plain(stable_step(law, mass, law.directions)).min()) for mass in masses), default=math.inf)
 
 
 def require_state(state: State, names: Sequence[str]) -> None:

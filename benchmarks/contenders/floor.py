@@ -1,0 +1,90 @@
+"""The floor: our engine with the true numbers, the true shape and mass: what the contact model itself cannot express.
+
+It alone reads the truth. MuJoCo's natural time and damping ratio of a contact are the contact time and damping ratio of
+ours; friction is that with the ground, for our law has one friction for all.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from cgwm.datasets.models import read_model
+from cgwm.datasets.scenes import read_truth
+from cgwm.datasets.tracks import Track
+from cgwm.pipeline.physics.contact import ContactLaw
+from cgwm.pipeline.physics.distance import plane_contacts
+from cgwm.pipeline.physics.world import State, World, symmetric
+from cgwm.pipeline.reporting.against_truth import OBJECT
+from cgwm.pipeline.splats.collision import shape_to_spheres
+from cgwm.schemas import ContactParameters, FileShape, Shape
+
+from .base import Array, Cell, Prediction
+from .training import rolled_out
+
+SPHERES = 200
+"""Most collision spheres, as in `cgwm fit`."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The truth in our engine."""
+
+    name: ClassVar[str] = "floor"
+
+    def fit(self, cell: Cell, budget_s: float | None) -> FittedFloor:
+        """Read the truth and fill the true mesh with spheres."""
+        started = time.perf_counter()
+        truth, model = read_truth(cell.capture), read_model(cell.splats)
+        file = model.file.model_copy(update={"contact": ContactParameters()})
+        world = World.from_model(replace(model, file=file))
+        shape = Shape(mesh=FileShape(path=truth.object.mesh))
+        factor = model.body(OBJECT).radius_factor
+        spheres, distance = shape_to_spheres(shape, cell.capture, SPHERES, factor)
+
+        def tensor(values: object) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float64)[None]
+
+        index = world.body_names.index(OBJECT)
+        centers, radii = tensor(spheres.means), tensor(factor * spheres.scales)
+        body = replace(
+            world.bodies[index],
+            mass=tensor(truth.object.mass_kg),
+            inertia=tensor(symmetric(truth.object.inertia_kg_m2)),
+            com=tensor(truth.object.com_m),
+            centers=centers,
+            radii=radii,
+            on_plane=plane_contacts(centers[0], radii[0]),
+        )
+        bodies = (*world.bodies[:index], body, *world.bodies[index + 1 :])
+        contact = truth.contact
+        numbers = {
+            "friction": contact.friction,
+            "contact_time_s": contact.natural_time_s,
+            "damping_ratio": contact.damping_ratio,
+        }
+        law = ContactLaw(**{name: tensor(value) for name, value in numbers.items()})
+        record = {
+            "seconds": round(time.perf_counter() - started, 2),
+            "evaluations": 0,
+            "parameters": numbers,
+            "spheres": len(spheres.means),
+            "surface_distance_m": distance,
+        }
+        return FittedFloor(replace(world, bodies=bodies, contact=law), record)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFloor:
+    """The true world in our engine."""
+
+    world: World
+    record: dict[str, Any]
+
+    def predict(self, start: State, drives: Mapping[str, Track], times_s: Array) -> Prediction:
+        """Predict open loop."""
+        return rolled_out(self.world, start, drives, times_s)

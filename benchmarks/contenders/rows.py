@@ -1,0 +1,71 @@
+"""The rows of the benchmark's table: who competes, and with how much time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cgwm.datasets.scenes.objects import SolidObject
+
+from .base import Contender
+from .cem_mujoco import CemMujoco
+from .cgwm_default import Cgwm
+from .floor import Floor
+from .paper import Paper
+from .pinwm import PinWm
+from .zeros import Ballistic, Frozen
+
+REFERENCE = "cgwm"
+"""The row whose measured fit time is the others' budget, in the same cell."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A contender, and its budget in units of the reference's fit time; None: it takes the time that it takes."""
+
+    make: Callable[[], Contender]
+    budget: float | None = None
+
+
+def true_solid(capture: Path) -> SolidObject:
+    """Return the true object of a capture of the benchmark."""
+    from tabletop import read_solid
+
+    return read_solid(capture)
+
+
+def _mujoco(shape: str, solid: Callable[[Path], SolidObject] | None, budget: float) -> tuple[str, Row]:
+    name = f"CEM + MuJoCo + R, {shape}, {budget:g}x"
+    return name, Row(lambda: CemMujoco(name, solid), budget)
+
+
+def _pinwm(budget: float) -> tuple[str, Row]:
+    name = f"in the manner of PIN-WM, {budget:g}x"
+    return name, Row(lambda: PinWm(name), budget)
+
+
+def _paper(budget: float) -> tuple[str, Row]:
+    name = f"the paper's form, {budget:g}x"
+    return name, Row(lambda: Paper(name), budget)
+
+
+FIXED = f"{REFERENCE}, geometry fixed"
+
+ROWS: dict[str, Row] = dict(
+    (
+        (REFERENCE, Row(Cgwm)),
+        (FIXED, Row(lambda: Cgwm(FIXED, {"geometry": False}))),
+        _paper(4),
+        _mujoco("true mesh", true_solid, 1),
+        _mujoco("true mesh", true_solid, 4),
+        _mujoco("learned shape", None, 1),
+        _mujoco("learned shape", None, 4),
+        _pinwm(1),
+        _pinwm(4),
+        (Frozen.name, Row(Frozen)),
+        (Ballistic.name, Row(Ballistic)),
+        (Floor.name, Row(Floor)),
+    )
+)
+"""By name, in the table's order."""

@@ -1,0 +1,185 @@
+"""The benchmark: Fall and Push. One motion of 15 frames to learn from, longer ones to predict open loop.
+
+python benchmarks/fall_push.py --folder /tmp/tabletop --device cpu --workers 2 [--objects box --rows "cgwm; frozen"]
+python benchmarks/fall_push.py --table
+
+Every (task, object, material, row) is a stored result, taken up again, so that the table can be finished in several
+runs, on several machines: join the stores' lines. What is there of captures and models in the folder is used; the
+model of an object is fitted once a task, to the photos of the first material's capture.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cgwm.pipeline.fit import fit
+from cgwm.schemas import CgwmError, SplatConfig
+from contenders.base import Cell
+from contenders.rows import REFERENCE, ROWS
+from fall_push_table import table
+from scoring import Judge
+from store import Store, timed
+
+TASKS = ("fall", "push")
+TESTS = 10
+
+
+@dataclass(frozen=True)
+class Job:
+    """One result to measure."""
+
+    task: str
+    object: str
+    material: str
+    row: str
+    cell: Cell
+
+    @property
+    def key(self) -> str:
+        """The result's key in the store."""
+        return "/".join((self.task, self.object, self.material, self.row, f"seed {self.cell.seed}", self.cell.device))
+
+
+@dataclass(frozen=True)
+class Work:
+    """Where captures and models lie, and how they are made."""
+
+    folder: Path
+    seed: int
+    device: str
+
+    def capture(self, task: str, obj: str, material: str) -> Path:
+        """Return the directory of a capture."""
+        return self.folder / f"{obj}_{material}_{task}"
+
+    def splats(self, task: str, obj: str) -> Path:
+        """Return the directory of a model without physics."""
+        return self.folder / "models" / f"{obj}_{task}"
+
+    def cell(self, task: str, obj: str, material: str) -> Cell:
+        """Return what contenders are given."""
+        return Cell(self.capture(task, obj, material), self.splats(task, obj), self.device, self.seed)
+
+    def make_capture(self, task: str, obj: str, material: str) -> None:
+        """Make a capture where there is none; its cameras are the true ones."""
+        path = self.capture(task, obj, material)
+        if not path.exists():
+            from tabletop import make_capture
+
+            make_capture(path, obj, material, task, self.seed, TESTS)
+
+    def make_splats(self, task: str, obj: str, material: str) -> None:
+        """Fit the spheres of an object to the photos of one of its captures."""
+        out = self.splats(task, obj)
+        if not out.exists():
+            config = SplatConfig(seed=self.seed, device=self.device)  # pyright: ignore[reportArgumentType]
+            fit(self.capture(task, obj, material), out, stage="sg-gs", splat_config=config)
+
+
+def measure(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
+    """Fit and judge one row in one cell. A fit that fails is a result, too: `failed` says why."""
+    figures: dict[str, Any] = {key: getattr(job, key) for key in ("task", "object", "material", "row")}
+    figures |= {"seed": job.cell.seed, "device": job.cell.device, "budget_s": budget_s, "psnr_every": psnr_every}
+    return figures | timed(lambda: _measured(job, budget_s, psnr_every))
+
+
+def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
+    started = time.perf_counter()
+    try:
+        fitted = ROWS[job.row].make().fit(job.cell, budget_s)
+    except Exception as error:  # whatever a contender dies of is its result
+        reason = error.found if isinstance(error, CgwmError) else f"{type(error).__name__}: {error}"
+        return {"failed": reason, "fit": {"seconds": round(time.perf_counter() - started, 2)}}
+    judge, record = Judge.of(job.cell, psnr_every), fitted.record
+    errors = judge.parameter_errors(record.get("parameters", {}))
+    return {"fit": record, "parameter_errors": errors, "episodes": judge.episode_errors(fitted)}
+
+
+def run(work: Work, store: Store, names: dict[str, Sequence[str]], pool: Executor, psnr_every: int) -> None:
+    """Make what is missing of captures, models and results; references first, since they set the others' budgets.
+
+    Args:
+        work: Where things lie.
+        store: Takes the results, as they come.
+        names: Which tasks, objects, materials and rows are wanted.
+        pool: Who works.
+        psnr_every: Compare every so manyth frame of the test videos; 0: none.
+    """
+    pairs = [(task, obj) for task in names["tasks"] for obj in names["objects"]]
+    cells = [(task, obj, material) for task, obj in pairs for material in names["materials"]]
+    jobs = [Job(*cell, row, work.cell(*cell)) for cell in cells for row in names["rows"]]
+    jobs = [job for job in jobs if store.known(job.key) is None]
+    wanted = sorted({(job.task, job.object, job.material) for job in jobs})
+    photographed = sorted({(task, obj, names["materials"][0]) for task, obj, _ in wanted})
+
+    def each(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> None:
+        for done in as_completed([pool.submit(function, *one) for one in arguments]):
+            done.result()
+
+    def measured(now: Sequence[Job]) -> None:
+        waiting = {pool.submit(measure, job, _budget(store, job), psnr_every): job for job in now}
+        for done in as_completed(waiting):
+            store.add(waiting[done].key, done.result())
+
+    each(work.make_capture, sorted({*wanted, *photographed}))
+    each(work.make_splats, photographed)
+    measured([job for job in jobs if job.row == REFERENCE])
+    measured([job for job in jobs if job.row != REFERENCE])
+
+
+def _budget(store: Store, job: Job) -> float | None:
+    """Return the seconds that a job may take: so many times what the reference took in the same cell."""
+    factor = ROWS[job.row].budget
+    if factor is None:
+        return None
+    reference = store.known(Job(**(vars(job) | {"row": REFERENCE})).key)
+    if reference is None:
+        raise SystemExit(f"{job.key}: its budget is the time of the row '{REFERENCE}', which is to be in --rows first.")
+    return factor * reference["fit"]["seconds"]
+
+
+def main() -> int:
+    """Measure what is missing, or print the table of what is stored."""
+    from tabletop import MATERIALS, OBJECTS
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", default=",".join(TASKS))
+    parser.add_argument("--objects", default=",".join(OBJECTS))
+    parser.add_argument("--materials", default=",".join(MATERIALS))
+    parser.add_argument("--rows", default="; ".join(ROWS), help="names of rows, separated by semicolons")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
+    parser.add_argument("--folder", type=Path, default=Path("out") / "fall_push", help="captures and models")
+    parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
+    parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
+    parser.add_argument("--psnr-every", type=int, default=1, help="compare every so manyth frame; 0: none")
+    parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
+    given = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
+    store = Store("fall_push", given.store, given.any_commit)
+    names = {key: [one.strip() for one in getattr(given, key).split(",")] for key in ("tasks", "objects", "materials")}
+    names["rows"] = [one.strip() for one in given.rows.split(";")]
+    for key, legal in (("tasks", TASKS), ("objects", OBJECTS), ("materials", MATERIALS), ("rows", ROWS)):
+        unknown = [one for one in names[key] if one not in legal]
+        if unknown:
+            parser.error(f"--{key}: {unknown[0]!r} is none of {', '.join(legal)}")
+    if not given.table:
+        work = Work(given.folder.resolve(), given.seed, given.device)
+        with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            run(work, store, names, pool, given.psnr_every)
+    print(table(store.results(), names, given.seed))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
