@@ -251,11 +251,12 @@ class _Picture:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
         self._bodies: list[tuple[int, Spheres, Relighting | None]] = []
+        light = model.file.light
         for index, body in enumerate(model.file.bodies):
             if body.name in model.body_splats:
-                splats, light = model.body_splats[body.name], model.file.light
-                lit = light is not None and splats.normals is not None
-                relighting = Relighting.of(light, body, tensor(splats.normals)) if lit else None
+                splats, relighting = model.body_splats[body.name], None
+                if light is not None and splats.normals is not None:
+                    relighting = Relighting.of(light, body, tensor(splats.normals))
                 self._bodies.append((index, Spheres.from_numpy(splats, device=device), relighting))
         scene = [] if model.scene is None else [Spheres.from_numpy(model.scene, device=device)]
         self._still = [spheres.seen_from(tensor(camera.center)) for spheres in scene]
