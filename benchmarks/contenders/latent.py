@@ -89,7 +89,7 @@ class Latent:
             data = self._simulated(training, cameras, cell, self.solid(cell.capture))
             left = stopwatch(budget_s)
         made_s = time.perf_counter() - began
-        with torch.random.fork_rng():
+        with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cell.seed)
             model = LatentModel(data.images.mean((0, 1)).cpu(), data.driven_m.shape[2]).to(cell.device)
         horizon = min(TEST_FRAMES, data.images.shape[1])

@@ -24,7 +24,7 @@ START_SIZE, ACTION_SIZE = 18, 6
 RATE, FREE_NATS, KL_WEIGHT, IMAGE_WEIGHT = 1e-3, 1.0, 0.05, 10.0
 BATCH = {"cpu": 16, "cuda": 64}
 """Sequences of a step: a GPU takes more in the same time."""
-SEEN_FRAMES, SHOWN_FRAMES = 15, 5
+SEEN_FRAMES, SHOWN_FRAMES = 8, 5
 """Frames of a sequence that the posterior sees; and how many, drawn anew each time, are compared as images."""
 GRADIENT_NORM = 10.0
 

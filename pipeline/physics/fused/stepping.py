@@ -110,7 +110,7 @@ class _Resident:
         return _Resident(
             replace(packed, structure=structure, **arrays),
             None if packed.turn is None else packed.turn.cpu(),
-            torch.empty(drives.shape, dtype=drives.dtype, pin_memory=drives.is_cuda),
+            torch.empty(drives.shape, dtype=drives.dtype, pin_memory=drives.is_cuda and drives.numel() > 0),
             drives.new_empty(1, 2, bodies, FRAME_WIDTH),
             drives.new_zeros(1, lanes, structure.carried_width),
         )
