@@ -100,7 +100,7 @@ def make_cell(folder: Path) -> Cell:
     return Cell(folder / "capture", folder / "splats", "cpu", 0)
 
 
-def rolling(driven: int = 0, count: int = 6, frames: int = 10) -> Sequences:
+def rolling(driven: int = 0, count: int = 6, frames: int = 8) -> Sequences:
     """Return sequences of a bright spot that moves as the pose does, at random constant velocities."""
     generator = torch.Generator().manual_seed(0)
     velocity = 0.3 * torch.randn(count, 1, 3, generator=generator)
@@ -121,16 +121,16 @@ def rolling(driven: int = 0, count: int = 6, frames: int = 10) -> Sequences:
 def trained(data: Sequences, seed: int, steps: int) -> tuple[LatentModel, list[float]]:
     torch.manual_seed(seed)
     model = LatentModel(data.images.mean((0, 1)), data.driven_m.shape[2], hidden=32, stochastic=4)
-    return model, train(model, data, seed, steps, stopwatch(None), 10)
+    return model, train(model, data, seed, steps, stopwatch(None), data.images.shape[1])
 
 
 def test_the_loss_falls_and_open_loop_prediction_beats_a_frozen_object() -> None:
     data = rolling(driven=1)
-    model, losses = trained(data, 0, 60)
+    model, losses = trained(data, 0, 100)
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
     position, rotation, images = predicted(model, data)
     frozen = (data.position_m - data.position_m[:, :1]).norm(dim=-1).mean()
-    assert float((position - data.position_m).norm(dim=-1).mean()) < 0.75 * float(frozen)
+    assert float((position - data.position_m).norm(dim=-1).mean()) < 0.6 * float(frozen)
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand_as(rotation), atol=1e-5, rtol=0)
     assert images.shape == data.images.shape
     still = (data.images[:, :1] - data.images).square().mean()
