@@ -20,15 +20,14 @@ from ..schemas import InputDataError, NotConvergedError, UsageError
 from .physics.checks import require_apart
 from .physics.driven import Drive
 from .physics.fused.stepping import FusedStepper
-from .physics.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix
+from .physics.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from .physics.stepping import Stepper, TorchStepper
 from .physics.world import State, World
-from .splats.relighting import Relighting
-from .splats.render import render
-from .splats.spheres import Spheres
+from .picture import Picture
 
-ROOM = 2
-"""The renderer's kernels get room for so many times the pairs of tiles and spheres that were last counted."""
+ROOM, LEAST_ROOM = 2, 65_536
+"""The renderer's kernels get room for so many times the pairs of tiles and spheres that were last counted, and at least
+for so many."""
 _SIZES = {"position_m": 3, "quat_wxyz": 4, "velocity_m_s": 3, "omega_body_rad_s": 3}
 
 
@@ -84,7 +83,7 @@ class ClosedLoop:
         self._times = torch.tensor([[0.0, control_dt_s]], dtype=torch.float64)
         stepper: Stepper = (FusedStepper if self._cuda else TorchStepper)(world, control_dt_s)
         self._stepper = stepper
-        self._picture = _Picture(model, camera, device)
+        self._picture = Picture(model, camera, device)
         self._poses: dict[str, tuple[Tensor, Tensor]] | None = None
         self._steps = 0
         self._graph: _Graph | None = None
@@ -115,14 +114,15 @@ class ClosedLoop:
         driven = [k for k, body in enumerate(world.bodies) if body.motion == "driven"]
         poses = {self.body_names[k]: (pose[0][:, k], quat_normalize(pose[1][:, k])) for k in driven}
         at_rest = self._typed(self._commanded(poses, {name: Velocity((0.0, 0.0, 0.0)) for name in poses}))
-        self._stepper.reset(start, at_rest)
         require_apart(world, start)
+        self._stepper.reset(start, at_rest)
         self._poses, self._steps = poses, 0
         frame, pairs = self._picture.of(start)
         if self._cuda and self._graph is None:
-            self._stepper.advance()  # compiles the kernel, which a capture cannot
+            capacity = _room(int(pairs))
+            self._advanced(capacity)  # compiles and loads all kernels, which a capture cannot
             self._stepper.reset(start, at_rest)
-            self._graph = self._captured(start, ROOM * int(pairs))
+            self._graph = self._captured(start, capacity)
         if self._cuda:
             torch.cuda.synchronize()
         return frame
@@ -158,7 +158,7 @@ class ClosedLoop:
             )
         state = outcome.state()
         if self._graph is not None and pairs > self._graph.capacity:
-            self._graph = self._captured(state, ROOM * pairs)
+            self._graph = self._captured(state, _room(pairs))
             return self._picture.of(state, self._graph.capacity)[0], state
         return outcome.frame.clone(), state
 
@@ -243,65 +243,8 @@ class _Graph:
         return self.outcome
 
 
-class _Picture:
-    """All spheres of a model before one camera; the background stands still, bodies are where a state puts them."""
-
-    def __init__(self, model: Model, camera: Camera, device: str) -> None:
-        def tensor(values: ArrayLike) -> Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self._bodies: list[tuple[int, Spheres, Relighting | None]] = []
-        light = model.file.light
-        for index, body in enumerate(model.file.bodies):
-            if body.name in model.body_splats:
-                splats, relighting = model.body_splats[body.name], None
-                if light is not None and splats.normals is not None:
-                    relighting = Relighting.of(light, body, tensor(splats.normals))
-                self._bodies.append((index, Spheres.from_numpy(splats, device=device), relighting))
-        scene = [] if model.scene is None else [Spheres.from_numpy(model.scene, device=device)]
-        self._still = [spheres.seen_from(tensor(camera.center)) for spheres in scene]
-        if not self._bodies:
-            raise InputDataError(
-                f"{model.root}: no body of the model has visual spheres, so there is nothing to see.",
-                todo="fit it from photos: cgwm fit CAPTURE --out MODEL.",
-            )
-        everything = [*(spheres for _, spheres, _ in self._bodies), *self._still]
-        self._scales = torch.cat([spheres.scales for spheres in everything])
-        self._opacities = torch.cat([spheres.opacities for spheres in everything])
-        self._viewmats, self._Ks = tensor(camera.T_cam_world)[None], tensor(camera.K)[None]
-        self._size = (camera.width, camera.height)
-        self._distortion = tensor(camera.distortion) if camera.distortion.any() else None
-
-    def of(self, state: State, capacity: int | None = None) -> tuple[Tensor, Tensor]:
-        """Return the frame of a state, uint8 RGB (H, W, 3), and the pairs () that the kernels found; 0 without them.
-
-        With a capacity nothing waits for the device, and pairs beyond it are lost.
-        """
-        positions, rotations = state.position_m[0].float(), quat_to_matrix(state.quat_wxyz[0]).float()
-        means, colors = [], []
-        for index, spheres, relighting in self._bodies:
-            means.append(spheres.means @ rotations[index].T + positions[index])
-            color = spheres.colors
-            if relighting is not None:
-                color = (color * relighting.turned(rotations[index])[:, None]).clamp(0, 1)
-            colors.append(color)
-        means += [spheres.means for spheres in self._still]
-        colors += [spheres.colors for spheres in self._still]
-        picture = render(
-            torch.cat(means),
-            self._scales,
-            self._opacities,
-            torch.cat(colors),
-            self._viewmats,
-            self._Ks,
-            *self._size,
-            distortion=self._distortion,
-            capacity=capacity,
-        )
-        if picture.pairs is None and self._scales.is_cuda:
-            raise UsageError("the renderer's kernels need Triton, which is not installed.", todo="see 'cgwm doctor'.")
-        frame = (picture.features[0].clamp(0, 1) * 255).round().to(torch.uint8)
-        return frame, self._scales.new_zeros(()) if picture.pairs is None else picture.pairs
+def _room(pairs: int) -> int:
+    return max(ROOM * pairs, LEAST_ROOM)
 
 
 def _row(name: str, values: ArrayLike | Tensor, size: int) -> Tensor:

@@ -111,7 +111,7 @@ class Latent:
     def _simulated(self, training: Training, cameras: Cameras, cell: Cell, solid: SolidObject) -> Sequences:
         """Return trajectories with ground truth, and what the cameras see of them."""
         true = read_truth(cell.capture).contact
-        world, times = training.world, _frame_s(training) * np.arange(TEST_FRAMES)
+        world, times = training.world, np.asarray(_frame_s(training) * np.arange(TEST_FRAMES), np.float64)
         index, pushed = world.free[0], bool(training.drives)
         tip = true.friction if true.friction_fingertip is None else true.friction_fingertip
         contact = ContactTruth(true.friction, tip, true.natural_time_s, true.damping_ratio, true.impedance)
