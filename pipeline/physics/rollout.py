@@ -61,7 +61,7 @@ def simulate(
     """
     require_physical(world)
     require_state(state, world.body_names)
-    engine = _Engine(world, state, times_s, driven or {})
+    engine = Engine(world, state, times_s, driven or {})
     motions = engine.begin(state)
     frames = [engine.frame(motions)]
     recorder = Recorder(engine.world, engine.placed(motions)) if record_contacts else None
@@ -77,8 +77,8 @@ def simulate(
     return Rollout(times_s, position, quat, velocity, omega, recorder.record() if recorder is not None else None)
 
 
-class _Engine:
-    """The constants of one rollout, and its step."""
+class Engine:
+    """The constants of one rollout, its step, and the contacts of the last step, from which the next begins."""
 
     def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
         world = self.world = changed_by_effects(world)
@@ -90,15 +90,14 @@ class _Engine:
         self.substeps = world.substeps(self.times)
         self.wrenches = [active for active in world.effects if active.effect.has("wrench")]
         self.flows = [active for active in world.effects if active.effect.has("flow")]
-        like = state.position_m.detach()
-        self.drives = {
-            index: Drive.command(body.name, driven, like)
-            for index, body in enumerate(world.bodies)
-            if body.motion == "driven"
-        }
+        self.drives = self._commands(driven, state.position_m.detach())
         self.batch = self._batch(state)
         self.contacts = Contacts(world, self.inertias)
         self.touched: list[PairImpulses] = []
+
+    def _commands(self, driven: Mapping[str, Track | Drive], like: Tensor) -> dict[int, Drive]:
+        bodies = enumerate(self.world.bodies)
+        return {k: Drive.command(body.name, driven, like) for k, body in bodies if body.motion == "driven"}
 
     def _batch(self, state: State) -> int:
         """Return the size of the batch that all the tensors together have."""
@@ -111,6 +110,7 @@ class _Engine:
         return max(x.shape[0] for x in numbers if isinstance(x, torch.Tensor))
 
     def begin(self, state: State) -> list[Motion]:
+        """Return the motions of the bodies at the first time."""
         motions = []
         for index, body in enumerate(self.world.bodies):
             position, quat, velocity = (x[:, index] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
@@ -123,11 +123,18 @@ class _Engine:
             motions.append(self._whole(motion))
         return motions
 
+    def commanded(self, motions: list[Motion], driven: Mapping[str, Track | Drive]) -> list[Motion]:
+        """Take other commands from the first time on, and return the motions with driven bodies as they begin."""
+        self.drives = self._commands(driven, motions[0].com)
+        first = self.times[:, 0]
+        return [self._whole(self.drives[k].at(first)) if k in self.drives else m for k, m in enumerate(motions)]
+
     def _whole(self, motion: Motion) -> Motion:
         """Return a motion with as many rows as the batch has."""
         return Motion(*(_expanded(x, self.batch) for x in vars(motion).values()))
 
     def step(self, motions: list[Motion], interval: int, substep: int) -> tuple[list[Motion], list[PairImpulses]]:
+        """Return the motions after a sub-step of an interval (counted from 1), and what touched."""
         count = self.substeps[interval - 1]
         h = _expanded(self.lengths[:, interval - 1] / count, self.batch)
         rotations = [quat_to_matrix(m.quat_wxyz) for m in motions]
@@ -200,6 +207,7 @@ class _Engine:
         return velocity, spin
 
     def frame(self, motions: list[Motion]) -> tuple[Tensor, ...]:
+        """Return the fields of the `State` (B, nb, ...) of the motions."""
         columns = []
         for index, (body, motion) in enumerate(zip(self.world.bodies, motions, strict=True)):
             if body.free:

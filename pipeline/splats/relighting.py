@@ -30,7 +30,14 @@ def light_terms(normals: Tensor, lamp: Tensor) -> Tensor:
 
 def brightness(light: Light, normals: Tensor) -> Tensor:
     """Return L (N,) at unit normals (N, 3), world frame."""
-    numbers = torch.tensor((*light.lamp, light.sky), dtype=normals.dtype, device=normals.device)
+    return _brightness(_numbers(light, normals), normals)
+
+
+def _numbers(light: Light, like: Tensor) -> Tensor:
+    return torch.tensor((*light.lamp, light.sky), dtype=like.dtype, device=like.device)
+
+
+def _brightness(numbers: Tensor, normals: Tensor) -> Tensor:
     return (1 + light_terms(normals, numbers[:3]) @ numbers).clamp_min(DARKEST)
 
 
@@ -39,12 +46,12 @@ class Relighting:
     """What turns the colours of a body's photos into those of another pose.
 
     Attributes:
-        light: The light.
+        numbers: The light's lamp and sky, shape (4,).
         normals: Of the body's spheres, body frame, shape (N, 3).
         in_photos: L at the normals of the photos, shape (N,).
     """
 
-    light: Light
+    numbers: Tensor
     normals: Tensor
     in_photos: Tensor
 
@@ -52,7 +59,8 @@ class Relighting:
     def of(light: Light, body: BodyModel, normals: Tensor) -> Relighting:
         """Prepare a body, given its spheres' normals (N, 3) in the body frame."""
         rotation = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz).to(normals))
-        return Relighting(light, normals, brightness(light, normals @ rotation.T))
+        numbers = _numbers(light, normals)
+        return Relighting(numbers, normals, _brightness(numbers, normals @ rotation.T))
 
     def factors(self, quat_wxyz: Tensor) -> Tensor:
         """Return the factors (N,) of the colours at an orientation (4,)."""
@@ -60,4 +68,4 @@ class Relighting:
 
     def turned(self, rotation: Tensor) -> Tensor:
         """Return the factors (N,) of the colours at an orientation (3, 3)."""
-        return brightness(self.light, self.normals @ rotation.T) / self.in_photos
+        return _brightness(self.numbers, self.normals @ rotation.T) / self.in_photos

@@ -15,6 +15,7 @@ struct Problem {
     Number* __restrict__ frames;           // (environments, frames, bodies, 16)
     Number* __restrict__ frame_tangents;
     Number* __restrict__ labels;           // (environments, frames, contacts, 12)
+    Number* carried;                       // (environments, LANES, CARRIED_WIDTH): see `resume`
     int environments, frame_count, sweeps;
     long long steps_stride, geometry_stride, drive_stride;
     int drive_last_stride;
@@ -132,6 +133,47 @@ INLINE void load(const Problem& problem, Environment& env) {
     }
 #endif
 }
+
+#if CARRIED
+// Takes up where the last launch ended: each body's position, orientation, velocity and spin, then the impulses of this
+// lane's contacts and whether any is not zero. Every lane has its own copy, so that none waits for another.
+INLINE void resume(const Problem& problem, Environment& env) {
+    const Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++, row += 13) {
+        Body& body = env.bodies[b];
+        body.position = vec(row[0], row[1], row[2]);
+        Quat quat = {row[3], row[4], row[5], row[6]};
+        body.quat = quat;
+        body.velocity = vec(row[7], row[8], row[9]);
+        body.spin = vec(row[10], row[11], row[12]);
+    }
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) env.before[i] = vec(row[3 * i], row[3 * i + 1], row[3 * i + 2]);
+    env.warm = row[3 * SLOTS] > Number(0);
+}
+
+// Leaves for the next launch what `resume` reads.
+INLINE void suspend(const Problem& problem, const Environment& env) {
+    if (env.lanes.idle) return;
+    Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++, row += 13) {
+        const Body& body = env.bodies[b];
+        Number numbers[13] = {body.position.x, body.position.y, body.position.z, body.quat.w, body.quat.x,
+                              body.quat.y, body.quat.z, body.velocity.x, body.velocity.y, body.velocity.z,
+                              body.spin.x, body.spin.y, body.spin.z};
+        for (int k = 0; k < 13; k++) row[k] = numbers[k];
+    }
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        row[3 * i] = env.before[i].x;
+        row[3 * i + 1] = env.before[i].y;
+        row[3 * i + 2] = env.before[i].z;
+    }
+    row[3 * SLOTS] = env.warm ? Number(1) : Number(0);
+}
+#endif
 
 #if DRIVEN
 // The commanded motion of a driven body at a time that never falls.

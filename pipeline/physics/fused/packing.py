@@ -79,7 +79,7 @@ def pack(
     turn = None if world.ground_normal is None else _upright(world.ground_normal)
     times = times_s if times_s.ndim == 2 else times_s[None]
     like = state.position_m.detach()
-    rows = {index: _drive_rows(Drive.command(body.name, driven, like), turn) for index, body in enumerate(world.bodies)
+    rows = {index: drive_rows(Drive.command(body.name, driven, like), turn) for index, body in enumerate(world.bodies)
             if body.motion == "driven"}  # fmt: skip
     effects = wrenches.coefficients(world)
     turned = turn is not None and len(world.bodies) > 1
@@ -151,8 +151,8 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     return columns
 
 
-def _drive_rows(drive: Drive, turn: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the samples (1 or B, S, 14) and the index of the last interval (1 or B,)."""
+def drive_rows(drive: Drive, turn: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return a command for the kernel: its samples (1 or B, S, 14) and the index of the last interval (1 or B,)."""
     # the velocities go from a sample to the next; the last sample has none
     parts = (
         drive.times_s[..., None], _turned(turn, drive.position_m), _turned_quat(turn, drive.quat_wxyz),

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Launch = Callable[[Structure, tuple[Tensor | None, ...], tuple[int, ...]], None]
 
-_FRAME_WIDTH, _LABEL_WIDTH = 16, 12
+FRAME_WIDTH, _LABEL_WIDTH = 16, 12
 
 
 def unsupported(world: World) -> str | None:
@@ -84,7 +84,7 @@ def roll(
     lanes: int | None = None,
 ) -> Rollout:
     """Do the work of `simulate_fused` with the given way to run the kernel."""
-    _check_kinds(world.gravity, state.position_m, state.quat_wxyz, state.velocity_m_s, state.omega_body_rad_s, times_s)
+    require_one_kind(world.gravity, *vars(state).values(), times_s)
     require_physical(world)
     require_state(state, world.body_names)
     world = changed_by_effects(world)
@@ -92,7 +92,7 @@ def roll(
         require_physical(world)  # an effect may have made a body that cannot be
     packed = pack(world, state, times_s, driven or {}, record_contacts)
     inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
-    _check_kinds(*inputs)
+    require_one_kind(*inputs)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         raise UsageError(
             "the fused kernel has no reverse derivatives.",
@@ -109,26 +109,32 @@ def roll(
     structure = packed.structure
     chosen = lanes or lanes_for(structure.contacts, batch, structure.single, dual, bodies > 1)
     structure = replace(structure, dual=dual, lanes=chosen)
-    frames = values[0].new_empty(batch, count, bodies, _FRAME_WIDTH)
+    frames = values[0].new_empty(batch, count, bodies, FRAME_WIDTH)
     frame_tangents = torch.empty_like(frames) if dual else None
     labels = values[0].new_empty(batch, count, structure.contacts, _LABEL_WIDTH) if record_contacts else None
     strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
     pointers = [x for pair in zip(values, tangents, strict=True) for x in pair]
     pointers += [packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last]
-    run(structure, (*pointers, frames, frame_tangents, labels), (batch, count, world.sweeps, *strides))
+    run(structure, (*pointers, frames, frame_tangents, labels, None), (batch, count, world.sweeps, *strides))
     if frame_tangents is not None:
         frames = forward_ad.make_dual(frames, frame_tangents)
-    return _rollout(world, times_s, packed, frames, labels)
+    return read_frames(world, times_s, packed, frames, labels)
 
 
-def _check_kinds(*tensors: Tensor) -> None:
+def require_one_kind(*tensors: Tensor) -> None:
+    """Check that tensors have one type and lie on one device.
+
+    Raises:
+        UsageError: If they do not.
+    """
     kinds = {(tensor.dtype, tensor.device) for tensor in tensors}
     if len(kinds) > 1:
         found = ", ".join(sorted(f"{dtype} on {device}" for dtype, device in kinds))
         raise UsageError(f"the world, the state, the times and the commands are of several kinds: {found}.", "one.")
 
 
-def _rollout(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labels: Tensor | None) -> Rollout:
+def read_frames(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labels: Tensor | None) -> Rollout:
+    """Return what a kernel wrote: frames (B, T, nb, 16) and labels (B, T, contacts, 12), in the world's frame."""
     position, quat, velocity = frames[..., :3], frames[..., 4:8], frames[..., 8:11]
     back = None if packed.turn is None else quat_conjugate(packed.turn)
     if back is not None:

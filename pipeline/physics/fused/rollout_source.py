@@ -152,6 +152,9 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
     env.drives = index * problem.drive_stride;
     env.drive_last = index * problem.drive_last_stride;
     load(problem, env);
+#if CARRIED
+    resume(problem, env);
+#endif
 #if DRIVEN
     for (int b = 0; b < BODIES; b++) {
         if (drive_number(b) >= 0) drive(problem, env, b, problem.steps.at(env.steps + 3));
@@ -178,18 +181,21 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
         for (int s = 1; s <= substeps; s++) step(problem, env, start + Number(s) * env.law.step_s);
         write(problem, env, frame);
     }
+#if CARRIED
+    suspend(problem, env);
+#endif
 }
 
 #define PARAMETERS                                                                                                   \
     const Number *table, const Number *table_t, const Number *steps, const Number *steps_t, const Number *geometry,  \
         const Number *geometry_t, const Number *drives, const Number *drives_t, const int *substeps,                 \
         const int *spheres, const int *drive_starts, const int *drive_last, Number *frames, Number *frame_tangents,  \
-        Number *labels, int environments, int frame_count, int sweeps, int steps_stride, int geometry_stride,        \
-        int drive_stride, int drive_last_stride
+        Number *labels, Number *carried, int environments, int frame_count, int sweeps, int steps_stride,            \
+        int geometry_stride, int drive_stride, int drive_last_stride
 #define PROBLEM                                                                                                      \
     {                                                                                                                \
         {table, table_t}, {steps, steps_t}, {geometry, geometry_t}, {drives, drives_t}, substeps, spheres,           \
-            drive_starts, drive_last, frames, frame_tangents, labels, environments, frame_count, sweeps,             \
+            drive_starts, drive_last, frames, frame_tangents, labels, carried, environments, frame_count, sweeps,    \
             steps_stride, geometry_stride, drive_stride, drive_last_stride                                           \
     }
 

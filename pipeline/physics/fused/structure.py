@@ -16,6 +16,8 @@ from .rollout_source import ROLLOUT
 THREADS = 32
 """Of a block: one warp, so that few environments still spread over all multiprocessors."""
 BODY_COLUMNS, WRENCH_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 4, 5
+MOTION_COLUMNS = 13
+"""The last ones of a body: position, orientation, velocity and spin."""
 _BUSY_THREADS = 262_144
 """With so many threads an H200 is busy; more environments need fewer threads each."""
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
@@ -50,7 +52,7 @@ class Structure:
     of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnet: one of them by the
     ground's pull; turned: whether the frame of bodies that touch each other is not the world's; free (bodies,); drives
     (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
-    ground, each with its number of contacts.
+    ground, each with its number of contacts; carried: whether each launch goes on where the one before ended.
     """
 
     single: bool
@@ -64,6 +66,7 @@ class Structure:
     drives: tuple[int, ...]
     spheres: tuple[int, ...]
     pairs: tuple[tuple[int, int, int], ...]
+    carried: bool = False
 
     @property
     def contacts(self) -> int:
@@ -81,6 +84,11 @@ class Structure:
         world = WORLD_COLUMNS + self.turned * TURN_COLUMNS + self.effects * WRENCH_COLUMNS
         return world + len(self.free) * BODY_COLUMNS
 
+    @property
+    def carried_width(self) -> int:
+        """Numbers that each thread hands to the next launch: motions of the bodies, impulses, whether any acts."""
+        return len(self.free) * MOTION_COLUMNS + 3 * self.slots + 1
+
     def source(self, host: bool = False) -> str:
         """Return the program; for the host, without the kernel's entry."""
         paired = len(self.free) > 1
@@ -92,6 +100,7 @@ class Structure:
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
+            "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]

@@ -1,0 +1,116 @@
+"""A world that the fused kernel takes on by one interval a launch, its arrays kept on the device in between."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ....schemas import UsageError
+from ..checks import require_physical, require_state
+from ..driven import Drive
+from ..effects.effect import changed_by_effects
+from ..world import State, World
+from .launch import launch
+from .packing import Packed, drive_rows, pack
+from .rollout import FRAME_WIDTH, Launch, read_frames, require_one_kind, unsupported
+from .structure import BODY_COLUMNS, MOTION_COLUMNS, lanes_for
+
+
+class FusedStepper:
+    """A `Stepper` by one launch of the kernel an interval.
+
+    What a rollout keeps from step to step (motions, and the contacts' impulses from which the next sweeps begin) stays
+    in an array on the device, so that nothing is packed anew. `advance` neither allocates outside of torch's caches nor
+    waits for the device: a CUDA graph can capture it.
+
+    Args:
+        world: The world, of one environment, on a CUDA device.
+        interval_s: Length of an interval [s].
+        run: How to launch the kernel.
+
+    Raises:
+        UsageError: If the kernel cannot take the world.
+        InputDataError: If masses, inertias, contact numbers or the step cannot be simulated.
+    """
+
+    def __init__(self, world: World, interval_s: float, run: Launch | None = None) -> None:
+        reason = unsupported(world) if run is None else None
+        if reason is not None:
+            raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="step it on the CPU.")
+        require_physical(world)
+        self._world = changed_by_effects(world)
+        if world.effects:
+            require_physical(self._world)  # an effect may have made a body that cannot be
+        self._run = run or launch
+        self._times = torch.tensor([[0.0, interval_s]], dtype=torch.float64).to(world.gravity)
+        self._driven = [body.name for body in world.bodies if body.motion == "driven"]
+        self._resident: _Resident | None = None
+
+    def reset(self, state: State, drives: Mapping[str, Drive]) -> None:
+        """See :class:`Stepper`; the state lies on the world's device and has its type, the drives lie on the CPU."""
+        like = self._world.gravity
+        require_one_kind(like, *vars(state).values())
+        require_state(state, self._world.body_names)
+        there = {name: Drive(*(x.to(like.device) for x in vars(drive).values())) for name, drive in drives.items()}
+        packed = pack(self._world, state, self._times, there, False)
+        if self._resident is None:
+            self._resident = _Resident.of(packed)
+        motions = packed.table[:, -len(self._world.bodies) * BODY_COLUMNS :].unflatten(1, (-1, BODY_COLUMNS))
+        motions = motions[..., -MOTION_COLUMNS:].flatten(1)
+        self._resident.carried.zero_()
+        self._resident.carried[..., : motions.shape[1]] = motions[:, None]
+        self.command(drives)
+
+    def command(self, drives: Mapping[str, Drive]) -> None:
+        """See :class:`Stepper`; the drives lie on the CPU, and the interval before is over (the copy may be read)."""
+        resident = self._resident
+        assert resident is not None  # see reset
+        if self._driven:
+            resident.sent.copy_(torch.cat([drive_rows(drives[name], resident.turn)[0] for name in self._driven], 1))
+            resident.packed.drives.copy_(resident.sent, non_blocking=True)
+
+    def advance(self) -> State:
+        """See :class:`Stepper`; the next call overwrites the state."""
+        resident = self._resident
+        assert resident is not None  # see reset
+        packed = resident.packed
+        pointers = (packed.table, None, packed.steps, None, packed.geometry, None, packed.drives, None)
+        pointers += (packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last)
+        pointers += (resident.frames, None, None, resident.carried)
+        # without strides: all arrays are of one environment
+        self._run(packed.structure, pointers, (1, 2, self._world.sweeps, 0, 0, 0, 0))
+        last = read_frames(self._world, self._times, packed, resident.frames, None)
+        return State(*(getattr(last, name)[:, -1] for name in State.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class _Resident:
+    """What stays where it is, so that a CUDA graph can read it.
+
+    packed: the inputs; turn: theirs, on the CPU; sent: commands on their way to the device; frames (1, 2, nb, 16);
+    carried (1, lanes, numbers): see `resume` in the source.
+    """
+
+    packed: Packed
+    turn: Tensor | None
+    sent: Tensor
+    frames: Tensor
+    carried: Tensor
+
+    @staticmethod
+    def of(packed: Packed) -> _Resident:
+        kind, bodies = packed.structure, len(packed.structure.free)
+        lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, bodies > 1)
+        structure = replace(kind, lanes=lanes, carried=True)
+        arrays = {name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "drives")}
+        drives = arrays["drives"]
+        return _Resident(
+            replace(packed, structure=structure, **arrays),
+            None if packed.turn is None else packed.turn.cpu(),
+            torch.empty(drives.shape, dtype=drives.dtype, pin_memory=drives.is_cuda and drives.numel() > 0),
+            drives.new_empty(1, 2, bodies, FRAME_WIDTH),
+            drives.new_zeros(1, lanes, structure.carried_width),
+        )
