@@ -36,10 +36,12 @@ SEGMENT_S = 0.03
 """A segment lasts at least so long, and from one frame to another."""
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """What the model may miss in a segment of flight: position [m], rotation [rad], velocity [m/s], omega [rad/s]."""
-ROUNDS = ((0.1, 30.0), (0.03, 10.0), (0.01, 4.0))
-"""What it may miss of the velocity that contact gives a body, and of the turning that goes with it; and the scale of
-the robust loss [sigmas]. The first rounds allow more, so that a first guess far off does not end in a valley of its
-own; the last one counts."""
+TIE_SHARE = 0.01
+"""What it may miss of the velocity that contact gives a body, and of the turning that goes with it."""
+ROUNDS = 2
+"""What contact gives is known from the first guess, then better from the first round."""
+ROBUST_SCALE = 4.0
+"""Of the robust loss of a frame [sigmas]; that of a tie is twice as wide."""
 STATE_STEPS = (2e-4, 2e-3, 1e-2, 1e-1)
 """Differences in position [m], rotation [rad], velocity [m/s], omega [rad/s] for the Jacobian."""
 PARAMETER_STEP = 0.1
@@ -91,7 +93,7 @@ class Shooting:
         tie: Standard deviation of what may differ where segments meet, shape (B, S).
         noise: Of the tracks (position [m], rotation [rad]), numbers or one for each frame and body (B, T, nf).
         prior: Of the parameters.
-        scale: Of the robust loss of a frame [sigmas]; that of a tie is twice as wide.
+        ahead: Another first guess of the states: each moves to the next frame in a straight line.
     """
 
     world: World
@@ -102,7 +104,7 @@ class Shooting:
     tie: Tensor
     noise: tuple[float | Tensor, float | Tensor]
     prior: Prior
-    scale: float = ROUNDS[-1][1]
+    ahead: State
 
     @staticmethod
     def of(
@@ -131,7 +133,8 @@ class Shooting:
             if not last:  # the next segment has seen that frame
                 seen[row, end[-1] :], turned[row, end[-1] :] = 0.0, 0.0
         starts = [place for places in cuts for place in places[:-1]]
-        state = _moving(world, whole, items, starts, segments.state)
+        ahead = segments.state
+        state = _moving(world, whole, items, starts, ahead)
         segments = replace(segments, seen=seen, turned=turned, state=state)
         like = world.gravity
         return Shooting(
@@ -145,18 +148,22 @@ class Shooting:
             .repeat(len(items), 1),
             noise,
             prior,
+            ahead,
         )
 
     def fit(self, shared: Tensor, iterations: int) -> Shot:
-        """Minimise from given parameters (P,) in fitted coordinates."""
-        problem, states = self, self.segments.state
-        shot: Shot | None = None
-        for share, scale in ROUNDS:
-            problem = replace(problem, tie=problem._allowed(shared, states, share), scale=scale)
-            shot, states = problem._minimised(shared, states, iterations)
-            shared = shot.shared
-        assert shot is not None
-        return shot
+        """Minimise from given parameters (P,) in fitted coordinates, from both first guesses of the states."""
+        best: Shot | None = None
+        for first in (self.segments.state, self.ahead):
+            states, values = first, shared
+            for _ in range(ROUNDS):
+                problem = replace(self, tie=self._allowed(values, states))
+                shot, states = problem._minimised(values, states, iterations)
+                values = shot.shared
+            if best is None or shot.cost < best.cost:
+                best = shot
+        assert best is not None
+        return best
 
     def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[Shot, State]:
         linear = self._linearised(shared, states)
@@ -180,7 +187,7 @@ class Shooting:
                 converged = damping > 1e8
         return self._shot(linear, shared, states, costs, converged), states
 
-    def _allowed(self, shared: Tensor, states: State, share: float) -> Tensor:
+    def _allowed(self, shared: Tensor, states: State) -> Tensor:
         """Return the standard deviations (B, S) of what may differ where segments meet."""
         with torch.no_grad():
             motion = self._motion(shared[None], states, torch.zeros_like(self.tie), 1)
@@ -189,7 +196,7 @@ class Shooting:
         for index in self.segments.free:
             fallen = self.world.gravity[0] * duration[:, None]
             change = motion.velocity_m_s[item, self.end, index] - states.velocity_m_s[:, index] - fallen
-            missed = share * change.norm(dim=1)
+            missed = TIE_SHARE * change.norm(dim=1)
             body = self.world.bodies[index]
             gyration = (torch.diagonal(body.inertia[0]).mean() / body.mass[0]).sqrt()
             turned = missed / gyration
@@ -280,8 +287,8 @@ class Shooting:
 
     def _parts(self, frames: Tensor, ties: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the cost, and the robust weights of frames (B, F) and ties (B,)."""
-        loss, weight = robust_loss(frames.square().sum(-1), self.scale)
-        tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * self.scale)
+        loss, weight = robust_loss(frames.square().sum(-1), ROBUST_SCALE)
+        tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * ROBUST_SCALE)
         pull = ((shared - self.prior.mean) / self.prior.std).square().sum()
         return loss.sum() + tie_loss.sum() + pull, weight, tie_weight
 
