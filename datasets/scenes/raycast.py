@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -20,6 +20,7 @@ Floats = NDArray[np.float32]
 Window = tuple[int, int, int, int]
 """First row, first column, end row, end column [px] of a part of an image."""
 _SIDES = np.array([1.0, 0.731, 0.417])  # a direction along which no two sides of an object agree but by chance
+_SMOOTH_SIDES = 2.0  # so many sides are told apart for each unit along it where a surface is smooth
 
 
 class Material(Protocol):
@@ -144,6 +145,7 @@ class Raycaster:
         labels: Value in the masks by geometry id; absent: background.
         lamp: The light.
         backdrop: Colour where rays hit nothing, in [0, 1].
+        smooth: Geometry ids whose facets are small and many: only sides that clearly differ are told apart there.
     """
 
     def __init__(
@@ -153,7 +155,9 @@ class Raycaster:
         labels: Mapping[int, int],
         lamp: Lamp,
         backdrop: tuple[float, float, float],
+        smooth: Iterable[int] = (),
     ) -> None:
+        self.smooth = frozenset(smooth)
         self.model, self.data = model, mujoco.MjData(model)
         self.materials, self.lamp = dict(materials), lamp
         self.backdrop = np.asarray(backdrop, np.float32)
@@ -229,7 +233,10 @@ class Raycaster:
             albedo = self.materials[int(geom)].albedo(local, facing, footprint)
             light, lit = self._light(points, normals)
             colours[chosen] = albedo * light[:, None]
-            code[chosen] = 10 * geom + normals @ _SIDES + 5 * lit
+            side = normals @ _SIDES
+            if int(geom) in self.smooth:
+                side = np.round(side * _SMOOTH_SIDES) / _SMOOTH_SIDES
+            code[chosen] = 10 * geom + side + 5 * lit
         return colours, code
 
     def _light(self, points: Array, normals: Array) -> tuple[Floats, NDArray[np.bool_]]:

@@ -47,7 +47,7 @@ from .dynamics import (
 )
 from .objects import write_obj
 from .plan import EpisodePlan, ScenePlan
-from .raycast import Lamp, Plain, Printed, Raycaster, Window, window_around
+from .raycast import Lamp, Material, Plain, Printed, Raycaster, Window, window_around
 from .rig import (
     MARKER_DICTIONARY,
     MAT_HALF,
@@ -88,13 +88,29 @@ class Set:
     gains: dict[str, Vector3]
 
 
-def build_set(plan: ScenePlan, photo_size: tuple[int, int], video_size: tuple[int, int], photos: int) -> Set:
-    """Build what is filmed; the sizes [px] and the number of photos change nothing else about it."""
+def build_set(
+    plan: ScenePlan,
+    photo_size: tuple[int, int],
+    video_size: tuple[int, int],
+    photos: int,
+    paint: Material | None = None,
+    scan: bool = False,
+) -> Set:
+    """Build what is filmed; the sizes [px] and the number of photos change nothing else about it.
+
+    Args:
+        plan: The scene.
+        photo_size: Width and height of the photos [px].
+        video_size: Width and height of the video frames [px].
+        photos: Number of photos.
+        paint: The object's material; by default it is painted by the plan's seed.
+        scan: Whether the object has so many small facets that its surface is drawn as one smooth mesh.
+    """
     rng = np.random.default_rng([plan.seed, 4])
     markers, lamp = draw_markers(rng), draw_lamp(rng)
-    model = build_model(plan.solid, plan.contact, plan.fingertip, MAT_HALF)
+    model = build_model(plan.solid, plan.contact, plan.fingertip, MAT_HALF, surface=scan)
     printed = Printed(make_mat(np.random.default_rng([plan.seed, 5]), markers))
-    painted = make_paint(np.random.default_rng([plan.seed, 6]), plan.solid)
+    painted = paint or make_paint(np.random.default_rng([plan.seed, 6]), plan.solid)
     parts = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith("part")]
     materials = {model.geom("ground").id: printed, **dict.fromkeys(parts, painted)}
     labels = dict.fromkeys(parts, 1)
@@ -102,7 +118,7 @@ def build_set(plan: ScenePlan, photo_size: tuple[int, int], video_size: tuple[in
         tip = model.geom(FINGERTIP).id
         materials[tip], labels[tip] = Plain((0.16, 0.55, 0.28)), 2
     assert all(model.geom_group[geom] == BODY_GROUP for geom in labels)
-    caster = Raycaster(model, materials, labels, lamp, (0.62, 0.64, 0.66))
+    caster = Raycaster(model, materials, labels, lamp, (0.62, 0.64, 0.66), parts if scan else ())
     gains = {"photos": draw_gain(rng, 1.0), "left": draw_gain(rng, rng.uniform(0.84, 0.94))}
     gains["right"] = draw_gain(rng, rng.uniform(1.06, 1.16))
     cameras = photo_cameras(photos, photo_size, np.random.default_rng([plan.seed, 7]))
