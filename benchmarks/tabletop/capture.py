@@ -24,6 +24,8 @@ from .tosses import plan_tosses
 Task = Literal["fall", "push"]
 TASKS: tuple[Task, ...] = ("fall", "push")
 PARTS_FILE = "truth_parts.npz"
+_SAMPLES = 2  # at each of the three moments of an exposure
+_STILL = 3e-5  # metres and entries of quaternions: a fiftieth of a pixel
 
 
 def make_capture(
@@ -70,7 +72,8 @@ def make_capture(
     plan, rejected = plan_capture(item, obj, material, task, seed, tests)
     print(f"{obj} {material} {task}: draws left out: {rejected or 'none'}", flush=True)
     with new_directory(Path(folder), overwrite) as directory:
-        record(build_set(plan, photo_size, video_size, photos, item.paint, item.scan), directory)
+        stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL)
+        record(stage, directory)
         cameras = read_truth(directory).cameras
         (directory / "cameras.json").write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
         write_parts(directory / PARTS_FILE, item.solid)

@@ -10,6 +10,9 @@ from cgwm.datasets.scenes.raycast import Material
 from cgwm.datasets.scenes.rig import make_paint
 from numpy.typing import NDArray
 
+from .paint import make_scan_paint
+from .scans import read_scan
+
 Array = NDArray[np.float64]
 
 SCANS = ("mustard_bottle", "power_drill", "banana", "mug")
@@ -35,7 +38,14 @@ class Item:
 
 
 def load_item(name: str) -> Item:
-    """Return one of `OBJECTS`; the same whatever the capture's seed."""
+    """Return one of `OBJECTS`; the same whatever the capture's seed.
+
+    Raises:
+        InputDataError: If it is a scan that is not in the cache.
+    """
+    if name in SCANS:
+        scan = read_scan(name)
+        return Item(scan.solid, make_scan_paint(scan), scan.down, scan=True)
     seed = FAMILIES.index(name)
     solid = make_object(seed)
     return Item(solid, make_paint(np.random.default_rng([seed, 6]), solid), resting_down(solid), scan=False)

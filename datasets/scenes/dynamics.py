@@ -84,9 +84,7 @@ class Motion:
         return np.round((times - self.start) * STEPS_PER_S).astype(np.int64)
 
 
-def build_model(
-    solid: SolidObject, contact: ContactTruth, fingertip: bool, mat_half: float = 1.0, surface: bool = False
-) -> MjModel:
+def build_model(solid: SolidObject, contact: ContactTruth, fingertip: bool, mat_half: float = 1.0) -> MjModel:
     """Build the MuJoCo model: ground plane z = 0, the object with a free joint, and where asked a fingertip.
 
     Contacts are explicit pairs, whose friction `CoulombFriction` looks after.
@@ -96,16 +94,9 @@ def build_model(
         contact: Its contact parameters.
         fingertip: Whether there is one, on three slide joints.
         mat_half: Half the side of the textured mat [m]; rays beyond it hit nothing, bodies do.
-        surface: Take the object's closed surface, as one mesh, in the place of its convex parts. For drawing alone:
-            rays are faster and meet the same, but contacts would be those of its convex hull.
     """
     assets, geoms, names = [], [], []
-    if surface:
-        names.append("part0")
-        faces = " ".join(str(corner) for corner in solid.faces.ravel().tolist())
-        assets.append(f'<mesh name="part0" vertex="{_text(solid.vertices.ravel())}" face="{faces}"/>')
-        geoms.append(f'<geom name="part0" type="mesh" mesh="part0" group="{BODY_GROUP}" contype="0" conaffinity="0"/>')
-    for index, part in enumerate(() if surface else solid.parts):
+    for index, part in enumerate(solid.parts):
         name = f"part{index}"
         names.append(name)
         middle, half = (part.max(axis=0) + part.min(axis=0)) / 2, (part.max(axis=0) - part.min(axis=0)) / 2
