@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from cgwm.datasets.meshes import Mesh
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Ar
 def distance_to_mesh(points: Array, mesh: Mesh) -> Array:
     """Return the distances of points (point, 3) to the nearest triangle of a mesh [m], shape (point,)."""
     corners = _cut(mesh.vertices[mesh.faces])
-    tree = cKDTree(corners.mean(axis=1))
+    tree = KDTree(corners.mean(axis=1))
     result = np.empty(len(points))
     for start in range(0, len(points), _CHUNK):
         part = np.s_[start : start + _CHUNK]

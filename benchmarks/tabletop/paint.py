@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from cgwm.datasets.meshes import Mesh
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .distance import sample_surface
 from .scans import Scan
@@ -92,7 +92,7 @@ def _grid(points: Array, colours: Floats, surface: Array, pitch: float) -> Colou
     )
     values = np.concatenate([points, colours], axis=1)
     means = np.stack([np.bincount(cell.ravel(), column) / count for column in values.T], axis=1)
-    nearest = cKDTree(means[:, :3]).query(nodes)[1]
+    nearest = KDTree(means[:, :3]).query(nodes)[1]
     node = np.zeros(tuple(shape), np.int32)
     node.ravel()[flat] = np.arange(1, len(flat) + 1)
     table = np.concatenate([np.full((1, 3), 0.5), means[nearest, 3:]]).astype(np.float32)

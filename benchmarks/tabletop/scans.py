@@ -44,8 +44,14 @@ class Scan:
     solid_to_scan: Distance
 
     def colours(self, count: int) -> tuple[Array, NDArray[np.float32]]:
-        """Return points on the scan (count, 3) [m] and their colours in [0, 1] (count, 3)."""
+        """Return points on the scan (count, 3) [m] and their colours in [0, 1] (count, 3).
+
+        Raises:
+            InputDataError: If the texture is broken.
+        """
         image = cv2.imdecode(self.jpeg, cv2.IMREAD_COLOR_RGB)
+        if image is None:
+            raise InputDataError(f"the texture of {self.solid.family} is no image.", "a cache that `prepare` wrote.")
         points, face, weights = sample_surface(self.scanned, count, np.random.default_rng(0))
         uv = np.einsum("nk,nkx->nx", weights, self.uv[face])
         rows, columns = image.shape[:2]
