@@ -65,7 +65,7 @@ def _toss(
         near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
         if wanted and near and stays_in_view(solid, motion, cameras):
             best = min((value for value, _ in useful), default=np.inf)
-            useful.append((_unpredictability(rng, solid, contact, motion, duration, best), motion))
+            useful.append((unpredictability(rng, solid, contact, motion, duration, best), motion))
             if useful[-1][0] < _PREDICTABLE or len(useful) == _CANDIDATES:
                 break
     if not useful:
@@ -96,7 +96,7 @@ def _instructive(motion: Motion) -> bool:
     return turned_deg(hit[3:7], end[3:7]) > 25 and float(np.linalg.norm(end[:2] - hit[:2])) > 0.04
 
 
-def _unpredictability(
+def unpredictability(
     rng: np.random.Generator,
     solid: SolidObject,
     contact: ContactTruth,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -20,6 +20,7 @@ Floats = NDArray[np.float32]
 Window = tuple[int, int, int, int]
 """First row, first column, end row, end column [px] of a part of an image."""
 _SIDES = np.array([1.0, 0.731, 0.417])  # a direction along which no two sides of an object agree but by chance
+_GRAZING = 0.05  # below this cosine the lamp hardly shows on a smooth surface, in its shadow or not
 
 
 class Material(Protocol):
@@ -144,6 +145,8 @@ class Raycaster:
         labels: Value in the masks by geometry id; absent: background.
         lamp: The light.
         backdrop: Colour where rays hit nothing, in [0, 1].
+        smooth: Geometry ids that together are one smooth surface of one body and one material: facets and parts are
+            not told apart there.
     """
 
     def __init__(
@@ -153,10 +156,16 @@ class Raycaster:
         labels: Mapping[int, int],
         lamp: Lamp,
         backdrop: tuple[float, float, float],
+        smooth: Iterable[int] = (),
     ) -> None:
         self.model, self.data = model, mujoco.MjData(model)
         self.materials, self.lamp = dict(materials), lamp
         self.backdrop = np.asarray(backdrop, np.float32)
+        one = list(smooth)
+        self.smooth = min(one, default=-2)
+        self._surface_of = np.arange(model.ngeom + 1, dtype=np.int32)
+        self._surface_of[one] = self.smooth
+        self._surface_of[-1] = -1
         # The last entry serves geometry -1.
         self.label_of = np.array([labels.get(geom, 0) for geom in range(model.ngeom)] + [0], np.uint8)
 
@@ -213,10 +222,11 @@ class Raycaster:
         origin, angle = camera.T_world_cam[:3, 3], 1 / camera.K[0, 0]
         colours = np.tile(self.backdrop, (len(directions), 1))
         code = np.full(len(directions), -1, np.float32)
-        for geom in np.flatnonzero(np.bincount(hits.geom + 1)) - 1:
+        surfaces = self._surface_of[hits.geom]
+        for geom in np.flatnonzero(np.bincount(surfaces + 1)) - 1:
             if geom < 0:
                 continue
-            chosen = np.flatnonzero(hits.geom == geom)
+            chosen = np.flatnonzero(surfaces == geom)
             distance, ray, normals = hits.distance[chosen], directions[chosen], hits.normal[chosen]
             points = origin + distance[:, None] * ray
             # A slanted surface stretches the footprint one way only; the root is the middle of its two widths.
@@ -227,20 +237,26 @@ class Raycaster:
             local = ((points - self.data.xpos[body]) @ turn).astype(np.float32)
             facing = (normals @ turn).astype(np.float32)
             albedo = self.materials[int(geom)].albedo(local, facing, footprint)
-            light, lit = self._light(points, normals)
+            smooth = geom == self.smooth
+            light, lit = self._light(points, normals, facing_only=smooth)
             colours[chosen] = albedo * light[:, None]
-            code[chosen] = 10 * geom + normals @ _SIDES + 5 * lit
+            code[chosen] = 10 * geom + (0 if smooth else normals @ _SIDES) + 5 * lit
         return colours, code
 
-    def _light(self, points: Array, normals: Array) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return a white surface's brightness by Lambert's law, and whether the lamp reaches it, each (point,)."""
+    def _light(self, points: Array, normals: Array, facing_only: bool) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return a white surface's brightness by Lambert's law, and whether the lamp reaches it, each (point,).
+
+        With `facing_only` no ray is cast for what faces away from the lamp; it counts as reached.
+        """
         lamp = self.lamp
         ray = points - lamp.position
         distance = np.linalg.norm(ray, axis=1)
         ray /= distance[:, None]
-        first = self.cast(lamp.position, ray, bodies_only=True).distance
-        lit = (first < 0) | (first > distance - 2e-4)
         cosine = -np.einsum("ij,ij->i", ray, normals).clip(-1, 0)
+        asked = cosine > _GRAZING if facing_only else np.ones(len(points), bool)
+        lit = np.ones(len(points), bool)
+        first = self.cast(lamp.position, ray[asked], bodies_only=True).distance
+        lit[asked] = (first < 0) | (first > distance[asked] - 2e-4)
         room = lamp.underneath + (lamp.ambient - lamp.underneath) * (normals[:, 2] + 1) / 2
         return (room + lamp.diffuse * cosine * lit).astype(np.float32), lit
 

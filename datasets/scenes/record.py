@@ -47,7 +47,7 @@ from .dynamics import (
 )
 from .objects import write_obj
 from .plan import EpisodePlan, ScenePlan
-from .raycast import Lamp, Plain, Printed, Raycaster, Window, window_around
+from .raycast import Lamp, Material, Plain, Printed, Raycaster, Window, window_around
 from .rig import (
     MARKER_DICTIONARY,
     MAT_HALF,
@@ -86,15 +86,39 @@ class Set:
     photos: dict[str, Camera]
     videos: dict[str, Camera]
     gains: dict[str, Vector3]
+    samples: int = 3
+    """Rays along and across a video's pixel on which surfaces meet, at each moment of an exposure."""
+    still: float = 0.0
+    """Bodies that have moved by no more than this, in metres and entries of quaternions, are not drawn anew."""
 
 
-def build_set(plan: ScenePlan, photo_size: tuple[int, int], video_size: tuple[int, int], photos: int) -> Set:
-    """Build what is filmed; the sizes [px] and the number of photos change nothing else about it."""
+def build_set(
+    plan: ScenePlan,
+    photo_size: tuple[int, int],
+    video_size: tuple[int, int],
+    photos: int,
+    paint: Material | None = None,
+    smooth: bool = False,
+    samples: int = 3,
+    still: float = 0.0,
+) -> Set:
+    """Build what is filmed; the sizes [px] and the number of photos change nothing else about it.
+
+    Args:
+        plan: The scene.
+        photo_size: Width and height of the photos [px].
+        video_size: Width and height of the video frames [px].
+        photos: Number of photos.
+        paint: The object's material; by default it is painted by the plan's seed.
+        smooth: Whether the object's many facets are to look like one smooth surface at their seams.
+        samples: See `Set`.
+        still: See `Set`.
+    """
     rng = np.random.default_rng([plan.seed, 4])
     markers, lamp = draw_markers(rng), draw_lamp(rng)
     model = build_model(plan.solid, plan.contact, plan.fingertip, MAT_HALF)
     printed = Printed(make_mat(np.random.default_rng([plan.seed, 5]), markers))
-    painted = make_paint(np.random.default_rng([plan.seed, 6]), plan.solid)
+    painted = paint or make_paint(np.random.default_rng([plan.seed, 6]), plan.solid)
     parts = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith("part")]
     materials = {model.geom("ground").id: printed, **dict.fromkeys(parts, painted)}
     labels = dict.fromkeys(parts, 1)
@@ -102,12 +126,12 @@ def build_set(plan: ScenePlan, photo_size: tuple[int, int], video_size: tuple[in
         tip = model.geom(FINGERTIP).id
         materials[tip], labels[tip] = Plain((0.16, 0.55, 0.28)), 2
     assert all(model.geom_group[geom] == BODY_GROUP for geom in labels)
-    caster = Raycaster(model, materials, labels, lamp, (0.62, 0.64, 0.66))
+    caster = Raycaster(model, materials, labels, lamp, (0.62, 0.64, 0.66), parts if smooth else ())
     gains = {"photos": draw_gain(rng, 1.0), "left": draw_gain(rng, rng.uniform(0.84, 0.94))}
     gains["right"] = draw_gain(rng, rng.uniform(1.06, 1.16))
     cameras = photo_cameras(photos, photo_size, np.random.default_rng([plan.seed, 7]))
     films = video_cameras(plan.seed, video_size)
-    return Set(plan, caster, lamp, markers, cameras, films, gains)
+    return Set(plan, caster, lamp, markers, cameras, films, gains, samples, still)
 
 
 def record(scene: Set, out: Path) -> None:
@@ -159,8 +183,13 @@ def film(scene: Set, camera_name: str, episode: EpisodePlan, still: Floats, out:
     images.mkdir(parents=True)
     masks.mkdir(parents=True)
     key = zlib.crc32(f"{camera_name}/{episode.name}".encode())
+    drawn: Array | None = None
+    colours, label = still, np.zeros(still.shape[:2], np.uint8)
     for frame in range(episode.frame_count):
-        colours, label = frame_of(scene, camera, episode.motion, frame / plan.frame_rate, still)
+        poses = _moments(episode.motion, frame / plan.frame_rate)
+        if drawn is None or np.abs(poses - drawn).max() > scene.still:
+            colours, label = frame_of(scene, camera, episode.motion, frame / plan.frame_rate, still)
+            drawn = poses
         rng = np.random.default_rng([plan.seed, 10, key, frame])
         image = expose(colours, scene.gains[camera_name], rng)
         write_image(images / f"{frame:06d}.jpg", image, _JPEG_QUALITY_VIDEO)
@@ -177,22 +206,28 @@ def frame_of(
     Returns:
         Ideal colours (height, width, 3) and labels, uint8 (height, width).
     """
-    caster, row = scene.caster, motion.row(time)
-    moments = [motion.qpos[row + step] for step in EXPOSURE_STEPS]
+    caster, moments = scene.caster, _moments(motion, time)
+    if np.ptp(moments, axis=0).max() <= scene.still:
+        moments = moments[[EXPOSURE_STEPS.index(0)]]
     label, colours = np.zeros(still.shape[:2], np.uint8), still.copy()
     window = _touched(scene, camera, moments)
     if window is None:
         return colours, label
     part = np.s_[window[0] : window[2], window[1] : window[3]]
     total = np.zeros_like(colours[part])
-    for qpos, step in zip(moments, EXPOSURE_STEPS, strict=True):
+    for index, qpos in enumerate(moments):
         caster.place(qpos)
-        view = caster.render(camera, window)
+        view = caster.render(camera, window, scene.samples)
         total += view.color
-        if step == 0:
+        if index == len(moments) // 2:
             label[part] = view.label
     colours[part] = total / len(moments)
     return colours, label
+
+
+def _moments(motion: Motion, time: float) -> Array:
+    """Return MuJoCo's positions at the moments of an exposure, shape (moment, nq)."""
+    return motion.qpos[motion.row(time) + np.array(EXPOSURE_STEPS)]
 
 
 def _empty(scene: Set, camera: Camera) -> Floats:
@@ -200,7 +235,7 @@ def _empty(scene: Set, camera: Camera) -> Floats:
     return scene.caster.render(camera).color
 
 
-def _touched(scene: Set, camera: Camera, moments: list[Array]) -> Window | None:
+def _touched(scene: Set, camera: Camera, moments: Array) -> Window | None:
     """Return the window that holds the bodies and their shadows on the ground at all moments."""
     points = []
     for qpos in moments:

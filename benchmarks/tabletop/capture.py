@@ -1,0 +1,125 @@
+"""Makes one capture: photos at rest, one short episode to train on, long ones to test on, and all that is true."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from cgwm.datasets.atomic import new_directory
+from cgwm.datasets.scenes import read_truth
+from cgwm.datasets.scenes.dynamics import rest_pose
+from cgwm.datasets.scenes.objects import SolidObject
+from cgwm.datasets.scenes.plan import ScenePlan
+from cgwm.datasets.scenes.record import build_set, record
+from cgwm.schemas import InputDataError, UsageError, did_you_mean
+
+from .materials import MATERIALS
+from .objects import OBJECTS, Item, load_item
+from .plan import FRAME_RATE
+from .pushes import plan_pushes
+from .tosses import plan_tosses
+
+Task = Literal["fall", "push"]
+TASKS: tuple[Task, ...] = ("fall", "push")
+PARTS_FILE = "truth_parts.npz"
+_SAMPLES = 2  # at each of the three moments of an exposure
+_STILL = 3e-5  # metres and entries of quaternions: a fiftieth of a pixel
+
+
+def make_capture(
+    folder: Path,
+    obj: str,
+    material: str,
+    task: Task,
+    seed: int = 0,
+    tests: int = 10,
+    video_size: tuple[int, int] = (320, 240),
+    photo_size: tuple[int, int] = (640, 480),
+    photos: int = 48,
+    overwrite: bool = False,
+) -> Path:
+    """Make a capture; the same arguments give the same bytes.
+
+    The photos, the cameras and the light depend on the object and the seed alone. Prints how many drawn motions were
+    left out, and why.
+
+    Args:
+        folder: Directory that takes the capture.
+        obj: One of `OBJECTS`.
+        material: One of `MATERIALS`.
+        task: "fall" or "push".
+        seed: Draws motion, cameras, light and noise.
+        tests: Number of test episodes.
+        video_size: Width and height of the video frames [px].
+        photo_size: Width and height of the photos [px].
+        photos: Number of photos.
+        overwrite: Replace what is at `folder`.
+
+    Returns:
+        `folder` as a path.
+
+    Raises:
+        UsageError: If a name or a number is not allowed, or `folder` exists.
+        InputDataError: If a scanned object is not in the cache and cannot be made.
+        NotConvergedError: If no motion could be drawn that serves.
+    """
+    for kind, value, allowed in (("object", obj, OBJECTS), ("material", material, MATERIALS), ("task", task, TASKS)):
+        if value not in allowed:
+            raise UsageError(f"unknown {kind} '{value}'.", ", ".join(allowed) + "." + did_you_mean(value, allowed))
+    item = load_item(obj)
+    plan, rejected = plan_capture(item, obj, material, task, seed, tests)
+    print(f"{obj} {material} {task}: draws left out: {rejected or 'none'}", flush=True)
+    with new_directory(Path(folder), overwrite) as directory:
+        stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL)
+        record(stage, directory)
+        cameras = read_truth(directory).cameras
+        (directory / "cameras.json").write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        write_parts(directory / PARTS_FILE, item.solid)
+    return Path(folder)
+
+
+def plan_capture(
+    item: Item, obj: str, material: str, task: Task, seed: int, tests: int
+) -> tuple[ScenePlan, dict[str, int]]:
+    """Draw every episode's true motion; nothing is rendered. Also returns the numbers of draws left out, by reason."""
+    scene_seed = zlib.crc32(f"{obj}/{seed}".encode())
+    rng = np.random.default_rng([scene_seed, 20])
+    photo_qpos = rest_pose(item.solid, item.down, rng.uniform(-np.pi, np.pi), *rng.uniform(-0.01, 0.01, 2))
+    motions = plan_tosses if task == "fall" else plan_pushes
+    rng = np.random.default_rng([scene_seed, 21, zlib.crc32(f"{material}/{task}".encode())])
+    contact = MATERIALS[material]
+    episodes, rejected = motions(rng, scene_seed, item.solid, item.down, contact, tests)
+    fingertip = task == "push"
+    plan = ScenePlan(task, scene_seed, item.solid, contact, photo_qpos, FRAME_RATE, episodes, fingertip)
+    return plan, rejected
+
+
+def write_parts(path: Path, solid: SolidObject) -> None:
+    """Write all of a solid but its colours: `truth_parts.npz`."""
+    ends = np.cumsum([len(part) for part in solid.parts])
+    np.savez_compressed(
+        path, family=solid.family, vertices=solid.vertices, faces=solid.faces, parts=np.concatenate(solid.parts),
+        part_ends=ends, mass_kg=solid.mass, com_m=solid.com, inertia_kg_m2=solid.inertia,
+    )  # fmt: skip
+
+
+def read_solid(folder: Path) -> SolidObject:
+    """Read the true object of a capture: `build_model(read_solid(folder), contact, fingertip)` is its true model.
+
+    Args:
+        folder: The capture.
+
+    Raises:
+        InputDataError: If the capture has none.
+    """
+    path = Path(folder) / PARTS_FILE
+    if not path.exists():
+        raise InputDataError(f"{path}: missing.", "a capture that `make_capture` wrote.")
+    with np.load(path) as file:
+        parts = np.split(file["parts"], file["part_ends"][:-1])
+        return SolidObject(
+            str(file["family"]), file["vertices"], file["faces"], tuple(parts),
+            float(file["mass_kg"]), file["com_m"], file["inertia_kg_m2"],
+        )  # fmt: skip
