@@ -9,8 +9,10 @@ from ..schemas import BodyModel, CamerasFile, FitFile, InputDataError, ModelFile
 from .atomic import new_directory
 from .kinds import refuse_other_kind
 from .ply import Splats, read_splats, write_splats
+from .tracks import Track, read_tracks, write_tracks
 
 CAMERAS = "cameras.json"
+POSE_TRACKS = "pose_tracks"
 PICTURES = ("held_out.png", "separation.png", "turntable.mp4")
 """What a model's directory may hold to look at: photos that the fit did not see, their renders and the error; how
 bodies were told from the scene where no masks did; and a film around what was fitted."""
@@ -30,6 +32,7 @@ class Model:
         fit: `fit.json`.
         cameras: The photos' cameras, where the fit refined them (`cameras.json`), or None.
         pictures: Contents of the files among `PICTURES` that there are, by name.
+        tracks: Poses that the fit found in videos, by episode and body (`pose_tracks/<episode>.csv`).
     """
 
     root: Path | None
@@ -40,6 +43,7 @@ class Model:
     fit: FitFile = field(default_factory=FitFile)
     cameras: CamerasFile | None = None
     pictures: dict[str, bytes] = field(default_factory=dict)
+    tracks: dict[str, dict[str, Track]] = field(default_factory=dict)
 
     def body(self, name: str) -> BodyModel:
         """Return the entry of a body in `model.json`."""
@@ -71,7 +75,9 @@ def read_model(path: Path | str) -> Model:
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
     pictures = {name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()}
     cameras = read_json(root / CAMERAS, CamerasFile) if (root / CAMERAS).is_file() else None
-    return Model(root, file, body_splats, collision, scene, fit, cameras, pictures)
+    names = [body.name for body in file.bodies]
+    tracks = {path.stem: read_tracks(path, names)[0] for path in sorted((root / POSE_TRACKS).glob("*.csv"))}
+    return Model(root, file, body_splats, collision, scene, fit, cameras, pictures, tracks)
 
 
 def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
@@ -100,6 +106,10 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
             (directory / CAMERAS).write_text(model.cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
         for name, content in model.pictures.items():
             (directory / name).write_bytes(content)
+        if model.tracks:
+            (directory / POSE_TRACKS).mkdir()
+        for episode, tracks in model.tracks.items():
+            write_tracks(directory / POSE_TRACKS / f"{episode}.csv", tracks)
         (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
         (directory / "model.json").write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)

@@ -8,7 +8,7 @@ the colours of what the photos did not show.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -69,7 +69,13 @@ class _Frame:
     position: Tensor
 
 
-def learn_appearance(model: Model, capture: Capture, exposures: dict[str, Exposure], split: str = "train") -> Model:
+def learn_appearance(
+    model: Model,
+    capture: Capture,
+    exposures: dict[str, Exposure],
+    split: str = "train",
+    found: Mapping[str, dict[str, Track]] | None = None,
+) -> Model:
     """Add to a model the light, and the colours of spheres that only the motion shows.
 
     Args:
@@ -77,11 +83,12 @@ def learn_appearance(model: Model, capture: Capture, exposures: dict[str, Exposu
         capture: With calibrated cameras, photos, videos and measured tracks.
         exposures: Of the video cameras; others are not looked at.
         split: The episodes to look at.
+        found: Tracks found in the videos, by episode and body, in the place of measured ones; None: measured ones.
 
     Returns:
         The model, unchanged where too little of a moving body is seen.
     """
-    frames = _frames(model, capture, exposures, split)
+    frames = _frames(model, capture, exposures, split, found)
     seen = {name: _seen(model, capture, name) for name in {model.file.bodies[frame.body].name for frame in frames}}
     rows = [row for frame in frames if (row := _ratios(model, frame, seen)) is not None]
     if sum(len(ratio) for ratio, _, _ in rows) < MIN_BLOCKS:
@@ -140,10 +147,16 @@ def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: floa
     return best, numbers
 
 
-def _frames(model: Model, capture: Capture, exposures: dict[str, Exposure], split: str) -> list[_Frame]:
+def _frames(
+    model: Model,
+    capture: Capture,
+    exposures: dict[str, Exposure],
+    split: str,
+    known: Mapping[str, dict[str, Track]] | None,
+) -> list[_Frame]:
     found = []
     for episode in capture.episodes(split)[:EPISODES]:
-        tracks = capture.tracks(episode)
+        tracks = capture.tracks(episode) if known is None else known.get(episode, {})
         for camera in usable_cameras(capture, episode)[0]:
             if camera not in exposures:
                 continue

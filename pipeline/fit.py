@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -19,6 +19,7 @@ from ..datasets.capture import Capture
 from ..datasets.colmap_model import find_colmap_model
 from ..datasets.geometry_maps import KINDS
 from ..datasets.models import Model, read_model, write_model
+from ..datasets.ply import Splats
 from ..schemas import (
     Body,
     BodyModel,
@@ -97,6 +98,8 @@ def fit(
     config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
     # phys-geo alone makes no spheres, so that the photos need not be read for their hashes
     made_of = {} if stage == "phys-geo" else _made_of(opened, splat_config)
+    if stage != "sg-gs":
+        made_of |= _physics_made_of(opened, stage, parent, split, phys_config)
     checkpoint = Checkpoint.beside(Path(out), made_of, resume, overwrite)
     moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
     # what videos cannot teach is told before hours of work
@@ -109,7 +112,7 @@ def fit(
         model = _start(opened, stage, parent, splat_config, checkpoint)
     if moves:
         with enough_memory(*_needs(phys_config)):
-            model = _with_physics(model, opened, split, phys_config)
+            model = _with_physics(model, opened, split, phys_config, checkpoint)
         file = model.file.model_copy(update={"warnings": (*model.file.warnings, *warnings)})
         model = replace(model, file=file)
     elif phys_config.effects:
@@ -154,6 +157,24 @@ def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:
     paths = [root / name for name in names] + ([] if colmap is None else [colmap]) + shapes
     inputs = {path.relative_to(root).as_posix(): sha256(path) for path in paths if path.exists()}
     return {"settings": config.model_dump_json(), "versions": json.dumps(_versions()), **inputs}
+
+
+def _physics_made_of(
+    capture: Capture, stage: Stage, parent: Path | None, split: str, config: PhysConfig
+) -> dict[str, str]:
+    """Return what the physics is made of, so that checkpoints of anything else are refused."""
+    made = {"physics settings": config.model_dump_json(), "split": split}
+    if stage == "phys-geo" and parent is not None and (parent / "model.json").is_file():
+        made["parent model"] = sha256(parent / "model.json")
+    if config.supervise == "tracks" or split not in capture.manifest.splits:
+        return made
+    for name in ("capture.toml", "cameras.json"):
+        if (capture.root / name).is_file():
+            made[name] = sha256(capture.root / name)
+    for episode in capture.episodes(split):
+        for camera in capture.videos(episode):
+            made[f"video {camera}/{episode}"] = sha256(capture.video_path(camera, episode))
+    return made
 
 
 def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatConfig, checkpoint: Checkpoint) -> Model:
@@ -274,7 +295,7 @@ def _has_motion(capture: Capture, split: str) -> bool:
     return any(capture.tracks(name) or capture.videos(name) for name in episodes)
 
 
-def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig) -> Model:
+def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint) -> Model:
     uses_photos = any(name in model.body_splats for name in capture.body_names)
     if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
         require_metric(capture.cameras)
@@ -303,19 +324,29 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
     else:
         from .phys_images import fit_physics_from_images
 
-        found = fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both")
+        both = config.supervise == "both"
+        found = fit_physics_from_images(world, ready, capture, split, config, both, checkpoint)
     record = found.record | {"seconds": round(time.perf_counter() - started, 2), "supervise": config.supervise}
     fitted = _merge(start, found)
-    ready = replace(ready, file=fitted, fit=FitFile(stages=ready.fit.stages | {"phys-geo": record}))
+    fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
+    ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
         from .appearance import learn_appearance
         from .exposure import estimate_exposures
 
         exposures = estimate_exposures(ready, capture, split, config.device)
         ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures}))
-        if config.supervise != "images":  # then measured tracks are not to be looked at
-            ready = learn_appearance(ready, capture, exposures, split)
+        # with images alone measured tracks are not to be looked at
+        ready = learn_appearance(
+            ready, capture, exposures, split, found.tracks if config.supervise == "images" else None
+        )
     return ready
+
+
+def _with_collision(model: Model, moved: Mapping[str, Splats]) -> Model:
+    """Return the model with colliding spheres that were moved; where they are the visual ones, both move."""
+    shown = {name: spheres for name, spheres in moved.items() if model.collision[name] is model.body_splats.get(name)}
+    return replace(model, collision=model.collision | moved, body_splats=model.body_splats | shown)
 
 
 def _has_video(capture: Capture, split: str) -> bool:

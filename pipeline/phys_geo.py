@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from ..datasets.capture import Capture
+from ..datasets.ply import Splats
 from ..datasets.progress import progress
 from ..datasets.tracks import Track
 from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
@@ -64,7 +65,7 @@ FRICTION_STARTS = (0.6, 1.6)
 """Further starts of the shooting: friction is off by these factors from the prior's median."""
 SHOT_ITERATIONS = 12
 """Least number of steps in each round of the shooting."""
-MODEL_EXCESS = 8.0
+MODEL_EXCESS = 20.0
 """Where the ties do not hold down to what `shooting` allows, the contact model misses more than noise, and the errors
 of one episode are not independent: the covariance grows by this times the ties' misfit. Chosen on the built-in scenes
 fall 0 to 5 (MuJoCo's contact); data that the model explains have no misfit, and are not touched."""
@@ -82,7 +83,9 @@ class PhysicsFit:
 
     contact, parameters: for `model.json`; ground_offset_m: fitted height of the ground, None where there
     is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; mass, effects: where these were
-    fitted; constants: of effects, `effect.constant` by name.
+    fitted; constants: of effects, `effect.constant` by name; starts: time [s] and state of the first frame of each
+    episode, where shooting found it; collision: colliding spheres by body, where they were moved; tracks: what was
+    found in videos, by episode and body.
     """
 
     contact: ContactParameters
@@ -94,6 +97,9 @@ class PhysicsFit:
     mass: FirstContacts | None = None
     effects: FirstContacts | None = None
     constants: dict[str, float] = field(default_factory=dict)
+    starts: dict[str, tuple[float, State]] = field(default_factory=dict)
+    collision: dict[str, Splats] = field(default_factory=dict)
+    tracks: dict[str, dict[str, Track]] = field(default_factory=dict)
 
 
 def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
@@ -178,9 +184,12 @@ def fit_physics(
         record["mass_distribution"] = mass.record
     if effects is not None:
         record["effects"] = effects.record
+    starts: dict[str, tuple[float, State]] = {}
     best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
     if covariance is None:
-        names, best, covariance = _shot(world, searched, (observations, warm), names, search, sigma, config, record)
+        names, best, covariance, starts = _shot(
+            world, searched, (observations, warm), names, search, sigma, config, record
+        )
     record["correlation"] = _correlation(covariance).tolist()
     found = physics_fit(world, names, best, covariance, sigma, record)
     more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
@@ -226,8 +235,8 @@ def _shot(
     sigma: tuple[float, float],
     config: PhysConfig,
     record: dict[str, Any],
-) -> tuple[list[Parameter], np.ndarray, np.ndarray]:
-    """Return what multiple shooting finds: names, estimate and covariance; the search's where it leads astray."""
+) -> tuple[list[Parameter], np.ndarray, np.ndarray, dict[str, tuple[float, State]]]:
+    """Return names, estimate, covariance and starts by multiple shooting; the search's where that leads astray."""
     shot_names = [*names, GROUND_SHIFT] if world.ground_normal is not None and GROUND_SHIFT not in names else names
     middle = np.array([p.encode(p.prior[0]) for p in shot_names])
     prior = ShotPrior(
@@ -254,8 +263,13 @@ def _shot(
         "kept": "shooting" if keep else "search",
     }
     if not keep:
-        return names, search.mean, search.covariance
-    return shot_names, shared, (1 + MODEL_EXCESS * best.misfit) * best.covariance.numpy()
+        return names, search.mean, search.covariance, {}
+    keys = best.state.__dataclass_fields__
+    starts_found = {
+        name: (float(time), State(*(getattr(best.state, key)[row : row + 1] for key in keys)))
+        for row, (name, time) in enumerate(zip(batch[0].names, batch[0].times_s[:, 0], strict=True))
+    }
+    return shot_names, shared, (1 + MODEL_EXCESS * best.misfit) * best.covariance.numpy(), starts_found
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:

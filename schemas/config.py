@@ -75,6 +75,10 @@ class PhysConfig(FileModel):
     iterations: Annotated[int, Field(ge=1)] = 10
     """Most steps of the local refinement (Levenberg-Marquardt)."""
     warmup_s: Annotated[float, Field(gt=0)] = 0.1
+    image_size: Annotated[int, Field(ge=32)] = 320
+    """Video frames are reduced to this longer side [px] for fitting."""
+    geometry: bool = True
+    """Whether the colliding spheres that touch are refined with the images, through the motion alone."""
     effects: tuple[str, ...] = ()
     """Effects to add to the model and to fit: names of built-in ones, or `path/to/file.py:ClassName`."""
     mass_distribution: bool = False

@@ -86,7 +86,7 @@ def estimate_states(
     states = torch.zeros(len(observations.names), 12 * len(observations.free)).to(like)
     nothing = torch.zeros(0).to(like)
     solution = minimise(
-        TrajectoryResiduals(world, [], warm, *noise),
+        TrajectoryResiduals(world, [], warm, *noise, differences=True),
         nothing,
         states,
         torch.zeros(0, 2).to(like),

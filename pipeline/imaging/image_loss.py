@@ -162,7 +162,7 @@ class ImageLoss:
         total = torch.zeros(len(instants), 2).to(self._static.means)
         shots = torch.zeros(len(instants)).to(total)
         for number, video in enumerate(self.footage.videos):
-            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            frames = self._frames(number, instants)
             for rows in _filmed(frames, _MAX_RENDERS):
                 window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
                 color, mask = self._residuals(number, window, position_m[rows], quat_wxyz[rows])
@@ -201,7 +201,7 @@ class ImageLoss:
             [like.new_tensor([self._step_m] * 3 + [self._step_m / self.radii[index]] * 3) for index in self.free]
         )
         for number in range(len(self.footage.videos)):
-            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            frames = self._frames(number, instants)
             for rows in _filmed(frames, max(1, _MAX_RENDERS // (size + 1))):
                 pair = self._shot_model(number, frames[rows], position_m[rows], quat_wxyz[rows], steps, blur)
                 for target, part in zip((value, slope, curvature), pair, strict=True):
@@ -216,7 +216,7 @@ class ImageLoss:
         count, free = len(instants), list(self.free)
         inside, union, error, blank, area = (torch.zeros(count).to(self._static.means) for _ in range(5))
         for number, video in enumerate(self.footage.videos):
-            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            frames = self._frames(number, instants)
             for rows in _filmed(frames, _MAX_RENDERS):
                 window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
                 picture = self._picture(number, window, position_m[rows], quat_wxyz[rows])
@@ -245,6 +245,10 @@ class ImageLoss:
             return difference
         usual = (video.frames.median(0).values - video.frames[frame]).abs().mean(-1)
         return difference.minimum(usual)
+
+    def _frames(self, number: int, instants: Tensor) -> Tensor:
+        """Return the frames of a video at instants (K,), -1 for none, on the device of the loss."""
+        return torch.as_tensor(self.footage.frame_at[number])[instants.cpu()].to(self._static.means.device)
 
     def moved(self, position_m: Tensor, quat_wxyz: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return poses of all bodies with those of the free ones changed by (K, 6 nf)."""

@@ -13,8 +13,9 @@ only), and a tracker that follows one of them from the first frame on may follow
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,6 +68,20 @@ class PoseTrack:
     found: Tensor
     searches: int
     rival_nats: float
+
+
+def track_state(track: PoseTrack) -> dict[str, object]:
+    """Return a track as a checkpoint takes it."""
+    quality = {name: getattr(track.quality, name) for name in track.quality.__dataclass_fields__}
+    rest = {name: getattr(track, name) for name in track.__dataclass_fields__ if name != "quality"}
+    # JSON has no infinity
+    return rest | {"quality": quality, "rival_nats": None if math.isinf(track.rival_nats) else track.rival_nats}
+
+
+def stored_track(state: Mapping[str, Any]) -> PoseTrack:
+    """Return the track of a checkpoint."""
+    rival = math.inf if state["rival_nats"] is None else state["rival_nats"]
+    return PoseTrack(**{**state, "quality": PoseQuality(**state["quality"]), "rival_nats": rival})
 
 
 @dataclass(frozen=True)
@@ -126,13 +141,13 @@ class PoseTracker:
         if float(found.float().mean()) < MIN_FOUND:
             raise NotConvergedError(self._failure(quality, found), todo=_TODO)
         return PoseTrack(
-            self._position.double(),
-            self._quat.double(),
-            model.curvature.double(),
-            self._covariance(model.curvature, quality).double(),
-            model.value,
-            quality,
-            found,
+            self._position.double().cpu(),
+            self._quat.double().cpu(),
+            model.curvature.double().cpu(),
+            self._covariance(model.curvature, quality).double().cpu(),
+            model.value.cpu(),
+            PoseQuality(*(getattr(quality, name).cpu() for name in quality.__dataclass_fields__)),
+            found.cpu(),
             self._searches,
             rival,
         )

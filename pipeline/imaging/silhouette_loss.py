@@ -94,7 +94,7 @@ class SilhouetteLoss(ImageLoss):
         count, free = len(instants), list(self.free)
         inside, union, error, blank, edges, area = (torch.zeros(count).to(self._static.means) for _ in range(6))
         for number, video in enumerate(self.footage.videos):
-            frames = torch.as_tensor(self.footage.frame_at[number])[instants]
+            frames = self._frames(number, instants)
             rows = (frames >= 0).nonzero()[:, 0]
             if not len(rows):
                 continue
