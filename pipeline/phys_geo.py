@@ -200,6 +200,7 @@ def fit_physics(
         warnings=(*found.warnings, *bound_warnings(known, more)),
         mass=mass,
         effects=effects,
+        starts=starts,
     )
 
 
