@@ -12,6 +12,7 @@ from .base import Contender
 from .cem_mujoco import CemMujoco
 from .cgwm_default import Cgwm
 from .floor import Floor
+from .latent import Latent
 from .paper import Paper
 from .pinwm import PinWm
 from .zeros import Ballistic, Frozen
@@ -50,6 +51,11 @@ def _paper(budget: float) -> tuple[str, Row]:
     return name, Row(lambda: Paper(name), budget)
 
 
+def _latent(data: str, solid: Callable[[Path], SolidObject] | None, budget: float) -> tuple[str, Row]:
+    name = f"latent, {data}, {budget:g}x"
+    return name, Row(lambda: Latent(name, solid), budget)
+
+
 FIXED = f"{REFERENCE}, geometry fixed"
 
 ROWS: dict[str, Row] = dict(
@@ -63,6 +69,10 @@ ROWS: dict[str, Row] = dict(
         _mujoco("learned shape", None, 4),
         _pinwm(1),
         _pinwm(4),
+        _latent("the same frames", None, 1),
+        _latent("the same frames", None, 4),
+        _latent("100 true trajectories", true_solid, 1),
+        _latent("100 true trajectories", true_solid, 4),
         (Frozen.name, Row(Frozen)),
         (Ballistic.name, Row(Ballistic)),
         (Floor.name, Row(Floor)),

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from .base import TRAIN_EPISODE, Array, Cell, Prediction
 
-COARSE_SIZE, FINE_SIZE = 80, 144
+COARSE_SIZE, FINE_SIZE = 80, 320
 """Longer side [px] of the pictures for searching poses and for the loss: those of `cgwm fit`."""
 WARMUP_S = 0.1
 """The state at the first frame is first estimated from the track over this long, cut at the first contact."""
