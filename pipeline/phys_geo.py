@@ -31,8 +31,8 @@ from ..schemas import Parameter as FittedParameter
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
+from .estimation.shooting import BEST, Shooting
 from .estimation.shooting import Prior as ShotPrior
-from .estimation.shooting import Shooting
 from .estimation.warmup import estimate_states, warmup_frames
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
@@ -61,10 +61,10 @@ POPULATION = (24, 96)
 OPEN_LOOP_TOLERANCE = 3.0
 """The shot's estimate may raise the open-loop error by this factor before the search's own is kept: a search over
 three numbers bends them until one rough motion ends where it should."""
-FRICTION_STARTS = (0.6, 1.6)
-"""Further starts of the shooting: friction is off by these factors from the prior's median."""
+STARTS = ((0.5, 1.0), (1.0, 1.0), (1.7, 1.0), (1.0, 0.6), (1.0, 1.6))
+"""Further starts of the shooting: friction and contact time are off by these factors from the priors' medians."""
 SHOT_ITERATIONS = 12
-"""Least number of steps in each round of the shooting."""
+"""Least number of steps in each descent of the shooting."""
 MODEL_EXCESS = 20.0
 """Where the ties do not hold down to what `shooting` allows, the contact model misses more than noise, and the errors
 of one episode are not independent: the covariance grows by this times the ties' misfit. Chosen on the built-in scenes
@@ -246,13 +246,20 @@ def _shot(
         torch.tensor([p.limits for p in shot_names], dtype=torch.float64),
     )
     starts = [np.concatenate([search.mean, middle[len(search.mean) :]])]
-    starts += [middle + math.log(factor) * (np.arange(len(middle)) == 0) for factor in FRICTION_STARTS]
+    for friction, contact_time in STARTS:
+        start = middle.copy()
+        start[:2] += np.log([friction, contact_time])  # the first two of `CONTACT_PARAMETERS`
+        starts.append(start)
     problem = Shooting.of(world, shot_names, episodes, [_span(tracks) for _, tracks in episodes], sigma, prior)
-    shots = [
-        problem.fit(torch.as_tensor(start), max(config.iterations, SHOT_ITERATIONS))
-        for start in progress(starts, "phys-geo: multiple shooting", len(starts))
-    ]
-    best = min(shots, key=lambda shot: shot.cost)
+    bar = progress(range(2 * len(starts) + BEST), "phys-geo: multiple shooting", total=2 * len(starts) + BEST)
+    steps = iter(bar)
+    shots = problem.fit(
+        [torch.as_tensor(start) for start in starts],
+        max(config.iterations, SHOT_ITERATIONS),
+        lambda: next(steps, None),
+    )
+    bar.close()
+    best = shots[0]
     shared = best.shared.numpy()
     cost = float(_open_loop(world, *batch, shot_names)(shared[None]).mean())
     keep = math.isfinite(best.cost) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -38,8 +38,8 @@ TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """What the model may miss in a segment of flight: position [m], rotation [rad], velocity [m/s], omega [rad/s]."""
 TIE_SHARE = 0.01
 """What it may miss of the velocity that contact gives a body, and of the turning that goes with it."""
-ROUNDS = 2
-"""What contact gives is known from the first guess, then better from the first round."""
+BEST = 3
+"""So many descents go on."""
 ROBUST_SCALE = 4.0
 """Of the robust loss of a frame [sigmas]; that of a tie is twice as wide."""
 STATE_STEPS = (2e-4, 2e-3, 1e-2, 1e-1)
@@ -151,19 +151,31 @@ class Shooting:
             ahead,
         )
 
-    def fit(self, shared: Tensor, iterations: int) -> Shot:
-        """Minimise from given parameters (P,) in fitted coordinates, from both first guesses of the states."""
-        best: Shot | None = None
-        for first in (self.segments.state, self.ahead):
-            states, values = first, shared
-            for _ in range(ROUNDS):
-                problem = replace(self, tie=self._allowed(values, states))
-                shot, states = problem._minimised(values, states, iterations)
-                values = shot.shared
-            if best is None or shot.cost < best.cost:
-                best = shot
-        assert best is not None
-        return best
+    def fit(self, starts: Sequence[Tensor], iterations: int, done: Callable[[], object] = lambda: None) -> list[Shot]:
+        """Minimise from several parameters (P,) in fitted coordinates, and from both first guesses of the states.
+
+        Where it starts decides in which valley it ends. The best few go on, with ties from what contact then gives.
+
+        Args:
+            starts: Where to start.
+            iterations: Most steps in each descent.
+            done: Called after each descent.
+
+        Returns:
+            Where those descents ended that went on, the lowest cost first.
+        """
+        first = []
+        for shared in starts:
+            for states in (self.segments.state, self.ahead):
+                tied = replace(self, tie=self._allowed(shared, states))
+                first.append(tied._minimised(shared, states, iterations))
+                done()
+        shots = []
+        for shot, states in sorted(first, key=lambda one: one[0].cost)[:BEST]:
+            tied = replace(self, tie=self._allowed(shot.shared, states))
+            shots.append(tied._minimised(shot.shared, states, iterations)[0])
+            done()
+        return sorted(shots, key=lambda shot: shot.cost)
 
     def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[Shot, State]:
         linear = self._linearised(shared, states)
