@@ -170,7 +170,7 @@ class ImageLoss:
                 silhouette = mask.abs().sum((1, 2, 3)) + _mask_outside(video, window)
                 pixels = video.size[0] * video.size[1]
                 pair = torch.stack([photometric, MASK_WEIGHT * silhouette], -1) / pixels
-                total = total.index_add(0, rows, pair)
+                total = total.index_add(0, rows.to(total.device), pair)
                 shots[rows] += 1
         return total / shots.clamp_min(1)[:, None]
 
@@ -205,7 +205,7 @@ class ImageLoss:
             for rows in _filmed(frames, max(1, _MAX_RENDERS // (size + 1))):
                 pair = self._shot_model(number, frames[rows], position_m[rows], quat_wxyz[rows], steps, blur)
                 for target, part in zip((value, slope, curvature), pair, strict=True):
-                    target.index_add_(0, rows, part)
+                    target.index_add_(0, rows.to(target.device), part)
                 shots[rows] += 1
         shots = shots.clamp_min(1)
         return PoseModel(value / shots, slope / shots[:, None], curvature / shots[:, None, None])
@@ -247,8 +247,8 @@ class ImageLoss:
         return difference.minimum(usual)
 
     def _frames(self, number: int, instants: Tensor) -> Tensor:
-        """Return the frames of a video at instants (K,), -1 for none, on the device of the loss."""
-        return torch.as_tensor(self.footage.frame_at[number])[instants.cpu()].to(self._static.means.device)
+        """Return the frames of a video at instants (K,), -1 for none, on the CPU."""
+        return torch.as_tensor(self.footage.frame_at[number])[instants.cpu()]
 
     def moved(self, position_m: Tensor, quat_wxyz: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return poses of all bodies with those of the free ones changed by (K, 6 nf)."""
