@@ -90,7 +90,7 @@ def whole_track(track: Track) -> torch.Tensor:
     observations, _ = estimate_states(world, observations, warm, NOISE)
     problem = TrajectoryResiduals(world, NAMES, observations, *NOISE)
     nothing = torch.zeros(1, 12, dtype=F64)
-    return minimise(problem, TRUTH, nothing, PRIOR.bounds, prior_information=state_prior(1), iterations=8).shared
+    return minimise(problem, TRUTH, nothing, PRIOR.bounds, prior_information=state_prior(1), iterations=5).shared
 
 
 def test_an_impact_that_the_model_does_not_follow_leaves_the_parameters_alone() -> None:
