@@ -145,15 +145,15 @@ def first_state(world: World, observations: Observations) -> State:
             if len(at) < 2:
                 continue
             t = observations.times_s[item, at] - observations.times_s[item, 0]
-            position[item, body], velocity[item, body] = _line(t, observations.position_m[item, at, column])
+            position[item, body], velocity[item, body] = straight_line(t, observations.position_m[item, at, column])
             if bool(observations.turned[item, at, column].all()):
                 measured = observations.quat_wxyz[item, at, column]
                 turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
-                quat[item, body], omega[item, body] = measured[0], _line(t, turn)[1]
+                quat[item, body], omega[item, body] = measured[0], straight_line(t, turn)[1]
     return State(position, quat, velocity, omega)
 
 
-def _line(t: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+def straight_line(t: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return value at 0 and slope (3,) of the straight line through values (n, 3) at t (n,), by least squares.
 
     By its formula: LAPACK's solution now and then differs in the last bit from one call to the next.
