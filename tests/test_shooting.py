@@ -111,18 +111,31 @@ def covered_box(per_side: int = 6) -> World:
     return world_of(replace(box_body(), centers=centers, radii=radii), step_s=0.002)
 
 
-def test_a_body_that_rests_on_many_spheres_stays_where_it_rests() -> None:
-    world, noise, count = covered_box(), (5e-4, 5e-3), 6
+@pytest.mark.parametrize("noise", [(5e-4, 5e-3), (3e-3, 3e-2)])
+def test_a_body_that_rests_on_many_spheres_starts_at_rest(noise: tuple[float, float]) -> None:
+    world, count = covered_box(), 6
     rest = torch.tensor([0.0, 0.0, 0.0299], dtype=F64).repeat(count, 1)
     quat = torch.tensor([1.0, 0, 0, 0], dtype=F64).repeat(count, 1)
     track = noisy(rest, quat, torch.arange(count, dtype=F64) / 60, noise)
     observations = Observations.of(world, [("0", {"box": track})], [(0.0, 1.0)])
     found, _ = estimate_states(world, observations, warmup_frames(world, observations, 0.1), noise)
+    # what a straight line through four frames leaves open is 0.23 rad/s for 5 mrad
+    assert float(found.state.omega_body_rad_s.norm()) < 60 * noise[1]
+    assert float(found.state.velocity_m_s.norm()) < 60 * noise[0]
     rollout = simulate(world, found.state, times(0.2))
-    away, turned = (
-        (rollout.position_m[0, :, 0] - rest[0]).norm(dim=1),
-        geodesic_angle(rollout.quat_wxyz[0, :, 0], quat[0]),
-    )
-    # the noise of a frame; the spin at the first instant is only what turns that frame into the next
-    assert float(away.max()) < 2 * noise[0] and float(turned.max()) < 2 * noise[1]
-    assert float(rollout.omega_body_rad_s[0, -1].norm()) < 1e-3
+    away = (rollout.position_m[0, :, 0] - rest[0]).norm(dim=1)
+    assert float(away.max()) < 2 * noise[0]
+    assert float(geodesic_angle(rollout.quat_wxyz[0, :, 0], quat[0]).max()) < 2 * noise[1]
+
+
+def test_a_body_that_is_struck_while_it_is_watched_keeps_the_velocity_that_it_had() -> None:
+    """Frames that lie on no straight line say nothing of the velocity at the first one."""
+    world, noise = covered_box(), (2e-4, 2e-3)
+    start = state_of(((0, 0, 0.0325), (1.0, 0.02, 0.05, 0.0), (0.5, 0.0, -0.8), (0.0, 0.0, 0.0)))
+    grid = torch.arange(7, dtype=F64) / 120
+    rollout = simulate(world, start, grid)
+    track = noisy(rollout.position_m[0, :, 0], rollout.quat_wxyz[0, :, 0], grid, noise)
+    observations = Observations.of(world, [("0", {"box": track})], [(0.0, 1.0)])
+    found, _ = estimate_states(world, observations, torch.ones(1, 7, dtype=torch.bool), noise)
+    line = float((observations.state.velocity_m_s[0, 0] - start.velocity_m_s[0, 0]).norm())
+    assert float((found.state.velocity_m_s[0, 0] - start.velocity_m_s[0, 0]).norm()) < 0.3 * line
