@@ -17,6 +17,7 @@ from cgwm.datasets.manifest import write_manifest
 from cgwm.datasets.scenes import TRUTH_FILE, TRUTH_MESH, make_scene, read_truth
 from cgwm.datasets.scenes.objects import make_object
 from cgwm.datasets.tracks import Track
+from cgwm.pipeline import phys_geo
 from cgwm.pipeline.fit import fit
 from cgwm.schemas import NotConvergedError, SplatConfig
 from worlds import ball_body, box_body, state_of, world_of
@@ -93,7 +94,8 @@ def frozen(bench, blind, judge):
     return errors(judge, bench.zeros.Frozen().fit(blind, None))
 
 
-def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, judge, frozen):
+def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, judge, frozen, monkeypatch):
+    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 2)
     fitted = bench.cgwm_default.Cgwm("cgwm", FEW).fit(blind, None)
     ballistic = errors(judge, bench.zeros.Ballistic().fit(blind, None))
     assert errors(judge, fitted) < 0.7 * min(frozen, ballistic)

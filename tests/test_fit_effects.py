@@ -8,7 +8,7 @@ import pytest
 import torch
 from cgwm.datasets import Track
 from cgwm.datasets.models import read_model
-from cgwm.pipeline import first_contacts
+from cgwm.pipeline import first_contacts, phys_geo
 from cgwm.pipeline.fit_effects import fit_with_constants, fitted_effects, with_effects
 from cgwm.pipeline.physics import World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
@@ -17,7 +17,7 @@ from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig, Usa
 from small_model import write_small_model
 from worlds import F64, ball_body, box_body, state_of, times, world_of
 
-BRIEF = PhysConfig(generations=4, population=24)
+BRIEF = PhysConfig(generations=4, population=24, iterations=1)
 
 
 def boxes(ground: bool = True) -> World:
@@ -44,7 +44,8 @@ def active(name: str, **values: float) -> ActiveEffect:
     return ActiveEffect.of(load_effect(name), values)
 
 
-def test_drag_is_found_with_the_contact_and_lowers_the_error() -> None:
+def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)  # the search and the first contacts tell
     episodes = thrown(replace(boxes(), effects=(active("quadratic_drag", k=0.2),)), 4)
     plain = fit_with_constants(boxes(), episodes, BRIEF, (5e-4, 1e-3))
     world = replace(boxes(), effects=(active("quadratic_drag"),))
@@ -57,6 +58,7 @@ def test_drag_is_found_with_the_contact_and_lowers_the_error() -> None:
 
 def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_contacts, "ITERATIONS", 1)
+    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
     effect = load_effect("ground_magnet")
     (constant,) = effect.constants
     truth = {effect.parameters[0].name: 6.0, constant.name: constant.grid[-1]}

@@ -5,7 +5,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -65,7 +66,7 @@ def calibrate_case(folder: Path) -> Case:
 def fit_case(folder: Path) -> Case:
     capture, out = folder / "capture", folder / "model"
     source = tosses(folder / "source", 60)
-    subprocess.run([*CGWM, "import", "contactnets", str(source), "--out", str(capture)], check=True)
+    subprocess.run([*CGWM, "import", "contactnets", str(source), "--out", str(capture)], check=True, timeout=120)
     return ["fit", str(capture), "--out", str(out)], out
 
 
@@ -92,6 +93,9 @@ CGWM_INTERRUPTIBLE = [
     "-c",
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from cgwm.cli import main; main()",
 ]
+WRITE_EARLY = ("demo", "synthesize", "import")
+"""What makes its temporary output at once: on a slow machine too it is interrupted while it works, not while it loads
+packages, where an interrupt can get lost."""
 CASES: dict[str, Callable[[Path], Case]] = {
     "demo": demo_case,
     "calibrate": calibrate_case,
@@ -103,6 +107,16 @@ CASES: dict[str, Callable[[Path], Case]] = {
 
 def partial(out: Path) -> list[Path]:
     return list(out.parent.glob(".*partial*"))
+
+
+@contextmanager
+def started(command: list[str], **options: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a command; whatever the test does, it is killed at the end: Popen's own end would wait for it."""
+    with subprocess.Popen(command, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def at_work(process: subprocess.Popen[bytes], out: Path, seconds: float) -> bool:
@@ -123,10 +137,9 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
     scratch.mkdir()
     before = set(tmp_path.rglob("*"))
     environment = os.environ | {"TMPDIR": str(scratch)}
-    with subprocess.Popen(
-        [*CGWM_INTERRUPTIBLE, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment
-    ) as process:
-        assert at_work(process, out, 4.0), process.communicate()[1].decode()
+    command = [*CGWM_INTERRUPTIBLE, *arguments]
+    with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
+        assert at_work(process, out, 30.0 if verb in WRITE_EARLY else 4.0), process.communicate()[1].decode()
         process.send_signal(number)
         printed, said = process.communicate(timeout=60)
     assert not out.exists()
@@ -142,10 +155,10 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
 
 def test_a_killed_command_can_be_run_again(tmp_path: Path) -> None:
     arguments, out = import_case(tmp_path)
-    with subprocess.Popen([*CGWM, *arguments]) as process:
+    with started([*CGWM, *arguments]) as process:
         assert at_work(process, out, 30.0)
         process.kill()
     assert len(partial(out)) == 1
-    subprocess.run([*CGWM, *arguments], check=True, capture_output=True)
+    subprocess.run([*CGWM, *arguments], check=True, capture_output=True, timeout=240)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "source"]
     assert (out / "capture.toml").is_file()

@@ -9,6 +9,7 @@ import torch
 from cgwm.datasets import Track
 from cgwm.datasets.manifest import write_manifest
 from cgwm.datasets.tracks import tracks_csv
+from cgwm.pipeline import phys_geo
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.mass_distribution import fit_mass_distribution
 from cgwm.pipeline.physics import simulate
@@ -114,8 +115,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_a_model_holds_the_mass_distribution_that_was_fitted(capture: Path, tmp_path: Path) -> None:
-    config = PhysConfig(population=8, generations=2, step_s=STEP_S, mass_distribution=True)
+def test_a_model_holds_the_mass_distribution_that_was_fitted(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)  # the mass is fitted before
+    config = PhysConfig(population=8, generations=2, iterations=1, step_s=STEP_S, mass_distribution=True)
     file = fit(capture, tmp_path / "model", phys_config=config)
     numbers = {parameter.name: parameter for parameter in file.parameters}
     assert file.bodies[0].com_m == tuple(numbers[f"box.com_{axis}_m"].estimate for axis in "xyz")

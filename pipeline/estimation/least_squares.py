@@ -76,7 +76,7 @@ def minimise(
         robust_scale: Scale c of the Cauchy loss in sigmas for a row; None for plain squares.
         iterations: Most accepted or refused steps.
         tolerance: Stop when the cost falls by less than this fraction.
-        prior_information: Information (S,) of a zero-mean prior on each state change.
+        prior_information: Information (S,), or (B, S), of a zero-mean prior on each state change.
         on_iteration: Called with the iteration and the cost.
 
     Returns:
@@ -143,7 +143,7 @@ def _linearise(residuals: Residuals, shared: Tensor, states: Tensor, scale: floa
     flat, flat_weighted, flat_r = jacobian.flatten(1, 2), weighted.flatten(1, 2), r.flatten(1, 2)
     normal = flat_weighted.transpose(1, 2) @ flat
     gradient = -(flat_weighted.transpose(1, 2) @ flat_r[..., None]).squeeze(-1)
-    a = normal[:, count:, count:] + torch.diag(prior)
+    a = normal[:, count:, count:] + torch.diag_embed(prior)
     ga = gradient[:, count:] - prior * states
     cost = loss.sum() + (prior * states.square()).sum()
     return _Linear(a, normal[:, count:, :count], normal[:, :count, :count], ga, gradient[:, :count], cost, chi2)

@@ -145,15 +145,23 @@ def first_state(world: World, observations: Observations) -> State:
             if len(at) < 2:
                 continue
             t = observations.times_s[item, at] - observations.times_s[item, 0]
-            line = torch.stack((torch.ones_like(t), t), -1)
-            fit = torch.linalg.lstsq(line, observations.position_m[item, at, column]).solution
-            position[item, body], velocity[item, body] = fit[0], fit[1]
+            position[item, body], velocity[item, body] = straight_line(t, observations.position_m[item, at, column])
             if bool(observations.turned[item, at, column].all()):
                 measured = observations.quat_wxyz[item, at, column]
                 turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
-                rate = torch.linalg.lstsq(line, turn).solution
-                quat[item, body], omega[item, body] = measured[0], rate[1]
+                quat[item, body], omega[item, body] = measured[0], straight_line(t, turn)[1]
     return State(position, quat, velocity, omega)
+
+
+def straight_line(t: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return value at 0 and slope (3,) of the straight line through values (n, 3) at t (n,), by least squares.
+
+    By its formula: LAPACK's solution now and then differs in the last bit from one call to the next.
+    """
+    middle, mean = t.mean(), values.mean(0)
+    away = (t - middle)[:, None]
+    slope = (away * (values - mean)).sum(0) / away.square().sum()
+    return mean - slope * middle, slope
 
 
 def _resting(world: World, batch: int) -> State:

@@ -8,16 +8,21 @@ import torch
 from torch import Tensor
 
 from ..physics.distance import union_distance
-from ..physics.rotation import quat_to_matrix
+from ..physics.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
 from ..physics.world import World
 from .least_squares import Solution, minimise
-from .observations import Observations
-from .trajectory import TrajectoryResiduals, retract, state_prior
+from .observations import START_FRAMES, Observations, straight_line
+from .trajectory import STATE_SIZE, TrajectoryResiduals, retract, state_prior
 
 MIN_FRAMES = 4
 """The warm-up has at least this many frames."""
 FLIGHT_MARGIN_M = 0.003
 """A body this far from contact, plus three quarters of its last move, has not touched since the frame before."""
+
+LINE_MISFIT = 2.0
+"""Frames lie on a straight line where their mean square misfit is below this, in units of the noise."""
+LINE_SPREAD = 2.0
+"""Where they do, the velocity in contact may differ from the line's by this many of its standard deviations."""
 
 
 def clearance(world: World, observations: Observations) -> Tensor:
@@ -92,6 +97,34 @@ def estimate_states(
         torch.zeros(0, 2).to(like),
         robust_scale=5.0,
         iterations=iterations,
-        prior_information=state_prior(len(observations.free)).to(like),
+        prior_information=_information(world, warm, noise),
     )
     return replace(observations, state=retract(observations.state, solution.states, observations.free)), solution
+
+
+def _information(world: World, warm: Observations, noise: tuple[float, float]) -> Tensor:
+    """Return the information (B, S) of the prior on state changes, tighter for what moves evenly while it touches.
+
+    Contact takes a velocity away at once, so that later frames do not tell it: the fit would spend it on the noise of
+    the first frame, and a body at rest would start with a hop.
+    """
+    bodies = len(warm.free)
+    information = state_prior(bodies).to(world.gravity).repeat(len(warm.names), 1)
+    touching = clearance(world, warm)[:, 0] <= FLIGHT_MARGIN_M
+    for item in touching.nonzero()[:, 0].tolist():
+        for column in range(bodies):
+            at = torch.nonzero(warm.seen[item, :, column] * warm.turned[item, :, column])[:START_FRAMES, 0]
+            if len(at) < 3:
+                continue
+            t = warm.times_s[item, at] - warm.times_s[item, 0]
+            measured = warm.quat_wxyz[item, at, column]
+            turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
+            rows = torch.stack([warm.position_m[item, at, column] / noise[0], turn / noise[1]])
+            lines = [straight_line(t, values) for values in rows]
+            away = torch.stack([v - (a + t[:, None] * b) for v, (a, b) in zip(rows, lines, strict=True)])
+            if float(away.square().sum()) < LINE_MISFIT * 6 * (len(at) - 2):
+                spread = LINE_SPREAD / (t - t.mean()).square().sum().sqrt()
+                first = STATE_SIZE * column + 6
+                for place, sigma in zip((first, first + 3), noise, strict=True):
+                    information[item, place : place + 3] += 1 / (sigma * spread).square()
+    return information
