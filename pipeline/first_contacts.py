@@ -80,9 +80,9 @@ def fit_first_contacts(
     observations = _windows(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
     start = [*wanted, *along]
     names = [parameter for parameter, _ in start]
-    std = [float(np.hypot(error, sigma)) for error, sigma in zip(MODEL_ERROR, noise, strict=True)]
+    position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
     solution = minimise(
-        TrajectoryResiduals(world, names, observations, *std),
+        TrajectoryResiduals(world, names, observations, position_std, rotation_std),
         torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity),
         torch.zeros(len(observations.names), STATE_SIZE * len(observations.free)).to(world.gravity),
         torch.tensor([parameter.limits for parameter in names]).to(world.gravity),

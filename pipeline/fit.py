@@ -346,7 +346,7 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
 def _with_collision(model: Model, moved: Mapping[str, Splats]) -> Model:
     """Return the model with colliding spheres that were moved; where they are the visual ones, both move."""
     shown = {name: spheres for name, spheres in moved.items() if model.collision[name] is model.body_splats.get(name)}
-    return replace(model, collision=model.collision | moved, body_splats=model.body_splats | shown)
+    return replace(model, collision=model.collision | dict(moved), body_splats=model.body_splats | shown)
 
 
 def _has_video(capture: Capture, split: str) -> bool:

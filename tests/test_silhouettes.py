@@ -155,7 +155,7 @@ def test_a_model_without_photos_rests_on_masks_and_says_so(tmp_path: Path) -> No
     _, (text,) = body_outlines(blind, capture, [EPISODE])
     assert "no visual spheres of the free body 'cube'" in text
     # where no shape is given, what collides is what is seen
-    assert {body.shape for body in model.file.bodies} == {None}
+    assert all(body.shape is None for body in model.file.bodies)
     assert np.abs(outlines["cube"].vertices).max() == pytest.approx(HALF, rel=0.05)
     (root / "video_masks" / "right").rename(root / "elsewhere")
     with pytest.raises(InputDataError, match=r"no background(.|\n)*camera 'right'(.|\n)*no masks(.|\n)*--stage all"):
