@@ -393,10 +393,13 @@ def physics_fit(
     contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
     warnings += [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
     if record.get("episodes", 0) < ENOUGH_EPISODES:
-        warnings.append(
-            f"with fewer than {ENOUGH_EPISODES} episodes the intervals rest on an assumption: that the errors of the "
-            f"contact model in one episode count as {ERRORS_PER_EPISODE:g} independent ones"
+        assumed = (
+            f"that the errors of the contact model in one episode count as {ERRORS_PER_EPISODE:g} independent ones"
         )
+        if record.get("kept") == "shooting":
+            grown = 1 + MODEL_EXCESS * record["shooting_misfit"]["ties"]
+            assumed = f"what the contact model misses in them makes variances {grown:.2g} times as large"
+        warnings.append(f"with fewer than {ENOUGH_EPISODES} episodes the intervals rest on an assumption: {assumed}")
     return PhysicsFit(
         contact,
         (*fitted, *_derived(world, names, best, covariance)),
