@@ -18,7 +18,7 @@ from cgwm.pipeline.phys_geo import track_episodes
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.rotation import geodesic_angle
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.world import World
 from torch import Tensor
 
 Motions = tuple[Tensor, Tensor]
@@ -101,7 +101,7 @@ class Account:
         for rows in seen.frames[items].argsort(stable=True).split(BATCH):
             tosses = items[rows]
             longest = int(seen.frames[tosses].max())
-            state = State(*(getattr(seen.state, key)[tosses] for key in seen.state.__dataclass_fields__))
+            state = seen.state.at(tosses)
             if change is not None:
                 state = retract(state, change.flatten(0, 1)[rows], seen.free)
             world = self.world

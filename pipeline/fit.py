@@ -309,7 +309,7 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
         update={"contact": ContactParameters(), "solver": Solver(step_s=config.step_s), "effects": effects}
     )
     ready = replace(model, file=start)
-    world = World.from_model(ready)
+    world = replace(World.from_model(ready), rolls_on=resolve_device(config.device).type)
     started = time.perf_counter()
     if config.supervise == "tracks":
         measured = capture.manifest.measurement

@@ -272,9 +272,8 @@ def _shot(
     }
     if not keep:
         return names, search.mean, search.covariance, {}
-    keys = best.state.__dataclass_fields__
     starts_found = {
-        name: (float(time), State(*(getattr(best.state, key)[row : row + 1] for key in keys)))
+        name: (float(time), best.state.at([row]))
         for row, (name, time) in enumerate(zip(batch[0].names, batch[0].times_s[:, 0], strict=True))
     }
     return shot_names, shared, (1 + MODEL_EXCESS * best.misfit) * best.covariance.numpy(), starts_found
@@ -336,9 +335,7 @@ def _open_loop(world: World, observations: Observations, warm: Tensor, names: li
         repeats = len(samples)
         values = torch.as_tensor(samples).repeat_interleave(len(observations.names), 0)
         decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(names)], -1)
-        base = State(
-            *(getattr(observations.state, key).repeat(repeats, 1, 1) for key in observations.state.__dataclass_fields__)
-        )
+        base = observations.state.repeat(repeats)
         drives = {name: drive.repeat(repeats) for name, drive in observations.drives.items()}
         with torch.no_grad():
             rollout = measure(

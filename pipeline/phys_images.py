@@ -45,8 +45,8 @@ from .physics.world import State, World
 from .sg_gs import resolve_device
 from .video_checks import examine_tracks
 
-TRACK_ITERATIONS, STATE_ITERATIONS, IMAGE_ITERATIONS = 4, 6, 6
-"""Most steps on the tracks, on a state for a whole track, and on the images: each costs a Jacobian of all rollouts."""
+STATE_ITERATIONS, IMAGE_ITERATIONS = 6, 6
+"""Most steps on a state for a whole track, and on the images: each costs a Jacobian of all rollouts."""
 HOLD_OUT_EVERY, HOLD_OUT_FROM = 4, 8
 """Of so many instants one is held out of the image loss, where an episode has at least so many."""
 DENSE_S = 0.004
@@ -112,8 +112,7 @@ def fit_physics_from_images(
     noise = tracks_noise(capture, episodes)
     known = noise[0] or 0.0, noise[1] or 0.0
     doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
-    brief = config.model_copy(update={"iterations": min(config.iterations, TRACK_ITERATIONS)})
-    start = fit_with_constants(world, [(episode.name, episode.tracks) for episode in episodes], brief, noise)
+    start = fit_with_constants(world, [(episode.name, episode.tracks) for episode in episodes], config, noise)
     clock.lap("dynamics")
 
     world = start.effects.world if start.effects is not None else world
@@ -263,14 +262,13 @@ def _touching(world: World, observations: Observations) -> TouchingSpheres | Non
 
 def _shot_states(observations: Observations, start: PhysicsFit) -> Observations | None:
     """Return the observations with the shooting's start states, where it has one of every episode's first frame."""
-    found = [start.starts.get(name) for name in observations.names]
-    if any(
-        one is None or abs(one[0] - float(t)) > 1e-6 for one, t in zip(found, observations.times_s[:, 0], strict=True)
-    ):
-        return None
-    states = [one[1] for one in found if one is not None]
-    keys = observations.state.__dataclass_fields__
-    return replace(observations, state=State(*(torch.cat([getattr(one, key) for one in states]) for key in keys)))
+    states = []
+    for name, time_s in zip(observations.names, observations.times_s[:, 0], strict=True):
+        found = start.starts.get(name)
+        if found is None or abs(found[0] - float(time_s)) > 1e-6:
+            return None
+        states.append(found[1])
+    return replace(observations, state=State.joined(*states))
 
 
 def _completed(track: Track, times_s: np.ndarray) -> Track:

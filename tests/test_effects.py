@@ -79,7 +79,7 @@ def scenes(name: str) -> Scenes:
         tracks = {"tip": Track(at, path)}
     still = ((-0.3, 0.0, 0.5), UP, (0, 0, 0), (0, 0, 0))
     states = [state_of(row, *([still] if tracks else [])) for row in rows]
-    joined = State(*(torch.cat([getattr(s, key) for s in states]) for key in State.__dataclass_fields__))
+    joined = State.joined(*states)
     return Scenes(world, joined, tracks)
 
 
@@ -383,7 +383,7 @@ def test_velocity_restitution_falls_with_the_speed_of_the_impact(damping_ratio: 
     """ln e falls by r v to first order, and by less than r v / 2 times that at the second."""
     speeds = torch.tensor([0.5, 1.0, 1.5], dtype=F64)
     rows = [state_of(((0, 0, 0.0402), UP, (0, 0, -float(v)), (0, 0, 0))) for v in speeds]
-    start = State(*(torch.cat([getattr(s, key) for s in rows]) for key in State.__dataclass_fields__))
+    start = State.joined(*rows)
     world = world_of(ball_body(), contact=law(damping_ratio=damping_ratio, contact_time_s=0.01), gravity=0.0)
     without, with_it = (
         rolled(replace(world, step_s=5e-4), start, 0.06, active("velocity_restitution", r=r), rate_hz=1 / 0.06)

@@ -14,6 +14,7 @@ from cgwm.datasets.tracks import Track
 from cgwm.pipeline import nvrtc
 from cgwm.pipeline.estimation.forward import batched_jacobian
 from cgwm.pipeline.physics import Body, ContactLaw, PublishedLaw, Rollout, State, World, dispatch, simulate
+from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
@@ -38,28 +39,14 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 Fused = Callable[..., Rollout]
 
 
-def on(device: str, dtype: torch.dtype, value: Any) -> Any:
-    """Return a world, a state, a command or a tensor on a device, in a precision."""
-    if isinstance(value, Tensor):
-        return value.to(device, dtype) if value.is_floating_point() else value.to(device)
-    if isinstance(value, World):
-        effects = tuple(replace(e, values=on(device, dtype, e.values)) for e in value.effects)
-        value = replace(value, bodies=tuple(on(device, dtype, body) for body in value.bodies), effects=effects)
-    if isinstance(value, World | Body | State | Drive | ContactLaw):
-        fields = {name: getattr(value, name) for name in value.__dataclass_fields__}
-        moved = {k: on(device, dtype, v) for k, v in fields.items() if isinstance(v, Tensor | ContactLaw)}
-        return replace(value, **moved)
-    return {k: on(device, dtype, v) for k, v in value.items()} if isinstance(value, dict) else value
-
-
 def on_cuda(
     world: World, state: State, times_s: Tensor, driven: Any = None, record: bool = False, **more: Any
 ) -> Rollout:
     """Return the rollout of the GPU."""
     dtype = world.gravity.dtype
-    more = {name: on("cuda", dtype, value) for name, value in more.items()}
-    driven = {k: on("cuda", dtype, v) for k, v in (driven or {}).items()}
-    return simulate_fused(*(on("cuda", dtype, x) for x in (world, state, times_s)), driven, record, **more)
+    more = {name: on_device(value, "cuda", dtype) for name, value in more.items()}
+    driven = {k: on_device(v, "cuda", dtype) for k, v in (driven or {}).items()}
+    return simulate_fused(*(on_device(x, "cuda", dtype) for x in (world, state, times_s)), driven, record, **more)
 
 
 def on_host(*arguments: Any, **more: Any) -> Rollout:
@@ -251,7 +238,7 @@ def test_single_precision(fused: Fused) -> None:
     world, state = world_of(cube(), step_s=0.002), tossed(4, 0.075)
     exact = simulate(world, state, times(0.1), None, True)
     assert exact.contacts is not None and exact.contacts.impulse_n_s.abs().amax() > 0
-    single = [on("cpu", torch.float32, x) for x in (world, state, times(0.1))]
+    single = [on_device(x, "cpu", torch.float32) for x in (world, state, times(0.1))]
     theirs, ours = simulate(*single), fused(*single, lanes=2)
     for name, scale in zip(POSES, (0.1, 1.0, 1.0, 10.0), strict=True):
         truth, mine, its = (getattr(rollout, name).cpu() for rollout in (exact, ours, theirs))
@@ -263,7 +250,7 @@ def test_single_precision_of_a_fast_spin(fused: Fused) -> None:
     """Beyond the angles of a step for which the kernel's rotation is a series."""
     state = tossed(2, 1.0)
     state = replace(state, omega_body_rad_s=state.omega_body_rad_s * 200)
-    single = [on("cpu", torch.float32, x) for x in (world_of(box_body(), step_s=0.002), state, times(0.02))]
+    single = [on_device(x, "cpu", torch.float32) for x in (world_of(box_body(), step_s=0.002), state, times(0.02))]
     mine, its = fused(*single), simulate(*single)
     assert (mine.omega_body_rad_s * 0.002).norm(dim=-1).amin() > 1
     torch.testing.assert_close(mine.quat_wxyz.cpu(), its.quat_wxyz, rtol=0, atol=1e-4)
@@ -416,7 +403,7 @@ def test_refusals() -> None:
     with pytest.raises(UsageError, match="no reverse derivatives"):
         on_host(world, replace(state, position_m=state.position_m.requires_grad_()), times(0.1))
     with pytest.raises(UsageError, match=r"several kinds: torch.float32 on cpu, torch.float64 on cpu"):
-        on_host(on("cpu", torch.float32, world), tossed(1), times(0.1))
+        on_host(on_device(world, "cpu", torch.float32), tossed(1), times(0.1))
     with pytest.raises(InputDataError, match="body 'box': mass"):
         on_host(world.with_body(0, mass=-world.bodies[0].mass), state, times(0.1))
     with pytest.raises(InputDataError, match="position_m of body 'box' is not finite"):
@@ -507,12 +494,12 @@ def test_which_derivatives_want_the_torch_engine() -> None:
 
 @NEEDS_GPU
 def test_the_kernel_is_taken_on_cuda(caplog: pytest.LogCaptureFixture) -> None:
-    world, state, frames = (on("cuda", F64, x) for x in (world_of(box_body()), tossed(1), times(0.1)))
+    world, state, frames = (on_device(x, "cuda", F64) for x in (world_of(box_body()), tossed(1), times(0.1)))
     with caplog.at_level("INFO", "cgwm"):
         found = dispatch.rollout(world, state, frames)
         assert torch.equal(found.position_m, simulate_fused(world, state, frames).position_m)
         assert not caplog.records
-        rolling = on("cuda", F64, replace(world_of(box_body()), effects=(active("rolling_resistance"),)))
+        rolling = on_device(replace(world_of(box_body()), effects=(active("rolling_resistance"),)), "cuda", F64)
         for _ in range(2):
             agree(simulate(world_of(box_body()), tossed(1), times(0.1)), dispatch.rollout(rolling, state, frames), 1e-9)
         assert [record.getMessage() for record in caplog.records] == [
@@ -522,11 +509,32 @@ def test_the_kernel_is_taken_on_cuda(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @NEEDS_GPU
+def test_rollouts_are_taken_to_the_gpu_and_brought_back() -> None:
+    world, state, driven = crowd()
+    away = replace(world, rolls_on="cuda")
+    expected = simulate(world, state, times(0.2), driven, True)
+    found = dispatch.rollout(away, state, times(0.2), driven, True)
+    assert found.position_m.device.type == "cpu" and not torch.equal(found.position_m, expected.position_m)
+    agree(expected, found, 1e-9)
+
+    def ends(z: Tensor, repeats: int, on: World) -> Tensor:
+        changed = apply_parameters(on, CONTACT_PARAMETERS, z.exp())
+        return dispatch.rollout(changed, tossed(repeats), times(0.1)).position_m[:, -1].flatten(1)
+
+    start = torch.tensor([[0.3, 0.005, 0.4]], dtype=F64).log()
+    here, there = (
+        batched_jacobian(lambda z, n, on=on: ends(z, n, on), start)
+        for on in (world_of(box_body()), replace(world_of(box_body()), rolls_on="cuda"))
+    )
+    assert torch.allclose(here[1], there[1], rtol=1e-6, atol=1e-9)
+
+
+@NEEDS_GPU
 def test_refusals_on_cuda() -> None:
-    world = on("cuda", F64, world_of(box_body()))
+    world = on_device(world_of(box_body()), "cuda", F64)
     assert unsupported(world) is None
     assert "several types" in (unsupported(replace(world, gravity=world.gravity.float())) or "")
-    half = on("cuda", torch.float16, world_of(box_body()))
+    half = on_device(world_of(box_body()), "cuda", torch.float16)
     assert "float16" not in (unsupported(half) or "") and "neither float32 nor float64" in (unsupported(half) or "")
 
 

@@ -30,10 +30,6 @@ def values(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers, dtype=F64)
 
 
-def joined(*states: State) -> State:
-    return State(*(torch.cat([getattr(state, k) for state in states]) for k in State.__dataclass_fields__))
-
-
 def batched(bodies: Sequence[Body]) -> Body:
     """One body whose batch holds the given ones; those of fewer spheres repeat their first, which changes nothing."""
     most = max(body.radii.shape[1] for body in bodies)
@@ -107,7 +103,7 @@ def test_a_thrown_top_keeps_its_momenta_to_rounding_and_its_energy_to_2e_6_over_
     bodies = [box_body(), box_body(half=(0.05, 0.05, 0.02))]
     world = world_of(batched(bodies), ground=False)
     thrown = (0.3, 0.0, 2.0)
-    start = joined(
+    start = State.joined(
         state_of(((0, 0, 0), UP, thrown, (3.0, 8.0, -2.0))), state_of(((0, 0, 0), UP, thrown, (0.2, 0.1, 50.0)))
     )
     rollout = simulate(world, start, times(10.0, 10))
@@ -250,7 +246,7 @@ def test_a_slider_stops_after_v2_by_2_mu_g_to_a_thousandth() -> None:
     mu = values(0.1, 0.2, 0.3, 0.5, 0.8, 0.1, 0.2, 0.3, 0.5, 0.8)
     slab, cube = box_body(half=(0.05, 0.05, 0.005)), box_body(half=(0.05, 0.05, 0.05))
     world = world_of(batched([slab] * 5 + [cube] * 5), contact=ContactLaw(mu, batch(0.004), batch(1.0)))
-    start = joined(*(state_of(((0, 0, z - REST_M), UP, (1.0, 0, 0), (0, 0, 0)), count=5) for z in (0.005, 0.05)))
+    start = State.joined(*(state_of(((0, 0, z - REST_M), UP, (1.0, 0, 0), (0, 0, 0)), count=5) for z in (0.005, 0.05)))
     rollout = simulate(world, start, times(1.1, 10))
     torch.testing.assert_close(rollout.position_m[:, -1, 0, 0], 1 / (2 * mu * G), atol=0, rtol=1e-3)
     torch.testing.assert_close(
@@ -266,7 +262,7 @@ def test_a_box_on_a_slope_slides_beyond_the_friction_cone_and_nowhere_else() -> 
     slab, cube = box_body(half=(0.05, 0.05, 0.01)), box_body(half=(0.05, 0.05, 0.05))
     slope = torch.cat((ratio, ratio)) * mu
     world = tilted(world_of(batched([slab] * 6 + [cube] * 6), contact=law(friction=mu)), slope)
-    start = joined(*(state_of(((0, 0, z - REST_M), UP, (0, 0, 0), (0, 0, 0)), count=6) for z in (0.01, 0.05)))
+    start = State.joined(*(state_of(((0, 0, z - REST_M), UP, (0, 0, 0), (0, 0, 0)), count=6) for z in (0.01, 0.05)))
     moved = simulate(world, start, times(1.0, 20)).position_m[:, :, 0, 0].unflatten(0, (2, 6))
     angle = (ratio * mu).atan()
     assert float((moved[:, :3, -1] - moved[:, :3, 10]).abs().max()) < 5e-5
@@ -328,7 +324,7 @@ def test_bodies_rest_for_10_s_within_a_tenth_of_a_millimetre() -> None:
         world_of(batched(bodies), contact=law(contact_time_s=0.005), step_s=0.0025), values(0.0, 0.2, 0.0, 0.0)
     )
     low = [float((body.centers[..., 2] - body.radii).min()) for body in bodies]
-    start = joined(*(state_of(((0, 0, -z), UP, (0, 0, 0), (0, 0, 0))) for z in low))
+    start = State.joined(*(state_of(((0, 0, -z), UP, (0, 0, 0), (0, 0, 0))) for z in low))
     rollout = simulate(world, start, times(10.0, 2))
     settled = 4
     drift = (rollout.position_m[:, settled:, 0] - rollout.position_m[:, settled : settled + 1, 0]).norm(dim=-1).amax(1)
@@ -362,7 +358,7 @@ def test_material_and_friction_do_not_depend_on_the_number_of_spheres(on_plane: 
     found = []
     for spheres in (8, 32, 128, 500):
         world = world_of(cube_of_spheres(spheres, half, on_plane), contact=law(friction=mu))
-        start = joined(
+        start = State.joined(
             state_of(((0, 0, half + 0.1), UP, (0, 0, 0), (0, 0, 0))),
             state_of(((0, 0, half - REST_M), UP, (0.5, 0, 0), (0, 0, 0))),
             state_of(((0, 0, half), UP, (0, 0, 0), (0, 0, 0))),

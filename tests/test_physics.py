@@ -117,7 +117,7 @@ def test_rollouts_of_a_batch_do_not_see_each_other() -> None:
     # one that flies, and one of which more spheres touch at once
     for other in (((0, 0, 0.2), UP, (0, 0, 0), (0, 0, 0)), ((0, 0, 0.03), UP, (0.5, 0, 0), (0, 0, 0))):
         b = state_of(other)
-        both = State(*(torch.cat((getattr(a, k), getattr(b, k))) for k in a.__dataclass_fields__))
+        both = State.joined(a, b)
         alone, together = (simulate(world_of(box_body()), start, times(0.6)).position_m for start in (a, both))
         torch.testing.assert_close(together[:1], alone, atol=1e-12, rtol=0)
 

@@ -82,11 +82,9 @@ class Observations:
         """Return some items of the batch."""
         index = torch.as_tensor(list(items))
         picked = {key: getattr(self, key)[index] for key in ("times_s", "position_m", "quat_wxyz", "seen", "turned")}
-        drives = {
-            name: Drive(*(getattr(d, key)[index] for key in d.__dataclass_fields__)) for name, d in self.drives.items()
-        }
-        state = State(*(getattr(self.state, key)[index] for key in self.state.__dataclass_fields__))
-        return replace(self, names=tuple(self.names[i] for i in items), drives=drives, state=state, **picked)
+        drives = {name: drive.select(index) for name, drive in self.drives.items()}
+        names = tuple(self.names[i] for i in items)
+        return replace(self, names=names, drives=drives, state=self.state.at(index), **picked)
 
 
 @dataclass(frozen=True)

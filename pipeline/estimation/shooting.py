@@ -1,10 +1,11 @@
 """Multiple shooting: parameters from motions that are cut into short segments, each with a state of its own.
 
 A rollout over several impacts is a rough function of where it starts, and its derivatives lead nowhere. Over a segment
-of a tenth of a second they lead to the minimum. The segments of an episode are tied: the state in which one ends and
-the one with which the next begins may differ by what the contact model itself may miss there, so that one impact that
-it cannot follow does not bend the parameters (Bock & Plitt 1984; with ties that give, weak-constraint assimilation,
-Tremolet 2006). Gauss-Newton on everything at once: the states at the start of all segments and the parameters.
+of some hundredths of a second they lead to the minimum. The segments of an episode are tied: the state in which one
+ends and the one with which the next begins may differ by what the contact model itself may miss there, so that one
+impact that it cannot follow does not bend the parameters (Bock & Plitt 1984; with ties that give, weak-constraint
+assimilation, Tremolet 2006). Gauss-Newton on everything at once: the states at the start of all segments and the
+parameters.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ..physics.dispatch import rollout as rolled_out
+from ..physics.dispatch import rollouts_at_once
 from ..physics.measured import as_measured, true_times
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
@@ -46,8 +48,6 @@ STATE_STEPS = (2e-4, 2e-3, 1e-2, 1e-1)
 """Differences in position [m], rotation [rad], velocity [m/s], omega [rad/s] for the Jacobian."""
 PARAMETER_STEP = 0.1
 """The same of a parameter, in widths of its prior."""
-MAX_ITEMS = 160
-"""Rollouts in one batch: more run out of the processor's cache."""
 TOLERANCE = 1e-4
 
 
@@ -65,14 +65,13 @@ class Shot:
     """Where the fit ended.
 
     shared (P,); covariance (P, P): from the curvature, times the misfit where that is above 1; state: of the first
-    frame of each episode, with its covariance (E, S, S) at free parameters; cost; costs by accepted step; misfit:
-    mean square of the tied residuals, in their own units; chi2: median of a frame's, over what it should be.
+    frame of each episode (E); cost; costs by accepted step; misfit: mean square of the tied residuals, in their own
+    units; chi2: median of a frame's, over what it should be.
     """
 
     shared: Tensor
     covariance: Tensor
     state: State
-    state_covariance: Tensor
     cost: float
     costs: list[float]
     misfit: float
@@ -202,7 +201,7 @@ class Shooting:
     def _allowed(self, shared: Tensor, states: State) -> Tensor:
         """Return the standard deviations (B, S) of what may differ where segments meet."""
         with torch.no_grad():
-            motion = self._motion(shared[None], states, torch.zeros_like(self.tie), 1)
+            motion = self._motion(self._world(shared[None]), states, torch.zeros_like(self.tie), 1)
         item, columns = torch.arange(len(self.end)), []
         duration = self.segments.times_s[item, self.end] - self.segments.times_s[:, 0]
         for index in self.segments.free:
@@ -219,14 +218,12 @@ class Shooting:
     def _shot(self, linear: _Linear, shared: Tensor, states: State, costs: list[float], converged: bool) -> Shot:
         covariance = torch.linalg.pinv(linear.matrix, hermitian=True)
         scale = max(1.0, linear.misfit, linear.chi2)
-        count, size = len(shared), self.tie.shape[1]
+        count = len(shared)
         first = [row for row in range(len(self.following)) if row not in set(self.following.tolist())]
-        blocks = [covariance[count + size * row :, count + size * row :][:size, :size] for row in first]
         return Shot(
             shared,
             scale * covariance[:count, :count],
-            State(*(getattr(states, key)[first] for key in states.__dataclass_fields__)),
-            torch.stack(blocks),
+            states.at(first),
             linear.cost,
             costs,
             linear.misfit,
@@ -249,9 +246,9 @@ class Shooting:
     def _rows(self, shared: Tensor, states: State, changes: Tensor, repeats: int) -> Tensor:
         """Return for each item residuals (6 nf T) in sigmas, then how its end differs from the next start (S)."""
         seen, free = self.segments, list(self.segments.free)
-        motion = self._motion(shared, states, changes, repeats)
-        times = seen.times_s.repeat(repeats, 1)
-        poses = as_measured(self._world(shared), motion, times)
+        world, times = self._world(shared), seen.times_s.repeat(repeats, 1)
+        motion = self._motion(world, states, changes, repeats)
+        poses = as_measured(world, motion, times)
         shift = poses.position_m[:, :, free] - seen.position_m.repeat(repeats, 1, 1, 1)
         measured = quat_conjugate(seen.quat_wxyz.repeat(repeats, 1, 1, 1))
         turn = quat_log(quat_multiply(measured, poses.quat_wxyz[:, :, free]))
@@ -266,10 +263,9 @@ class Shooting:
         values = [p.decode(shared[:, k]) for k, p in enumerate(self.parameters)]
         return apply_parameters(self.world, self.parameters, torch.stack(values, -1)) if values else self.world
 
-    def _motion(self, shared: Tensor, states: State, changes: Tensor, repeats: int) -> Rollout:
-        """Return the true motion of the segments from changed states (K B, S)."""
-        seen, world = self.segments, self._world(shared)
-        base = State(*(getattr(states, key).repeat(repeats, 1, 1) for key in states.__dataclass_fields__))
+    def _motion(self, world: World, states: State, changes: Tensor, repeats: int) -> Rollout:
+        """Return the true motion of the segments in a world (K B) from changed states (K B, S)."""
+        seen, base = self.segments, states.repeat(repeats)
         times = seen.times_s.repeat(repeats, 1)
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
         return rolled_out(world, retract(base, changes, list(seen.free)), true_times(world, times), drives)
@@ -326,7 +322,7 @@ class Shooting:
         moves = torch.cat([torch.zeros(1, count + size).to(shared), torch.diag(steps), -torch.diag(steps)])
         values = torch.cat([shared, torch.zeros(size).to(shared)]) + moves.repeat_interleave(batch, 0)
         parts = []
-        chunk = max(1, MAX_ITEMS // batch)
+        chunk = max(1, rollouts_at_once(self.world) // batch)
         with torch.no_grad():
             for first in range(0, len(moves), chunk):
                 some = values[first * batch : (first + chunk) * batch]

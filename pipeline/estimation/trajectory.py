@@ -90,8 +90,7 @@ class TrajectoryResiduals:
         values = [p.decode(inputs[:, k]) for k, p in enumerate(self.parameters)]
         world = apply_parameters(self.world, self.parameters, torch.stack(values, -1)) if count else self.world
         seen = self.observations
-        base = State(*(getattr(seen.state, key).repeat(repeats, 1, 1) for key in seen.state.__dataclass_fields__))
-        state = retract(base, inputs[:, count:], seen.free)
+        state = retract(seen.state.repeat(repeats), inputs[:, count:], seen.free)
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
         return measure(world, state, seen.times_s.repeat(repeats, 1), drives)
 

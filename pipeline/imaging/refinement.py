@@ -17,6 +17,7 @@ from ...datasets.progress import progress
 from ..estimation.least_squares import robust_loss
 from ..estimation.observations import Observations
 from ..estimation.trajectory import STATE_SIZE, STATE_STEPS, retract
+from ..physics.dispatch import rollouts_at_once
 from ..physics.measured import measure
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
@@ -40,8 +41,6 @@ GEOMETRY_WEIGHT = 1e-5
 the motion does not tell about, and lets those move that it does (choice of cgwm)."""
 PARAMETER_STEP, SPHERE_STEP = 0.03, 0.25
 """Differences of a parameter (fitted coordinate) and of a sphere (in widths of its prior)."""
-MAX_ROLLOUTS = 160
-"""In one batch: more run out of the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +159,9 @@ class ImageObjective:
         changed = (inputs[:, None] + torch.diag(steps)).flatten(0, 1)
         items = [item for item in range(batch) for _ in range(len(steps))]
         free, columns = list(self.observations.free), []
-        for first in range(0, len(items), MAX_ROLLOUTS):
-            rows, some = changed[first : first + MAX_ROLLOUTS], items[first : first + MAX_ROLLOUTS]
+        chunk = rollouts_at_once(self.world)
+        for first in range(0, len(items), chunk):
+            rows, some = changed[first : first + chunk], items[first : first + chunk]
             with torch.no_grad():
                 moved = self._rolled(rows[:, : len(shared)], rows[:, len(shared) :], some)
             here = [rollout.position_m[some][:, :, free], rollout.quat_wxyz[some][:, :, free]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from .devices import on_device
 from .driven import Drive
 from .fused import simulate_fused, unsupported
 from .rollout import Rollout, simulate
@@ -18,6 +20,8 @@ from .world import State, World
 
 if TYPE_CHECKING:
     from ...datasets.tracks import Track
+
+CPU_ROLLOUTS, GPU_ROLLOUTS = 160, 8192
 
 
 def rollout(
@@ -29,18 +33,33 @@ def rollout(
 ) -> Rollout:
     """Do what `simulate` does, on CUDA in one kernel where that can take the world.
 
-    Where it cannot, the log says so once for each reason; on the CPU there is no choice, and nothing to say.
+    Where it cannot, the log says so once for each reason; on the CPU there is no choice, and nothing to say. A world
+    that rolls on another device than its own is taken there if the kernel can take it, and the rollout brought back.
 
     Raises:
         InputDataError, UsageError: See :func:`simulate`.
     """
-    if world.gravity.device.type != "cuda":
+    home = world.gravity.device
+    if world.rolls_on is not None and home.type == "cpu":
+        away = on_device(replace(world, rolls_on=None), world.rolls_on)
+        reason = unsupported(away) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
+        if reason is None:
+            state, times_s = on_device((state, times_s), world.rolls_on)
+            driven = {name: on_device(command, world.rolls_on) for name, command in (driven or {}).items()}
+            return on_device(simulate_fused(away, state, times_s, driven, record_contacts), home)
+        _note(reason)
+    if home.type != "cuda":
         return simulate(world, state, times_s, driven, record_contacts)
     reason = unsupported(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
     if reason is None:
         return simulate_fused(world, state, times_s, driven, record_contacts)
     _note(reason)
     return simulate(world, state, times_s, driven, record_contacts)
+
+
+def rollouts_at_once(world: World) -> int:
+    """Return how many rollouts one call should take: more run out of the processor's cache, or of the GPU's memory."""
+    return GPU_ROLLOUTS if "cuda" in (world.rolls_on, world.gravity.device.type) else CPU_ROLLOUTS
 
 
 def lacking_derivatives(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -81,8 +81,12 @@ class Drive:
         """Return the batch repeated, as `Tensor.repeat` does."""
         if self.times_s.shape[0] == 1:
             return self
-        fields = (getattr(self, name) for name in self.__dataclass_fields__)
-        return Drive(*(field.repeat(times, *[1] * (field.ndim - 1)) for field in fields))
+        every = (getattr(self, field.name) for field in fields(self))
+        return Drive(*(values.repeat(times, *[1] * (values.ndim - 1)) for values in every))
+
+    def select(self, rows: Tensor) -> Drive:
+        """Return some rows of the batch."""
+        return Drive(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def at(self, time_s: Tensor) -> Motion:
         """Return pose and velocity at times (B,) or (1,) [s]; the motion's spin is the angular velocity (world)."""

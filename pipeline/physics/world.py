@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,7 +53,8 @@ class World:
     """The bodies and what surrounds them.
 
     gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
-    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact.
+    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact; rolls_on: the device
+    that `dispatch.rollout` takes rollouts to and their results back from, None for where the tensors lie.
     """
 
     bodies: tuple[Body, ...]
@@ -63,6 +65,7 @@ class World:
     step_s: float = 0.001
     sweeps: int = 10
     effects: tuple[ActiveEffect, ...] = ()
+    rolls_on: str | None = None
 
     @property
     def body_names(self) -> list[str]:
@@ -155,6 +158,19 @@ class State:
     quat_wxyz: Tensor
     velocity_m_s: Tensor
     omega_body_rad_s: Tensor
+
+    def at(self, rows: Tensor | Sequence[int] | slice) -> State:
+        """Return some rows of the batch."""
+        return State(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def repeat(self, times: int) -> State:
+        """Return the batch repeated, as `Tensor.repeat` does."""
+        return State(*(getattr(self, field.name).repeat(times, 1, 1) for field in fields(self)))
+
+    @staticmethod
+    def joined(*states: State) -> State:
+        """Return the batches one after the other."""
+        return State(*(torch.cat([getattr(state, field.name) for state in states]) for field in fields(State)))
 
 
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:

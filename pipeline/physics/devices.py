@@ -1,0 +1,35 @@
+"""Worlds, states and rollouts from one device to another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+
+def on_device(thing: T, device: torch.device | str, dtype: torch.dtype | None = None) -> T:
+    """Return a thing whose tensors lie on a device; derivatives go along.
+
+    Args:
+        thing: A tensor, a dataclass, a mapping or a tuple of such; anything else is returned as it is.
+        device: Where to.
+        dtype: Of the floating-point tensors; None leaves it.
+    """
+    return _moved(thing, torch.device(device), dtype)
+
+
+def _moved(thing: Any, device: torch.device, dtype: torch.dtype | None) -> Any:
+    if isinstance(thing, Tensor):
+        return thing.to(device, dtype if thing.is_floating_point() else None)
+    if isinstance(thing, Mapping):
+        return {key: _moved(value, device, dtype) for key, value in thing.items()}
+    if isinstance(thing, tuple):
+        return tuple(_moved(value, device, dtype) for value in thing)
+    if is_dataclass(thing) and not isinstance(thing, type):
+        return replace(thing, **{f.name: _moved(getattr(thing, f.name), device, dtype) for f in fields(thing)})
+    return thing
