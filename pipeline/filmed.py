@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datasets.capture import Capture
@@ -19,7 +20,7 @@ from .checkpoint import Slot
 from .imaging.coarse import coarse_model
 from .imaging.footage import Footage, load_footage
 from .imaging.image_loss import ImageLoss
-from .imaging.pose_tracks import PoseTrack, PoseTracker, stored_track, track_state
+from .imaging.pose_tracks import PoseTrack, PoseTracker, pose_noise, stored_track, track_state
 from .imaging.silhouette_loss import image_loss
 from .phys_geo import MAX_SPAN_S
 from .physics.driven import Drive
@@ -78,7 +79,7 @@ def filmed_episode(
         NotConvergedError: If the body is not found.
     """
     measured = capture.tracks(name)
-    drives = _drives(world, capture, name, measured)
+    drives = commands(world, capture, name, measured)
     own = {body.name: measured[body.name] for body in world.bodies if body.free and body.name in measured}
     if tracks_too and own and not capture.videos(name):
         return Episode(name, None, None, own | drives, None)
@@ -99,7 +100,7 @@ def filmed_episode(
         )
     small = _within_span(load_footage(capture, name, COARSE_SIZE, device))
     coarse = image_loss(coarse_model(model), small, world.free, outlines)
-    position, quat = _given_poses(world, drives, footage.times_s)
+    position, quat = driven_poses(world, drives, footage.times_s)
     found = PoseTracker(coarse, loss, position, quat).run()
     slot.write(track_state(found))
     return Episode(name, footage, loss, _tracks_of(world, footage, found) | drives, found)
@@ -117,30 +118,48 @@ def _tracks_of(world: World, footage: Footage, found: PoseTrack) -> dict[str, Tr
     }
 
 
-def _drives(world: World, capture: Capture, name: str, measured: dict[str, Track]) -> dict[str, Track]:
-    """Return the tracks of driven bodies: they are commands, with images as well."""
+def commands(world: World, capture: Capture, episode: str, measured: Mapping[str, Track]) -> dict[str, Track]:
+    """Return the tracks of the driven bodies, which are their commands, with images as well.
+
+    Args:
+        world: The world.
+        capture: The capture.
+        episode: Name of the episode.
+        measured: All its measured tracks, by body.
+
+    Raises:
+        InputDataError: If a driven body has none.
+    """
     drives = {}
     for body in world.bodies:
         if body.motion == "driven":
             if body.name not in measured:
                 raise InputDataError(
-                    f"{capture.root}: the driven body '{body.name}' has no track in episode '{name}'; "
+                    f"{capture.root}: the driven body '{body.name}' has no track in episode '{episode}'; "
                     f"its track is its command.",
-                    todo=f"add rows for '{body.name}' to tracks/{name}.csv.",
+                    todo=f"add rows for '{body.name}' to tracks/{episode}.csv.",
                 )
             drives[body.name] = measured[body.name]
     return drives
 
 
-def _given_poses(world: World, drives: dict[str, Track], times_s: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return poses of all bodies (I, nb, ...) at times (I,), those of driven bodies filled in."""
+def driven_poses(world: World, drives: Mapping[str, Track], times_s: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    """Return poses in the world frame with those of driven bodies; the others lie unturned at the origin.
+
+    Args:
+        world: The world, of nb bodies.
+        drives: Commands by body.
+        times_s: Times [s], shape (I,).
+
+    Returns:
+        Positions [m], shape (I, nb, 3), and orientations `quat_wxyz`, shape (I, nb, 4).
+    """
     count, bodies = len(times_s), len(world.bodies)
     position = torch.zeros(count, bodies, 3, dtype=torch.float64)
     quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(count, bodies, 1)
     for index, body in enumerate(world.bodies):
         if body.name in drives:
-            drive = Drive.of([drives[body.name]] * count, position)
-            motion = drive.at(torch.as_tensor(times_s))
+            motion = Drive.of([drives[body.name]] * count, position).at(torch.as_tensor(times_s))
             position[:, index], quat[:, index] = motion.com, motion.quat_wxyz
     return position, quat
 
@@ -163,9 +182,7 @@ def tracks_noise(capture: Capture, episodes: Sequence[Episode]) -> tuple[float |
     found = [episode.found for episode in episodes if episode.found is not None]
     if not found:
         return capture.manifest.measurement.position_std_m, capture.manifest.measurement.rotation_std_rad
-    variance = torch.cat([track.covariance[track.found].diagonal(dim1=1, dim2=2) for track in found])
-    std = variance.unflatten(1, (-1, 2, 3)).median(0).values.mean((0, 2)).sqrt()
-    return float(std[0]), float(std[1])
+    return pose_noise(found)
 
 
 def track_record(episode: Episode) -> dict[str, Any]:
@@ -173,7 +190,7 @@ def track_record(episode: Episode) -> dict[str, Any]:
     if episode.found is None:
         return {"source": "measured"}
     found, quality = episode.found, episode.found.quality
-    spread = found.covariance.diagonal(dim1=1, dim2=2).unflatten(1, (-1, 2, 3)).mean(-1).sqrt()[found.found]
+    spread = found.variance.mean(-1).sqrt()
     std = spread.median(0)
     overlap = quality.iou[found.found].nanmedian()
     return {

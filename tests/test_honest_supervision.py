@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from cgwm.datasets.models import read_model
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline import phys_geo
@@ -16,18 +15,15 @@ from cgwm.schemas import PhysConfig, SplatConfig
 from small_model import HALF, MASS
 from tiny_capture import model_of, thrown, with_manifest, with_tracks, write_tiny_capture
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = PhysConfig(supervise="images", device="cpu", step_s=0.003, population=8, generations=2, iterations=1)
 FRAMES = 7
 
 
 @pytest.fixture(autouse=True)
-def one_thread_and_few_steps(monkeypatch: pytest.MonkeyPatch):
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few steps of the shooting: each of many would add to what is but rounding."""
     monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def told(tmp_path: Path, masks: bool = True) -> Path:

@@ -17,21 +17,18 @@ from cgwm.pipeline.physics.rollout import Rollout, simulate
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import PhysConfig, UsageError
 from test_honest_supervision import contents
-from test_phys_images import FRAMES, NAMES, TRUTH, film, objective_of, start_state, tiny_model
-from tiny_capture import EPISODE, model_of, thrown, write_tiny_capture
+from test_phys_images import FRAMES, NAMES, TRUTH, film, objective_of, tiny_model
+from tiny_capture import EPISODE, model_of, start_state, thrown, write_tiny_capture
 from worlds import box_body, state_of, times, world_of
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = PhysConfig(supervise="images", device="cpu", step_s=0.003, population=8, generations=2, iterations=1)
 SHORT = 7
 
 
 @pytest.fixture(autouse=True)
-def one_thread_and_few_steps(monkeypatch: pytest.MonkeyPatch):
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

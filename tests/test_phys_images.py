@@ -1,4 +1,4 @@
-"""Physics from images: exact gradients through contact, poses from renders, a loss that falls, honest refusals."""
+"""Physics from images: gradients through contact, poses from renders, a loss that falls, honest refusals."""
 
 import math
 from dataclasses import replace
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_capture
 import torch
 from cgwm.datasets.capture import Capture
 from cgwm.datasets.models import Model
@@ -23,15 +24,16 @@ from cgwm.pipeline.imaging.touching import TouchingSpheres
 from cgwm.pipeline.phys_images import fit_physics_from_images
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION, apply_parameters
 from cgwm.pipeline.physics.rollout import Rollout, simulate
-from cgwm.pipeline.physics.rotation import geodesic_angle, quat_exp, quat_to_matrix
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.rotation import geodesic_angle, quat_to_matrix
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.splats.render import RenderOutput, render
 from cgwm.pipeline.splats.spheres import Spheres
-from cgwm.schemas import InputDataError, NotConvergedError, PhysConfig, Solver
-from small_model import collision_splats, cube_splats, small_model, table_splats
+from cgwm.schemas import InputDataError, NotConvergedError, PhysConfig
+from small_model import cube_splats, small_model, table_splats
+from tiny_capture import CAMERAS, HEIGHT, WIDTH, start_state
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 FRAMES, RATE = 8, 30.0
-WIDTH, HEIGHT = 64, 48
 GAIN = {"left": (0.9, 1.0, 1.1), "right": (1.1, 1.05, 0.95)}
 NAMES = [FRICTION, DAMPING_RATIO]
 LIFT = torch.tensor([0.01, 0.01, 0.08], dtype=torch.float64)
@@ -39,40 +41,12 @@ LIFT = torch.tensor([0.01, 0.01, 0.08], dtype=torch.float64)
 TRUTH = torch.tensor([math.log(0.4), math.log(0.3)], dtype=torch.float64)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def tiny_model() -> Model:
-    """The cube with few spheres; its colours vary slowly enough for pixels of a centimetre.
+    """The tiny capture's cube, on a table of smaller spheres.
 
-    The table's spheres are small enough that none reaches half a body's radius into what stands on it.
+    None of them reaches half a body's radius into what stands on it.
     """
-    model = small_model()
-    body = cube_splats(150)
-    colors = np.clip(0.5 + body.means / 0.1 * np.array([0.9, 0.9, 0.9]), 0.05, 0.95)
-    file = model.file.model_copy(update={"solver": Solver(step_s=0.004, sweeps=2)})
-    corners = {"cube": collision_splats(2)}
-    return replace(
-        model, file=file, collision=corners, body_splats={"cube": replace(body, colors=colors)}, scene=table_splats(24)
-    )
-
-
-def viewmat(azimuth_deg: float, distance: float = 0.55, height: float = 0.35) -> torch.Tensor:
-    azimuth = math.radians(azimuth_deg)
-    eye = np.array([distance * math.cos(azimuth), distance * math.sin(azimuth), height])
-    forward = np.array([0, 0, 0.08]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
-    return torch.as_tensor(matrix)
+    return replace(tiny_capture.tiny_model(), scene=table_splats(24))
 
 
 def drawn(spheres: Spheres, view: torch.Tensor, K: torch.Tensor) -> RenderOutput:
@@ -87,11 +61,10 @@ def film(model: Model, rollout: Rollout, masks: bool = True, noise: float = 0.01
     The cube is drawn over the table: no real table reaches into what stands on it, as one of coarse spheres would.
     """
     generator = torch.Generator().manual_seed(0)
-    K = torch.tensor([[70.0, 0, WIDTH / 2], [0, 70.0, HEIGHT / 2], [0, 0, 1]], dtype=dtype)
     body, scene = (Spheres.from_numpy(s, dtype) for s in (model.body_splats["cube"], model.scene) if s is not None)
     videos = []
-    for camera, azimuth in (("left", 20.0), ("right", 115.0)):
-        view = viewmat(azimuth).to(dtype)
+    for name, camera in CAMERAS.items():
+        view, K = (torch.as_tensor(matrix).to(dtype) for matrix in (camera.T_cam_world, camera.K))
         pictures, covers = [], []
         for k in range(rollout.position_m.shape[1]):
             pose = torch.eye(4, dtype=torch.float64)
@@ -99,13 +72,13 @@ def film(model: Model, rollout: Rollout, masks: bool = True, noise: float = 0.01
             pose[:3, 3] = rollout.position_m[0, k, 0]
             cube, table = drawn(body.moved(pose.to(dtype)), view, K), drawn(scene, view, K)
             picture = cube.features[0] + (1 - cube.alpha[0, ..., None]) * table.features[0]
-            exposed = torch.tensor(GAIN[camera], dtype=dtype) * picture
+            exposed = torch.tensor(GAIN[name], dtype=dtype) * picture
             pictures.append((exposed + noise * torch.randn(exposed.shape, generator=generator)).clamp(0, 1).to(dtype))
             covers.append((cube.alpha > 0.5).to(dtype))
         count = len(pictures)
         videos.append(
             Video(
-                camera,
+                name,
                 np.arange(count) / RATE,
                 torch.stack(pictures),
                 torch.stack(covers) if masks else None,
@@ -114,16 +87,6 @@ def film(model: Model, rollout: Rollout, masks: bool = True, noise: float = 0.01
             )
         )
     return Footage.of("000", tuple(videos))
-
-
-def start_state() -> State:
-    """A tilted cube above the table, moving sideways: it hits within five frames."""
-
-    def row(*values: float) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float64).view(1, 1, -1)
-
-    quat = quat_exp(torch.tensor([0.3, 0.5, 0.2], dtype=torch.float64)).view(1, 1, 4)
-    return State(row(-0.05, -0.03, 0.125), quat, row(0.4, 0.2, -0.6), row(1.5, -2.0, 1.0))
 
 
 @pytest.fixture(scope="module")

@@ -18,17 +18,11 @@ from cgwm.pipeline.physics.rollout import Rollout, simulate
 from cgwm.pipeline.physics.rotation import geodesic_angle
 from cgwm.pipeline.physics.world import World
 from small_model import HALF, cube_splats, table_splats
-from test_phys_images import FRAMES, RATE, film, start_state, tiny_model, viewmat
+from test_phys_images import FRAMES, RATE, film, tiny_model
+from tiny_capture import CAMERAS, start_state
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 STILL = torch.zeros(FRAMES, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(FRAMES, 1, 1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def two_sided(difference: float) -> Model:
@@ -119,8 +113,7 @@ def test_what_stands_before_a_body_hides_it_and_what_stands_behind_does_not() ->
     rollout = motion(model)
     footage = film(model, rollout)
     footage = Footage.of("000", footage.videos[:1])
-    view = viewmat(20.0)
-    eye = -view[:3, :3].T @ view[:3, 3]
+    eye = torch.as_tensor(CAMERAS["left"].center)
     at = rollout.position_m[0, :1], rollout.quat_wxyz[0, :1]
     middle = at[0][0, 0]
     areas, slopes = {}, {}

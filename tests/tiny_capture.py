@@ -40,17 +40,21 @@ def tiny_model() -> Model:
     )
 
 
-@cache
-def thrown() -> Track:
+def start_state() -> State:
     """A tilted cube above the table, moving sideways: it hits within five frames."""
 
     def row(*values: float) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float64).view(1, 1, -1)
 
     quat = quat_exp(torch.tensor([0.3, 0.5, 0.2], dtype=torch.float64)).view(1, 1, 4)
-    start = State(row(-0.05, -0.03, 0.125), quat, row(0.4, 0.2, -0.6), row(1.5, -2.0, 1.0))
+    return State(row(-0.05, -0.03, 0.125), quat, row(0.4, 0.2, -0.6), row(1.5, -2.0, 1.0))
+
+
+@cache
+def thrown() -> Track:
+    """The cube from `start_state` on."""
     times = torch.arange(FRAMES, dtype=torch.float64) / RATE_HZ
-    rollout = simulate(World.from_model(tiny_model()), start, times)
+    rollout = simulate(World.from_model(tiny_model()), start_state(), times)
     return Track(times.numpy(), rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy())
 
 

@@ -24,6 +24,7 @@ from cgwm.datasets.scenes.dynamics import ContactTruth, matrix_from_quat
 from cgwm.datasets.scenes.objects import SolidObject
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.exposure import estimate_exposures
+from cgwm.pipeline.filmed import driven_poses
 from cgwm.pipeline.imaging.pose_tracks import PoseTrack
 from cgwm.pipeline.physics.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
 from cgwm.pipeline.physics.world import State, World
@@ -36,7 +37,7 @@ from torch import Tensor
 
 from .base import TRAIN_EPISODE, Array, Cell, Prediction
 from .latent_model import LatentModel, Sequences, predicted, stopwatch, train
-from .training import Training, checked, driven_poses, find_poses, open_training
+from .training import Training, checked, find_poses, open_training
 from .trajectories import Trajectory, draw_trajectories
 
 Image = NDArray[np.uint8]

@@ -3,9 +3,9 @@
 What it has of PIN-WM: fixed geometry and looks, a differentiable rigid-body simulator, and Adam on the loss of
 rendered frames alone, 100 iterations from prior values. What is ours: the contact law (cgwm's closed form instead of
 a complementarity problem on meshes), the renderer (the same spheres as everybody's), the loss (cgwm's: L1 and, so
-that all see the same data, silhouettes), and a start that is fitted, too, from that of cgwm's pose tracks. Gradients
-are exact: those of the renderer by the poses times the rollout's Jacobian, in forward mode. Mass is given, so it is
-not fitted.
+that all see the same data, silhouettes), and a start that is fitted, too, from that of cgwm's pose tracks. The gradient
+is the renderer's by the poses, which is exact, times the rollout's Jacobian by differences, as cgwm's own refinement
+has it. Mass is given, so it is not fitted.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MAX_SLOPE = 10.0
 
 @dataclass(frozen=True)
 class PinWm:
-    """Adam on the image loss, with exact gradients; geometry stays as it is."""
+    """Adam on the image loss; geometry stays as it is."""
 
     name: str
     iterations: int = ITERATIONS
@@ -137,7 +137,7 @@ class _Problem:
         return float(self.training.costs(rollout.position_m, rollout.quat_wxyz)[0])
 
     def value_and_slope(self, numbers: Tensor, change: Tensor) -> tuple[float, list[Tensor]]:
-        """Return the loss and its gradient; infinite where the rollout diverges."""
+        """Return the loss and its gradient (of the rollout by differences); infinite where the rollout diverges."""
         states = (self.root @ change)[None]
         rollout = self.objective.rollout(numbers, states)
         position, quat = rollout.position_m[0], rollout.quat_wxyz[0]

@@ -1,6 +1,7 @@
 """The training episode as a fit may see it: frames, masks, cameras, and the commands of driven bodies.
 
-And what contenders find in it with the same tools: the track of poses, and the state at the first frame.
+And what contenders find in it with the same tools: the track of poses, and the state at the first frame. Pictures
+have the sizes that `cgwm fit` has.
 """
 
 from __future__ import annotations
@@ -15,20 +16,18 @@ from cgwm.datasets.models import Model, read_model
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.estimation.observations import START_FRAMES, Observations, first_state
 from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
+from cgwm.pipeline.filmed import COARSE_SIZE, commands, driven_poses
 from cgwm.pipeline.imaging.coarse import coarse_model
 from cgwm.pipeline.imaging.footage import Footage, load_footage
 from cgwm.pipeline.imaging.image_loss import ImageLoss
-from cgwm.pipeline.imaging.pose_tracks import PoseTrack, PoseTracker
-from cgwm.pipeline.physics.driven import Drive
+from cgwm.pipeline.imaging.pose_tracks import PoseTrack, PoseTracker, pose_noise
 from cgwm.pipeline.physics.measured import measure
 from cgwm.pipeline.physics.world import State, World
-from cgwm.schemas import ContactParameters, InputDataError, NotConvergedError
+from cgwm.schemas import ContactParameters, NotConvergedError, PhysConfig
 from torch import Tensor
 
 from .base import TRAIN_EPISODE, Array, Cell, Prediction
 
-COARSE_SIZE, FINE_SIZE = 80, 320
-"""Longer side [px] of the pictures for searching poses and for the loss: those of `cgwm fit`."""
 WARMUP_S = 0.1
 """The state at the first frame is first estimated from the track over this long, cut at the first contact."""
 
@@ -87,32 +86,10 @@ def open_training(cell: Cell) -> Training:
     file = model.file.model_copy(update={"contact": ContactParameters()})
     model = replace(model, file=file)
     world = World.from_model(model)
-    footage = load_footage(capture, TRAIN_EPISODE, FINE_SIZE, cell.device)
-    drives = commands(world, capture, TRAIN_EPISODE)
+    footage = load_footage(capture, TRAIN_EPISODE, PhysConfig().image_size, cell.device)
+    drives = commands(world, capture, TRAIN_EPISODE, capture.tracks(TRAIN_EPISODE))
     position, quat = driven_poses(world, drives, footage.times_s)
     return Training(model, world, ImageLoss(model, footage, world.free), drives, position, quat)
-
-
-def commands(world: World, capture: Capture, episode: str) -> dict[str, Track]:
-    """Return the tracks of the driven bodies, which are their commands."""
-    tracks = capture.tracks(episode)
-    driven = [body.name for body in world.bodies if body.motion == "driven"]
-    lacking = [name for name in driven if name not in tracks]
-    if lacking:
-        raise InputDataError(f"{capture.root}: the driven body '{lacking[0]}' has no track in episode '{episode}'.")
-    return {name: tracks[name] for name in driven}
-
-
-def driven_poses(world: World, drives: Mapping[str, Track], times_s: Array) -> tuple[Tensor, Tensor]:
-    """Return poses (I, nb, ...) at times (I,) with those of driven bodies; the others lie unturned at the origin."""
-    count, bodies = len(times_s), len(world.bodies)
-    position = torch.zeros(count, bodies, 3, dtype=torch.float64)
-    quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(count, bodies, 1)
-    for index, body in enumerate(world.bodies):
-        if body.name in drives:
-            motion = Drive.of([drives[body.name]] * count, position).at(torch.as_tensor(times_s))
-            position[:, index], quat[:, index] = motion.com, motion.quat_wxyz
-    return position, quat
 
 
 def find_poses(training: Training, cell: Cell) -> PoseTrack:
@@ -164,9 +141,7 @@ def observed(training: Training, found: PoseTrack) -> Found:
     seen = found.found.cpu().to(observations.seen)[None, :, None].expand_as(observations.seen)
     observations = replace(observations, seen=seen.clone(), turned=seen.clone())
     observations = replace(observations, state=first_state(world, observations))  # of what was seen alone
-    variance = found.covariance[found.found].diagonal(dim1=1, dim2=2).cpu()
-    std = variance.unflatten(1, (-1, 2, 3)).median(0).values.mean((0, 2)).sqrt()
-    noise = float(std[0]), float(std[1])
+    noise = pose_noise([found])
     span = float(times[START_FRAMES - 1] - times[0])
     spread = [std for std in (*noise, noise[0] / span, noise[1] / span) for _ in range(3)] * len(world.free)
     covariance = torch.diag(torch.tensor(spread, dtype=torch.float64).square())

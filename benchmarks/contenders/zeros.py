@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 
 from cgwm.datasets.models import read_model
 from cgwm.datasets.tracks import Track
+from cgwm.pipeline.filmed import driven_poses
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import ContactParameters
 
 from .base import Array, Cell, Prediction
-from .training import driven_poses, rolled_out
+from .training import rolled_out
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,15 @@ from cgwm.datasets.scenes.objects import SolidObject
 from cgwm.schemas import InputDataError
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from store import shared_data
 
 from .distance import surface_distance
-from .scans import Scan
+from .scans import CACHE_VARIABLE, Scan
 
 Array = NDArray[np.float64]
 
-ARCHIVE = Path("/work/shared/data/ycb.tar.xz")
+ARCHIVE = "ycb.tar.xz"
+"""The scans, in the folder of measured data."""
 _CONCAVITY_M = 0.003
 """What CoACD may leave of a concavity; the smaller, the more parts."""
 _SIMPLER_M = 0.0002
@@ -43,9 +45,7 @@ def prepare_scan(name: str, raw: Path) -> Scan:
     """
     folder = raw / "ycb" / "ycb" / name
     if not folder.exists():
-        if not ARCHIVE.exists():
-            raise InputDataError(f"{ARCHIVE}: missing.", "the YCB scans, or a cache that was made from them.")
-        with tarfile.open(ARCHIVE) as archive:
+        with tarfile.open(_archive()) as archive:
             archive.extractall(raw, filter="data")
     mass = float(json.loads((raw / "ycb" / "ycb_mass.json").read_text(encoding="utf-8"))[name])
     scanned, uv = _read_textured(folder / "textured.obj")
@@ -67,6 +67,17 @@ def prepare_scan(name: str, raw: Path) -> Scan:
     jpeg = cv2.imencode(".jpg", texture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
     out, back = surface_distance(scanned, visible), surface_distance(visible, scanned)
     return Scan(solid, _rest(solid), scanned, uv, np.asarray(jpeg, np.uint8).ravel(), out, back)
+
+
+def _archive() -> Path:
+    data = shared_data()
+    if data is None or not (data / ARCHIVE).is_file():
+        raise InputDataError(
+            "there is no folder of measured data." if data is None else f"{data / ARCHIVE}: missing.",
+            f"the YCB scans as {ARCHIVE}, or a cache that was made from them.",
+            f"set CGWM_SHARED_DATA to the folder that holds {ARCHIVE}, or {CACHE_VARIABLE} to that of the cache.",
+        )
+    return data / ARCHIVE
 
 
 def _module(name: str) -> Any:

@@ -54,6 +54,17 @@ def robust_loss(chi2: Tensor, scale: float | None) -> tuple[Tensor, Tensor]:
     return scale**2 * torch.log1p(ratio), 1 / (1 + ratio)
 
 
+def bound_stops(shared: Tensor, downhill: Tensor, bounds: Tensor) -> Tensor:
+    """Tell which parameters a bound stops (P,): those that lie on it while the cost falls beyond it.
+
+    Args:
+        shared: The parameters, shape (P,).
+        downhill: The negative gradient of the cost by them, shape (P,).
+        bounds: Lower and upper bounds, shape (P, 2).
+    """
+    return ((shared <= bounds[:, 0]) & (downhill < 0)) | ((shared >= bounds[:, 1]) & (downhill > 0))
+
+
 def minimise(
     residuals: Residuals,
     shared: Tensor,
@@ -163,8 +174,7 @@ def _eliminate(linear: _Linear, damping: float) -> tuple[Tensor, Tensor, Tensor,
 def _step(linear: _Linear, shared: Tensor, bounds: Tensor, damping: float) -> tuple[Tensor, Tensor]:
     reduced, gradient, by_shared, by_gradient = _eliminate(linear, damping)
     total, slope = reduced.sum(0), gradient.sum(0)
-    blocked = ((shared <= bounds[:, 0]) & (slope < 0)) | ((shared >= bounds[:, 1]) & (slope > 0))
-    free = (~blocked).to(shared.dtype)
+    free = (~bound_stops(shared, slope, bounds)).to(shared.dtype)
     scale = total.diagonal().clamp_min(1e-9)
     system = total * free[:, None] * free + torch.diag(damping * scale + (1 - free) * scale + 1e-9)
     step = torch.linalg.solve(system, slope * free) if shared.numel() else shared

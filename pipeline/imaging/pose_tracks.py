@@ -13,7 +13,7 @@ only), and a tracker that follows one of them from the first frame on may follow
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,6 +68,20 @@ class PoseTrack:
     found: Tensor
     searches: int
     rival_nats: float
+
+    @property
+    def variance(self) -> Tensor:
+        """Variances of the free bodies' poses where they were found (F, nf, 2, 3): shift [m2] and turn [rad2]."""
+        return self.covariance[self.found].diagonal(dim1=1, dim2=2).unflatten(1, (-1, 2, 3))
+
+
+def pose_noise(tracks: Sequence[PoseTrack]) -> tuple[float, float]:
+    """Return the noise of found poses (position [m], rotation [rad]), by axis.
+
+    It is the root of the variance's median over the instants of all tracks, averaged over axes and free bodies.
+    """
+    std = torch.cat([track.variance for track in tracks]).median(0).values.mean((0, 2)).sqrt()
+    return float(std[0]), float(std[1])
 
 
 def track_state(track: PoseTrack) -> dict[str, object]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...datasets.progress import progress
-from ..estimation.least_squares import robust_loss
+from ..estimation.least_squares import bound_stops, robust_loss
 from ..estimation.observations import Observations
 from ..estimation.trajectory import STATE_SIZE, STATE_STEPS, retract
 from ..physics.dispatch import rollouts_at_once
@@ -173,7 +173,7 @@ class ImageObjective:
     def normal_equations(
         self, shared: Tensor, states: Tensor, rollout: Rollout, curvature: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return matrix and exact gradient of the objective in (P + B S) unknowns: parameters, then each state."""
+        """Return matrix and gradient of the objective in (P + G + B S) unknowns: parameters, spheres, each state."""
         jacobian = self.jacobian(shared, states, rollout)
         _, track_slope, track_weight = self._tracks(rollout)
         slope = self.gradient(rollout) / self.scale + TRACK_WEIGHT * track_slope
@@ -289,11 +289,8 @@ def _step(
 ) -> tuple[Tensor, Tensor]:
     """Return shared numbers and states after one damped step; a number that a bound stops takes no part."""
     count = len(shared)
-    blocked = torch.zeros(len(slope), dtype=torch.bool)
-    blocked[:count] = ((shared <= bounds[:, 0]) & (slope[:count] > 0)) | (
-        (shared >= bounds[:, 1]) & (slope[:count] < 0)
-    )
-    free = (~blocked).double()
+    free = torch.ones_like(slope)
+    free[:count] = (~bound_stops(shared, -slope[:count], bounds)).double()
     diagonal = matrix.diagonal().clamp_min(1e-12)
     system = matrix * free[:, None] * free + torch.diag(damping * diagonal + (1 - free) * diagonal)
     step = -torch.linalg.solve(system, slope * free)
