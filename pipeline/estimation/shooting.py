@@ -26,7 +26,7 @@ from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
 from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
 from ..physics.world import State, World
-from .least_squares import robust_loss
+from .least_squares import bound_stops, robust_loss
 from .observations import Observations
 from .trajectory import retract, state_prior
 from .warmup import FLIGHT_MARGIN_M, clearance
@@ -234,12 +234,8 @@ class Shooting:
     def _solved(self, linear: _Linear, damping: Tensor, shared: Tensor) -> Tensor:
         """Return a damped step; a parameter that a bound stops takes no part."""
         count = len(shared)
-        slope = linear.slope
-        blocked = torch.zeros(len(slope), dtype=torch.bool)
-        blocked[:count] = ((shared <= self.prior.bounds[:, 0]) & (slope[:count] > 0)) | (
-            (shared >= self.prior.bounds[:, 1]) & (slope[:count] < 0)
-        )
-        free = (~blocked).to(slope)
+        slope, free = linear.slope, torch.ones_like(linear.slope)
+        free[:count] = (~bound_stops(shared, -slope[:count], self.prior.bounds)).to(slope)
         system = linear.matrix * free[:, None] * free + torch.diag(damping + (1 - free))
         return -torch.linalg.solve(system, slope * free)
 
