@@ -31,8 +31,8 @@ from ..schemas import Parameter as FittedParameter
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
-from .estimation.shooting import BEST, Shooting
 from .estimation.shooting import Prior as ShotPrior
+from .estimation.shooting import Shooting
 from .estimation.warmup import estimate_states, warmup_frames
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
@@ -63,6 +63,9 @@ OPEN_LOOP_TOLERANCE = 3.0
 three numbers bends them until one rough motion ends where it should."""
 STARTS = ((0.5, 1.0), (1.0, 1.0), (1.7, 1.0), (1.0, 0.6), (1.0, 1.6))
 """Further starts of the shooting: friction and contact time are off by these factors from the priors' medians."""
+BEST, SEVERAL_EPISODES = 3, 3
+"""So many descents go on; from so many episodes on it starts at the search's result only, and one goes on: together
+they have one valley."""
 SHOT_ITERATIONS = 12
 """Least number of steps in each descent of the shooting."""
 MODEL_EXCESS = 20.0
@@ -246,37 +249,40 @@ def _shot(
         torch.tensor([p.limits for p in shot_names], dtype=torch.float64),
     )
     starts = [np.concatenate([search.mean, middle[len(search.mean) :]])]
-    for friction, contact_time in STARTS:
+    several = len(episodes) >= SEVERAL_EPISODES
+    for friction, contact_time in () if several else STARTS:
         start = middle.copy()
         start[:2] += np.log([friction, contact_time])  # the first two of `CONTACT_PARAMETERS`
         starts.append(start)
-    problem = Shooting.of(world, shot_names, episodes, [_span(tracks) for _, tracks in episodes], sigma, prior)
-    bar = progress(range(2 * len(starts) + BEST), "phys-geo: multiple shooting", total=2 * len(starts) + BEST)
+    problem = Shooting.of(world, shot_names, episodes, [_span(tracks) for _, tracks in episodes], sigma, prior, several)
+    best = 1 if several else BEST
+    bar = progress(range(2 * len(starts) + best), "phys-geo: multiple shooting", total=2 * len(starts) + best)
     steps = iter(bar)
     shots = problem.fit(
         [torch.as_tensor(start) for start in starts],
         max(config.iterations, SHOT_ITERATIONS),
+        best,
         lambda: next(steps, None),
     )
     bar.close()
-    best = shots[0]
-    shared = best.shared.numpy()
+    shot = shots[0]
+    shared = shot.shared.numpy()
     cost = float(_open_loop(world, *batch, shot_names)(shared[None]).mean())
-    keep = math.isfinite(best.cost) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
+    keep = math.isfinite(shot.cost) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
     record |= {
-        "shooting_costs": [shot.cost for shot in shots],
-        "shooting_converged": best.converged,
-        "shooting_misfit": {"ties": best.misfit, "frames": best.chi2},
+        "shooting_costs": [one.cost for one in shots],
+        "shooting_converged": shot.converged,
+        "shooting_misfit": {"ties": shot.misfit, "frames": shot.chi2},
         "open_loop_m": {"search": search.lowest, "shooting": cost},
         "kept": "shooting" if keep else "search",
     }
     if not keep:
         return names, search.mean, search.covariance, {}
     starts_found = {
-        name: (float(time), best.state.at([row]))
+        name: (float(time), shot.state.at([row]))
         for row, (name, time) in enumerate(zip(batch[0].names, batch[0].times_s[:, 0], strict=True))
     }
-    return shot_names, shared, (1 + MODEL_EXCESS * best.misfit) * best.covariance.numpy(), starts_found
+    return shot_names, shared, (1 + MODEL_EXCESS * shot.misfit) * shot.covariance.numpy(), starts_found
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:
@@ -310,7 +316,7 @@ def _search(
         _open_loop(world, observations, warm, names),
         prior,
         seed=config.seed,
-        population=config.population or min(max(MAX_ROLLOUTS // episodes, POPULATION[0]), POPULATION[1]),
+        population=config.population or _population(episodes),
         generations=config.generations,
         errors=ERRORS_PER_EPISODE * episodes,
         floor=floor,
@@ -318,6 +324,14 @@ def _search(
     )
     bar.close()
     return result
+
+
+def _population(episodes: int) -> int:
+    """Return how many samples a generation has."""
+    rollouts = MAX_ROLLOUTS
+    if SEVERAL_EPISODES <= episodes < ENOUGH_EPISODES:  # shooting from there on, which has one valley then
+        rollouts //= 5
+    return min(max(rollouts // episodes, POPULATION[0]), POPULATION[1])
 
 
 def _open_loop(world: World, observations: Observations, warm: Tensor, names: list[Parameter]):

@@ -62,7 +62,7 @@ def tumble(kicked_at: int | None = None) -> Track:
 
 def shot(track: Track, start: torch.Tensor) -> Shot:
     problem = Shooting.of(box_world(), NAMES, [("0", {"box": track})], [(0.0, 1.0)], NOISE, PRIOR)
-    return problem.fit([start], 8)[0]
+    return problem.fit([start], 8, 1)[0]
 
 
 def off(factor: float) -> torch.Tensor:

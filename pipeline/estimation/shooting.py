@@ -40,10 +40,10 @@ TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """What the model may miss in a segment of flight: position [m], rotation [rad], velocity [m/s], omega [rad/s]."""
 TIE_SHARE = 0.01
 """What it may miss of the velocity that contact gives a body, and of the turning that goes with it."""
-BEST = 3
-"""So many descents go on."""
 ROBUST_SCALE = 4.0
 """Of the robust loss of a frame [sigmas]; that of a tie is twice as wide."""
+RESTING_SIGMAS = 6.0
+"""A body that moves by less in a segment, in units of the noise, may be at rest."""
 STATE_STEPS = (2e-4, 2e-3, 1e-2, 1e-1)
 """Differences in position [m], rotation [rad], velocity [m/s], omega [rad/s] for the Jacobian."""
 PARAMETER_STEP = 0.1
@@ -113,25 +113,30 @@ class Shooting:
         spans: Sequence[tuple[float, float]],
         noise: tuple[float, float],
         prior: Prior,
+        contacts_only: bool = False,
     ) -> Shooting:
-        """Cut the span [s] of each episode into segments."""
+        """Cut the span [s] of each episode into segments.
+
+        With `contacts_only` those are left out that tell nothing of contact and lie beside none that does: in flight,
+        and where all rests; not the first ones, whose states are where episodes begin.
+        """
         whole = Observations.of(world, episodes, spans)
         cuts = [_cuts(times[:count]) for times, count in zip(whole.times_s, whole.frames.tolist(), strict=True)]
-        items = [k for k, places in enumerate(cuts) for _ in places[:-1]]
-        windows = [
-            (float(whole.times_s[k, a]) - 1e-9, float(whole.times_s[k, b]) + 1e-9)
-            for k, places in enumerate(cuts)
-            for a, b in itertools.pairwise(places)
-        ]
+        pieces = [(k, a, b) for k, places in enumerate(cuts) for a, b in itertools.pairwise(places)]
+        if contacts_only:
+            telling = _telling(world, whole, pieces, noise)
+            pieces = [piece for piece, tells in zip(pieces, telling, strict=True) if tells or piece[1] == 0]
+        items = [k for k, _, _ in pieces]
+        windows = [(float(whole.times_s[k, a]) - 1e-9, float(whole.times_s[k, b]) + 1e-9) for k, a, b in pieces]
         segments = Observations.of(world, [episodes[k] for k in items], windows)
         following, end, seen, turned = [], [], segments.seen.clone(), segments.turned.clone()
         for row, k in enumerate(items):
-            last = row + 1 == len(items) or items[row + 1] != k
+            last = row + 1 == len(items) or pieces[row + 1][:2] != (k, pieces[row][2])
             following.append(-1 if last else row + 1)
             end.append(int((segments.times_s[row] <= windows[row][1]).sum()) - 1)
             if not last:  # the next segment has seen that frame
                 seen[row, end[-1] :], turned[row, end[-1] :] = 0.0, 0.0
-        starts = [place for places in cuts for place in places[:-1]]
+        starts = [first for _, first, _ in pieces]
         ahead = segments.state
         state = _moving(world, whole, items, starts, ahead)
         segments = replace(segments, seen=seen, turned=turned, state=state)
@@ -150,7 +155,9 @@ class Shooting:
             ahead,
         )
 
-    def fit(self, starts: Sequence[Tensor], iterations: int, done: Callable[[], object] = lambda: None) -> list[Shot]:
+    def fit(
+        self, starts: Sequence[Tensor], iterations: int, best: int, done: Callable[[], object] = lambda: None
+    ) -> list[Shot]:
         """Minimise from several parameters (P,) in fitted coordinates, and from both first guesses of the states.
 
         Where it starts decides in which valley it ends. The best few go on, with ties from what contact then gives.
@@ -158,6 +165,7 @@ class Shooting:
         Args:
             starts: Where to start.
             iterations: Most steps in each descent.
+            best: How many go on.
             done: Called after each descent.
 
         Returns:
@@ -170,7 +178,7 @@ class Shooting:
                 first.append(tied._minimised(shared, states, iterations))
                 done()
         shots = []
-        for shot, states in sorted(first, key=lambda one: one[0].cost)[:BEST]:
+        for shot, states in sorted(first, key=lambda one: one[0].cost)[:best]:
             tied = replace(self, tie=self._allowed(shot.shared, states))
             shots.append(tied._minimised(shot.shared, states, iterations)[0])
             done()
@@ -219,7 +227,8 @@ class Shooting:
         covariance = torch.linalg.pinv(linear.matrix, hermitian=True)
         scale = max(1.0, linear.misfit, linear.chi2)
         count = len(shared)
-        first = [row for row in range(len(self.following)) if row not in set(self.following.tolist())]
+        names = self.segments.names
+        first = [row for row, name in enumerate(names) if row == 0 or names[row - 1] != name]
         return Shot(
             shared,
             scale * covariance[:count, :count],
@@ -381,6 +390,23 @@ def _cuts(times_s: Tensor) -> list[int]:
     if len(places) > 2 and places[-1] != len(times_s) - 1:
         places.pop()  # the last segment takes up what is too short for one
     return [*places, len(times_s) - 1] if places[-1] != len(times_s) - 1 else places
+
+
+def _telling(
+    world: World, whole: Observations, pieces: Sequence[tuple[int, int, int]], noise: tuple[float, float]
+) -> list[bool]:
+    """Return which pieces (episode, first and last frame) tell of contact: in it, or beside it, and not at rest."""
+    flying = clearance(world, whole) > FLIGHT_MARGIN_M
+    moved = whole.position_m.new_zeros(len(pieces))
+    for row, (k, a, b) in enumerate(pieces):
+        shift = (whole.position_m[k, b] - whole.position_m[k, a]).abs().amax() / noise[0]
+        turn = quat_log(quat_multiply(quat_conjugate(whole.quat_wxyz[k, a]), whole.quat_wxyz[k, b]))
+        moved[row] = torch.maximum(shift, turn.abs().amax() / noise[1])
+    touches = [not bool(flying[k, a : b + 1].all()) for k, a, b in pieces]
+    tells = [touch and bool(way > RESTING_SIGMAS) for touch, way in zip(touches, moved, strict=True)]
+    beside = [False, *tells, False]
+    near = [any(beside[row : row + 3]) for row in range(len(pieces))]
+    return near
 
 
 def _moving(world: World, whole: Observations, items: list[int], starts: list[int], state: State) -> State:

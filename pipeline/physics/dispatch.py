@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from .detection import pairs_of, slot_count
 from .devices import on_device
 from .driven import Drive
 from .fused import simulate_fused, unsupported
@@ -21,7 +22,8 @@ from .world import State, World
 if TYPE_CHECKING:
     from ...datasets.tracks import Track
 
-CPU_ROLLOUTS, GPU_ROLLOUTS = 160, 8192
+CPU_CONTACTS, CPU_ROLLOUTS, GPU_ROLLOUTS = 32_000, (160, 2048), 8192
+"""Possible contacts in a batch on the CPU, and the least and most rollouts; rollouts on a GPU."""
 
 
 def rollout(
@@ -59,7 +61,10 @@ def rollout(
 
 def rollouts_at_once(world: World) -> int:
     """Return how many rollouts one call should take: more run out of the processor's cache, or of the GPU's memory."""
-    return GPU_ROLLOUTS if "cuda" in (world.rolls_on, world.gravity.device.type) else CPU_ROLLOUTS
+    if "cuda" in (world.rolls_on, world.gravity.device.type):
+        return GPU_ROLLOUTS
+    contacts = sum(slot_count(world, pair) for pair in pairs_of(world))
+    return min(max(CPU_CONTACTS // max(contacts, 1), CPU_ROLLOUTS[0]), CPU_ROLLOUTS[1])
 
 
 def lacking_derivatives(
