@@ -52,7 +52,8 @@ class World:
     """The bodies and what surrounds them.
 
     gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
-    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact.
+    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact; touching: whether
+    bodies touch at all (without, every motion is free flight, and costs a tenth).
     """
 
     bodies: tuple[Body, ...]
@@ -63,6 +64,7 @@ class World:
     step_s: float = 0.001
     sweeps: int = 10
     effects: tuple[ActiveEffect, ...] = ()
+    touching: bool = True
 
     @property
     def body_names(self) -> list[str]:
