@@ -177,5 +177,8 @@ def _warnings(names: Sequence[str], shared: Sequence[str], outliers: int) -> lis
         listed = ", ".join(f"'{name}'" for name in left_out)
         found.append(f"not all models can predict {listed}: short predictions are compared on the other episodes.")
     if outliers:
-        found.append(f"{outliers} measured frames of flight lie where no motion leads: they are left out.")
+        found.append(
+            f"{outliers} measured pose{'' if outliers == 1 else 's'} of flight lie far off their neighbours: short "
+            "predictions leave them out."
+        )
     return found

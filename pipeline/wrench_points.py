@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas import Organiser, Phase
-from .diagnosis.wrench import ResidualWrenches, organisers, residual_wrenches, wrench_windows
+from .diagnosis.segments import Segment
+from .diagnosis.wrench import coordinates_of, organisers, wrench_windows
 from .physics.world import World
 from .short_errors import Cut, ShortErrors, ShortFit
 
@@ -26,20 +27,23 @@ KNOWN_STD = 1e3
 
 @dataclass(frozen=True, eq=False)
 class WrenchPoint:
-    """What is missing in one segment: force over mass and torque over inertia, and where the body was.
+    """One piece of the motion: how badly it is fitted, what is missing in it, and where the body was.
 
     Attributes:
-        episode: Of the segment.
+        episode: Of the piece.
         span_s: Its start and end, from the episode's first measured frame [s].
-        phase: What the segment's residuals are due to.
-        acceleration: Residual acceleration [m/s2] (3,) and angular acceleration [rad/s2] (3,), world frame, shape (6,).
+        phase: What its residuals are due to.
+        misfit: Root of the reduced chi-square of its short prediction, in units of the noise.
+        acceleration: Residual acceleration [m/s2] (3,) and angular acceleration [rad/s2] (3,), world frame, shape (6,);
+            NaN in contact, where the ground answers every force.
         std: Standard errors, same shape; NaN where nothing was measured.
-        coordinates: Of the segment's middle: time [s], x, y, height [m], heading [deg], speed [m/s], spin [rad/s].
+        coordinates: Of its middle: time [s], x, y, height [m], heading [deg], speed [m/s], spin [rad/s].
     """
 
     episode: str
     span_s: tuple[float, float]
     phase: Phase
+    misfit: float
     acceleration: Array
     std: Array
     coordinates: Mapping[str, float]
@@ -48,10 +52,9 @@ class WrenchPoint:
 def wrench_points(
     world: World, fit: ShortFit, cut: Cut, episodes: Sequence[str]
 ) -> tuple[list[WrenchPoint], list[Organiser]]:
-    """Return the residual wrench of every piece, and what orders that of flight; nothing for several free bodies.
+    """Return the pieces of the motion as points, and what orders the wrench of flight; nothing for several free bodies.
 
-    Flights are looked at in half-overlapping windows, contacts in the segments that were fitted. Only those of flight
-    are told apart by a coordinate: there the model has no contact law that could be wrong.
+    Flights are looked at in half-overlapping windows, contacts in the segments that were fitted.
 
     Args:
         world: The model's.
@@ -61,38 +64,50 @@ def wrench_points(
     """
     if len(world.free) != 1:
         return [], []
+    points: list[WrenchPoint] = []
     flight = wrench_windows(world, fit.whole, cut.flight, cut.noise)
-    contact = None if fit.contact is None else residual_wrenches(fit.contact)
-    points = [
-        point for found in (flight, contact) if found is not None for point in _points(found, fit.errors, episodes)
-    ]
+    if flight is not None:
+        std = np.sqrt(np.diagonal(flight.covariance, axis1=1, axis2=2))
+        std = np.where(std < KNOWN_STD, std, np.nan)
+        points += _points(flight.segments, flight.coordinates, flight.wrench, std, fit.errors, episodes)
+    if fit.contact is not None:
+        nothing = np.full((len(fit.contact.items), 6), np.nan)
+        points += _points(fit.contact.items, coordinates_of(fit.contact)[0], nothing, nothing, fit.errors, episodes)
     if flight is None or len(flight.segments) < LEAST_WINDOWS:
         return points, []
     ordered = [one for one in organisers(flight) if one.share >= LEAST_SHARE and one.p_value < SIGNIFICANT]
     return points, [Organiser(coordinate=one.coordinate, share=one.share) for one in ordered]
 
 
-def _points(found: ResidualWrenches, errors: Mapping[str, ShortErrors], episodes: Sequence[str]) -> list[WrenchPoint]:
-    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    std = np.where(std < KNOWN_STD, std, np.nan)
+def _points(
+    segments: Sequence[Segment],
+    coordinates: Mapping[str, Array],
+    wrench: Array,
+    std: Array,
+    errors: Mapping[str, ShortErrors],
+    episodes: Sequence[str],
+) -> list[WrenchPoint]:
     points = []
-    for k, segment in enumerate(found.segments):
+    for k, segment in enumerate(segments):
         one = errors[episodes[segment.episode]]
         times = one.time_s - one.time_s[0]
+        rows = slice(segment.first, segment.last + 1)
         middle = (segment.first + segment.last) // 2
-        if one.cause[middle] < 0:
+        left = float(one.freedom[rows].sum())
+        if one.cause[middle] < 0 or left <= 0:
             continue
-        coordinates = {name: float(values[k]) for name, values in found.coordinates.items() if name != "episode"}
-        coordinates["time"] -= float(one.time_s[0])
-        coordinates["heading"] = float(np.degrees(coordinates["heading"]))
+        place = {name: float(values[k]) for name, values in coordinates.items() if name != "episode"}
+        place["time"] -= float(one.time_s[0])
+        place["heading"] = float(np.degrees(place["heading"]))
         points.append(
             WrenchPoint(
                 one.episode,
                 (float(times[segment.first]), float(times[segment.last])),
                 one.phase_name(one.cause[middle]),
-                found.wrench[k],
+                float(np.sqrt(np.nansum(np.square(one.sigmas[rows])) / left)),
+                wrench[k],
                 std[k],
-                coordinates,
+                place,
             )
         )
     return points

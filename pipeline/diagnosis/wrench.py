@@ -108,7 +108,7 @@ def residual_wrenches(segments: Segments) -> ResidualWrenches:
     )
     weak = torch.eye(6).to(linear.information) / WEAK_STD**2
     wrench = torch.linalg.solve(linear.information + weak, linear.score)
-    coordinates, velocity, omega = _coordinates(segments)
+    coordinates, velocity, omega = coordinates_of(segments)
     return ResidualWrenches(segments.items, wrench.numpy(), linear.information.numpy(), coordinates, velocity, omega)
 
 
@@ -174,7 +174,7 @@ def _bins(values: Array) -> Array:
     return np.searchsorted(edges, values).astype(np.float64)
 
 
-def _coordinates(segments: Segments) -> tuple[dict[str, Array], Array, Array]:
+def coordinates_of(segments: Segments) -> tuple[dict[str, Array], Array, Array]:
     """Return coordinates by name (n,), velocities (n, 3) and angular velocities (n, 3), world, half-way."""
     motion, body = segments.rollout(), segments.observations.free[0]
     item = torch.arange(len(segments.items))

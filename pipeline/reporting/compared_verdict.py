@@ -101,7 +101,7 @@ def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
     if model.reduced_chi2 is None:
         return "Too few measured frames follow each other for short predictions."
     known = [
-        (phase, figures.reduced_chi2**0.5, figures.frames)
+        (phase, figures.reduced_chi2**0.5, figures.position_rms_m)
         for phase, figures in model.by_phase.items()
         if figures is not None and figures.reduced_chi2 is not None and figures.frames >= LEAST_FRAMES
     ]
@@ -109,10 +109,11 @@ def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
     name = names[model.model]
     if not missed:
         return f"Short predictions of {name} are within the noise in all phases."
-    phase, times, _ = missed[0]
-    within = [_during(phase) for phase, size, _ in known if size <= EXPLAINED]
+    phase, times, size = missed[0]
+    within = [other for other, multiple, _ in known if multiple <= EXPLAINED]
     words = f"Short predictions of {name} still err by {times:.1f} times the noise {_during(phase)}"
-    return words + (f" and explain {' and '.join(w.removeprefix('in ') for w in within)}." if within else ".")
+    words += f" ({_mm(size)})" if size is not None else ""
+    return words + (f"; they are within the noise {' and '.join(map(_during, within))}." if within else ".")
 
 
 def _during(phase: str) -> str:

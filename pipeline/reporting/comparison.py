@@ -169,6 +169,8 @@ def _models(result: CompareResult, names: Sequence[str]) -> str:
         move, turn = (figures.get(key) or {} for key in ("translation_error_m", "rotation_error_deg"))
         values = [fixed(move.get(key), 2, _MM) for key in ("median", "mean", "final")]
         rows.append([f"({zero} object)", "–", *values, fixed(turn.get("median"), 2), "–", "–", "–", "–"])
+    shown = [k for k in range(len(header)) if k < 2 or any(row[k] != "–" for row in rows)]
+    header, rows = [header[k] for k in shown], [[row[k] for k in shown] for row in rows]
     return _sortable(header, rows, range(2, len(header)))
 
 
@@ -304,7 +306,8 @@ def _phases(result: CompareResult, names: Sequence[str]) -> str:
         f"({fixed(noise['position_m'], 2, _MM)} mm and {number(noise['rotation_rad'] * 57.29578, 2)} deg an axis). "
         "Reduced χ² is the mean square, allowing for the fitted starts: about 1 where the model explains the data. "
         "Residuals of one impact hang together: their χ² is no test. The last columns are the root mean square "
-        "residuals of each degree of freedom; fitted starts make them smaller than 1 where nothing is missing."
+        "residuals of each degree of freedom; fitted starts make them smaller than 1 where nothing is missing. Noise "
+        "that the manifest does not give is estimated from the roughness of the tracks: smoothed tracks err by more."
     )
     return section("By phase and degree of freedom", paragraph(words), _sortable(header, rows, range(2, len(header))))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .charts import decades
 
-_WIDTH, _HEIGHT = 1060, 320
+_WIDTH, _HEIGHT = 1060, 360
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60, 150, 28, 44
 _LOWEST_MM = 0.01
 _LABEL_HEIGHT = 14

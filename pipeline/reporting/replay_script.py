@@ -149,13 +149,13 @@ function frameOf() {  // what both views show: all that was measured, and predic
   if (data.ground) low[2] = Math.min(low[2], data.ground.offset / Math.hypot(...data.ground.normal) - 0.01);
   bounds = { low, high };
 }
-const step = range => [1, 2, 5, 10].map(f => f * 10 ** Math.floor(Math.log10(range)))
-  .find(s => range / s <= 6) || range;
+const step = range => [1, 2, 5, 10].map(f => f * 10 ** Math.floor(Math.log10(range) - 1))
+  .find(s => range / s <= 7) || range;
 function view(canvas, vertical) {
   const e = episode(), U = e.axes[0], V = e.axes[vertical], { low, high } = bounds;
   const width = canvas.clientWidth || 520, left = 42, bottom = 22;
   const scale = (width - left - 8) / (high[0] - low[0] || 1);
-  const tall = Math.min(Math.max((high[vertical] - low[vertical]) * scale, 70), 360);
+  const tall = Math.min(Math.max((high[vertical] - low[vertical]) * scale, 70), 280);
   const s = Math.min(scale, tall / (high[vertical] - low[vertical] || 1)), ratio = window.devicePixelRatio || 1;
   const height = tall + bottom + 8;
   canvas.style.height = height + "px";
@@ -167,12 +167,13 @@ function view(canvas, vertical) {
   const place = p => [x0 + s * (dot(U, p) - mid), y0 - s * (dot(V, p) - middle)];
   g.font = "11px system-ui, sans-serif"; g.fillStyle = soft; g.strokeStyle = "#e6e8ec"; g.lineWidth = 1;
   const grid = step(Math.max(high[0] - low[0], high[vertical] - low[vertical]));
-  const words = v => (Math.abs(v) < 1e-9 ? 0 : v).toFixed(grid < 0.1 ? 2 : 1);
+  const words = v => (Math.abs(v) < 1e-9 ? 0 : v).toFixed(grid < 0.1 ? 2 : 1).replace("-", "\u2212");
   const from = mid - (x0 - left) / s, to = mid + (width - 8 - x0) / s;
   for (let v = Math.ceil(from / grid) * grid; v <= to + 1e-9; v += grid) {
     const x = x0 + s * (v - mid);
     g.beginPath(); g.moveTo(x, 8); g.lineTo(x, 8 + tall); g.stroke();
-    g.textAlign = "center"; g.fillText(words(v), x, height - 8);
+    g.textAlign = "center";
+    if (x < width - 14) g.fillText(words(v), x, height - 8);
   }
   const down = middle - tall / 2 / s, above = middle + tall / 2 / s;
   for (let v = Math.ceil(down / grid) * grid; v <= above + 1e-9; v += grid) {
@@ -387,7 +388,7 @@ const show = k => { frame = k; draw(); };
 function choose(k, time) {
   at = k; frame = time === undefined ? 0 : nearest(episode().t, time);
   picker.value = k; slider.max = episode().t.length - 1;
-  find("bearing").textContent = episode().bearing;
+  find("bearing").textContent = String(episode().bearing).replace("-", "\u2212");
   prepare(); draw();
 }
 const stop = () => { cancelAnimationFrame(timer); timer = null; play.textContent = "Play"; };
@@ -422,7 +423,8 @@ const chart = document.getElementById("wrench");
 if (!chart || !data.wrench) return;
 const part = name => chart.querySelector("[data-part=" + name + "]"), plot = part("plot");
 const options = (select, names) => names.forEach((name, k) => select.append(new Option(name, k)));
-const kinds = ["force x", "force y", "force z", "torque x", "torque y", "torque z"];
+const kinds = ["missing force x", "missing force y", "missing force z", "missing torque x", "missing torque y",
+  "missing torque z", "misfit"];
 const coordinates = data.wrench.coordinates;
 options(part("model"), data.models); options(part("kind"), kinds);
 options(part("coordinate"), coordinates.map(c => c.name + (c.unit ? " [" + c.unit + "]" : "")));
@@ -431,7 +433,7 @@ options(phasePicker, ["all phases", ...data.phases]);
 function scatter() {
   const [m, kind, c, ph] = ["model", "kind", "coordinate", "phase"].map(name => Number(part(name).value));
   const points = data.wrench.models[m].filter(p => p.a[kind] !== null && p.c[c] !== null && (!ph || p.ph === ph - 1));
-  const unit = kind < 3 ? "m/s²" : "rad/s²", name = coordinates[c];
+  const unit = kind < 3 ? "m/s²" : kind < 6 ? "rad/s²" : "× noise", signed = kind < 6, name = coordinates[c];
   chart.dataset.points = points.length;
   if (!points.length) { plot.innerHTML = '<text x="20" y="40">nothing in this phase</text>'; return; }
   const w = 1060, h = 340, l = 62, r = 12, top = 26, b = 40;
@@ -439,11 +441,12 @@ function scatter() {
   const sizes = points.map(p => Math.abs(p.a[kind]) + p.s[kind]).sort((u, v) => u - v);
   const most = sizes[Math.floor(0.95 * (sizes.length - 1))] * 1.1 || 1;  // the rest runs along the rim
   const X = v => l + (w - l - r) * (v - x0) / (x1 - x0 || 1);
-  const Y = v => top + (h - top - b) * (0.5 - Math.max(-1, Math.min(1, v / most)) / 2);
-  let out = '<text class="title" x="' + l + '" y="15">missing ' + kinds[kind] + " [" + unit + "] against "
+  const base = signed ? -most : 0;
+  const Y = v => top + (h - top - b) * (1 - Math.max(0, Math.min(1, (v - base) / (most - base))));
+  let out = '<text class="title" x="' + l + '" y="15">' + kinds[kind] + " [" + unit + "] against "
     + escaped(name.name + (name.unit ? " [" + name.unit + "]" : "")) + "</text>";
-  const sy = step(2 * most), sx = step(x1 - x0 || 1);
-  for (let v = Math.ceil(-most / sy) * sy; v <= most; v += sy)
+  const sy = step(most - base), sx = step(x1 - x0 || 1);
+  for (let v = Math.ceil(base / sy) * sy; v <= most; v += sy)
     out += '<line class="grid" x1="' + l + '" x2="' + (w - r) + '" y1="' + Y(v) + '" y2="' + Y(v) + '"/>'
       + '<text x="' + (l - 6) + '" y="' + (Y(v) + 4) + '" text-anchor="end">' + +v.toPrecision(3) + "</text>";
   for (let v = Math.ceil(x0 / sx) * sx; v <= x1 + 1e-9; v += sx)
@@ -454,7 +457,7 @@ function scatter() {
     out += '<line class="error" style="stroke:' + color + '" x1="' + x + '" x2="' + x + '" y1="' + Y(a - s)
       + '" y2="' + Y(a + s) + '"/><circle data-k="' + k + '" cx="' + x + '" cy="' + Y(a) + '" r="3" style="fill:'
       + color + '"><title>episode ' + escaped(p.e) + ", " + p.t.toFixed(3) + " s, " + data.phases[p.ph] + ": "
-      + a.toPrecision(3) + " ± " + s.toPrecision(2) + " " + unit + "</title></circle>";
+      + a.toPrecision(3) + (signed ? " ± " + s.toPrecision(2) : "") + " " + unit + "</title></circle>";
   });
   const bins = [0, 1, 2, 3].map(() => [0, 0, 0]);
   const order = points.map((_, k) => k).sort((i, j) => xs[i] - xs[j]);

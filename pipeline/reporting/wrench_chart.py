@@ -9,10 +9,12 @@ import numpy as np
 
 from ...schemas import PHASES
 from ..compared import ComparedModel
-from ..wrench_points import WrenchPoint
+from ..wrench_points import LEAST_WINDOWS, WrenchPoint
 from .page import number, paragraph, section, table, text
 
 UNITS = {"time": "s", "x": "m", "y": "m", "height": "m", "heading": "deg", "speed": "m/s", "spin": "rad/s"}
+_MISFIT = 6
+"""Place of the misfit after force and torque."""
 MOST_POINTS = 1500
 """Of one model; of more, every so manyth is drawn."""
 
@@ -39,10 +41,11 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
         for name, label in (("model", "model"), ("kind", "what"), ("coordinate", "against"), ("phase", "in"))
     )
     words = (
-        "The constant force over mass, and torque over inertia, that each piece of the motion would need on top of the "
-        "model (one standard error each way), with the state at its start left free; world frame. A dot leads to its "
-        "moment; the black line joins weighted means of four equally filled bins; what exceeds the scale runs along "
-        "its rim. In contact it is the mean of all that the contact law misses there."
+        "Each dot is a piece of the motion and leads to its moment. Misfit: the residual of its short prediction in "
+        "units of the noise. In flight also the constant force over mass, and torque over inertia, that it would need "
+        "on top of the model (one standard error each way; world frame); in contact the ground answers every force, so "
+        "that none is told. The black line joins weighted means of four equally filled bins; what exceeds the scale "
+        "runs along its rim."
     )
     rows = [
         [text(one.short_name), text(organiser.coordinate), number(100 * organiser.share, 2)]
@@ -51,7 +54,12 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
     ]
     header = ["model", "in flight ordered by", "share of the excess over the noise [%]"]
     silent = [one.short_name for one in models if one.wrenches and not one.organisers]
-    none = f"In flight no coordinate orders what {', '.join(silent)} misses." if silent else ""
+    windows = sum(point.phase == "flight" for point in models[0].wrenches)
+    none = ""
+    if silent and windows < LEAST_WINDOWS:
+        none = f"{windows} windows of flight are too few to tell what orders the missing force."
+    elif silent:
+        none = f"In flight nothing orders what is missing in {', '.join(silent)}: it is noise, or no pattern of these."
     return section(
         "What is missing, and where",
         paragraph(words),
@@ -64,12 +72,13 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
 
 
 def _first(models: Sequence[ComparedModel], names: Sequence[str]) -> list[int]:
-    """Return the component and the coordinate that are shown first: where the first model misses most."""
-    points = models[0].wrenches or next(one.wrenches for one in models if one.wrenches)
-    excess = np.array([np.square(p.acceleration / p.std) for p in points])
-    kind = int(np.nanmedian(excess, 0).argmax())
+    """Return the quantity and the coordinate that are shown first: the force that is most ordered, or the misfit."""
     ordered = [o.coordinate for o in models[0].organisers if o.coordinate in names]
-    return [kind, names.index(ordered[0]) if ordered else 0]
+    excess = np.array([np.square(p.acceleration / p.std) for p in models[0].wrenches if p.phase == "flight"])
+    if not ordered or not np.isfinite(excess).any():
+        return [_MISFIT, 0]
+    typical = [np.nanmedian(column) if np.isfinite(column).any() else 0.0 for column in excess.T]
+    return [int(np.argmax(typical)), names.index(ordered[0])]
 
 
 def _thinned(points: Sequence[WrenchPoint]) -> Sequence[WrenchPoint]:
@@ -82,7 +91,10 @@ def _point(point: WrenchPoint, names: Sequence[str]) -> dict[str, Any]:
         "e": point.episode,
         "t": round(0.5 * (point.span_s[0] + point.span_s[1]), 4),
         "ph": PHASES.index(point.phase),
-        "a": [round(float(v), 4) if k else None for v, k in zip(point.acceleration, known, strict=True)],
-        "s": [round(float(v), 4) if k else None for v, k in zip(point.std, known, strict=True)],
+        "a": [
+            *(round(float(v), 4) if k else None for v, k in zip(point.acceleration, known, strict=True)),
+            round(point.misfit, 3),
+        ],
+        "s": [*(round(float(v), 4) if k else None for v, k in zip(point.std, known, strict=True)), 0],
         "c": [round(float(v), 4) if (v := point.coordinates.get(name)) is not None else None for name in names],
     }
