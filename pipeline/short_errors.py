@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from .diagnosis.segments import Segment, Segments, cut_episodes, fit_states, who
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.trajectory import state_prior
-from .physics.world import World
+from .physics.world import State, World
 
 if TYPE_CHECKING:
     from ..schemas import Measurement
@@ -28,6 +28,13 @@ Array = NDArray[np.float64]
 
 FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
 """Of a residual: position in the world frame, rotation vector in the body frame."""
+BAD_FIT = 1.3
+"""A contact segment with a reduced chi-square above this is fitted from other starts too."""
+STARTS = 8
+START_SPREAD = 3.0
+"""Of these starts, in units of what the noise makes of a state between two frames."""
+MOST_SEARCHED = 64
+"""Segments searched in one batch."""
 DIVERGED = 1e4
 """Residual of a short prediction that diverged, in units of the noise."""
 
@@ -129,7 +136,7 @@ def short_errors(world: World, episodes: Sequence[Episode], cut: Cut) -> ShortFi
     """
     whole, outliers = without_outliers(whole_episodes(world, episodes), cut.flight, cut.noise)
     flight = fit_states(Segments.of("flight", world, whole, cut.flight, cut.noise)) if cut.flight else None
-    contact = fit_states(Segments.of("contact", world, whole, cut.contact, cut.noise)) if cut.contact else None
+    contact = _searched(Segments.of("contact", world, whole, cut.contact, cut.noise)) if cut.contact else None
     names = [name for name, _ in episodes]
     phases = phases_of(names, whole, cut.clear, contact)
     bodies = tuple(world.bodies[k].name for k in whole.free)
@@ -156,6 +163,44 @@ def short_errors(world: World, episodes: Sequence[Episode], cut: Cut) -> ShortFi
         found[one.episode].phase[covered] = places[covered]
         found[one.episode].cause[:] = _causes(found[one.episode])
     return ShortFit(whole, contact, found, outliers)
+
+
+def _searched(contact: Segments) -> Segments:
+    """Return contact segments with their states fitted, those that fit badly from several starts.
+
+    Whether a corner strikes before or after the next one makes minima of their own; what is left there would be taken
+    for the model's fault.
+    """
+    fitted = fit_states(contact)
+    nothing = torch.zeros(0).to(fitted.world.gravity)
+
+    def costs(segments: Segments) -> Tensor:
+        rows = segments.residuals((), nothing, jacobian=False)[0]
+        return torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
+
+    best = costs(fitted)
+    bad = (best > BAD_FIT * fitted.dof).nonzero()[:, 0].tolist()
+    if not bad:
+        return fitted
+    position, rotation = fitted.noise
+    step = float(fitted.observations.times_s.diff(dim=1).median())
+    spread = [std for std in (position, rotation, position / step, rotation / step) for _ in range(3)]
+    spreads = START_SPREAD * torch.tensor(spread).to(nothing).repeat(len(fitted.observations.free))
+    generator = torch.Generator().manual_seed(0)
+    states = [getattr(fitted.observations.state, key).clone() for key in fitted.observations.state.__dataclass_fields__]
+    for first in range(0, len(bad), MOST_SEARCHED):
+        places = bad[first : first + MOST_SEARCHED]
+        many = fitted.select([place for place in places for _ in range(STARTS)])
+        change = spreads * torch.randn(len(many.items), len(spreads), generator=generator, dtype=torch.float64)
+        tried = fit_states(many.moved(change.to(spreads)), search=False)
+        found = costs(tried).unflatten(0, (len(places), STARTS))
+        for k, place in enumerate(places):
+            choice = int(found[k].argmin())
+            if float(found[k, choice]) < float(best[place]):
+                row = k * STARTS + choice
+                for target, key in zip(states, tried.observations.state.__dataclass_fields__, strict=True):
+                    target[place] = getattr(tried.observations.state, key)[row]
+    return replace(fitted, observations=replace(fitted.observations, state=State(*states)))
 
 
 def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: dict[str, ShortErrors]) -> None:

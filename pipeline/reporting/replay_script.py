@@ -391,19 +391,17 @@ function choose(k, time) {
   find("bearing").textContent = String(episode().bearing).replace("-", "\u2212");
   prepare(); draw();
 }
-const stop = () => { cancelAnimationFrame(timer); timer = null; play.textContent = "Play"; };
+const stop = () => { clearInterval(timer); timer = null; play.textContent = "Play"; };
 play.addEventListener("click", () => {
   if (timer) return stop();
   const e = episode(), last = e.t[e.t.length - 1], slow = Number(find("speed").value);
   if (frame >= e.t.length - 1) frame = 0;
   const start = e.t[frame]; began = performance.now(); play.textContent = "Pause";
-  const tick = () => {
+  timer = setInterval(() => {
     const t = start + (performance.now() - began) / 1000 * slow;
     show(nearest(e.t, Math.min(t, last)));
-    if (t >= last) return stop();
-    timer = requestAnimationFrame(tick);
-  };
-  timer = requestAnimationFrame(tick);
+    if (t >= last) stop();
+  }, 30);
 });
 slider.addEventListener("input", () => { stop(); show(Number(slider.value)); });
 picker.addEventListener("change", () => { stop(); choose(Number(picker.value)); });
