@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Kind = Literal["flight", "contact"]
 
-FLIGHT_S = 0.30
+FLIGHT_S = 0.60
 """A flight is cut into equal parts of at most this length."""
 MIN_FLIGHT_S = 0.06
 """A shorter flight between two contacts tells no acceleration: it belongs to the contact."""
@@ -47,6 +47,9 @@ FLIGHT_STEP_S = 0.0025
 """Largest step in flight, where nothing is stiff; the error of a drag of 1 / s is 0.1 %."""
 MAX_ROWS = 4096
 """Rollouts in one batch: more run out of the processor's cache."""
+STILL_SIGMAS = 4.0
+"""Nothing moves where the means of both halves of a segment differ by less than this many of their standard errors."""
+KEPT_RESTS = 2
 START_FRAMES = (2, 4, 7)
 """A contact segment's state is searched from straight lines through so many frames (pitfall P2)."""
 PARAMETER_STEP = 0.04
@@ -130,7 +133,7 @@ class Segments:
         size = STATE_SIZE * len(self.observations.free)
         steps = [_difference(p) for p in parameters]
         parts = []
-        for places in self.chunks(2 * (size + len(parameters)) + 1 if jacobian else 1):
+        for places in self.chunks(2 * size + len(parameters) + 1 if jacobian else 1):
             some = self.observations.select(places)
             problem = TrajectoryResiduals(self.world, parameters, some, *self.noise, True, steps)
             shared = values if values.ndim == 1 else values[places]
@@ -160,9 +163,8 @@ class Segments:
 
 
 def _difference(parameter: Parameter) -> tuple[float, float]:
-    """Return how far down and up a parameter is moved for its derivative; not below 0 where it may not be."""
-    step = PARAMETER_STEP * parameter.prior[1]
-    return (0.0 if parameter.bounds[0] == 0.0 else step, step)
+    """Return how far down and up a parameter is moved for its derivative; up alone, as many may not be below 0."""
+    return 0.0, PARAMETER_STEP * parameter.prior[1]
 
 
 def world_for(kind: Kind, world: World) -> World:
@@ -207,7 +209,36 @@ def cut_episodes(
                     lead = max(1, round(LEAD_S / step))
                     a, b = max(first, a - lead), min(last, b + lead)
                     contact += [Segment(episode, *part) for part in _parts(a, b, step, CONTACT_S, share=True)]
-    return flight, contact, clear
+    return flight, _without_rest(whole, contact, noise), clear
+
+
+def _without_rest(whole: Observations, items: Sequence[Segment], noise: tuple[float, float]) -> list[Segment]:
+    """Return the segments less those in which nothing moves, but for the first ones in a row: they tell no more."""
+    kept, resting = [], {}
+    for item in items:
+        frames = slice(item.first, item.last + 1)
+        still = True
+        for values, mask, sigma in (
+            (whole.position_m[item.episode, frames], whole.seen[item.episode, frames], noise[0]),
+            (_turns(whole, item), whole.turned[item.episode, frames], noise[1]),
+        ):
+            half = len(values) // 2
+            parts = [
+                (values[p] * mask[p, :, None]).sum(0) / mask[p, :, None].sum(0).clamp_min(1.0)
+                for p in (slice(0, half), slice(half, None))
+            ]
+            limit = STILL_SIGMAS * sigma * (2 / half) ** 0.5
+            still &= bool(((parts[1] - parts[0]).abs() < limit).all())
+        resting[item.episode] = resting.get(item.episode, 0) + 1 if still else 0
+        if resting[item.episode] <= KEPT_RESTS:
+            kept.append(item)
+    return kept
+
+
+def _turns(whole: Observations, item: Segment) -> Tensor:
+    """Return the rotation vectors (T, nf, 3) from the first frame of a segment to each."""
+    quat = whole.quat_wxyz[item.episode, item.first : item.last + 1]
+    return quat_log(quat_multiply(quat_conjugate(quat[:1]), quat))
 
 
 def _stretches(times: Tensor) -> list[tuple[int, int]]:
@@ -403,6 +434,12 @@ def _merged(choice: Tensor, first: Segments, second: Segments) -> Segments:
     mask = choice[:, None, None]
     fields = [torch.where(mask, getattr(a, key), getattr(b, key)) for key in a.__dataclass_fields__]
     return replace(second, observations=replace(second.observations, state=State(*fields)))
+
+
+def better_of(a: Segments, b: Segments, parameters: Sequence[Parameter], values: Tensor) -> Segments:
+    """Return of each segment the one of two states that fits better."""
+    costs = [costs_of(part, parameters, values) for part in (a, b)]
+    return _better(a, costs[0], b, costs[1])[0]
 
 
 def _placed(segments: Segments, places: Sequence[int], some: Segments) -> Segments:

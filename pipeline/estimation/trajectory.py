@@ -78,10 +78,14 @@ class TrajectoryResiduals:
         states = (size - len(self.parameters)) // STATE_SIZE
         own = [(step, step) for step in STATE_STEPS for _ in range(3)] * states
         down, up = torch.tensor([*self.parameter_steps, *own]).to(inputs).T
-        moves = torch.cat([torch.zeros(1, size).to(inputs), torch.diag(up), -torch.diag(down)])
+        below, above = (down > 0).nonzero()[:, 0], (up > 0).nonzero()[:, 0]
+        moves = torch.cat([torch.zeros(1, size).to(inputs), torch.diag(up)[above], -torch.diag(down)[below]])
         with torch.no_grad():
             rows = self._residuals((inputs + moves[:, None]).flatten(0, 1), len(moves)).unflatten(0, (-1, batch))
-        slopes = (rows[1 : size + 1] - rows[size + 1 :]) / (down + up)[:, None, None]
+        ends = rows[:1].expand(size, -1, -1)
+        high = ends.index_copy(0, above, rows[1 : 1 + len(above)])
+        low = ends.index_copy(0, below, rows[1 + len(above) :])
+        slopes = (high - low) / (down + up)[:, None, None]
         return rows[0], torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 
     def rollout(self, shared: Tensor, states: Tensor) -> Rollout:
