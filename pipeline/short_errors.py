@@ -14,7 +14,7 @@ from torch import Tensor
 from ..schemas import PHASES, Phase
 from .diagnosis.noise import flight_noise, without_outliers
 from .diagnosis.phases import phases_of
-from .diagnosis.segments import Segment, Segments, cut_episodes, fit_states, whole_episodes
+from .diagnosis.segments import Segment, Segments, costs_of, cut_episodes, fit_states, whole_episodes
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.trajectory import state_prior
@@ -30,9 +30,10 @@ FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
 """Of a residual: position in the world frame, rotation vector in the body frame."""
 BAD_FIT = 1.3
 """A contact segment with a reduced chi-square above this is fitted from other starts too."""
-STARTS = 8
+DRAWS, STARTS = 32, 2
+"""States that are drawn about the fitted one, and so many of them, the best, that are fitted."""
 START_SPREAD = 3.0
-"""Of these starts, in units of what the noise makes of a state between two frames."""
+"""Of the draws, in units of what the noise makes of a state between two frames."""
 MOST_SEARCHED = 64
 """Segments searched in one batch."""
 DIVERGED = 1e4
@@ -160,7 +161,7 @@ def short_errors(world: World, episodes: Sequence[Episode], cut: Cut) -> ShortFi
     for one in phases:
         places = np.array([PHASES.index(name) for name in one.phase.tolist()], np.int64)
         covered = np.isfinite(found[one.episode].span_s[:, 0])
-        found[one.episode].phase[covered] = places[covered]
+        found[one.episode].phase[:] = _placed(places, covered, one.clear)
         found[one.episode].cause[:] = _causes(found[one.episode])
     return ShortFit(whole, contact, found, outliers)
 
@@ -173,34 +174,30 @@ def _searched(contact: Segments) -> Segments:
     """
     fitted = fit_states(contact)
     nothing = torch.zeros(0).to(fitted.world.gravity)
-
-    def costs(segments: Segments) -> Tensor:
-        rows = segments.residuals((), nothing, jacobian=False)[0]
-        return torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
-
-    best = costs(fitted)
+    best = costs_of(fitted, (), nothing)
     bad = (best > BAD_FIT * fitted.dof).nonzero()[:, 0].tolist()
-    if not bad:
-        return fitted
     position, rotation = fitted.noise
     step = float(fitted.observations.times_s.diff(dim=1).median())
     spread = [std for std in (position, rotation, position / step, rotation / step) for _ in range(3)]
     spreads = START_SPREAD * torch.tensor(spread).to(nothing).repeat(len(fitted.observations.free))
     generator = torch.Generator().manual_seed(0)
-    states = [getattr(fitted.observations.state, key).clone() for key in fitted.observations.state.__dataclass_fields__]
+    fields = fitted.observations.state.__dataclass_fields__
+    states = {key: getattr(fitted.observations.state, key).clone() for key in fields}
     for first in range(0, len(bad), MOST_SEARCHED):
         places = bad[first : first + MOST_SEARCHED]
-        many = fitted.select([place for place in places for _ in range(STARTS)])
-        change = spreads * torch.randn(len(many.items), len(spreads), generator=generator, dtype=torch.float64)
-        tried = fit_states(many.moved(change.to(spreads)), search=False)
-        found = costs(tried).unflatten(0, (len(places), STARTS))
+        drawn = fitted.select([place for place in places for _ in range(DRAWS)])
+        change = torch.randn(len(drawn.items), len(spreads), generator=generator, dtype=torch.float64)
+        drawn = drawn.moved(spreads * change.to(spreads))
+        order = costs_of(drawn, (), nothing).unflatten(0, (len(places), DRAWS)).argsort(1)[:, :STARTS]
+        rows = (torch.arange(len(places))[:, None] * DRAWS + order).flatten().tolist()
+        tried = fit_states(drawn.select(rows), search=False)
+        found = costs_of(tried, (), nothing).unflatten(0, (len(places), STARTS))
         for k, place in enumerate(places):
             choice = int(found[k].argmin())
             if float(found[k, choice]) < float(best[place]):
-                row = k * STARTS + choice
-                for target, key in zip(states, tried.observations.state.__dataclass_fields__, strict=True):
-                    target[place] = getattr(tried.observations.state, key)[row]
-    return replace(fitted, observations=replace(fitted.observations, state=State(*states)))
+                for key, target in states.items():
+                    target[place] = getattr(tried.observations.state, key)[k * STARTS + choice]
+    return replace(fitted, observations=replace(fitted.observations, state=State(**states)))
 
 
 def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: dict[str, ShortErrors]) -> None:
@@ -230,11 +227,24 @@ def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: 
         one.span_s[at] = times[0], times[-1]
 
 
+def _placed(places: NDArray[np.int64], covered: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the phase (T,) of each frame, -1 where it is unknown.
+
+    Of a long rest only the first segments are fitted: what stays in contact after a rest goes on resting.
+    """
+    found = np.where(covered, places, -1)
+    rest = PHASES.index("rest")
+    for k in range(1, len(found)):
+        if not covered[k] and not clear[k] and found[k - 1] == rest:
+            found[k] = rest
+    return found
+
+
 def _causes(one: ShortErrors) -> NDArray[np.int64]:
     """Return the phase (T,) that the residuals of each frame's segment are due to."""
     causes = one.phase.copy()
     flight, impact = PHASES.index("flight"), PHASES.index("impact")
-    for span in np.unique(one.span_s[one.phase >= 0], axis=0):
+    for span in np.unique(one.span_s[np.isfinite(one.span_s).all(1)], axis=0):
         rows = (one.span_s == span).all(1)
         touching = one.phase[rows & (one.phase != flight)]
         if len(touching):

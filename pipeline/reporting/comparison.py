@@ -8,6 +8,7 @@ from typing import Any
 
 from ...schemas import PHASES, CompareResult, ErrorSummary, ModelComparison, PairedDifference
 from ..compared import ComparedModel
+from ..diagnosis.segments import CONTACT_S, FLIGHT_S
 from ..paired import LEAST_EPISODES
 from ..short_errors import FREEDOMS
 from .ladder import Rung, ladder_svg
@@ -223,7 +224,8 @@ def _player(replay: Replay, filmed: bool) -> str:
         left_out = f"To keep the page small the player lacks the episodes {', '.join(replay.left_out)}."
     words = (
         "Black: measured. In colour: predicted, open loop from the warm-up (shaded). The lower curve is of short "
-        "predictions: pieces of at most 0.1 s in contact and 0.3 s in flight, each from the start that fits it best; "
+        f"predictions: pieces of at most {CONTACT_S:g} s in contact and {FLIGHT_S:g} s in flight, each from the start "
+        "that fits it best; "
         "the dashed line is the noise. Click or drag on a curve to move in time."
     )
     if filmed:
