@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..datasets.atomic import new_file, refuse_existing
+from ..datasets.atomic import new_file, refuse_existing, sha256
 from ..datasets.capture import Capture
 from ..datasets.models import Model, read_model
 from ..datasets.progress import note, progress
@@ -124,7 +124,7 @@ def compare_models(
         best=best.model,
         pairs=tuple(_pairs(compared)),
         measurement_std={"position_m": cut.noise[0], "rotation_rad": cut.noise[1]},
-        warnings=tuple(_warnings(names, shared, outliers)),
+        warnings=(*_fitted_to_them(compared, capture, shared), *_warnings(names, shared, outliers)),
     )
     verdict = compared_verdict(result, {one.name: one.short_name for one in compared})
     return Comparison(result.model_copy(update={"verdict": verdict}), tuple(compared))
@@ -170,6 +170,19 @@ def _pairs(models: Sequence[ComparedModel]) -> list[PairedDifference]:
     return [pair for pair in found if pair is not None]
 
 
+def _fitted_to_them(models: Sequence[ComparedModel], capture: Capture, episodes: Sequence[str]) -> list[str]:
+    """Return a message on each model that was fitted to episodes on which it is now judged, told by their hashes."""
+    found = []
+    for one in models:
+        seen = one.model.file.provenance.input_sha256
+        tracks = {name: capture.root / "tracks" / f"{name}.csv" for name in episodes}
+        own = [name for name, path in tracks.items() if seen.get(f"tracks/{name}.csv") == sha256(path)]
+        if own:
+            share = f"{len(own)} of the {len(episodes)} episodes"
+            found.append(f"{one.name} was fitted to {share}: its errors there are no predictions.")
+    return found
+
+
 def _warnings(names: Sequence[str], shared: Sequence[str], outliers: int) -> list[str]:
     found = []
     left_out = [name for name in names if name not in shared]
@@ -178,7 +191,7 @@ def _warnings(names: Sequence[str], shared: Sequence[str], outliers: int) -> lis
         found.append(f"not all models can predict {listed}: short predictions are compared on the other episodes.")
     if outliers:
         found.append(
-            f"{outliers} measured pose{'' if outliers == 1 else 's'} of flight lie far off their neighbours: short "
-            "predictions leave them out."
+            "short predictions leave out positions and orientations in flight that lie far off their neighbours: "
+            f"{outliers} of them."
         )
     return found

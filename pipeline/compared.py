@@ -131,7 +131,7 @@ def _worst(short: Iterable[ShortErrors]) -> list[WorstMoment]:
                     episode=one.episode,
                     t0_s=start,
                     t1_s=end,
-                    phase=one.phase_name(one.cause[at]),
+                    phase=one.phase_name(int(one.cause[at])),
                     quantity=f"{one.bodies[body]} {FREEDOMS[freedom]}",
                     z=float(size[at, body, freedom]),
                 )

@@ -68,7 +68,7 @@ class ShortErrors:
     @staticmethod
     def phase_name(place: int) -> Phase:
         """Return the name of a phase."""
-        return PHASES[int(place)]
+        return PHASES[place]
 
     def largest(self) -> Array:
         """Return the largest residual of any body and degree of freedom (T,), in units of the noise; NaN without."""

@@ -103,7 +103,7 @@ def _points(
             WrenchPoint(
                 one.episode,
                 (float(times[segment.first]), float(times[segment.last])),
-                one.phase_name(one.cause[middle]),
+                one.phase_name(int(one.cause[middle])),
                 float(np.sqrt(np.nansum(np.square(one.sigmas[rows])) / left)),
                 wrench[k],
                 std[k],

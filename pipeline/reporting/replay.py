@@ -184,8 +184,9 @@ def _view(one: EpisodePrediction, up: Array) -> tuple[Array, Array, float]:
     main = vectors[:, -1]
     travel = flat[-1] - flat[0]
     main = main if main @ travel >= 0 else -main
-    along = main[0] * x + main[1] * y
-    return along, np.cross(up, along), float(np.degrees(np.arctan2(main[1], main[0])))
+    along = (main[0] * x + main[1] * y).astype(np.float64)
+    across = np.cross(up, along).astype(np.float64)
+    return along, across, float(np.degrees(np.arctan2(main[1], main[0])))
 
 
 def _mean(values: Array, decimals: int) -> list[float | None]:

@@ -149,7 +149,7 @@ function frameOf() {  // what both views show: all that was measured, and predic
   if (data.ground) low[2] = Math.min(low[2], data.ground.offset / Math.hypot(...data.ground.normal) - 0.01);
   bounds = { low, high };
 }
-const step = range => [1, 2, 5, 10].map(f => f * 10 ** Math.floor(Math.log10(range) - 1))
+const step = range => [1, 2, 5, 10, 20].map(f => f * 10 ** Math.floor(Math.log10(range) - 1))
   .find(s => range / s <= 7) || range;
 function view(canvas, vertical) {
   const e = episode(), U = e.axes[0], V = e.axes[vertical], { low, high } = bounds;
@@ -428,6 +428,8 @@ options(part("model"), data.models); options(part("kind"), kinds);
 options(part("coordinate"), coordinates.map(c => c.name + (c.unit ? " [" + c.unit + "]" : "")));
 const phasePicker = part("phase");
 options(phasePicker, ["all phases", ...data.phases]);
+part("marks").innerHTML = data.phases.filter(name => data.wrench.models.some(m => m.some(p => data.phases[p.ph] === name)))
+  .map(name => '<span><i style="background:' + marks[name] + '"></i>' + name + "</span>").join("");
 function scatter() {
   const [m, kind, c, ph] = ["model", "kind", "coordinate", "phase"].map(name => Number(part(name).value));
   const points = data.wrench.models[m].filter(p => p.a[kind] !== null && p.c[c] !== null && (!ph || p.ph === ph - 1));

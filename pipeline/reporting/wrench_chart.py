@@ -65,6 +65,7 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
         paragraph(words),
         f'<div class="wrench" id="wrench"><div class="controls">{picks}</div>'
         '<svg class="chart" data-part="plot" viewBox="0 0 1060 340" role="img" aria-label="residual wrench"></svg>'
+        '<div class="phases" data-part="marks"></div>'
         "</div>",
         table(header, rows, numeric=(2,)) if rows else "",
         paragraph(none, "soft") if none else "",
