@@ -49,7 +49,7 @@ def without_outliers(
     seen, turned = whole.seen.clone(), whole.turned.clone()
     kinked = torch.zeros_like(seen[..., 0], dtype=torch.bool)
     wrong: set[tuple[int, int, int, int]] = set()
-    for kind, mask in ((0, seen), (1, turned)):
+    for kind in (0, 1):
         for segment, column, frames, away in _windows(whole, flight, kind, step=1):
             size = np.abs(away).max(1) / noise[kind]
             if size.max() <= OUTLIER_SIGMAS:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from ..estimation.noise import estimate_noise
@@ -119,8 +119,9 @@ def _agreed(
             warnings.append(
                 f"the {name} noise is given as {said:.2g} {unit}; in flight it is {seen:.2g} {unit}, which is used."
             )
-            said = None
-        chosen.append(said or seen or otherwise)
+            chosen.append(seen)
+        else:
+            chosen.append(said or seen or otherwise)
     return chosen[0], chosen[1]
 
 
@@ -129,4 +130,4 @@ def _cut(item: Segment, whole: Observations, longest_s: float) -> list[Segment]:
     times = whole.times_s[item.episode, item.first : item.last + 1]
     number = max(1, min(round(float(times[-1] - times[0]) / longest_s + 0.49), count // 6))
     edges = [item.first + round(k * count / number) for k in range(number + 1)]
-    return [replace(item, first=a, last=b - 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [replace(item, first=a, last=b - 1) for a, b in itertools.pairwise(edges)]
