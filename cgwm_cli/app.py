@@ -8,6 +8,7 @@ import typer
 
 from .calibrate import calibrate
 from .demo import demo
+from .diagnose import diagnose
 from .doctor import doctor
 from .effects import list_effects, new_effect, show_effect
 from .eval import evaluate
@@ -22,6 +23,7 @@ VERBS = (
     ("fit", fit, "A capture to a world model."),
     ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
     ("eval", evaluate, "A model against measurements."),
+    ("diagnose", diagnose, "Which effect a model lacks."),
     ("import", import_capture, "Recordings in another format to a capture."),
     ("validate", validate, "Check a capture, a model or a dataset."),
     ("doctor", doctor, "What this machine has, and what would be used."),

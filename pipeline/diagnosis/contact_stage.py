@@ -1,4 +1,4 @@
-"""What contact says: which of several equals in flight it leaves, and whether an effect that acts in contact is missing.
+"""What contact says: which of several equals in flight it leaves, and whether an effect of contact is missing.
 
 No contact law is exact, so that a textbook p-value finds an effect in most data that have none. Variances are scaled by
 the misfit that is there anyway, segments that no candidate helps count less, the effect has to help episodes that it
@@ -32,7 +32,7 @@ SEPARATE_CHI2 = 12.0
 SEPARATE_T = 1.5
 """... in most episodes: the mean of their differences, in its standard errors."""
 BLIND = 1.0
-"""Flight is blind to an effect whose standard error there is above this many of its scales: then contact may name it."""
+"""Flight is blind to an effect whose standard error there is above this many scales: then contact may name it."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from .refit import Refit, refit
 from .score import Picture, ScoreTest, canonical_correlation, gain_by_episode, picture, score_test
 from .segments import Segments
 
-ALPHA = 0.01
+ALPHA = 0.002
 """Level of all flight tests of a diagnosis together (Bonferroni over the candidates and their grids)."""
 SHORTLIST = 5
 """So many candidates are refitted."""

@@ -49,7 +49,8 @@ class Findings:
 
     before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
     candidates, the best first; contact: all contact evidence; world: with the selected effects; flight: the segments
-    with states fitted by it.
+    with states fitted by it; base: the world without
+    them.
     """
 
     verdict: VerdictName
@@ -62,6 +63,14 @@ class Findings:
     world: World
     flight: Segments | None
     contact_chi2: float | None
+    base: World
+
+    @property
+    def judged_in_contact(self) -> set[str]:
+        """Names of the effects whose evidence is from contact."""
+        return {one.evidence.name for one in self.contact} | {
+            c.evidence.name for c in self.chosen if c.where != "flight"
+        }
 
 
 def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
@@ -80,7 +89,7 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
         verdict = "missing_effect"
     ranking = _ranking(chosen, slots, contact)
     return Findings(
-        verdict, tuple(chosen), remaining, before, after, tuple(ranking), tuple(contact), final, flight, chi2
+        verdict, tuple(chosen), remaining, before, after, tuple(ranking), tuple(contact), final, flight, chi2, world
     )
 
 
