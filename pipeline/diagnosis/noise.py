@@ -36,32 +36,37 @@ def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float 
 
 def without_outliers(
     whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]
-) -> tuple[Observations, int]:
-    """Return the episodes with frames of flight marked as not seen that no motion explains, and how many.
+) -> tuple[Observations, int, Tensor]:
+    """Return the episodes without wrong measurements in flight, how many there were, and where flight is none.
 
-    The worst of a window goes first, then the window is looked at anew, since it bends the cubic of its neighbours.
+    A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen. Where the
+    others of a window do not lie on a cubic either, something touched: a bounce on a ground that is not where it was
+    said to be, or a hand.
+
+    Returns:
+        The episodes; the number of wrong measurements; frames (E, T) of flight in which something touched.
     """
-    seen, turned, count = whole.seen.clone(), whole.turned.clone(), 0
-    changed = True
-    while changed:
-        changed = False
-        current = replace(whole, seen=seen, turned=turned)
-        for mask, kind in ((seen, 0), (turned, 1)):
-            worst: dict[tuple[int, int, int], float] = {}
-            for segment, column, frames, away in _windows(current, flight, kind):
-                size = np.abs(away).max(1) / noise[kind]
-                k = int(size.argmax())
-                if size[k] > OUTLIER_SIGMAS:
-                    key = (segment.episode, int(frames[k]), column)
-                    worst[key] = max(worst.get(key, 0.0), float(size[k]))
-            kept: list[tuple[int, int, int]] = []
-            for key in sorted(worst, key=lambda place: -worst[place]):
-                # neighbours of an outlier look like ones themselves until it is gone
-                if all(key[0] != other[0] or abs(key[1] - other[1]) >= WINDOW for other in kept):
-                    kept.append(key)
-                    mask[key] = 0.0
-                    count, changed = count + 1, True
-    return replace(whole, seen=seen, turned=turned), count
+    seen, turned = whole.seen.clone(), whole.turned.clone()
+    kinked = torch.zeros_like(seen[..., 0], dtype=torch.bool)
+    wrong: set[tuple[int, int, int, int]] = set()
+    for kind in (0, 1):
+        for segment, column, frames, away in _windows(whole, flight, kind, step=1):
+            size = np.abs(away).max(1) / noise[kind]
+            if size.max() <= OUTLIER_SIGMAS:
+                continue
+            worst = int(size.argmax())
+            rest = torch.as_tensor(np.delete(frames, worst))
+            left = _cubic(whole, segment.episode, column, rest, kind)
+            if np.abs(left).max() / noise[kind] <= OUTLIER_SIGMAS:
+                wrong.add((kind, segment.episode, int(frames[worst]), column))
+            else:
+                kinked[segment.episode, torch.as_tensor(frames)] = True
+    count = 0
+    for kind, episode, frame, column in wrong:
+        if not bool(kinked[episode, frame]):
+            (seen, turned)[kind][episode, frame, column] = 0.0
+            count += 1
+    return replace(whole, seen=seen, turned=turned), count, kinked
 
 
 def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarray, np.ndarray]:

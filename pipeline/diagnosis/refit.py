@@ -61,11 +61,12 @@ def refit(
         world: The model's world, with the effects that are fitted.
         parameters: What is fitted beside the states; priors are centred on where they start.
         start: Where (P,), in fitted coordinates; None for the world's own values.
+        iterations: Most steps.
     """
     centre = base_values(world, parameters)
     values = centre if start is None else start
     prior = torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(centre)
-    bounds = torch.tensor([p.limits for p in parameters]).to(centre)
+    bounds = torch.tensor([p.limits for p in parameters]).reshape(-1, 2).to(centre)
     parts = [replace(part, world=world_for(part.kind, world)) for part in parts]
     pictures = [linearised(part, parameters, values) for part in parts]
     cost, damping = _cost(parts, pictures, values, centre, prior), 1e-3

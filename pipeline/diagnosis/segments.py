@@ -181,14 +181,22 @@ def whole_episodes(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
 
 
 def cut_episodes(
-    world: World, whole: Observations, noise: tuple[float, float]
+    world: World, whole: Observations, noise: tuple[float, float], touched: Tensor | None = None
 ) -> tuple[list[Segment], list[Segment], Tensor]:
     """Cut whole episodes into flight and contact segments.
+
+    Args:
+        world: The world, for shape and ground.
+        whole: The episodes (E).
+        noise: Of the tracks (position [m], rotation [rad]).
+        touched: Frames (E, T) that are known not to be flight.
 
     Returns:
         The flight segments, the contact segments, and which frames (E, T) are surely in flight.
     """
     clear = clear_frames(world, whole, noise)
+    if touched is not None:
+        clear &= ~touched
     flight: list[Segment] = []
     contact: list[Segment] = []
     for episode, times in enumerate(whole.times_s):
