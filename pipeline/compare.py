@@ -13,6 +13,7 @@ from ..datasets.models import Model, read_model
 from ..datasets.progress import note, progress
 from ..schemas import CompareResult, InputDataError, PairedDifference, UsageError
 from .compared import ComparedModel
+from .diagnosis.prepared import prepare
 from .eval import check_bodies, evaluate_model
 from .paired import paired_difference
 from .physics.world import World
@@ -21,7 +22,7 @@ from .reporting.compared_verdict import compared_verdict
 from .reporting.comparison import comparison_html
 from .reporting.footage import footage_of
 from .sg_gs import resolve_device
-from .short_errors import Cut, short_errors
+from .short_errors import short_errors
 from .wrench_points import wrench_points
 
 REPORT_HTML = "compare.html"
@@ -101,16 +102,17 @@ def compare_models(
     if not shared:
         raise InputDataError("there is no episode that all models can predict.", todo="look at 'cgwm eval' of each.")
     episodes: list[Episode] = [(name, capture.tracks(name)) for name in shared]
-    cut = Cut.of(World.from_model(models[0][1]), episodes, capture.manifest.measurement)
-    compared, outliers = [], 0
+    first, given = World.from_model(models[0][1]), capture.manifest.measurement
+    prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
+    bodies = [first.bodies[k].name for k in first.free]
+    compared = []
     with progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
         for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
             world = World.from_model(model)
-            fit = short_errors(world, episodes, cut)
-            points, organisers = wrench_points(world, fit, cut, shared)
-            outliers = max(outliers, fit.outliers)
+            fit = short_errors(world, episodes, prepared, bodies)
+            points, organisers = wrench_points(world, fit, prepared)
             compared.append(
-                ComparedModel(name, short_name, model, evaluation, cut.noise, fit.errors, points, organisers)
+                ComparedModel(name, short_name, model, evaluation, prepared.noise, fit.errors, points, organisers)
             )
             bar.update(1)
     figures = tuple(one.figures() for one in compared)
@@ -123,8 +125,12 @@ def compare_models(
         models=figures,
         best=best.model,
         pairs=tuple(_pairs(compared)),
-        measurement_std={"position_m": cut.noise[0], "rotation_rad": cut.noise[1]},
-        warnings=(*_fitted_to_them(compared, capture, shared), *_warnings(names, shared, outliers)),
+        measurement_std={"position_m": prepared.noise[0], "rotation_rad": prepared.noise[1]},
+        warnings=(
+            *_fitted_to_them(compared, capture, shared),
+            *_left_out(names, shared),
+            *prepared.warnings,
+        ),
     )
     verdict = compared_verdict(result, {one.name: one.short_name for one in compared})
     return Comparison(result.model_copy(update={"verdict": verdict}), tuple(compared))
@@ -183,15 +189,9 @@ def _fitted_to_them(models: Sequence[ComparedModel], capture: Capture, episodes:
     return found
 
 
-def _warnings(names: Sequence[str], shared: Sequence[str], outliers: int) -> list[str]:
-    found = []
+def _left_out(names: Sequence[str], shared: Sequence[str]) -> list[str]:
     left_out = [name for name in names if name not in shared]
-    if left_out:
-        listed = ", ".join(f"'{name}'" for name in left_out)
-        found.append(f"not all models can predict {listed}: short predictions are compared on the other episodes.")
-    if outliers:
-        found.append(
-            "short predictions leave out positions and orientations in flight that lie far off their neighbours: "
-            f"{outliers} of them."
-        )
-    return found
+    if not left_out:
+        return []
+    listed = ", ".join(f"'{name}'" for name in left_out)
+    return [f"not all models can predict {listed}: short predictions are compared on the other episodes."]

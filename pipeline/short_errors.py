@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..schemas import PHASES, Phase
-from .diagnosis.noise import flight_noise, without_outliers
 from .diagnosis.phases import phases_of
-from .diagnosis.segments import Segment, Segments, costs_of, cut_episodes, fit_states, whole_episodes
-from .estimation.noise import estimate_noise
+from .diagnosis.prepared import Prepared
+from .diagnosis.segments import Segments, costs_of, fit_states, whole_episodes
 from .estimation.observations import Observations
 from .estimation.trajectory import state_prior
 from .physics.world import State, World
 
 if TYPE_CHECKING:
-    from ..schemas import Measurement
     from .prediction import Episode
 
 Array = NDArray[np.float64]
@@ -77,77 +75,46 @@ class ShortErrors:
         return np.where(known.any(1), np.where(known, size, 0.0).max(1), np.nan)
 
 
-@dataclass(frozen=True)
-class Cut:
-    """How episodes are cut, the same for all models that are compared.
-
-    flight, contact: the segments; clear (E, T): frames that are surely in flight; noise: standard deviations of the
-    tracks (position [m], rotation [rad]).
-    """
-
-    flight: tuple[Segment, ...]
-    contact: tuple[Segment, ...]
-    clear: Tensor
-    noise: tuple[float, float]
-
-    @staticmethod
-    def of(world: World, episodes: Sequence[Episode], given: Measurement) -> Cut:
-        """Cut episodes by the shape and the ground of a world.
-
-        Args:
-            world: The first model's.
-            episodes: Names, and tracks of all that moves.
-            given: The manifest's noise; what it lacks is measured on flight, or where too little is flight on windows
-                of five frames of everything.
-        """
-        whole = whole_episodes(world, episodes)
-        free = [world.bodies[k].name for k in world.free]
-        rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
-        known = (given.position_std_m or rough[0], given.rotation_std_rad or rough[1])
-        flight, contact, clear = cut_episodes(world, whole, known)
-        own = flight_noise(whole, flight)
-        noise = (
-            given.position_std_m or own[0] or rough[0],
-            given.rotation_std_rad or own[1] or rough[1],
-        )
-        return Cut(tuple(flight), tuple(contact), clear, noise)
-
-
 @dataclass(frozen=True, eq=False)
 class ShortFit:
     """Short predictions of one model.
 
-    whole: the episodes, without outliers; contact: its fitted segments, None where there are none; errors by episode;
-    outliers: frames that were left out.
+    whole: the episodes, without outliers; contact: its fitted segments, None where there are none; errors by episode.
     """
 
     whole: Observations
     contact: Segments | None
     errors: dict[str, ShortErrors]
-    outliers: int
 
 
-def short_errors(world: World, episodes: Sequence[Episode], cut: Cut) -> ShortFit:
+def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, bodies: Sequence[str]) -> ShortFit:
     """Fit the states of all segments to their frames by a model, and return what is left.
 
     Args:
         world: The model's.
-        episodes: Those that were cut.
-        cut: The segments.
+        episodes: Names, and tracks of all that moves.
+        prepared: The same episodes as they were cut, the same way for all models that are compared.
+        bodies: The free bodies in the order that `prepared` has them in.
     """
-    whole, outliers = without_outliers(whole_episodes(world, episodes), cut.flight, cut.noise)
-    flight = fit_states(Segments.of("flight", world, whole, cut.flight, cut.noise)) if cut.flight else None
-    contact = _searched(Segments.of("contact", world, whole, cut.contact, cut.noise)) if cut.contact else None
+    whole = whole_episodes(world, episodes)
+    columns = [list(bodies).index(world.bodies[k].name) for k in whole.free]
+    whole = replace(whole, seen=prepared.whole.seen[..., columns], turned=prepared.whole.turned[..., columns])
+    noise, contact = prepared.noise, None
+    flight = None
+    if prepared.flight is not None:
+        flight = fit_states(Segments.of("flight", world, whole, prepared.flight.items, noise))
+    if prepared.contact_items:
+        contact = _searched(Segments.of("contact", world, whole, prepared.contact_items, noise))
     names = [name for name, _ in episodes]
-    phases = phases_of(names, whole, cut.clear, contact)
-    bodies = tuple(world.bodies[k].name for k in whole.free)
+    phases = phases_of(names, whole, prepared.clear, contact)
+    own = tuple(world.bodies[k].name for k in whole.free)
     found = {
         one.episode: ShortErrors(
             one.episode,
-            bodies,
+            own,
             one.time_s,
-            np.full((len(one.time_s), len(bodies), 6), np.nan),
-            np.zeros((len(one.time_s), len(bodies), 6)),
+            np.full((len(one.time_s), len(own), 6), np.nan),
+            np.zeros((len(one.time_s), len(own), 6)),
             np.full(len(one.time_s), -1),
             np.full(len(one.time_s), -1),
             np.full((len(one.time_s), 2), np.nan),
@@ -163,7 +130,7 @@ def short_errors(world: World, episodes: Sequence[Episode], cut: Cut) -> ShortFi
         covered = np.isfinite(found[one.episode].span_s[:, 0])
         found[one.episode].phase[:] = _placed(places, covered, one.clear)
         found[one.episode].cause[:] = _causes(found[one.episode])
-    return ShortFit(whole, contact, found, outliers)
+    return ShortFit(whole, contact, found)
 
 
 def _searched(contact: Segments) -> Segments:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas import Organiser, Phase
+from .diagnosis.prepared import Prepared
 from .diagnosis.segments import Segment
 from .diagnosis.wrench import coordinates_of, organisers, wrench_windows
 from .physics.world import World
-from .short_errors import Cut, ShortErrors, ShortFit
+from .short_errors import ShortErrors, ShortFit
 
 Array = NDArray[np.float64]
 
@@ -49,9 +50,7 @@ class WrenchPoint:
     coordinates: Mapping[str, float]
 
 
-def wrench_points(
-    world: World, fit: ShortFit, cut: Cut, episodes: Sequence[str]
-) -> tuple[list[WrenchPoint], list[Organiser]]:
+def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list[WrenchPoint], list[Organiser]]:
     """Return the pieces of the motion as points, and what orders the wrench of flight; nothing for several free bodies.
 
     Flights are looked at in half-overlapping windows, contacts in the segments that were fitted.
@@ -59,13 +58,14 @@ def wrench_points(
     Args:
         world: The model's.
         fit: Its short predictions.
-        cut: How the episodes were cut.
-        episodes: Their names.
+        prepared: How the episodes were cut.
     """
     if len(world.free) != 1:
         return [], []
     points: list[WrenchPoint] = []
-    flight = wrench_windows(world, fit.whole, cut.flight, cut.noise)
+    episodes = prepared.names
+    flown = () if prepared.flight is None else prepared.flight.items
+    flight = wrench_windows(world, fit.whole, flown, prepared.noise)
     if flight is not None:
         std = np.sqrt(np.diagonal(flight.covariance, axis1=1, axis2=2))
         std = np.where(std < KNOWN_STD, std, np.nan)

@@ -14,6 +14,7 @@ from cgwm.datasets.capture import Capture
 from cgwm.datasets.models import Model, write_model
 from cgwm.datasets.tracks import Track, write_tracks
 from cgwm.pipeline.compare import Comparison, compare, compare_models
+from cgwm.pipeline.diagnosis.prepared import prepare
 from cgwm.pipeline.eval import evaluate
 from cgwm.pipeline.paired import LEAST_EPISODES, paired_difference
 from cgwm.pipeline.physics import State, World, simulate
@@ -157,41 +158,49 @@ def test_the_interval_covers_the_median_difference() -> None:
 # Other captures and models
 
 
-def test_centroid_tracks(tmp_path: Path) -> None:
-    root = write_capture(tmp_path / "capture", episodes=2, turned=False)
-    found = compare_models([("a", invisible(truth()))], Capture.open(root), device="cpu")
-    (model,) = found.result.models
-    assert model.rotation_error_deg is None
-    assert model.reduced_chi2 is not None and 0.6 < model.reduced_chi2 < 1.5
-    for figures in model.by_phase.values():
-        assert figures is None or (figures.rotation_rms_deg is None and set(figures.sigmas) == {"x", "y", "z"})
-    assert "2 episodes are few to judge a model by" in found.result.verdict
-
-
-def test_an_effect_is_rolled_out_and_what_it_would_explain_is_ordered(tmp_path: Path) -> None:
-    """Wind of 0.4 m/s2 in long flights: with the effect within the noise, without it the wrench says so."""
-    root = write_capture(tmp_path / "capture", episodes=EPISODES)
-    wind = EffectModel(name="constant_force", parameters={"f_x": 0.4, "f_y": 0.0, "f_z": 0.0})
-    base = invisible(truth())
-    windy = replace(base, file=base.file.model_copy(update={"effects": (wind,)}))
+def flights(root: Path, model: Model, turned: bool = True) -> Path:
+    """Replace the throws of a capture by long flights of a model, all in another direction."""
     times = np.arange(40) / 50
-    for seed in range(EPISODES):
+    for seed, path in enumerate(sorted((root / "tracks").iterdir())):
         state = State(
             torch.tensor([[[-0.5, 0.1 * seed, 2.0]]]).double(),
             torch.tensor([[[1.0, 0.0, 0.0, 0.0]]]).double(),
             torch.tensor([[[0.5 - 0.2 * seed, 0.3, 2.5]]]).double(),
             torch.tensor([[[1.0, 0.5 * seed, 0.0]]]).double(),
         )
-        rollout = simulate(World.from_model(windy), state, torch.tensor(times))
+        rollout = simulate(World.from_model(model), state, torch.tensor(times))
         motion = Motion(rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy())
-        write_tracks(root / "tracks" / f"{seed:03d}.csv", {"cube": measured(times, motion, seed)}, overwrite=True)
-    found = compare_models([("base", base), ("windy", windy)], Capture.open(root), device="cpu")
-    plain, with_wind = found.result.models
-    assert with_wind.effects == ("constant_force",)
-    assert with_wind.reduced_chi2 is not None and 0.8 < with_wind.reduced_chi2 < 1.25
-    assert plain.reduced_chi2 is not None and plain.reduced_chi2 > 1.25 * with_wind.reduced_chi2
+        write_tracks(path, {"cube": measured(times, motion, seed, turned)}, overwrite=True)
+    return root
+
+
+def test_centroid_tracks(tmp_path: Path) -> None:
+    root = flights(write_capture(tmp_path / "capture", episodes=2), truth(), turned=False)
+    found = compare_models([("a", invisible(truth()))], Capture.open(root), device="cpu")
+    (model,) = found.result.models
+    assert model.rotation_error_deg is None
+    assert model.reduced_chi2 is not None and 0.7 < model.reduced_chi2 < 1.3
+    flight = model.by_phase["flight"]
+    assert flight is not None and flight.rotation_rms_deg is None and set(flight.sigmas) == {"x", "y", "z"}
+    assert all(figures is None for phase, figures in model.by_phase.items() if phase != "flight")
+    assert "2 episodes are few to judge a model by" in found.result.verdict
+    points = found.models[0].wrenches
+    assert points and all(np.isnan(p.std[3:]).all() and np.isfinite(p.std[:3]).all() for p in points)
+
+
+def test_an_effect_is_rolled_out_and_what_it_would_explain_is_ordered(tmp_path: Path) -> None:
+    """A push of 0.4 m/s2 in long flights: with the effect within the noise, without it the wrench says so."""
+    push = EffectModel(name="constant_force", parameters={"f_x": 0.4, "f_y": 0.0, "f_z": 0.0})
+    base = invisible(truth())
+    pushed = replace(base, file=base.file.model_copy(update={"effects": (push,)}))
+    root = flights(write_capture(tmp_path / "capture", episodes=EPISODES), pushed)
+    found = compare_models([("base", base), ("pushed", pushed)], Capture.open(root), device="cpu")
+    plain, right = found.result.models
+    assert right.effects == ("constant_force",)
+    assert right.reduced_chi2 is not None and 0.8 < right.reduced_chi2 < 1.25
+    assert plain.reduced_chi2 is not None and plain.reduced_chi2 > 1.25 * right.reduced_chi2
     assert plain.wrench[0].coordinate == "constant" and plain.wrench[0].share > 0.5
-    assert with_wind.wrench == ()
+    assert right.wrench == ()
     force = np.array([point.acceleration[0] for point in found.models[0].wrenches])
     weight = np.array([point.std[0] ** -2 for point in found.models[0].wrenches])
     assert float((force * weight).sum() / weight.sum()) == pytest.approx(0.4, abs=0.1)
@@ -429,16 +438,15 @@ def test_the_ladder_has_every_episode_and_the_zeros() -> None:
 
 def test_short_errors_leave_the_states_their_freedom(folder: Path) -> None:
     """Each segment's leverages add up to the numbers of its state."""
-    from cgwm.pipeline.short_errors import Cut
-
     capture = Capture.open(folder / "capture")
     world = World.from_model(truth())
     episodes = [(name, capture.tracks(name)) for name in capture.episodes("test")]
-    cut = Cut.of(world, episodes, capture.manifest.measurement)
-    assert cut.noise == (capture.manifest.measurement.position_std_m, capture.manifest.measurement.rotation_std_rad)
-    fit = short_errors(world, episodes, cut)
-    assert cut.flight and cut.contact
-    for segment in cut.flight:
+    given = capture.manifest.measurement
+    prepared = prepare(world, episodes, (given.position_std_m, given.rotation_std_rad))
+    assert prepared.noise == (given.position_std_m, given.rotation_std_rad)
+    fit = short_errors(world, episodes, prepared, ["cube"])
+    assert prepared.flight is not None and prepared.contact_items
+    for segment in prepared.flight.items:
         one = fit.errors[episodes[segment.episode][0]]
         rows = slice(segment.first, segment.last + 1)
         taken = float((1 - one.freedom[rows]).sum())

@@ -99,7 +99,7 @@ def _versus(
 def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
     """Return where short predictions miss most, in units of the noise."""
     if model.reduced_chi2 is None:
-        return "Too few measured frames follow each other for short predictions."
+        return "Nothing is said of short predictions: too few frames follow each other where they can be made."
     known = [
         (phase, figures.reduced_chi2**0.5, figures.position_rms_m)
         for phase, figures in model.by_phase.items()

@@ -428,7 +428,8 @@ options(part("model"), data.models); options(part("kind"), kinds);
 options(part("coordinate"), coordinates.map(c => c.name + (c.unit ? " [" + c.unit + "]" : "")));
 const phasePicker = part("phase");
 options(phasePicker, ["all phases", ...data.phases]);
-part("marks").innerHTML = data.phases.filter(name => data.wrench.models.some(m => m.some(p => data.phases[p.ph] === name)))
+const present = new Set(data.wrench.models.flat().map(p => data.phases[p.ph]));
+part("marks").innerHTML = data.phases.filter(name => present.has(name))
   .map(name => '<span><i style="background:' + marks[name] + '"></i>' + name + "</span>").join("");
 function scatter() {
   const [m, kind, c, ph] = ["model", "kind", "coordinate", "phase"].map(name => Number(part(name).value));
