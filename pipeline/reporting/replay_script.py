@@ -2,7 +2,7 @@
 
 REPLAY_STYLE = """
 :root { --m0: #1f5fa8; --m1: #c46a1b; --m2: #1d7a46; --m3: #8e3b8e; --m4: #b3261e; --m5: #5b6472; }
-.chart.ladder { max-width: 1060px; }
+.chart.ladder { max-width: 1060px; min-width: 640px; } .wrench .scroll svg { min-width: 640px; }
 .ladder .episode { opacity: .45; } .ladder .episode:hover { opacity: 1; }
 .ladder .episode .line { stroke: var(--frozen); stroke-width: 1; } .ladder .episode circle { fill: var(--frozen); }
 .ladder .episode:hover .line { stroke: var(--ink); } .ladder .zero { stroke: var(--ballistic); stroke-dasharray: 5 4; }
@@ -246,7 +246,7 @@ function view(canvas, vertical) {
 
 // Curves over time
 
-const W = 520, H = 150, LEFT = 46, RIGHT = 8, TOP = 20, BOTTOM = 22;
+const W = 520, H = 150, LEFT = 46, RIGHT = 14, TOP = 20, BOTTOM = 22;
 const across = t => LEFT + (W - LEFT - RIGHT) * t / (episode().t[episode().t.length - 1] || 1);
 function curve(name, title, pick, floor, reference) {
   const svg = find(name), e = episode();

@@ -64,7 +64,8 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
         "What is missing, and where",
         paragraph(words),
         f'<div class="wrench" id="wrench"><div class="controls">{picks}</div>'
-        '<svg class="chart" data-part="plot" viewBox="0 0 1060 340" role="img" aria-label="residual wrench"></svg>'
+        '<div class="scroll"><svg class="chart" data-part="plot" viewBox="0 0 1060 340" role="img" '
+        'aria-label="residual wrench"></svg></div>'
         '<div class="phases" data-part="marks"></div>'
         "</div>",
         table(header, rows, numeric=(2,)) if rows else "",
