@@ -27,6 +27,7 @@ _PUBLIC = {
     "SynthesizeConfig": ".schemas",
     "UsageError": ".schemas",
     "calibrate": ".pipeline.calibrate",
+    "compare": ".pipeline.compare",
     "doctor": ".pipeline.doctor",
     "evaluate": ".pipeline.eval",
     "fit": ".pipeline.fit",
@@ -44,6 +45,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .datasets.models import Model, read_model  # pyright: ignore[reportMissingImports]
     from .datasets.pinwm import import_pinwm  # pyright: ignore[reportMissingImports]
     from .pipeline.calibrate import calibrate  # pyright: ignore[reportMissingImports]
+    from .pipeline.compare import compare  # pyright: ignore[reportMissingImports]
     from .pipeline.demo import run_demo  # pyright: ignore[reportMissingImports]
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
@@ -78,6 +80,7 @@ __all__ = [
     "UsageError",
     "__version__",
     "calibrate",
+    "compare",
     "doctor",
     "evaluate",
     "fit",

@@ -7,7 +7,9 @@ from typing import Annotated, Any
 import typer
 
 from .calibrate import calibrate
+from .compare import compare
 from .demo import demo
+from .diagnose import diagnose
 from .doctor import doctor
 from .effects import list_effects, new_effect, show_effect
 from .eval import evaluate
@@ -22,6 +24,8 @@ VERBS = (
     ("fit", fit, "A capture to a world model."),
     ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
     ("eval", evaluate, "A model against measurements."),
+    ("compare", compare, "Where and when each model fails, side by side."),
+    ("diagnose", diagnose, "Which effect a model lacks."),
     ("import", import_capture, "Recordings in another format to a capture."),
     ("validate", validate, "Check a capture, a model or a dataset."),
     ("doctor", doctor, "What this machine has, and what would be used."),

@@ -100,7 +100,7 @@ def evaluate_model(
     Raises:
         See :func:`evaluate`.
     """
-    _check_bodies(model, capture.body_names, str(capture.root))
+    check_bodies(model, capture.body_names, str(capture.root))
     world = World.from_model(model)
     episodes, warnings = _usable(model, [(name, capture.tracks(name)) for name in capture.episodes(split)])
     if not episodes:
@@ -131,7 +131,7 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
         if len(reader) == 0:
             raise InputDataError(f"{dataset}: split '{split}' has no rollout.", todo="name another with --split.")
         names = [name.decode() for name in reader.group(0)["bodies/names"][()]]
-        _check_bodies(model, names, str(dataset))
+        check_bodies(model, names, str(dataset))
         world = World.from_model(model)
         # what a dataset stores are true states, not measured ones
         world = replace(world, effects=tuple(a for a in world.effects if a.effect.phase != "measurement"))
@@ -156,7 +156,12 @@ def _stored_tracks(reader: RolloutReader, number: int) -> dict[str, Track]:
     }
 
 
-def _check_bodies(model: Model, names: Sequence[str], target: str) -> None:
+def check_bodies(model: Model, names: Sequence[str], target: str) -> None:
+    """Refuse a model whose bodies do not have the names of a target's.
+
+    Raises:
+        InputDataError: With both lists.
+    """
     own = [body.name for body in model.file.bodies]
     if set(own) != set(names):
         raise InputDataError(

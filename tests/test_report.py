@@ -2,7 +2,6 @@
 
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -32,6 +31,7 @@ from cgwm.schemas import (
     SplatCheck,
     read_json,
 )
+from pages import Tags
 
 
 def evaluation(turn_deg: float = 7.25, frozen_m: float = 0.21) -> EvalResult:
@@ -164,29 +164,6 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("report")
     write_report(folder, result(), pictures())
     return folder, (folder / "report.html").read_text(encoding="utf-8")
-
-
-class Tags(HTMLParser):
-    """Collect every attribute that could load something, and check that elements are closed in order."""
-
-    EMPTY = frozenset({"meta", "img", "input", "br", "rect", "line", "path", "circle"})
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.addresses: list[str] = []
-        self.faults: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in self.EMPTY:
-            self.open.append(tag)
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag in self.EMPTY:
-            return
-        if not self.open or self.open.pop() != tag:
-            self.faults.append(f"</{tag}> at {self.getpos()}")
 
 
 def test_the_page_loads_nothing_from_elsewhere(page: tuple[Path, str]) -> None:

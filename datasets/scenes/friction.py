@@ -44,7 +44,6 @@ class CoulombFriction:
         self._pairs = {frozenset(pair): index for index, pair in enumerate(geoms)}
         self._pause = 0
         self._dof = int(model.body_dofadr[self._body])
-        self._friction = model.pair_friction[:, 0].copy()
         # MuJoCo's rate is 2 / (impedance * time constant)
         self._time_times_rate = 2 / model.pair_solimp[:, 1]
         model.pair_solreffriction[:, 0] = self._time_times_rate / _SLOWEST_RATE
@@ -83,11 +82,19 @@ class CoulombFriction:
         unopposed = sign * (acceleration * direction).sum(1) + mobility * held
 
         pairs = np.array([self._pairs[frozenset(pair)] for pair in geoms.tolist()])
-        wanted = (1 + _EXCESS) * mobility * self._friction[pairs] * pressed - unopposed
+        friction = _friction_along(self._model.pair_friction[pairs, :2], along)  # may have been changed on the way
+        wanted = (1 + _EXCESS) * mobility * friction * pressed - unopposed
         rate = np.where(pressed > 0, wanted / speed, 0.0).clip(_SLOWEST_RATE, _FASTEST_RATE)
         for pair in set(pairs.tolist()):
             fastest = rate[pairs == pair].max()
             self._model.pair_solreffriction[pair, 0] = self._time_times_rate[pair] / fastest
+
+
+def _friction_along(friction: Array, along: Array) -> Array:
+    """Return the friction (n,) along unit vectors (n, 2), of cones with the half axes (n, 2)."""
+    if (friction[:, 0] == friction[:, 1]).all():
+        return friction[:, 0]
+    return 1 / np.sqrt(((along / friction) ** 2).sum(1))
 
 
 def _cross(a: Array, b: Array) -> Array:

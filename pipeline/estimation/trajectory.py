@@ -46,9 +46,10 @@ class TrajectoryResiduals:
     """The residuals of an open-loop rollout from every item's state: what `least_squares.minimise` wants.
 
     Rows are (frame, free body); their six columns are position and rotation, in sigmas. The standard deviations are
-    numbers, or one for every row, shape (B, F, 1). With `differences` the Jacobian is that of central differences over
-    `STATE_STEPS` (there must be no parameters then): exact derivatives of a body that rests on many spheres grow by a
-    third in every step of 1 ms, and lead nowhere.
+    numbers, or one for every row, shape (B, F, 1). With `differences` the Jacobian is that of differences over
+    `STATE_STEPS`: exact derivatives of a body that rests on many spheres grow by a third in every step of 1 ms, and
+    lead nowhere. Each parameter then needs its `parameter_steps`, how far down and how far up, in fitted coordinates;
+    a step of 0 leaves that side out.
     """
 
     world: World
@@ -57,6 +58,7 @@ class TrajectoryResiduals:
     position_std_m: float | Tensor
     rotation_std_rad: float | Tensor
     differences: bool = False
+    parameter_steps: Sequence[tuple[float, float]] = ()
 
     def __call__(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
         """Return residuals (B, F, 6) and, if wanted, their Jacobian (B, F, 6, P + S)."""
@@ -71,13 +73,19 @@ class TrajectoryResiduals:
         return batched_jacobian(self._residuals, inputs)
 
     def _differenced(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals (B, m) and their differences (B, m, S) by the states (B, S)."""
+        """Return residuals (B, m) and their differences (B, m, P + S) by the inputs (B, P + S)."""
         batch, size = inputs.shape
-        steps = torch.tensor([step for step in STATE_STEPS for _ in range(3)]).to(inputs).repeat(size // STATE_SIZE)
-        moves = torch.cat([torch.zeros(1, size).to(inputs), torch.diag(steps), -torch.diag(steps)])
+        states = (size - len(self.parameters)) // STATE_SIZE
+        own = [(step, step) for step in STATE_STEPS for _ in range(3)] * states
+        down, up = torch.tensor([*self.parameter_steps, *own]).to(inputs).T
+        below, above = (down > 0).nonzero()[:, 0], (up > 0).nonzero()[:, 0]
+        moves = torch.cat([torch.zeros(1, size).to(inputs), torch.diag(up)[above], -torch.diag(down)[below]])
         with torch.no_grad():
             rows = self._residuals((inputs + moves[:, None]).flatten(0, 1), len(moves)).unflatten(0, (-1, batch))
-        slopes = (rows[1 : size + 1] - rows[size + 1 :]) / (2 * steps[:, None, None])
+        ends = rows[:1].expand(size, -1, -1)
+        high = ends.index_copy(0, above, rows[1 : 1 + len(above)])
+        low = ends.index_copy(0, below, rows[1 + len(above) :])
+        slopes = (high - low) / (down + up)[:, None, None]
         return rows[0], torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 
     def rollout(self, shared: Tensor, states: Tensor) -> Rollout:

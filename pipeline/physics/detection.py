@@ -87,6 +87,8 @@ class Points:
 
 def pairs_of(world: World) -> list[tuple[int, int]]:
     """Return the pairs of bodies that can touch: each free body with the ground (-1) and with every other body."""
+    if not world.touching:
+        return []
     bodies = world.bodies
     pairs = [(i, GROUND) for i, body in enumerate(bodies) if body.free and world.ground_normal is not None]
     for i, first in enumerate(bodies):

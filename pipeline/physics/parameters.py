@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -18,7 +19,8 @@ class Parameter:
 
     reveals: which motion makes it observable; prior: median and standard deviation before any data, the latter in the
     fitted coordinate (natural logarithm where the parameter is logarithmic); at_bounds: what it means when a fit ends
-    at the lower and at the upper bound.
+    at the lower and at the upper bound; shared: whether one value serves all episodes, or each
+    group of episodes, or each episode, has its own.
     """
 
     name: str
@@ -28,6 +30,7 @@ class Parameter:
     reveals: str
     prior: tuple[float, float]
     at_bounds: tuple[str, str] = ("the motion asks for less", "the motion asks for more")
+    shared: Literal["all", "group", "episode"] = "all"
 
     def encode(self, value: float) -> float:
         """Return the fitted coordinate of a value."""
@@ -112,7 +115,9 @@ def effect_parameters(world: World) -> list[Parameter]:
             beyond = "the effect would be stronger than its formula admits: something else is missing, or in its place"
             least = "these data do not show the effect: leave it out" if number.nonnegative else beyond
             bounds = (low, number.limit)
-            found.append(Parameter(name, number.unit, bounds, False, effect.reveals, prior, (least, beyond)))
+            found.append(
+                Parameter(name, number.unit, bounds, False, effect.reveals, prior, (least, beyond), number.shared)
+            )
     return found
 
 

@@ -53,8 +53,9 @@ class World:
     """The bodies and what surrounds them.
 
     gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
-    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact; rolls_on: the device
-    that `dispatch.rollout` takes rollouts to and their results back from, None for where the tensors lie.
+    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact; touching: whether
+    bodies touch at all (without, every motion is free flight, and costs a tenth); rolls_on: the device that
+    `dispatch.rollout` takes rollouts to and their results back from, None for where the tensors lie.
     """
 
     bodies: tuple[Body, ...]
@@ -65,6 +66,7 @@ class World:
     step_s: float = 0.001
     sweeps: int = 10
     effects: tuple[ActiveEffect, ...] = ()
+    touching: bool = True
     rolls_on: str | None = None
 
     @property

@@ -108,13 +108,14 @@ for (const player of document.querySelectorAll("[data-frames]")) {
 """
 
 
-def page(title: str, body: Sequence[str], style: str = "") -> str:
+def page(title: str, body: Sequence[str], style: str = "", script: str = "") -> str:
     """Return a whole HTML document.
 
     Args:
         title: In the browser's title bar.
         body: Pieces of HTML, in order.
         style: Further rules for the style sheet.
+        script: What runs after the page's own script.
     """
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -124,7 +125,7 @@ def page(title: str, body: Sequence[str], style: str = "") -> str:
         "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n"
         f"<title>{text(title)}</title>\n<style>{STYLE}{style}</style>\n</head>\n<body>\n<main>\n"
         + "\n".join(body)
-        + f"\n</main>\n<script>{SCRIPT}</script>\n</body>\n</html>\n"
+        + f"\n</main>\n<script>{SCRIPT}{script}</script>\n</body>\n</html>\n"
     )
 
 

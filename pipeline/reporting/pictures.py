@@ -56,10 +56,10 @@ class RolloutTile:
     mask: Image
 
 
-def tiles(strip: FrameStrip, width: int = TILE_WIDTH) -> tuple[Image, Image]:
+def tiles(strip: FrameStrip, width: int = TILE_WIDTH, outlined: bool = True) -> tuple[Image, Image]:
     """Return the real and the predicted frames, cut to where the object moves and reduced to `width` pixels.
 
-    Where masks are known, the predicted frames carry the outline of where the object truly was.
+    Where masks are known, the predicted frames carry the outline of where the object truly was, if `outlined`.
 
     Returns:
         Two arrays, uint8 RGB, shape (T, 3/4 width, width, 3).
@@ -69,7 +69,7 @@ def tiles(strip: FrameStrip, width: int = TILE_WIDTH) -> tuple[Image, Image]:
     cut = (slice(None), slice(y, y + h), slice(x, x + w))
     real = np.stack([_resized(frame, size) for frame in strip.real[cut]])
     predicted = np.stack([_resized(frame, size) for frame in strip.predicted[cut]])
-    if strip.masks is not None:
+    if outlined and strip.masks is not None:
         for frame, mask in zip(predicted, strip.masks[cut], strict=True):
             _outline(frame, mask)
     return real, predicted

@@ -1,0 +1,39 @@
+"""List the cases of a stage, or make their captures.
+
+python -m hidden_effects list [--stage report] [--only cube/com_offset]
+python -m hidden_effects make OUT [--stage report] [--only cube/com_offset]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from . import cases, make_capture
+
+
+def main() -> int:
+    """Print one name a line; with `make`, write OUT/<name with / as __> and OUT.truth/<the same>.json for each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("list", "make"))
+    parser.add_argument("out", nargs="?", type=Path)
+    parser.add_argument("--stage", choices=("development", "report"), default="development")
+    parser.add_argument("--only", default="", help="part of the name")
+    parser.add_argument("--repeats", type=int, default=1)
+    words = parser.parse_args()
+    if words.what == "make" and words.out is None:
+        parser.error("where to? name a directory: make OUT")
+    for case in cases(words.stage, words.repeats):
+        if words.only not in case.name:
+            continue
+        if words.what == "make":
+            name, secret = case.name.replace("/", "__"), words.out.with_name(f"{words.out.name}.truth")
+            secret.mkdir(parents=True, exist_ok=True)
+            make_capture(words.out / name, case, secret / f"{name}.json", overwrite=True)
+        print(case.name)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""A case: what is hidden in a capture, how it is thrown and how it is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .mechanics import Hidden
+from .protocol import Protocol
+from .registry import EFFECTS, Size, draw_effect
+from .things import Kind, Thing, draw_thing
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything about a capture; two captures of equal cases are equal to the last bit.
+
+    Args:
+        name: A stable name.
+        thing: The body: "cube" (a box of about 10 cm) or "ball" (35 mm radius).
+        effects: Names from `EFFECTS`; none for a null.
+        magnitude: Of all effects.
+        seed: Of the body, the effects' numbers, the throws and the noise.
+        law: The contact's law, 1 or 2 (see `mechanics`).
+        protocol: Kinds of motion.
+        train: Number of training episodes.
+        test: Number of test episodes.
+        length_s: Length of an episode, in true time.
+        rate_hz: Of the measurement.
+        position_std_m: Noise of each coordinate.
+        rotation_std_rad: Noise about each body axis.
+        mass_given: Whether the manifest has the mass.
+        inertia_given: Whether it has the inertia and the centre of mass of the homogeneous body.
+        noise_given: Whether it has the noise.
+        centroid_only: Whether tracks have no orientation.
+        outliers: Share of the samples that are grossly wrong (2 to 10 cm, and 20 to 60 degrees).
+        gaps: Number of gaps of 3 to 8 samples in every episode.
+        uneven: Spread of the times, in sampling intervals (0.3: each time off by up to that).
+    """
+
+    name: str
+    thing: Kind
+    effects: tuple[str, ...] = ()
+    magnitude: Size = "large"
+    seed: int = 0
+    law: int = 1
+    protocol: Protocol = "mixed"
+    train: int = 6
+    test: int = 4
+    length_s: float = 1.0
+    rate_hz: float = 100.0
+    position_std_m: float = 0.0005
+    rotation_std_rad: float = 0.0052
+    mass_given: bool = True
+    inertia_given: bool = False
+    noise_given: bool = False
+    centroid_only: bool = False
+    outliers: float = 0.0
+    gaps: int = 0
+    uneven: float = 0.0
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.effects if name not in EFFECTS]
+        if unknown:
+            raise ValueError(f"no effect '{unknown[0]}'; there are {', '.join(EFFECTS)}")
+        if self.law not in (1, 2, 3):
+            raise ValueError(f"contact law {self.law}; there are 1 and 2, and 3 for trials")
+        if not 0 <= self.uneven < 0.5:
+            raise ValueError(f"times uneven by {self.uneven:g} intervals; at least 0, below 0.5")
+
+    def rng(self, purpose: str) -> np.random.Generator:
+        """Return random numbers of their own for a purpose, so that one does not depend on how many another takes."""
+        return np.random.default_rng([self.seed, *purpose.encode()])
+
+    def drawn_thing(self) -> Thing:
+        """Return the body and its contact."""
+        return draw_thing(self.thing, self.law, self.rng("thing"))
+
+    def drawn_effects(self) -> list[Hidden]:
+        """Return the effects with their true numbers."""
+        thing = self.drawn_thing()
+        return [draw_effect(name, thing, self.magnitude, self.rng(f"effect {name}")) for name in self.effects]

@@ -1,0 +1,175 @@
+"""Truths that act in flight: forces in the air, gravity, and how the mass lies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .mechanics import Hidden, Mechanics, Moment, Wrench, cross
+from .registry import direction, hidden_effect, horizontal, sign, turn
+from .things import Thing
+
+NONE = np.zeros(3)
+_MAGNET_RANGE_M = 0.1
+
+
+@hidden_effect("linear_drag", "flight", 0.15, 0.6)
+def linear_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Force -m c u, c [1/s]."""
+
+    def wrench(now: Moment) -> Wrench:
+        return -now.mass_kg * size * now.velocity_m_s, NONE
+
+    return Hidden("linear_drag", {"c": size}, "force -m c u at the centre of mass", wrench=wrench)
+
+
+@hidden_effect("quadratic_drag", "flight", 0.1, 0.4)
+def quadratic_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Force of the air, k [1/m]: on a box by its sides, on a ball as usual; it has no torque."""
+    areas = np.prod(thing.half_extents_m) / thing.half_extents_m
+
+    def wrench(now: Moment) -> Wrench:
+        return _air(thing, size, areas, now, now.velocity_m_s), NONE
+
+    return Hidden("quadratic_drag", {"k": size}, _AIR, wrench=wrench)
+
+
+_AIR = (
+    "box: force -m k (A_i / mean A) |u_i| u_i along each body axis i, A_i the area of its side; ball: -m k |u| u. "
+    "No torque"
+)
+
+
+def _air(thing: Thing, k: float, areas: np.ndarray, now: Moment, wind: np.ndarray) -> np.ndarray:
+    if thing.kind == "ball":
+        return -now.mass_kg * k * np.sqrt(wind @ wind) * wind
+    along = wind @ now.rotation
+    return -now.mass_kg * k * now.rotation @ (areas / areas.mean() * np.abs(along) * along)
+
+
+@hidden_effect("wind", "flight", 2.0, 4.0)
+def wind(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Quadratic drag against air that flows at w [m/s] with any heading; k = 0.1 1/m, 0.2 where w is large."""
+    areas = np.prod(thing.half_extents_m) / thing.half_extents_m
+    air, k = size * horizontal(rng), 0.1 if size < 3 else 0.2
+
+    def wrench(now: Moment) -> Wrench:
+        return _air(thing, k, areas, now, now.velocity_m_s - air), NONE
+
+    values = {"w_x": air[0], "w_y": air[1], "k": k}
+    return Hidden("wind", values, f"{_AIR}; u - w for u", ("quadratic_drag",), wrench=wrench)
+
+
+@hidden_effect("magnus_lift", "flight", {"ball": 0.01}, {"ball": 0.04})
+def magnus_lift(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Force m s omega x u, s [1] of either sign."""
+    s = size * sign(rng)
+
+    def wrench(now: Moment) -> Wrench:
+        return now.mass_kg * s * cross(now.omega_rad_s, now.velocity_m_s), NONE
+
+    return Hidden("magnus_lift", {"s": s}, "force m s omega x u at the centre of mass", wrench=wrench)
+
+
+@hidden_effect("spin_damping", "flight", 0.2, 1.0)
+def spin_damping(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Torque -d I omega with the mean of the moments for I, d [1/s]."""
+    inertia = float(thing.inertia_kg_m2.mean())
+
+    def wrench(now: Moment) -> Wrench:
+        return NONE, -size * inertia * now.omega_rad_s
+
+    return Hidden("spin_damping", {"d": size}, "torque -d (tr I / 3) omega", wrench=wrench)
+
+
+@hidden_effect("constant_force", "flight", 0.15, 0.4)
+def constant_force(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Force m f in the world, f [m/s2] between 30 and 60 degrees above or below the horizon."""
+    angle = np.radians(rng.uniform(30, 60)) * sign(rng)
+    f = size * (np.cos(angle) * horizontal(rng) + np.sin(angle) * np.array([0.0, 0.0, 1.0]))
+
+    def wrench(now: Moment) -> Wrench:
+        return now.mass_kg * f, NONE
+
+    return Hidden("constant_force", _named("f", f), "force m f at the centre of mass", wrench=wrench)
+
+
+@hidden_effect("gravity_tilt", "flight", 0.7, 2.0)
+def gravity_tilt(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Gravity turned about a horizontal axis, by an angle [deg]."""
+    vector = np.radians(size) * horizontal(rng)
+
+    def build(world: Mechanics) -> Mechanics:
+        return replace(world, gravity_m_s2=turn(vector) @ world.gravity_m_s2)
+
+    values = {"tilt_x": vector[0], "tilt_y": vector[1]}
+    return Hidden("gravity_tilt", values, "MuJoCo's gravity turned by exp(tilt_x e_x + tilt_y e_y)", build=build)
+
+
+@hidden_effect("gravity_scale", "flight", 0.01, 0.03)
+def gravity_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Gravity (1 + s) g of either sign of s [1]."""
+    s = size * sign(rng)
+
+    def build(world: Mechanics) -> Mechanics:
+        return replace(world, gravity_m_s2=(1 + s) * world.gravity_m_s2)
+
+    return Hidden("gravity_scale", {"s": s}, "MuJoCo's gravity times 1 + s", build=build)
+
+
+@hidden_effect("buoyancy", "flight", 0.1, 0.3)
+def buoyancy(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Force m b upwards, b [m/s2]."""
+
+    def wrench(now: Moment) -> Wrench:
+        return np.array([0.0, 0.0, now.mass_kg * size]), NONE
+
+    return Hidden("buoyancy", {"b": size}, "force m b upwards at the centre of mass", wrench=wrench)
+
+
+@hidden_effect("ground_magnet", "flight", 3.0, 10.0)
+def ground_magnet(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """Pull m A (1 + h / l)^-4 with the height h of the lowest point, A [m/s2]; it falls to 1/e within 0.28 l."""
+
+    def wrench(now: Moment) -> Wrench:
+        height = max(float(now.heights_m.min()), 0.0)
+        return np.array([0.0, 0.0, -now.mass_kg * size * (1 + height / _MAGNET_RANGE_M) ** -4]), NONE
+
+    form = "force -m A (1 + h / l)^-4 e_z at the centre of mass, h the height of the lowest point"
+    return Hidden("ground_magnet", {"A": size, "l": _MAGNET_RANGE_M}, form, wrench=wrench)
+
+
+@hidden_effect("com_offset", "flight", {"cube": 0.002, "ball": 0.001}, {"cube": 0.006, "ball": 0.004})
+def com_offset(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """The centre of mass moved by d [m], body frame; the inertia about it stays."""
+    d = size * direction(rng)
+
+    def build(world: Mechanics) -> Mechanics:
+        return replace(world, com_m=world.com_m + d)
+
+    return Hidden("com_offset", _named("d", d), "MuJoCo's inertial position moved by d", build=build)
+
+
+@hidden_effect("inertia_shape", "flight", {"cube": 0.1}, {"cube": 0.3})
+def inertia_shape(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """The moments of the body times 1 + size, 1 and 1 - size, about axes turned by chance."""
+    axes = turn(rng.uniform(0.3, 1.2) * direction(rng))
+    factors = rng.permutation([1 + size, 1.0, 1 - size])
+
+    def build(world: Mechanics) -> Mechanics:
+        root = axes @ np.diag(np.sqrt(factors)) @ axes.T
+        return replace(world, inertia_kg_m2=root @ world.inertia_kg_m2 @ root)
+
+    inertia = build(Mechanics.of(thing, 1)).inertia_kg_m2
+    six = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return Hidden(
+        "inertia_shape",
+        {"inertia_kg_m2": six.tolist(), "factors": factors.tolist()},
+        "MuJoCo's inertia is Q I Q, Q symmetric with the roots of the factors as eigenvalues",
+        build=build,
+    )
+
+
+def _named(letter: str, vector: np.ndarray) -> dict[str, float]:
+    return {f"{letter}_{axis}": float(value) for axis, value in zip("xyz", vector, strict=True)}

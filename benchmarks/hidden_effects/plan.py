@@ -1,0 +1,81 @@
+"""The list of all cases, for development and for the report: the same plan, with seeds that have nothing in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+from zlib import crc32
+
+import numpy as np
+
+from .case import Case
+from .registry import EFFECTS, Size
+from .things import Kind
+
+Stage = Literal["development", "report"]
+Noise = Literal["spread", "study"]
+
+UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
+"""Effects that are in no library."""
+KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
+"""Effects of the library: all but `time_offset`, which takes a driven body."""
+PAIRS: tuple[tuple[Kind, tuple[str, str]], ...] = (
+    ("cube", ("linear_drag", "gravity_tilt")),
+    ("cube", ("anisotropic_friction", "spin_damping")),
+    ("cube", ("ground_magnet", "torsional_friction")),
+    ("cube", ("com_offset", "viscous_friction")),
+    ("cube", ("marker_offset", "linear_drag")),
+    ("ball", ("magnus_lift", "rolling_resistance")),
+    ("ball", ("quadratic_drag", "spin_damping")),
+    ("ball", ("gravity_tilt", "torsional_friction")),
+)
+RATES_HZ = (60.0, 100.0, 148.0)
+SIZES: tuple[Size, ...] = ("small", "large")
+NULLS = 200
+
+
+def cases(stage: Stage, repeats: int = 1, nulls: int = NULLS, noise: Noise = "spread") -> list[Case]:
+    """Return the cases of a stage; the name of a case, and so its seed, does not depend on the other arguments.
+
+    Every effect of the library on the bodies on which it makes sense, small and large; nulls, half of them under each
+    contact law; pairs; and effects in no library, small and large. The contact law alternates.
+
+    Args:
+        stage: Which seeds: those that thresholds may be chosen by, or those of the report.
+        repeats: Number of seeds for each effect, pair and unknown.
+        nulls: Number of nulls.
+        noise: "spread": 60, 100 or 148 Hz, 0.2 to 2 mm and 0.1 to 0.6 degrees by chance, the two growing together;
+            "study": 100 Hz, 0.5 mm and 0.3 degrees.
+    """
+    if stage not in ("development", "report"):
+        raise ValueError(f"stage '{stage}'; there are development and report")
+    found = []
+    for name in (*KNOWN, *UNKNOWN):
+        for thing in EFFECTS[name].things:
+            for size in SIZES:
+                found += [(thing, (name,), size, k) for k in range(repeats)]
+    for thing, pair in PAIRS:
+        found += [(thing, pair, "large", k) for k in range(repeats)]
+    for k in range(nulls):
+        found.append((("cube", "ball")[k // 2 % 2], (), "large", k))
+    return [_case(stage, noise, *entry) for entry in found]
+
+
+def _case(stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int) -> Case:
+    what = f"{'+'.join(effects)}/{size}" if effects else "null"
+    name = f"{stage}/{thing}/{what}/{k}"
+    code = crc32(name.encode())
+    # the last bit tells the stages apart, whatever the names
+    seed = 2 * (code // 2) + (stage == "report")
+    law = 1 + (k if not effects else code // 2) % 2
+    case = Case(name, thing, effects, size, seed, law)
+    if noise == "study":
+        return case
+    rng = case.rng("measurement")
+    share = rng.uniform()
+    return replace(
+        case,
+        rate_hz=float(rng.choice(RATES_HZ)),
+        position_std_m=round(0.0002 * 10.0**share, 6),
+        rotation_std_rad=round(float(np.radians(0.1 * 6.0**share)), 6),
+    )

@@ -1,0 +1,88 @@
+"""How a body is thrown: first states drawn by the kind of motion."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from .mechanics import Start
+from .registry import direction, horizontal
+from .things import Array, Thing
+
+Motion = Literal["throw", "slide", "drop", "roll"]
+Protocol = Literal["mixed", "throws", "slides", "drops", "rolls"]
+
+_TRAIN: tuple[Motion, ...] = ("throw", "slide", "drop", "throw", "roll", "throw")
+_TEST: tuple[Motion, ...] = ("throw", "slide", "drop", "roll")
+_ALONE: dict[Protocol, Motion] = {"throws": "throw", "slides": "slide", "drops": "drop", "rolls": "roll"}
+_GAP_M = 2e-4
+"""Height of the lowest point above the ground where a motion begins on it."""
+
+
+def motions(protocol: Protocol, train: int, test: int) -> list[Motion]:
+    """Return the kinds of motion of the training and then the test episodes; both splits begin their cycles anew."""
+    if protocol in _ALONE:
+        return [_ALONE[protocol] for _ in range(train + test)]
+    return [_TRAIN[k % len(_TRAIN)] for k in range(train)] + [_TEST[k % len(_TEST)] for k in range(test)]
+
+
+def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
+    """Return a first state; paths pass within some centimetres of the world's origin, with any heading.
+
+    throw: from 0.25 to 0.6 m at 1 to 2.5 m/s, up to 2 m/s upwards, spin of up to 15 rad/s about any axis.
+    slide: flat on the ground at 0.8 to 2 m/s, a box turning by up to 5 rad/s; a ball with spin of up to 20 rad/s.
+    drop: from 0.2 to 0.8 m, turned by chance, hardly moving.
+    roll: a ball that rolls at 0.4 to 1.3 m/s while it turns about the vertical, or a box that tumbles over its edges.
+    """
+    heading, up = horizontal(rng), np.array([0.0, 0.0, 1.0])
+    spin = rng.uniform(3, 15) * direction(rng)
+    quat = _any_turn(rng)
+    if motion == "throw":
+        velocity = rng.uniform(1.0, 2.5) * heading + rng.uniform(0.0, 2.0) * up
+        height, ahead = rng.uniform(0.25, 0.6), 0.35
+    elif motion == "drop":
+        velocity, spin = rng.uniform(-0.1, 0.1, 3), 0.1 * spin
+        height, ahead = rng.uniform(0.2, 0.8), 0.0
+    elif motion == "slide":
+        velocity, height, ahead = rng.uniform(0.8, 2.0) * heading, _GAP_M, 0.3
+        if thing.kind == "cube":
+            quat, spin = _yaw(rng), rng.uniform(-5, 5) * up
+        else:
+            spin = rng.uniform(-20, 20) * np.cross(up, heading) + rng.uniform(-20, 20) * up
+    else:
+        speed = rng.uniform(0.4, 1.3) if thing.kind == "ball" else rng.uniform(0.8, 1.4)
+        velocity, ahead = speed * heading, 0.4
+        spin = speed / thing.size_m * np.cross(up, heading) + rng.uniform(-10, 10) * up * (thing.kind == "ball")
+        height = _GAP_M if thing.kind == "ball" else rng.uniform(0.02, 0.06)
+    place = rng.uniform(-0.05, 0.05, 3) * (1.0, 1.0, 0.0) - ahead * velocity * (1.0, 1.0, 0.0)
+    rotation = rotations(quat[None])[0]
+    place[2] = height + _depth(thing, rotation)
+    return Start(place, quat, velocity, rotation.T @ spin)
+
+
+def rotations(quat_wxyz: Array) -> Array:
+    """Return the rotation matrices (T, 3, 3) of unit quaternions (T, 4)."""
+    w, x, y, z = quat_wxyz.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, -1) for row in rows], -2).astype(np.float64)
+
+
+def _depth(thing: Thing, rotation: Array) -> float:
+    """Return how far the body reaches below its middle [m]."""
+    middles, radius = thing.spheres
+    return float(radius - (middles @ rotation.T)[:, 2].min())
+
+
+def _any_turn(rng: np.random.Generator) -> Array:
+    quat = rng.standard_normal(4)
+    return quat / np.linalg.norm(quat)
+
+
+def _yaw(rng: np.random.Generator) -> Array:
+    half = 0.5 * rng.uniform(0, 2 * np.pi)
+    return np.array([np.cos(half), 0.0, 0.0, np.sin(half)])

@@ -1,0 +1,99 @@
+"""The hidden effects by name: on which bodies, how large, and how their true numbers are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .mechanics import Hidden
+from .things import Kind, Thing
+
+Array = NDArray[np.float64]
+Size = Literal["small", "large"]
+Acts = Literal["flight", "contact", "measurement", "unknown"]
+Draw = Callable[[Thing, float, np.random.Generator], Hidden]
+BOTH: tuple[Kind, ...] = ("cube", "ball")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An effect that can be hidden.
+
+    Args:
+        name: That of `cgwm effects list`, or one of the generator's own where `acts` is "unknown".
+        acts: Where; "unknown": in flight, and in no library.
+        small: Its magnitude by body, in its unit; the bodies are those on which it makes sense.
+        large: The same.
+        draw: Draws the true numbers at a magnitude.
+    """
+
+    name: str
+    acts: Acts
+    small: dict[Kind, float]
+    large: dict[Kind, float]
+    draw: Draw
+
+    @property
+    def things(self) -> tuple[Kind, ...]:
+        """The bodies on which it makes sense."""
+        return tuple(self.small)
+
+
+EFFECTS: dict[str, Entry] = {}
+"""All of them, by name."""
+
+
+def hidden_effect(
+    name: str, acts: Acts, small: float | dict[Kind, float], large: float | dict[Kind, float]
+) -> Callable[[Draw], Draw]:
+    """Return a decorator that enters an effect; one number counts for both bodies."""
+
+    def by_thing(value: float | dict[Kind, float]) -> dict[Kind, float]:
+        return dict(value) if isinstance(value, dict) else dict.fromkeys(BOTH, float(value))
+
+    def enter(draw: Draw) -> Draw:
+        EFFECTS[name] = Entry(name, acts, by_thing(small), by_thing(large), draw)
+        return draw
+
+    return enter
+
+
+def draw_effect(name: str, thing: Thing, size: Size, rng: np.random.Generator) -> Hidden:
+    """Return an effect with true numbers drawn for a body.
+
+    Raises:
+        ValueError: If the effect makes no sense on that body.
+    """
+    entry = EFFECTS[name]
+    if thing.kind not in entry.small:
+        raise ValueError(f"{name} on a {thing.kind}; allowed: {', '.join(entry.things)}")
+    return entry.draw(thing, (entry.small if size == "small" else entry.large)[thing.kind], rng)
+
+
+def horizontal(rng: np.random.Generator) -> Array:
+    """Return a horizontal unit vector of any heading."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def direction(rng: np.random.Generator) -> Array:
+    """Return a unit vector, uniform on the sphere."""
+    vector = rng.standard_normal(3)
+    return vector / np.linalg.norm(vector)
+
+
+def sign(rng: np.random.Generator) -> float:
+    """Return 1 or -1."""
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def turn(vector: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a rotation vector [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / angle if angle else np.zeros(3)
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew

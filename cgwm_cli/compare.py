@@ -1,0 +1,85 @@
+"""`cgwm compare`: models side by side, and where each of them fails."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import Debug, DeviceName, Json, Overwrite, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import CompareResult, ModelComparison, PairedDifference
+
+
+def compare(
+    models: Annotated[
+        list[Path],
+        typer.Argument(metavar="MODEL...", help="Directories of models, the base first.", show_default=False),
+    ],
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture with tracks.", show_default=False)],
+    split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to predict.")] = "test",
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The page to write.")] = Path("compare.html"),
+    warmup_s: Annotated[
+        float, typer.Option("--warmup-s", help="Length of the start that the models may see [s].")
+    ] = 0.1,
+    device: Annotated[
+        DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")
+    ] = "auto",
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Where and when each model fails, side by side; an HTML page to look at."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.compare import compare as work
+        from ..schemas import UsageError
+
+        if not warmup_s > 0:
+            raise UsageError(f"--warmup-s {warmup_s:g}: no length of time.", "more than 0 s.")
+        emit(work(models, capture, split, out, warmup_s, device, overwrite), _summary)
+
+
+def _summary(result: CompareResult) -> str:
+    from .output import table, warnings
+
+    header = ["", *(model.model for model in result.models)]
+    rows = [
+        [name, *(_figure(model, key, scale) for model in result.models)]
+        for name, key, scale in (
+            ("translation error, median [mm]", "translation_error_m", 1e3),
+            ("rotation error, median [deg]", "rotation_error_deg", 1.0),
+            ("PSNR, object, median [dB]", "psnr_object_db", 1.0),
+            ("state-fitted residual, median [mm]", "state_fitted_residual_m", 1e3),
+            ("noise of the start alone, median [mm]", "state_noise_floor_m", 1e3),
+        )
+        if any(getattr(model, key) is not None for model in result.models)
+    ]
+    rows.append(["short predictions, reduced chi2", *(_number(model.reduced_chi2) for model in result.models)])
+    for phase in result.models[0].by_phase:
+        found = [model.by_phase[phase] for model in result.models]
+        if any(figures is not None for figures in found):
+            rows.append([f"  in {phase}", *(_number(figures.reduced_chi2 if figures else None) for figures in found)])
+    lines = [result.verdict, table(rows, header), *(_pair(pair) for pair in result.pairs)]
+    said = [*result.warnings, *dict.fromkeys(words for model in result.models for words in model.warnings)]
+    return "\n".join([*lines, *warnings(said), *([f"Page: {result.report}"] if result.report else [])])
+
+
+def _figure(model: ModelComparison, key: str, scale: float) -> str:
+    summary = getattr(model, key)
+    return "-" if summary is None else f"{summary.median * scale:.1f}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _pair(pair: PairedDifference) -> str:
+    change = f"median difference {pair.median_difference_m * 1e3:+.1f} mm"
+    if pair.interval_95_m is not None:
+        low, high = (1e3 * value for value in pair.interval_95_m)
+        change += f" (95 %: {low:+.1f} to {high:+.1f})"
+    return f"{pair.model} against {pair.than}: better in {pair.better} of {pair.episodes} episodes, {change}."

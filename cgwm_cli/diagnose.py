@@ -1,0 +1,69 @@
+"""`cgwm diagnose`: which effect a model lacks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import Debug, Json, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import DiagnoseResult, RankedEffect
+
+SHOWN = 8
+"""So many candidates are listed; --json has all."""
+
+
+def diagnose(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture with tracks.", show_default=False)],
+    split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to look at.")] = "train",
+    candidates: Annotated[
+        str,
+        typer.Option(
+            "--candidates",
+            metavar="FILE.py:CLASS,...",
+            help="Effects of your own, beside the built-in ones.",
+            show_default=False,
+        ),
+    ] = "",
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Which physical or measurement effect is missing, and what these data cannot tell apart."""
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.diagnose import diagnose as work
+
+        wanted = [name.strip() for name in candidates.split(",") if name.strip()]
+        emit(work(model, capture, split, wanted), _summary)
+
+
+def _summary(result: DiagnoseResult) -> str:
+    from .output import table, warnings
+
+    lines = [result.sentence]
+    shown = [entry for entry in result.ranking if entry.effect in result.selected]
+    shown += [entry for entry in result.ranking if entry not in shown]
+    lines.append(table([_row(entry) for entry in shown[:SHOWN]], ["effect", "acts in", "judged in", "p", "estimate"]))
+    if result.flight_before is not None and result.flight_after is not None:
+        before, after = result.flight_before.statistic, result.flight_after.statistic
+        lines.append(
+            f"flight, mean chi2 of what is left: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
+        )
+    if result.residual_law is not None:
+        terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
+        lines.append(f"law of what is left: {terms}; organised by {result.residual_law.where}")
+    if result.selected:
+        lines.append(f"Next: cgwm fit CAPTURE --from MODEL --effects {','.join(result.selected)} --out NEW")
+    return "\n".join([*lines, *warnings(result.warnings)])
+
+
+def _row(entry: RankedEffect) -> list[str]:
+    numbers = ", ".join(f"{p.name} = {p.estimate:.3g} +- {p.std_error:.2g} {p.unit}" for p in entry.parameters[:3])
+    if len(entry.parameters) > 3:
+        numbers += ", ..."
+    return [entry.effect, ", ".join(entry.acts_in), entry.judged_in, f"{entry.score_p:.2g}", numbers]

@@ -1,0 +1,265 @@
+"""`cgwm diagnose`: which physical or measurement effect a model lacks, what else it could be, and what remains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..datasets.capture import Capture
+from ..datasets.models import Model, read_model
+from ..datasets.tracks import Track
+from ..schemas import (
+    DiagnoseResult,
+    EffectEstimate,
+    FlightTest,
+    InputDataError,
+    LawTerm,
+    RankedEffect,
+    ResidualLaw,
+    UsageError,
+)
+from .diagnosis.candidates import Candidate, admissible
+from .diagnosis.phases import size_of
+from .diagnosis.prepared import Prepared, prepare
+from .diagnosis.residual_law import residual_law
+from .diagnosis.segments import whole_episodes
+from .diagnosis.slots import Evidence
+from .diagnosis.verdict import Findings, find
+from .diagnosis.wrench import Omnibus, organisers, wrench_windows
+from .estimation.warmup import clearance
+from .phys_geo import track_episodes
+from .physics.effects.registry import effect_names, load_effect
+from .physics.world import World
+
+MIN_EPISODES = 3
+"""Fewer leave nothing to hold out: what helps one episode would be proved by that episode."""
+MAX_EPISODES = 40
+"""Of more episodes so many, evenly spread, are looked at: everything missing shows in them."""
+LONGEST_STEP_S = 0.2
+"""Slower tracks show no flight; those in milliseconds look so."""
+MOST_SUNK = 0.2
+"""A body whose lowest point lies deeper than this share of its size under the ground has another shape or ground."""
+
+
+def diagnose(
+    model: Path,
+    capture: Path,
+    split: str = "train",
+    candidates: Sequence[str] = (),
+) -> DiagnoseResult:
+    """Find what a fitted model lacks of measured motions; no episode outside the split is opened.
+
+    Args:
+        model: MODEL, with fitted physics.
+        capture: The capture, with tracks.
+        split: The episodes to look at; cross-validation is among them.
+        candidates: Effects beside the built-in ones, `file.py:Class` or names of entry points.
+
+    Raises:
+        InputDataError: If the data cannot carry a verdict: what is lacking, and what to do.
+        UsageError: If there is no such split or effect.
+    """
+    loaded = read_model(model)
+    opened = Capture.open(capture, splits=(split,))
+    world = _world(loaded, opened)
+    library = library_of(candidates)
+    episodes = _episodes(loaded, opened, split)
+    _refuse_strange(world, episodes, opened)
+    groups = _groups(opened, [name for name, _ in episodes])
+    measured = opened.manifest.measurement
+    known = (measured.position_std_m, measured.rotation_std_rad)
+    prepared = prepare(world, episodes, known, groups)
+    return report(prepared, world, library)
+
+
+def report(prepared: Prepared, world: World, library: Sequence[Candidate]) -> DiagnoseResult:
+    """Return the diagnosis of prepared episodes."""
+    if prepared.flight is None and not prepared.contact_items:
+        raise InputDataError(
+            "no part of the tracks is long enough to be followed by the model: neither six frames of flight nor of "
+            "contact without a gap.",
+            todo="record at 60 Hz or more, or name another split.",
+        )
+    findings = find(prepared, world, library)
+    _, refused = admissible(world, library, prepared.turned)
+    clear = prepared.clear & (prepared.whole.seen.amax(-1) > 0)
+    seen = int((prepared.whole.seen.amax(-1) > 0).sum())
+    warnings = [*prepared.warnings, *_one_phase(prepared)]
+    law = _law(prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
+    selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
+    groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
+    return DiagnoseResult(
+        verdict=findings.verdict,
+        sentence=_sentence(findings, law),
+        selected=selected,
+        remaining_unexplained=findings.remaining,
+        ranking=tuple(_ranked(e, findings) for e in findings.ranking),
+        aliases=tuple(tuple(e.candidate.spec for e in group) for group in groups),
+        residual_law=law,
+        episodes=len(prepared.names),
+        phases={"flight": int(clear.sum()), "contact": seen - int(clear.sum())},
+        noise={"position_m": prepared.noise[0], "rotation_rad": prepared.noise[1]},
+        flight_before=_flight_test(findings.before),
+        flight_after=_flight_test(findings.after),
+        contact_chi2=findings.contact_chi2,
+        not_tested=dict(sorted(refused.items())),
+        warnings=tuple(warnings),
+    )
+
+
+def library_of(candidates: Sequence[str]) -> list[Candidate]:
+    """Return the built-in effects, those of installed packages, and the given ones, as candidates.
+
+    Raises:
+        UsageError: If an effect cannot be loaded, or two have one name.
+    """
+    specs = [*effect_names(), *(spec for spec in candidates if spec not in effect_names())]
+    library = [Candidate(spec, load_effect(spec)) for spec in specs]
+    names: dict[str, str] = {}
+    for candidate in library:
+        own = candidate.effect.name
+        if own in names:
+            raise UsageError(
+                f"two candidates are called '{own}': {names[own]} and {candidate.spec}.", todo="rename one of them."
+            )
+        names[own] = candidate.spec
+    return library
+
+
+def _world(model: Model, capture: Capture) -> World:
+    """Return the model's world, on the ground of the capture: one moved by a fit hides what moved it."""
+    own = [body.name for body in model.file.bodies]
+    if set(own) != set(capture.body_names):
+        raise InputDataError(
+            f"the model's bodies are {', '.join(own)}; those of {capture.root} are {', '.join(capture.body_names)}.",
+            "a model of this capture's bodies.",
+            f"run 'cgwm fit {capture.root} --out MODEL'.",
+        )
+    world = World.from_model(model)
+    ground = capture.manifest.world.ground
+    if ground is None or world.ground_offset is None:
+        return world
+    return replace(world, ground_offset=torch.full_like(world.ground_offset, ground.offset_m))
+
+
+def _episodes(model: Model, capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
+    moving = [body.name for body in model.file.bodies if body.motion != "fixed"]
+    episodes = [(name, tracks) for name, tracks in track_episodes(capture, split) if set(moving) <= set(tracks)]
+    if len(episodes) < MIN_EPISODES:
+        raise InputDataError(
+            f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all that moves.",
+            f"at least {MIN_EPISODES}: what helps one has to be proved on others.",
+            "record more, or name another split with --split.",
+        )
+    chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
+    return [episodes[k] for k in chosen]
+
+
+def _groups(capture: Capture, names: Sequence[str]) -> list[int]:
+    entries = [capture.manifest.episodes.get(name) for name in names]
+    sessions = [(entry.group or "") if entry is not None else "" for entry in entries]
+    return [sorted(set(sessions)).index(session) for session in sessions]
+
+
+def _refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], capture: Capture) -> None:
+    """Refuse times in another unit, and bodies that sink into the ground."""
+    free = [world.bodies[k].name for k in world.free]
+    step = float(np.median(np.concatenate([np.diff(t[b].time_s) for _, t in episodes for b in free if b in t])))
+    if step > LONGEST_STEP_S:
+        raise InputDataError(
+            f"{capture.root}: the tracks have a frame every {step:.3g} s; if these are milliseconds, they are not "
+            "what the column time_s says.",
+            f"at most {LONGEST_STEP_S:g} s.",
+            "write time_s in seconds.",
+        )
+    whole = whole_episodes(world, episodes)
+    if world.ground_normal is None or not bool(whole.turned.any()):
+        return
+    size = min(size_of(world.bodies[k]) for k in world.free)
+    gap = clearance(world, whole)[whole.seen.amax(-1) > 0]
+    deep = float(torch.quantile(gap, 0.05))
+    if deep < -MOST_SUNK * size:
+        raise InputDataError(
+            f"{capture.root}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
+            f"size is {1e3 * size:.0f} mm.",
+            "a shape, a ground and tracks that belong together.",
+            "check [[bodies]] shape, [world] ground, and which body was tracked.",
+        )
+
+
+def _one_phase(prepared: Prepared) -> list[str]:
+    if not prepared.contact_items:
+        return ["there is no contact to look at: effects that act in contact cannot be judged."]
+    if prepared.flight is None:
+        return ["there is no flight to look at: effects that act in flight cannot be judged."]
+    return []
+
+
+def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
+    """Return the law of what is left: of everything where nothing was selected, else beside the selected effects."""
+    if prepared.flight is None:
+        return None
+    world = findings.base if findings.verdict == "unexplained" else findings.world
+    windows = wrench_windows(world, prepared.whole, prepared.flight.items, prepared.noise)
+    if windows is None:
+        return None
+    law = residual_law(windows)
+    return ResidualLaw(
+        terms=tuple(
+            LawTerm(term=t.name, coefficient=t.coefficient, std_error=t.std_error, unit=t.unit) for t in law.terms
+        ),
+        exponent=law.exponents,
+        left_chi2=law.left_chi2,
+        where=organisers(windows)[0].coordinate,
+    )
+
+
+def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
+    effect = evidence.candidate.effect
+    where = "contact" if effect.phase == "contact" or effect.name in findings.judged_in_contact else "flight"
+    numbers = evidence.numbers
+    if numbers is None:
+        std = np.sqrt(np.diag(evidence.test.covariance))
+        numbers = {
+            p.name: (float(v), float(s))
+            for p, v, s in zip(effect.parameters, evidence.test.estimate, std, strict=False)
+        }
+    unit = {p.name: p.unit for p in effect.parameters}
+    return RankedEffect(
+        effect=evidence.candidate.spec,
+        acts_in=(effect.phase,),
+        judged_in=where,
+        score_p=evidence.p_value,
+        delta_bic=evidence.delta_bic,
+        parameters=tuple(
+            EffectEstimate(name=name, unit=unit[name], estimate=float(v), std_error=float(s))
+            for name, (v, s) in numbers.items()
+        ),
+        constants=evidence.constants,
+    )
+
+
+def _flight_test(found: Omnibus | None) -> FlightTest | None:
+    if found is None:
+        return None
+    return FlightTest(statistic=found.statistic, degrees_of_freedom=found.dof, p_value=found.p_value)
+
+
+def _sentence(findings: Findings, law: ResidualLaw | None) -> str:
+    names = [c.evidence.candidate.spec for c in findings.chosen]
+    if findings.verdict == "none_missing":
+        return "Nothing is missing that these data could show."
+    if findings.verdict == "unexplained":
+        where = f"; it is organised by {law.where}" if law is not None else ""
+        return f"Something is missing in flight, and none of the candidates explains it{where}."
+    words = []
+    for one in findings.chosen:
+        others = [e.candidate.spec for e in one.equals[1:]]
+        words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
+    listed = " and ".join(word or name for word, name in zip(words, names, strict=True))
+    rest = " Something beside it remains unexplained." if findings.remaining else ""
+    return f"Missing: {listed}.{rest}"

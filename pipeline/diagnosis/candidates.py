@@ -1,0 +1,128 @@
+"""Candidate effects beside a model: all of them in one world at their neutral values, so that one Jacobian has all."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..physics.effects.effect import ActiveEffect, Effect
+from ..physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, effect_parameters
+from ..physics.world import World
+from .segments import Kind
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing; spec: what the user types."""
+
+    spec: str
+    effect: Effect
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A candidate at one combination of its constants.
+
+    place: of the candidate among the candidates; active: the effect at neutral, under a name of its own; constants: by
+    name.
+    """
+
+    place: int
+    active: ActiveEffect
+    constants: dict[str, float]
+
+    @property
+    def parameters(self) -> list[str]:
+        """Names of its parameters as `effect_parameters` gives them."""
+        effect = self.active.effect
+        return [f"{effect.name}.{number.name}" for number in effect.parameters]
+
+
+def admissible(world: World, candidates: Sequence[Candidate], turned: bool) -> tuple[list[Candidate], dict[str, str]]:
+    """Return the candidates that can be tested with a world, and why the others cannot, by name.
+
+    Args:
+        world: The model's world; what it already has is no candidate.
+        candidates: In any order.
+        turned: Whether orientations were measured.
+    """
+    present = {active.effect.name for active in world.effects}
+    driven = any(body.motion == "driven" for body in world.bodies)
+    has = {
+        "ground": world.ground_normal is not None,
+        "contact": world.ground_normal is not None or len(world.bodies) > 1,
+        "spin": turned,
+        "driven": driven,
+        "drag": any("drag" in active.effect.provides for active in world.effects),
+    }
+    words = {
+        "ground": "there is no ground",
+        "contact": "there is nothing to touch",
+        "spin": "no orientation was measured",
+        "driven": "no body is driven",
+        "drag": "the model has no drag, without which it does nothing",
+    }
+    kept, refused = [], {}
+    for candidate in candidates:
+        effect = candidate.effect
+        lacking = next((need for need in effect.needs if not has[need]), None)
+        if effect.name in present:
+            refused[effect.name] = "the model has it"
+        elif lacking is not None:
+            refused[effect.name] = words[lacking]
+        elif driven and effect.phase == "measurement" and "driven" not in effect.needs:
+            refused[effect.name] = "the command of the driven body was measured alike"
+        else:
+            kept.append(candidate)
+    return kept, refused
+
+
+def variants_of(candidates: Sequence[Candidate], like: Tensor) -> list[Variant]:
+    """Return every candidate at every combination of its constants' grids."""
+    found = []
+    for place, candidate in enumerate(candidates):
+        constants = candidate.effect.constants
+        for values in itertools.product(*(constant.grid for constant in constants)):
+            chosen = {constant.name: value for constant, value in zip(constants, values, strict=True)}
+            own = copy.copy(candidate.effect)
+            # several copies of one effect stand side by side in a world, and parameters go by name
+            own.name = f"candidate_{len(found)}"  # pyright: ignore[reportAttributeAccessIssue]
+            found.append(Variant(place, ActiveEffect.of(own, chosen, like), chosen))
+    return found
+
+
+def acts_in(variant: Variant, kind: Kind) -> bool:
+    """Whether a candidate can change segments of a kind."""
+    return kind == "contact" or variant.active.effect.phase != "contact"
+
+
+def with_variants(world: World, variants: Sequence[Variant], kind: Kind) -> tuple[World, list[Parameter]]:
+    """Return the world with all candidates at neutral, and their parameters in the same order."""
+    chosen = [variant for variant in variants if acts_in(variant, kind)]
+    active = tuple(variant.active for variant in chosen)
+    everything = replace(world, effects=(*world.effects, *active))
+    names = {name for variant in chosen for name in variant.parameters}
+    return everything, [p for p in effect_parameters(everything) if p.name in names]
+
+
+def base_parameters(world: World, kind: Kind) -> list[Parameter]:
+    """Return the numbers of a model that are fitted along: those of its effects, and in contact those of contact."""
+    own = effect_parameters(world)
+    if kind == "flight":
+        acting = {a.effect.name for a in world.effects if a.effect.phase != "contact"}
+        return [p for p in own if p.name.partition(".")[0] in acting]
+    ground = [GROUND_SHIFT] if world.ground_normal is not None else []
+    return [*CONTACT_PARAMETERS, *ground, *own]
+
+
+def base_values(world: World, parameters: Sequence[Parameter]) -> Tensor:
+    """Return the model's values (P,) of parameters in fitted coordinates; 0 for candidates and the ground's shift."""
+    law = vars(world.contact)
+    own = {f"{a.effect.name}.{name}": float(value[0]) for a in world.effects for name, value in a.values.items()}
+    values = [p.encode(float(law[p.name][0])) if p.name in law else own.get(p.name, 0.0) for p in parameters]
+    return torch.tensor(values, dtype=torch.float64).to(world.gravity)

@@ -1,0 +1,212 @@
+"""What contact says: which of several equals in flight it leaves, and whether an effect of contact is missing.
+
+No contact law is exact, so that a textbook p-value finds an effect in most data that have none. Variances are scaled by
+the misfit that is there anyway, segments that no candidate helps count less, the effect has to help episodes that it
+was not fitted to, and the threshold is what data without an effect reach.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..physics.parameters import GROUND_SHIFT
+from ..physics.world import World
+from .candidates import Candidate, admissible, base_parameters, variants_of
+from .linear import robust_excess
+from .prepared import Prepared
+from .refit import Refit, refit
+from .score import Picture, gain_by_episode, picture, score_test
+from .segments import Segments, fit_states, world_for
+from .slots import Evidence
+
+Array = NDArray[np.float64]
+
+SEPARATE_CHI2 = 12.0
+"""Contact rules out an equal in flight that it makes worse by more than this, as odds of 400 ..."""
+SEPARATE_T = 1.5
+"""... in most episodes: the mean of their differences, in its standard errors."""
+BLIND = 1.0
+"""Flight is blind to an effect whose standard error there is above this many scales: then contact may name it."""
+
+
+@dataclass(frozen=True)
+class ContactEvidence:
+    """An effect in contact: its evidence, and what the decision rests on.
+
+    score: the statistic over the misfit, less the penalty of BIC; gain: of all held-out episodes together; t: their
+    mean in its standard errors.
+    """
+
+    evidence: Evidence
+    score: float
+    gain: float
+    t: float
+
+
+def fitted_contact(prepared: Prepared, world: World, start: Segments | None = None) -> tuple[Refit, Segments] | None:
+    """Return the contact's numbers refitted to its segments, and the segments; None where there is no contact.
+
+    The ground stays where it was said to be: it is projected out later, and not let bend the states here.
+    """
+    contact = prepared.contact(world) if start is None else _again(start, world)
+    if contact is None:
+        return None
+    own = {f"{a.effect.name}." for a in world.effects}
+    parameters = [
+        p
+        for p in base_parameters(world, "contact")
+        if p is not GROUND_SHIFT and not any(p.name.startswith(name) for name in own)
+    ]
+    found = refit([contact], world, parameters)
+    return found, found.segments[0]
+
+
+def _again(start: Segments, world: World) -> Segments:
+    return fit_states(replace(start, world=world_for("contact", world)), iterations=4, search=False)
+
+
+def separated(
+    equals: Sequence[Evidence], contact: Segments, world: World, groups: Sequence[int]
+) -> tuple[list[Evidence], dict[str, float]]:
+    """Return those of several equals in flight that contact leaves, the best first, and the gain of each there.
+
+    Each has the numbers that flight gave it; the contact's own numbers follow.
+
+    Args:
+        equals: Refitted in flight.
+        contact: Segments with states fitted by the world without any of them.
+        world: That world.
+        groups: Session of each episode.
+    """
+    chosen = [e.candidate for e in equals]
+    variants = variants_of(chosen, world.gravity[0, :1])
+    picked = [
+        next(v for v in variants if chosen[v.place] is e.candidate and v.constants == e.constants) for e in equals
+    ]
+    seen = picture(contact, world, picked, groups, robust=False)
+    seen = reweighted(seen, [k for v in picked for k in seen.columns(v.parameters)])
+    gains = []
+    for evidence, variant in zip(equals, picked, strict=True):
+        assert evidence.numbers is not None
+        value = np.array([evidence.numbers[p.name][0] for p in evidence.candidate.effect.parameters])
+        gains.append(_gains_at(seen, seen.columns(variant.parameters), value))
+    total = np.array([float(e.refitted.cost) if e.refitted else math.inf for e in equals])
+    total = total - np.array([g.sum() for g in gains])
+    order = sorted(range(len(equals)), key=lambda k: (total[k] + _bic(equals[k], seen), equals[k].name))
+    best = min(order, key=lambda k: total[k])
+    kept = []
+    for k in order:
+        worse = gains[best] - gains[k]
+        spread = worse.std(ddof=1) / math.sqrt(len(worse)) if len(worse) > 1 else math.inf
+        out = total[k] - total[best] > SEPARATE_CHI2 and worse.mean() > SEPARATE_T * spread
+        if not out:
+            kept.append(equals[k])
+    return kept, {e.name: float(g.sum()) for e, g in zip(equals, gains, strict=True)}
+
+
+def contact_evidence(
+    contact: Segments,
+    world: World,
+    candidates: Sequence[Candidate],
+    groups: Sequence[int],
+    turned: bool,
+    flight: Picture | None = None,
+) -> list[ContactEvidence]:
+    """Return the evidence of every candidate that contact may name, the best first.
+
+    Args:
+        contact: Segments with fitted states.
+        world: In which they were fitted.
+        candidates: All of them.
+        groups: Session of each episode.
+        turned: Whether orientations were measured.
+        flight: The picture of the flights, with the same candidates; None where there are none.
+    """
+    kept, _ = admissible(world, candidates, turned)
+    variants = variants_of(kept, world.gravity[0, :1])
+    variants = [v for v in variants if v.active.effect.phase == "contact" or _blind(v, flight)]
+    if not variants:
+        return []
+    seen = picture(contact, world, variants, groups, robust=True)
+    misfit = max(1.0, float((seen.weight * seen.chi2).sum() / (seen.weight * seen.dof).sum()))
+    penalty = math.log(max(seen.dof.sum(), 2.0))
+    best: dict[int, ContactEvidence] = {}
+    tries: dict[int, int] = {}
+    for variant in variants:
+        columns = seen.columns(variant.parameters)
+        test = score_test(seen, columns, dispersion=misfit)
+        gains = gain_by_episode(seen, columns) / misfit
+        tries[variant.place] = tries.get(variant.place, 0) + 1
+        evidence = Evidence(kept[variant.place], variant.constants, test, test.p_value, tuple(gains.tolist()))
+        score = test.statistic - test.dof * penalty if test.admissible else -math.inf
+        spread = gains.std(ddof=1) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
+        t = float(gains.mean() / spread) if spread > 0 else 0.0
+        found = ContactEvidence(evidence, score, float(gains.sum()), t)
+        if variant.place not in best or found.score > best[variant.place].score:
+            best[variant.place] = found
+    results = [
+        replace(
+            one,
+            score=one.score - 2 * math.log(tries[place]),
+            evidence=replace(one.evidence, p_value=min(1.0, one.evidence.p_value * tries[place])),
+        )
+        for place, one in best.items()
+    ]
+    return sorted(results, key=lambda one: (-one.score, one.evidence.name))
+
+
+def reweighted(seen: Picture, columns: Sequence[int]) -> Picture:
+    """Return the picture with robust weights from the misfit that is left when every segment has its own numbers.
+
+    A segment that a candidate explains counts fully; one that nothing explains counts little.
+    """
+    chosen = [*range(seen.base), *columns]
+    width = np.array([seen.parameters[k].prior[1] for k in chosen])
+    information = seen.information[:, chosen][:, :, chosen] * np.outer(width, width)
+    score = seen.score[:, chosen] * width
+    step = np.linalg.solve(information + np.eye(len(chosen)), score[..., None])[..., 0]
+    left = seen.chi2 - np.einsum("bi,bi->b", score, step) - seen.dof
+    weight = robust_excess(torch.as_tensor(left))[1].numpy()
+    return replace(seen, weight=weight)
+
+
+def _gains_at(seen: Picture, columns: Sequence[int], value: Array) -> Array:
+    """Return the gain of each episode with given values of an effect, the model's numbers following."""
+    base = list(range(seen.base))
+    m = (seen.information * seen.weight[:, None, None]).sum(0)
+    g = (seen.score * seen.weight[:, None]).sum(0)
+    prior = np.diag(seen.prior[: seen.base])
+    follow = np.linalg.solve(m[np.ix_(base, base)] + prior, g[base] - m[np.ix_(base, list(columns))] @ value)
+    without = np.linalg.solve(m[np.ix_(base, base)] + prior, g[base])
+    chosen = [*base, *columns]
+    gains = []
+    for episode in np.unique(seen.episode):
+        mine = seen.weight * (seen.episode == episode)
+        own = (seen.information * mine[:, None, None]).sum(0)[np.ix_(chosen, chosen)]
+        slope = (seen.score * mine[:, None]).sum(0)[chosen]
+        both = [np.concatenate([follow, value]), np.concatenate([without, np.zeros_like(value)])]
+        gains.append(np.subtract(*[2 * slope @ x - x @ own @ x for x in both]))
+    return np.array(gains)
+
+
+def _bic(evidence: Evidence, seen: Picture) -> float:
+    return len(evidence.candidate.effect.parameters) * math.log(max(seen.dof.sum(), 2.0))
+
+
+def _blind(variant: object, flight: Picture | None) -> bool:
+    """Whether flight could not see an effect of a size that matters, which contact may then name."""
+    effect = variant.active.effect  # pyright: ignore[reportAttributeAccessIssue]
+    if effect.phase != "flight" or "ground" not in effect.needs:
+        return False
+    if flight is None:
+        return True
+    columns = flight.columns(variant.parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    test = score_test(flight, columns)
+    scale = np.array([p.scale for p in effect.parameters])
+    return test.dof < len(columns) or bool((np.sqrt(np.diag(test.covariance)) > BLIND * scale).any())

@@ -1,0 +1,133 @@
+"""Measured episodes made ready for a diagnosis: noise, outliers, and segments of flight and of contact."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from ..estimation.noise import estimate_noise
+from ..estimation.observations import Observations
+from ..physics.world import World
+from .noise import flight_noise, without_outliers
+from .phases import is_round
+from .segments import Segment, Segments, cut_episodes, fit_states, whole_episodes
+
+if TYPE_CHECKING:
+    from ...datasets.tracks import Track
+
+NOISE_DISAGREES = 1.3
+"""A given noise that differs from the measured one by this factor is not believed."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Episodes ready for tests.
+
+    names (E); groups (E): session of each episode; whole (E): all frames; clear (E, T): frames surely in flight; noise:
+    position [m], rotation [rad]; flight: segments with fitted states, None where there are none; contact_items: the
+    contact segments; outliers: frames left out; turned: whether orientations were measured; warnings.
+    """
+
+    names: tuple[str, ...]
+    groups: tuple[int, ...]
+    whole: Observations
+    clear: Tensor
+    noise: tuple[float, float]
+    flight: Segments | None
+    contact_items: tuple[Segment, ...]
+    outliers: int
+    turned: bool
+    warnings: tuple[str, ...]
+
+    def contact(self, world: World) -> Segments | None:
+        """Return the contact segments with states fitted by a world; None where there are none."""
+        if not self.contact_items:
+            return None
+        return fit_states(Segments.of("contact", world, self.whole, self.contact_items, self.noise))
+
+    def pieces(self, world: World, longest_s: float) -> Segments | None:
+        """Return the flights cut into equal pieces of at most a length [s], states fitted; None for none."""
+        if self.flight is None:
+            return None
+        items = [piece for item in self.flight.items for piece in _cut(item, self.whole, longest_s)]
+        return fit_states(Segments.of("flight", world, self.whole, items, self.noise))
+
+
+def prepare(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    given: tuple[float | None, float | None] = (None, None),
+    groups: Sequence[int] | None = None,
+) -> Prepared:
+    """Cut episodes, measure their noise, and fit the states of their flights.
+
+    Args:
+        world: The model's world.
+        episodes: Name and tracks by body of each.
+        given: Noise of the tracks, where it is known; what the flights show otherwise wins.
+        groups: Session of each episode; all the same by default.
+    """
+    warnings: list[str] = []
+    free = [world.bodies[k].name for k in world.free]
+    rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
+    noise = (given[0] or rough[0], given[1] or rough[1])
+    whole = whole_episodes(world, episodes)
+    turned = bool(whole.turned.any())
+    flight, contact, clear = cut_episodes(world, whole, noise)
+    noise = _agreed(given, flight_noise(whole, flight), noise, warnings)
+    whole, outliers, touched = without_outliers(whole, flight, noise)
+    if outliers or bool(touched.any()):
+        flight, contact, clear = cut_episodes(world, whole, noise, touched)
+        noise = _agreed(given, flight_noise(whole, flight), noise, [])
+    if outliers:
+        warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
+    flight, contact, clear = cut_episodes(world, whole, noise, touched)
+    if not turned and not all(is_round(world.bodies[k]) for k in world.free):
+        contact = []
+        warnings.append("no orientation was measured and the body is no ball: contacts cannot be looked at.")
+    fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
+    return Prepared(
+        tuple(name for name, _ in episodes),
+        tuple(groups or [0] * len(episodes)),
+        whole,
+        clear,
+        noise,
+        fitted,
+        tuple(contact),
+        outliers,
+        turned,
+        tuple(warnings),
+    )
+
+
+def _agreed(
+    given: tuple[float | None, float | None],
+    found: tuple[float | None, float | None],
+    rough: tuple[float, float],
+    warnings: list[str],
+) -> tuple[float, float]:
+    """Return the noise to work with: what was given, unless the flights show another; else what they show."""
+    chosen = []
+    for name, unit, said, seen, otherwise in zip(
+        ("position", "rotation"), ("m", "rad"), given, found, rough, strict=True
+    ):
+        if said is not None and seen is not None and not 1 / NOISE_DISAGREES < said / seen < NOISE_DISAGREES:
+            warnings.append(
+                f"the {name} noise is given as {said:.2g} {unit}; in flight it is {seen:.2g} {unit}, which is used."
+            )
+            chosen.append(seen)
+        else:
+            chosen.append(said or seen or otherwise)
+    return chosen[0], chosen[1]
+
+
+def _cut(item: Segment, whole: Observations, longest_s: float) -> list[Segment]:
+    count = item.last - item.first + 1
+    times = whole.times_s[item.episode, item.first : item.last + 1]
+    number = max(1, min(round(float(times[-1] - times[0]) / longest_s + 0.49), count // 6))
+    edges = [item.first + round(k * count / number) for k in range(number + 1)]
+    return [replace(item, first=a, last=b - 1) for a, b in itertools.pairwise(edges)]

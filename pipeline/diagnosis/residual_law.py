@@ -1,0 +1,144 @@
+"""The law of a residual wrench by sparse regression, where no candidate explains it: which terms, which exponent.
+
+The residual accelerations of windows, with their covariances, are regressed on a dictionary of physical terms; terms
+enter one by one while each pays for itself by BIC. The data are accelerations with their information, not derivatives
+of tracks, which drown in noise (study of diagnosis, section 4a).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .wrench import ResidualWrenches
+
+Array = NDArray[np.float64]
+
+MOST_TERMS = 4
+EXPONENTS = tuple(np.arange(0.0, 3.51, 0.25).tolist())
+MARGIN = 10.0
+"""A term enters if it lowers chi2 by this more than its penalty: the dictionary is searched, not given."""
+CHI2_95 = 3.84
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term: its coefficient, standard error and unit."""
+
+    name: str
+    coefficient: float
+    std_error: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Law:
+    """Terms, exponents of the speed by term (best, low, high), and the mean chi2 that is left per number."""
+
+    terms: tuple[Term, ...]
+    exponents: dict[str, tuple[float, float, float]]
+    left_chi2: float
+
+
+def residual_law(found: ResidualWrenches) -> Law:
+    """Return the law of residual wrenches (n windows)."""
+    target, information = found.wrench, found.information
+    columns = {name: build(found) for name, (build, _) in DICTIONARY.items()}
+    chosen: list[str] = []
+    total = _chi2(target, information)
+    penalty = math.log(max(6 * len(target), 2)) + MARGIN
+    while len(chosen) < MOST_TERMS:
+        gains = {
+            name: total - _fit([columns[k] for k in (*chosen, name)], target, information)[2]
+            for name in columns
+            if name not in chosen
+        }
+        best = max(gains, key=lambda name: gains[name])
+        if gains[best] < penalty:
+            break
+        chosen.append(best)
+        total -= gains[best]
+    left = total / max(6 * len(target) - len(chosen), 1)
+    if not chosen:
+        return Law((), {}, left)
+    value, covariance, _ = _fit([columns[name] for name in chosen], target, information)
+    terms = tuple(
+        Term(name, float(v), float(s), DICTIONARY[name][1])
+        for name, v, s in zip(chosen, value, np.sqrt(np.diag(covariance)), strict=True)
+    )
+    exponents = {}
+    for name in chosen:
+        power = POWERS.get(name)
+        if power is not None:
+            others = [columns[k] for k in chosen if k != name]
+            exponents[name] = _exponent(power, others, found)
+    return Law(terms, exponents, left)
+
+
+def _exponent(
+    power: Callable[[ResidualWrenches, float], Array], others: list[Array], found: ResidualWrenches
+) -> tuple[float, float, float]:
+    """Return the exponent with the lowest chi2, and the range in which it rises by less than `CHI2_95`."""
+    costs = np.array([_fit([power(found, p), *others], found.wrench, found.information)[2] for p in EXPONENTS])
+    near = [p for p, cost in zip(EXPONENTS, costs, strict=True) if cost < costs.min() + CHI2_95]
+    return EXPONENTS[int(costs.argmin())], min(near), max(near)
+
+
+def _fit(columns: list[Array], target: Array, information: Array) -> tuple[Array, Array, float]:
+    """Return coefficients, covariance and chi2 of a weighted regression; columns (n, 6)."""
+    design = np.stack(columns, -1).astype(np.float64)
+    normal = np.einsum("nik,nij,njl->kl", design, information, design)
+    slope = np.einsum("nik,nij,nj->k", design, information, target)
+    covariance = np.linalg.pinv(normal, hermitian=True)
+    value = covariance @ slope
+    return value, covariance, _chi2(target - design @ value, information)
+
+
+def _chi2(target: Array, information: Array) -> float:
+    return float(np.einsum("ni,nij,nj->", target, information, target))
+
+
+def _linear(values: Array) -> Array:
+    return np.concatenate((values, np.zeros_like(values)), 1)
+
+
+def _angular(values: Array) -> Array:
+    return np.concatenate((np.zeros_like(values), values), 1)
+
+
+def _along(values: Array, exponent: float) -> Array:
+    """Return |v|^(p - 1) v."""
+    size = np.linalg.norm(values, axis=1, keepdims=True).clip(1e-6)
+    return values * size ** (exponent - 1)
+
+
+def _axis(place: int) -> Callable[[ResidualWrenches], Array]:
+    def build(found: ResidualWrenches) -> Array:
+        column = np.zeros((len(found.wrench), 6))
+        column[:, place] = 1.0
+        return column
+
+    return build
+
+
+DICTIONARY: dict[str, tuple[Callable[[ResidualWrenches], Array], str]] = {
+    "-u": (lambda f: _linear(-f.velocity), "1/s"),
+    "-|u| u": (lambda f: _linear(-_along(f.velocity, 2)), "1/m"),
+    "omega x u": (lambda f: _linear(np.cross(f.omega, f.velocity)), "1"),
+    "x": (_axis(0), "m/s2"),
+    "y": (_axis(1), "m/s2"),
+    "z": (_axis(2), "m/s2"),
+    "-omega": (lambda f: _angular(-f.omega), "1/s"),
+    "-|omega| omega": (lambda f: _angular(-_along(f.omega, 2)), "1/rad"),
+}
+"""Terms of the acceleration (x, y, z: constant along the world's axes) and, with omega alone, of the angular one."""
+POWERS: dict[str, Callable[[ResidualWrenches, float], Array]] = {
+    "-u": lambda f, p: _linear(-_along(f.velocity, p)),
+    "-|u| u": lambda f, p: _linear(-_along(f.velocity, p)),
+    "-omega": lambda f, p: _angular(-_along(f.omega, p)),
+    "-|omega| omega": lambda f, p: _angular(-_along(f.omega, p)),
+}

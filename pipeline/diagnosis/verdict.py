@@ -1,0 +1,228 @@
+"""The verdict: what is missing, what else it could be, whether something remains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from ..physics.effects.effect import ActiveEffect
+from ..physics.world import World
+from .candidates import Candidate, base_parameters
+from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
+from .prepared import Prepared
+from .refit import refit
+from .segments import Segments, fit_states, world_for
+from .slots import Evidence, Slot, fill
+from .wrench import Omnibus, omnibus, residual_wrenches
+
+VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
+
+MOST_EFFECTS = 3
+"""So many effects are looked for in flight, one after the other."""
+OMNIBUS_S = (0.3, 0.15)
+"""Lengths of the pieces of flight whose residual wrench tells whether anything is left: slow forces and short ones."""
+OMNIBUS_LIMIT, OMNIBUS_P = 1.6, 1e-4
+"""Something is left where the mean chi2 of a residual wrench is above this and its p-value below. On data without an
+effect the statistic was 1.0 +- 0.2 (study of diagnosis, section 0)."""
+ENOUGH_SHARE = 0.9
+"""What is left beside an effect that explains this share of the excess is a detail of its law; of less, a stranger."""
+CONTACT_SCORE = 30.0
+"""An effect in contact is named above this score: data without an effect stay below it (`contact_stage`)."""
+CONTACT_T = 1.0
+CONTACT_LEAD = 0.5
+"""Another effect in contact with this share of the best one's score leaves the two unseparated."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """An effect that was selected, and its equals (itself the first); acts_in: where its evidence is from."""
+
+    evidence: Evidence
+    equals: tuple[Evidence, ...]
+    where: Literal["flight", "contact"]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that a diagnosis finds.
+
+    before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
+    candidates, the best first; contact: all contact evidence; world: with the selected effects; flight: the segments
+    with states fitted by it; base: the world without
+    them.
+    """
+
+    verdict: VerdictName
+    chosen: tuple[Chosen, ...]
+    remaining: bool
+    before: Omnibus | None
+    after: Omnibus | None
+    ranking: tuple[Evidence, ...]
+    contact: tuple[ContactEvidence, ...]
+    world: World
+    flight: Segments | None
+    contact_chi2: float | None
+    base: World
+
+    @property
+    def judged_in_contact(self) -> set[str]:
+        """Names of the effects whose evidence is from contact."""
+        return {one.evidence.name for one in self.contact} | {
+            c.evidence.name for c in self.chosen if c.where != "flight"
+        }
+
+
+def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
+    """Return what is missing of a world, from prepared episodes alone."""
+    before = worst_omnibus(prepared, world)
+    slots, after_flight, flight = _flight_search(prepared, world, candidates)
+    chosen, contact, final, chi2 = _with_contact(prepared, world, after_flight, slots, candidates)
+    after = worst_omnibus(prepared, final) if chosen else before
+    remaining = after is not None and after.statistic > OMNIBUS_LIMIT and after.p_value < OMNIBUS_P
+    verdict: VerdictName = "none_missing"
+    if remaining and _explained(before, after) < ENOUGH_SHARE:
+        verdict = "unexplained"
+    elif any(len(one.equals) > 1 for one in chosen):
+        verdict = "not_separable"
+    elif chosen:
+        verdict = "missing_effect"
+    ranking = _ranking(chosen, slots, contact)
+    return Findings(
+        verdict, tuple(chosen), remaining, before, after, tuple(ranking), tuple(contact), final, flight, chi2, world
+    )
+
+
+def worst_omnibus(prepared: Prepared, world: World) -> Omnibus | None:
+    """Return the omnibus statistic of flight over all lengths of pieces, the one with the smallest p-value."""
+    found = []
+    for longest_s in OMNIBUS_S:
+        pieces = prepared.pieces(world, longest_s)
+        if pieces is not None:
+            found.append(omnibus(residual_wrenches(pieces)))
+    return min(found, key=lambda one: (one.p_value, -one.statistic)) if found else None
+
+
+def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
+    """Return the share of the omnibus statistic's excess that is gone."""
+    if before is None or after is None or before.statistic <= 1:
+        return 0.0
+    return 1 - (after.statistic - 1) / (before.statistic - 1)
+
+
+def _flight_search(
+    prepared: Prepared, world: World, candidates: Sequence[Candidate]
+) -> tuple[list[Slot], World, Segments | None]:
+    """Return the slots that effects fill in flight, the world with the best of each, and the segments there."""
+    flight, slots, current = prepared.flight, [], world
+    if flight is None:
+        return [], world, None
+    while len(slots) < MOST_EFFECTS:
+        slot = fill(flight, current, candidates, prepared.groups, prepared.turned)
+        if not slot.flagged:
+            slots = slots or [slot]
+            break
+        refitted = slot.best.refitted
+        assert refitted is not None
+        slots.append(slot)
+        current, flight = refitted.world, refitted.segments[0]
+    filled = [slot for slot in slots if slot.flagged]
+    if len(filled) > 1:  # the first were chosen before the others were known
+        for place in range(len(filled) - 1):
+            without = _without(current, filled[place].best.name)
+            states = fit_states(replace(flight, world=world_for("flight", without)))
+            slot = fill(states, without, candidates, prepared.groups, prepared.turned)
+            refitted = slot.best.refitted
+            if slot.flagged and refitted is not None:
+                filled[place] = slot
+                current, flight = refitted.world, refitted.segments[0]
+        slots = filled
+    return slots, current, flight
+
+
+def _with_contact(
+    prepared: Prepared, world: World, after_flight: World, slots: Sequence[Slot], candidates: Sequence[Candidate]
+) -> tuple[list[Chosen], list[ContactEvidence], World, float | None]:
+    """Return the selected effects, the evidence of contact, the world with them, and contact's chi2 / dof."""
+    filled = [slot for slot in slots if slot.flagged]
+    open_slots = [slot for slot in filled if len(slot.equals) > 1]
+    clear_world = after_flight
+    for slot in open_slots:
+        clear_world = _without(clear_world, slot.best.name)
+    fitted = fitted_contact(prepared, clear_world)
+    if fitted is None:
+        chosen = [Chosen(slot.best, slot.equals, "flight") for slot in filled]
+        return chosen, [], after_flight, None
+    base, contact = fitted
+    final, chosen = after_flight, []
+    for slot in filled:
+        equals = slot.equals
+        if len(equals) > 1:
+            kept, _ = separated(equals, contact, base.world, prepared.groups)
+            equals = tuple(kept)
+            final = _replaced(final, slot.best, equals[0])
+        chosen.append(Chosen(equals[0], equals, "flight"))
+    final = replace(final, contact=base.world.contact)
+    if filled and open_slots:
+        again = fitted_contact(prepared, final, contact)
+        assert again is not None  # there was contact before
+        base, contact = again
+    rows = contact.residuals([], contact.observations.times_s.new_zeros(0), jacobian=False)[0]
+    chi2 = float(rows.square().sum() / contact.dof.sum())
+    evidence = contact_evidence(contact, base.world, candidates, prepared.groups, prepared.turned)
+    named = _named(evidence)
+    if named:
+        chosen.append(Chosen(named[0].evidence, tuple(one.evidence for one in named), "contact"))
+        final = _added(base.world, contact, named[0].evidence)
+        number = {p.name: (v, s) for p, v, s in final[1]}
+        first = replace(named[0].evidence, numbers=number)
+        chosen[-1] = Chosen(first, (first, *chosen[-1].equals[1:]), "contact")
+        return chosen, evidence, final[0], chi2
+    return chosen, evidence, replace(final, contact=base.world.contact), chi2
+
+
+def _named(evidence: Sequence[ContactEvidence]) -> list[ContactEvidence]:
+    """Return the effect that contact names and its equals; none where it names none."""
+    fit = [one for one in evidence if one.evidence.test.admissible and one.gain > 0 and one.t > CONTACT_T]
+    if not fit or fit[0] is not evidence[0] or fit[0].score < CONTACT_SCORE:
+        return []
+    return [one for one in fit if one.score > CONTACT_LEAD * fit[0].score]
+
+
+def _added(world: World, contact: Segments, evidence: Evidence):
+    """Return the world with an effect refitted in contact, and its parameters with estimate and standard error."""
+    effect = evidence.candidate.effect
+    added = replace(
+        world,
+        effects=(*world.effects, ActiveEffect.of(effect, evidence.constants, world.gravity[0, :1])),
+    )
+    parameters = [
+        p for p in base_parameters(added, "contact") if "." not in p.name or p.name.startswith(f"{effect.name}.")
+    ]
+    found = refit([contact], added, parameters)
+    own = [p for p in parameters if p.name.startswith(f"{effect.name}.")]
+    numbers = [(p.name.partition(".")[2], *found.number(p.name)) for p in own]
+    return found.world, [(replace(p, name=n), v, s) for p, (n, v, s) in zip(own, numbers, strict=True)]
+
+
+def _without(world: World, name: str) -> World:
+    return replace(world, effects=tuple(a for a in world.effects if a.effect.name != name))
+
+
+def _replaced(world: World, old: Evidence, new: Evidence) -> World:
+    """Return the world with one effect in the place of another, at its refitted numbers."""
+    if old.name == new.name or new.refitted is None:
+        return world
+    own = next(a for a in new.refitted.world.effects if a.effect.name == new.name)
+    return replace(world, effects=(*_without(world, old.name).effects, own))
+
+
+def _ranking(chosen: Sequence[Chosen], slots: Sequence[Slot], contact: Sequence[ContactEvidence]) -> list[Evidence]:
+    """Return all candidates once: selected ones and their equals first, then by where they were judged."""
+    found: dict[str, Evidence] = {}
+    everything = [e for one in chosen for e in one.equals]
+    everything += [e for slot in slots[:1] for e in slot.evidence]
+    everything += [one.evidence for one in contact if one.evidence.candidate.effect.phase == "contact"]
+    for evidence in everything:
+        found.setdefault(evidence.name, evidence)
+    return list(found.values())

@@ -1,0 +1,128 @@
+"""The verdict on a comparison in words: what the figures say, and whether there are enough of them to say it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ...schemas import CompareResult, ModelComparison, PairedDifference
+from ..paired import LEAST_EPISODES
+
+EXPLAINED = 1.2
+"""Short predictions whose errors are below so many times the noise are explained."""
+LEAST_FRAMES = 10
+"""A phase with fewer frames is not spoken of."""
+
+
+def compared_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
+    """Return one or two sentences on a comparison.
+
+    Args:
+        result: The figures.
+        names: What a model is called, by its name in the figures.
+    """
+    last = result.models[-1]
+    subject = next(model for model in result.models if model.model == result.best)
+    if len(result.models) == 1:
+        sentences = [_alone(last, result, names)]
+    else:
+        # against the first model, or where that is the best one, what came after it
+        other = result.models[0] if subject is not result.models[0] else last
+        pair = _pair(result, subject.model, other.model)
+        sentences = [_versus(pair, subject, other, result, names)] if pair else [_alone(subject, result, names)]
+    if result.episodes < LEAST_EPISODES:
+        sentences.append(
+            f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} too few to tell whether a "
+            "difference is more than chance."
+            if len(result.models) > 1
+            else f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} few to judge a model by."
+        )
+    sentences.append(_short(subject, names))
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _pair(result: CompareResult, model: str, than: str) -> PairedDifference | None:
+    """Return the difference of two models, turned round where it is there the other way."""
+    for pair in result.pairs:
+        if (pair.model, pair.than) == (model, than):
+            return pair
+        if (pair.model, pair.than) == (than, model):
+            span = pair.interval_95_m
+            return PairedDifference(
+                model=model,
+                than=than,
+                episodes=pair.episodes,
+                better=pair.episodes - pair.better,
+                median_difference_m=-pair.median_difference_m,
+                interval_95_m=None if span is None else (-span[1], -span[0]),
+            )
+    return None
+
+
+def _alone(model: ModelComparison, result: CompareResult, names: Mapping[str, str]) -> str:
+    median = model.translation_error_m.median
+    words = (
+        f"{names[model.model]} predicts {_episodes(result.episodes, result.split)} with a median error of {_mm(median)}"
+    )
+    zeros = [(name, _zero(model, name)) for name in ("frozen", "ballistic")]
+    known = [(name, value) for name, value in zeros if value is not None]
+    if not known:
+        return words + "."
+    name, nearest = min(known, key=lambda pair: pair[1])
+    guess = "that it stands still" if name == "frozen" else "free flight"
+    if nearest <= median:
+        return f"{words}, no better than to guess {guess} ({_mm(nearest)})."
+    return f"{words}; to guess {guess} would err by {_mm(nearest)}."
+
+
+def _zero(model: ModelComparison, name: str) -> float | None:
+    return ((model.baselines.get(name) or {}).get("translation_error_m") or {}).get("median")
+
+
+def _versus(
+    pair: PairedDifference,
+    model: ModelComparison,
+    other: ModelComparison,
+    result: CompareResult,
+    names: Mapping[str, str],
+) -> str:
+    a, b = names[model.model], names[other.model]
+    first, second = model.translation_error_m.median, other.translation_error_m.median
+    counted = f"{pair.better} of {_episodes(pair.episodes, result.split)}"
+    words = f"{a} predicts {counted} better than {b} (median {_mm(first)} instead of {_mm(second)})"
+    if pair.interval_95_m is None:
+        return words + "."
+    if pair.interval_95_m[0] <= 0 <= pair.interval_95_m[1]:
+        return words + ", which may be chance: the 95 % interval of the difference holds zero."
+    return words + "."
+
+
+def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
+    """Return where short predictions miss most, in units of the noise."""
+    if model.reduced_chi2 is None:
+        return "Nothing is said of short predictions: too few frames follow each other where they can be made."
+    known = [
+        (phase, figures.reduced_chi2**0.5, figures.position_rms_m)
+        for phase, figures in model.by_phase.items()
+        if figures is not None and figures.reduced_chi2 is not None and figures.frames >= LEAST_FRAMES
+    ]
+    missed = sorted((item for item in known if item[1] > EXPLAINED), key=lambda item: -item[1])
+    name = names[model.model]
+    if not missed:
+        return f"Short predictions of {name} are within the noise in all phases."
+    phase, times, size = missed[0]
+    within = [other for other, multiple, _ in known if multiple <= EXPLAINED]
+    words = f"Short predictions of {name} still err by {times:.1f} times the noise {_during(phase)}"
+    words += f" ({_mm(size)})" if size is not None else ""
+    return words + (f"; they are within the noise {' and '.join(map(_during, within))}." if within else ".")
+
+
+def _during(phase: str) -> str:
+    return {"impact": "in impacts"}.get(phase, f"in {phase}")
+
+
+def _episodes(count: int, split: str = "") -> str:
+    return f"{count}{' ' + split if split else ''} episode{'' if count == 1 else 's'}"
+
+
+def _mm(value: float) -> str:
+    return f"{value * 1e3:.1f} mm" if value < 0.1 else f"{value * 1e3:.0f} mm"
