@@ -181,7 +181,7 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
             friction.update(data)
     if not np.isfinite(poses).all():
         raise ArithmeticError("MuJoCo's motion is not finite")
-    return Motion(np.arange(count) * STEP_S, poses[:, :3], poses[:, 3:], touching)
+    return Motion(np.arange(count, dtype=np.float64) * STEP_S, poses[:, :3], poses[:, 3:], touching)
 
 
 class _Reader:

@@ -22,8 +22,9 @@ _GAP_M = 2e-4
 
 def motions(protocol: Protocol, train: int, test: int) -> list[Motion]:
     """Return the kinds of motion of the training and then the test episodes; both splits begin their cycles anew."""
-    if protocol in _ALONE:
-        return [_ALONE[protocol] for _ in range(train + test)]
+    alone = _ALONE.get(protocol)
+    if alone is not None:
+        return [alone for _ in range(train + test)]
     return [_TRAIN[k % len(_TRAIN)] for k in range(train)] + [_TEST[k % len(_TEST)] for k in range(test)]
 
 
