@@ -1,7 +1,7 @@
 """List the cases of a stage, or make their captures.
 
 python -m hidden_effects list [--stage report] [--only cube/com_offset]
-python -m hidden_effects make OUT [--stage report] [--only cube/com_offset]
+python -m hidden_effects make OUT [--stage report] [--only cube/com_offset] [--engine drake]
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from . import cases, make_capture
+from . import cases, drake_cases, make_capture
 
 
 def main() -> int:
@@ -21,10 +21,12 @@ def main() -> int:
     parser.add_argument("--stage", choices=("development", "report"), default="development")
     parser.add_argument("--only", default="", help="part of the name")
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--engine", choices=("mujoco", "drake"), default="mujoco")
     words = parser.parse_args()
     if words.what == "make" and words.out is None:
         parser.error("where to? name a directory: make OUT")
-    for case in cases(words.stage, words.repeats):
+    listed = drake_cases if words.engine == "drake" else cases
+    for case in listed(words.stage, words.repeats):
         if words.only not in case.name:
             continue
         if words.what == "make":

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .mechanics import STEP_S, Hidden, Mechanics, Moment, Wrench, cross
-from .registry import Array, hidden_effect, horizontal, sign
-from .things import Thing, damping_ratio_of, restitution_of
+from .mechanics import STEP_S, Hidden, Mechanics, Moment, Wrench
+from .registry import hidden_effect, horizontal, sign
+from .rotation import cross
+from .things import Array, Thing, damping_ratio_of, restitution_of
 
 _STRIBECK_SPEED_M_S = 0.4
 _ADHESION_GAP_M = 0.002

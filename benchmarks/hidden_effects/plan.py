@@ -30,7 +30,19 @@ PAIRS: tuple[tuple[Kind, tuple[str, str]], ...] = (
     ("ball", ("gravity_tilt", "torsional_friction")),
 )
 RATES_HZ = (60.0, 100.0, 148.0)
+DRAKE: tuple[tuple[Kind, str], ...] = (
+    ("cube", "linear_drag"),
+    ("ball", "magnus_lift"),
+    ("cube", "com_offset"),
+    ("ball", "gravity_tilt"),
+    ("cube", "spin_damping"),
+    ("cube", "viscous_friction"),
+    ("cube", "length_scale"),
+    ("ball", "gust"),
+)
+"""Effects that the second engine hides, too."""
 SIZES: tuple[Size, ...] = ("small", "large")
+THINGS: tuple[Kind, ...] = ("cube", "ball")
 NULLS = 200
 
 
@@ -49,21 +61,34 @@ def cases(stage: Stage, repeats: int = 1, nulls: int = NULLS, noise: Noise = "sp
     """
     if stage not in ("development", "report"):
         raise ValueError(f"stage '{stage}'; there are development and report")
-    found = []
-    for name in (*KNOWN, *UNKNOWN):
-        for thing in EFFECTS[name].things:
-            for size in SIZES:
-                found += [(thing, (name,), size, k) for k in range(repeats)]
-    for thing, pair in PAIRS:
-        found += [(thing, pair, "large", k) for k in range(repeats)]
-    for k in range(nulls):
-        found.append((("cube", "ball")[k // 2 % 2], (), "large", k))
-    return [_case(stage, noise, *entry) for entry in found]
+    found = [
+        _case(stage, noise, thing, (name,), size, k)
+        for name in (*KNOWN, *UNKNOWN)
+        for thing in EFFECTS[name].things
+        for size in SIZES
+        for k in range(repeats)
+    ]
+    found += [_case(stage, noise, thing, pair, "large", k) for thing, pair in PAIRS for k in range(repeats)]
+    return found + [_case(stage, noise, THINGS[k // 2 % 2], (), "large", k) for k in range(nulls)]
 
 
-def _case(stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int) -> Case:
+def drake_cases(stage: Stage, repeats: int = 1, nulls: int = 40, noise: Noise = "spread") -> list[Case]:
+    """Return cases whose truth is drake: nulls, and eight effects, small and large; see `cases`."""
+    found = [
+        _case(stage, noise, thing, (name,), size, k, "/drake")
+        for thing, name in DRAKE
+        for size in SIZES
+        for k in range(repeats)
+    ]
+    found += [_case(stage, noise, THINGS[k % 2], (), "large", k, "/drake") for k in range(nulls)]
+    return [replace(case, engine="drake", law=1) for case in found]
+
+
+def _case(
+    stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int, engine: str = ""
+) -> Case:
     what = f"{'+'.join(effects)}/{size}" if effects else "null"
-    name = f"{stage}/{thing}/{what}/{k}"
+    name = f"{stage}{engine}/{thing}/{what}/{k}"
     code = crc32(name.encode())
     # the last bit tells the stages apart, whatever the names
     seed = 2 * (code // 2) + (stage == "report")

@@ -8,6 +8,7 @@ import numpy as np
 
 from .mechanics import Start
 from .registry import direction, horizontal
+from .rotation import rotation_of
 from .things import Array, Thing
 
 Motion = Literal["throw", "slide", "drop", "roll"]
@@ -25,7 +26,7 @@ def motions(protocol: Protocol, train: int, test: int) -> list[Motion]:
     alone = _ALONE.get(protocol)
     if alone is not None:
         return [alone for _ in range(train + test)]
-    return [_TRAIN[k % len(_TRAIN)] for k in range(train)] + [_TEST[k % len(_TEST)] for k in range(test)]
+    return [*(_TRAIN[k % len(_TRAIN)] for k in range(train)), *(_TEST[k % len(_TEST)] for k in range(test))]
 
 
 def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
@@ -57,20 +58,9 @@ def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
         spin = speed / thing.size_m * np.cross(up, heading) + rng.uniform(-10, 10) * up * (thing.kind == "ball")
         height = _GAP_M if thing.kind == "ball" else rng.uniform(0.02, 0.06)
     place = rng.uniform(-0.05, 0.05, 3) * (1.0, 1.0, 0.0) - ahead * velocity * (1.0, 1.0, 0.0)
-    rotation = rotations(quat[None])[0]
+    rotation = rotation_of(quat)
     place[2] = height + _depth(thing, rotation)
     return Start(place, quat, velocity, rotation.T @ spin)
-
-
-def rotations(quat_wxyz: Array) -> Array:
-    """Return the rotation matrices (T, 3, 3) of unit quaternions (T, 4)."""
-    w, x, y, z = quat_wxyz.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, -1) for row in rows], -2).astype(np.float64)
 
 
 def _depth(thing: Thing, rotation: Array) -> float:
