@@ -425,6 +425,20 @@ def test_the_list_of_cases() -> None:
     assert set(stages[1]) & set(more) == {case for case in stages[1] if case in more}
 
 
+def test_the_rough_cases(tmp_path: Path) -> None:
+    found = hidden_effects.rough_cases("development", nulls=8)
+    assert len(found) == 16 and sum(case.centroid_only for case in found) == 6
+    assert all(case.thing == "ball" for case in found if case.centroid_only)
+    assert not {case.seed for case in found} & {case.seed for case in hidden_effects.cases("development")}
+    case = next(case for case in found if case.effects == ("magnus_lift",))
+    hidden_effects.make_capture(tmp_path / "a", replace(case, train=1, test=1))
+    capture = Capture.open(tmp_path / "a")
+    check_capture(capture)
+    track = capture.tracks("000")["ball"]
+    assert track.quat_wxyz is None and capture.manifest.bodies[0].mass_kg is None
+    assert np.diff(track.time_s).max() > 2.5 / case.rate_hz and np.ptp(np.diff(track.time_s)) > 0.5 / case.rate_hz
+
+
 def test_wrong_cases_are_refused() -> None:
     with pytest.raises(ValueError, match="no effect 'lift'"):
         Case("x", "ball", ("lift",))

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from .mechanics import Start
-from .registry import direction, horizontal
+from .registry import direction, horizontal, sign
 from .rotation import rotation_of
 from .things import Array, Thing
 
@@ -33,9 +33,11 @@ def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
     """Return a first state; paths pass within some centimetres of the world's origin, with any heading.
 
     throw: from 0.25 to 0.6 m at 1 to 2.5 m/s, up to 2 m/s upwards, spin of up to 15 rad/s about any axis.
-    slide: flat on the ground at 0.8 to 2 m/s, a box turning by up to 5 rad/s; a ball with spin of up to 20 rad/s.
+    slide: flat on the ground at 0.8 to 2 m/s, a box turning at 1 to 5 rad/s about the vertical; a ball with spin
+        of 5 to 20 rad/s about the vertical, and as much forwards or backwards.
     drop: from 0.2 to 0.8 m, turned by chance, hardly moving.
-    roll: a ball that rolls at 0.4 to 1.3 m/s while it turns about the vertical, or a box that tumbles over its edges.
+    roll: a ball that rolls at 0.4 to 1.3 m/s while it turns at 3 to 10 rad/s about the vertical, or a box that tumbles
+        over its edges.
     """
     heading, up = horizontal(rng), np.array([0.0, 0.0, 1.0])
     spin = rng.uniform(3, 15) * direction(rng)
@@ -49,13 +51,14 @@ def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
     elif motion == "slide":
         velocity, height, ahead = rng.uniform(0.8, 2.0) * heading, _GAP_M, 0.3
         if thing.kind == "cube":
-            quat, spin = _yaw(rng), rng.uniform(-5, 5) * up
+            quat, spin = _yaw(rng), sign(rng) * rng.uniform(1, 5) * up
         else:
-            spin = rng.uniform(-20, 20) * np.cross(up, heading) + rng.uniform(-20, 20) * up
+            spin = sign(rng) * rng.uniform(5, 20) * np.cross(up, heading) + sign(rng) * rng.uniform(5, 20) * up
     else:
         speed = rng.uniform(0.4, 1.3) if thing.kind == "ball" else rng.uniform(0.8, 1.4)
         velocity, ahead = speed * heading, 0.4
-        spin = speed / thing.size_m * np.cross(up, heading) + rng.uniform(-10, 10) * up * (thing.kind == "ball")
+        spin = speed / thing.size_m * np.cross(up, heading)
+        spin = spin + sign(rng) * rng.uniform(3, 10) * up * (thing.kind == "ball")
         height = _GAP_M if thing.kind == "ball" else rng.uniform(0.02, 0.06)
     place = rng.uniform(-0.05, 0.05, 3) * (1.0, 1.0, 0.0) - ahead * velocity * (1.0, 1.0, 0.0)
     rotation = rotation_of(quat)
