@@ -31,8 +31,14 @@ _PUBLIC = {
     "doctor": ".pipeline.doctor",
     "evaluate": ".pipeline.eval",
     "fit": ".pipeline.fit",
+    "import_balldrops": ".datasets.balldrops",
     "import_contactnets": ".datasets.contactnets",
+    "import_csv": ".datasets.csv_tracks",
+    "import_hdf5": ".datasets.hdf5_tracks",
+    "import_jugglebot": ".datasets.jugglebot",
     "import_pinwm": ".datasets.pinwm",
+    "import_rosbag": ".datasets.rosbag",
+    "import_tum": ".datasets.tum",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "synthesize": ".pipeline.synthesize",
@@ -40,10 +46,16 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tree they lie beside it
+    from .datasets.balldrops import import_balldrops  # pyright: ignore[reportMissingImports]
     from .datasets.capture import Capture  # pyright: ignore[reportMissingImports]
     from .datasets.contactnets import import_contactnets  # pyright: ignore[reportMissingImports]
+    from .datasets.csv_tracks import import_csv  # pyright: ignore[reportMissingImports]
+    from .datasets.hdf5_tracks import import_hdf5  # pyright: ignore[reportMissingImports]
+    from .datasets.jugglebot import import_jugglebot  # pyright: ignore[reportMissingImports]
     from .datasets.models import Model, read_model  # pyright: ignore[reportMissingImports]
     from .datasets.pinwm import import_pinwm  # pyright: ignore[reportMissingImports]
+    from .datasets.rosbag import import_rosbag  # pyright: ignore[reportMissingImports]
+    from .datasets.tum import import_tum  # pyright: ignore[reportMissingImports]
     from .pipeline.calibrate import calibrate  # pyright: ignore[reportMissingImports]
     from .pipeline.compare import compare  # pyright: ignore[reportMissingImports]
     from .pipeline.demo import run_demo  # pyright: ignore[reportMissingImports]
@@ -84,8 +96,14 @@ __all__ = [
     "doctor",
     "evaluate",
     "fit",
+    "import_balldrops",
     "import_contactnets",
+    "import_csv",
+    "import_hdf5",
+    "import_jugglebot",
     "import_pinwm",
+    "import_rosbag",
+    "import_tum",
     "read_model",
     "run_demo",
     "synthesize",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -13,13 +13,28 @@ from .run import running
 if TYPE_CHECKING:
     from ..schemas import ImportResult
 
+_SPLITS = ("train", "test", "seed")
+_TRACKS = ("body", "up", *_SPLITS)
+_OPTIONS = {
+    "contactnets": _SPLITS,
+    "pinwm": ("train",),
+    "jugglebot": ("only", *_SPLITS),
+    "balldrops": ("only",),
+    "csv": ("columns", "length_unit", "time_unit", *_TRACKS),
+    "tum": ("length_unit", "time_unit", *_TRACKS),
+    "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
+    "rosbag": ("topic", *_TRACKS),
+}
+"""Which options mean something for which format."""
+
 
 def import_capture(
     format_: Annotated[
-        Literal["contactnets", "pinwm"],
+        Literal["contactnets", "pinwm", "jugglebot", "balldrops", "csv", "tum", "hdf5", "rosbag"],
         typer.Argument(
             metavar="FORMAT",
-            help="contactnets: tosses of a cube (.pt files or .npz); pinwm: pushes of a block, with frames and masks.",
+            help="csv, tum, hdf5, rosbag: poses of your own; contactnets: tosses of a cube (.pt files or .npz); "
+            "pinwm: pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: balls that fall.",
             show_default=False,
         ),
     ],
@@ -32,19 +47,56 @@ def import_capture(
         typer.Option(
             "--train",
             min=1,
-            help="contactnets: episodes of the split 'train' (50); pinwm: frames of each of them (12).",
+            help="Episodes of the split 'train' (contactnets: 50, else 60 %); pinwm: frames of each of them (12).",
             show_default=False,
         ),
     ] = None,
     test: Annotated[
         int | None,
-        typer.Option("--test", min=0, help="contactnets: episodes of the split 'test' (100).", show_default=False),
+        typer.Option(
+            "--test",
+            min=0,
+            help="Episodes of the split 'test' (contactnets: 100, else the others).",
+            show_default=False,
+        ),
     ] = None,
     seed: Annotated[
         int | None,
+        typer.Option("--seed", min=0, help="Seed of the permutation before splitting (0).", show_default=False),
+    ] = None,
+    only: Annotated[
+        str | None,
         typer.Option(
-            "--seed", min=0, help="contactnets: seed of the permutation before splitting (0).", show_default=False
+            "--only", metavar="GROUP", help="jugglebot: one session; balldrops: one ball.", show_default=False
         ),
+    ] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            "--columns",
+            metavar="KEY=NAME,...",
+            help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz); "
+            "hdf5: of sets (time, position, quat_wxyz, quat_xyzw).",
+            show_default=False,
+        ),
+    ] = None,
+    length_unit: Annotated[
+        Literal["m", "cm", "mm", "in"] | None,
+        typer.Option("--length-unit", help="csv, tum, hdf5: unit of positions (m).", show_default=False),
+    ] = None,
+    time_unit: Annotated[
+        Literal["s", "ms", "us", "ns"] | None,
+        typer.Option("--time-unit", help="csv, tum, hdf5: unit of times (s).", show_default=False),
+    ] = None,
+    body: Annotated[
+        str | None, typer.Option("--body", help="Name of the body, where the data have none.", show_default=False)
+    ] = None,
+    up: Annotated[
+        Literal["z", "y"] | None, typer.Option("--up", help="The axis that points up (z).", show_default=False)
+    ] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option("--topic", help="rosbag: the poses; of transforms /tf:CHILD_FRAME.", show_default=False),
     ] = None,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -52,24 +104,51 @@ def import_capture(
     debug: Debug = False,
 ) -> None:
     """Recordings in another format to a capture."""
+    given = {"train": train, "test": test, "seed": seed, "only": only, "columns": columns, "body": body, "up": up}
+    given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic}
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        words = {name: value for name, value in given.items() if value is not None}
+        _refuse(format_, words)
+        emit(_imported(format_, source, out, words, overwrite), _summary)
+
+
+def _refuse(format_: str, given: dict[str, Any]) -> None:
+    """Refuse options that mean nothing for a format."""
     from ..schemas import UsageError
 
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        if format_ == "pinwm":
-            from ..datasets.pinwm import import_pinwm
+    legal = [f"--{name.replace('_', '-')}" for name in _OPTIONS[format_]]
+    for name in given:
+        option = f"--{name.replace('_', '-')}"
+        if option not in legal:
+            raise UsageError(
+                f"{option} with {format_}: it means nothing there.", f"{', '.join(legal)}.", "leave it out."
+            )
 
-            if test is not None or seed is not None:
-                raise UsageError(
-                    f"{'--test' if test is not None else '--seed'} with pinwm: nothing is drawn at random there.",
-                    "--train, the number of frames to fit on.",
-                    "leave it out.",
-                )
-            emit(import_pinwm(source, out, 12 if train is None else train, overwrite), _summary)
-        else:
-            from ..datasets.contactnets import import_contactnets
 
-            counts = (50 if train is None else train, 100 if test is None else test)
-            emit(import_contactnets(source, out, *counts, seed or 0, overwrite), _summary)
+def _imported(format_: str, source: Path, out: Path, given: dict[str, Any], overwrite: bool) -> ImportResult:
+    """Import with the options that were given, all others as the importer has them."""
+    from .. import datasets
+
+    renamed = {"train": "n_train", "test": "n_test"}
+    words = {renamed.get(name, name): value for name, value in given.items() if not name.endswith("_unit")}
+    if "columns" in words:
+        words["columns"] = _named(words["columns"])
+    if "length_unit" in _OPTIONS[format_]:
+        words["units"] = datasets.Units(given.get("length_unit"), given.get("time_unit"))
+    return getattr(datasets, f"import_{format_}")(source, out, **words, overwrite=overwrite)
+
+
+def _named(text: str) -> dict[str, str]:
+    """Return what `--columns` names: key to name."""
+    from ..schemas import UsageError
+
+    named = {}
+    for part in text.split(","):
+        key, sign, name = part.partition("=")
+        if not (sign and key.strip() and name.strip()):
+            raise UsageError(f"--columns: '{part}' is no KEY=NAME.", "KEY=NAME,KEY=NAME.", "for example time=t,px=X.")
+        named[key.strip()] = name.strip()
+    return named
 
 
 def _summary(result: ImportResult) -> str:

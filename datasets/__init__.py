@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .atomic import new_directory, new_file, sha256
+    from .balldrops import import_balldrops
     from .cameras import Camera, camera_of, read_cameras, to_intrinsics
     from .capture import Capture
     from .check import CaptureFacts, check_capture
     from .contactnets import import_contactnets
+    from .csv_tracks import import_csv
     from .dataset import read_manifest
+    from .hdf5_tracks import import_hdf5
     from .images import read_label, read_rgb, write_image
+    from .jugglebot import import_jugglebot
     from .kinds import kind_of
     from .loader import RolloutDataset, RolloutReader
     from .manifest import manifest_toml, write_manifest
@@ -23,17 +27,24 @@ if TYPE_CHECKING:
     from .pinwm import import_pinwm
     from .ply import Splats, read_splats, write_splats
     from .progress import progress
+    from .recordings import Units
+    from .rosbag import import_rosbag
     from .tracks import Track, read_tracks, write_tracks
+    from .tum import import_tum
     from .video import read_video
 
 _HOMES = {
     "atomic": ("new_directory", "new_file", "sha256"),
+    "balldrops": ("import_balldrops",),
     "cameras": ("Camera", "camera_of", "read_cameras", "to_intrinsics"),
     "capture": ("Capture",),
     "check": ("CaptureFacts", "check_capture"),
     "contactnets": ("import_contactnets",),
+    "csv_tracks": ("import_csv",),
     "dataset": ("read_manifest",),
+    "hdf5_tracks": ("import_hdf5",),
     "images": ("read_label", "read_rgb", "write_image"),
+    "jugglebot": ("import_jugglebot",),
     "kinds": ("kind_of",),
     "loader": ("RolloutDataset", "RolloutReader"),
     "manifest": ("manifest_toml", "write_manifest"),
@@ -43,7 +54,10 @@ _HOMES = {
     "pinwm": ("import_pinwm",),
     "ply": ("Splats", "read_splats", "write_splats"),
     "progress": ("progress",),
+    "recordings": ("Units",),
+    "rosbag": ("import_rosbag",),
     "tracks": ("Track", "read_tracks", "write_tracks"),
+    "tum": ("import_tum",),
     "video": ("read_video",),
 }
 _PUBLIC = {name: f".{module}" for module, names in _HOMES.items() for name in names}
@@ -59,10 +73,17 @@ __all__ = [
     "SolidProperties",
     "Splats",
     "Track",
+    "Units",
     "camera_of",
     "check_capture",
+    "import_balldrops",
     "import_contactnets",
+    "import_csv",
+    "import_hdf5",
+    "import_jugglebot",
     "import_pinwm",
+    "import_rosbag",
+    "import_tum",
     "kind_of",
     "manifest_toml",
     "mass_properties",

@@ -20,8 +20,9 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 try:
     hidden_effects = importlib.import_module("hidden_effects")
-    mechanics, record, protocol, registry = (
-        importlib.import_module(f"hidden_effects.{name}") for name in ("mechanics", "record", "protocol", "registry")
+    mechanics, mujoco_engine, drake_engine, record, protocol, things = (
+        importlib.import_module(f"hidden_effects.{name}")
+        for name in ("mechanics", "mujoco_engine", "drake_engine", "record", "protocol", "things")
     )
 finally:
     sys.path.remove(str(BENCHMARKS))
@@ -41,7 +42,7 @@ def motion_of(case, kind: str = "throw", length_s: float = 1.0, **change: object
     thing, hidden = case.drawn_thing(), case.drawn_effects()
     start = replace(protocol.draw_start(thing, kind, case.rng("start")), **change)
     world = mechanics.build(mechanics.Mechanics.of(thing, case.law), hidden)
-    return mechanics.simulate(world, hidden, start, length_s), start, hidden
+    return record.ENGINES[case.engine].simulate(world, hidden, start, length_s), start, hidden
 
 
 def high(case, length_s: float = 0.5, **change: object):
@@ -252,11 +253,11 @@ def bounce(case, speed: float) -> float:
     start = {"position_m": np.array([0, 0, radius + 1e-3]), "velocity_m_s": np.array([0, 0, -speed])}
     motion, _, _ = motion_of(case, "drop", 0.03, **start, omega_body_rad_s=np.zeros(3))
     last = np.flatnonzero(motion.touching)[-1] + 2
-    return float(motion.position_m[last + 1, 2] - motion.position_m[last, 2]) / mechanics.STEP_S / speed
+    return float(np.diff(motion.position_m[:, 2])[last] / np.diff(motion.time_s)[last]) / speed
 
 
 def test_restitution_and_how_it_falls_with_the_speed() -> None:
-    from_ratio = importlib.import_module("hidden_effects.things").restitution_of
+    from_ratio = things.restitution_of
     case = silent("ball")
     e = from_ratio(case.drawn_thing().damping_ratio)
     assert bounce(case, 2.0) == pytest.approx(e, rel=0.05)
@@ -364,6 +365,44 @@ def test_noise_outliers_gaps_and_uneven_times() -> None:
     assert off[~wrong].max() < 1e-4 and off[wrong].min() > 0.019
 
 
+def test_drake_as_a_second_truth(tmp_path: Path) -> None:
+    pytest.importorskip("pydrake", reason="drake is not installed: pip install drake")
+    case = silent("cube", "com_offset", engine="drake")
+    motion, start, hidden = motion_of(case, "throw", 0.3, position_m=np.array([0, 0, 9.0]))
+    rotation = Rotation.from_quat(motion.quat_wxyz, scalar_first=True).as_matrix()
+    d = vector(hidden[0].values, "d")
+    assert far_from_a_parabola(motion.time_s, motion.position_m + rotation @ d) < 1e-5
+    other, _, _ = motion_of(replace(case, engine="mujoco"), "throw", 0.3, position_m=np.array([0, 0, 9.0]))
+    at = np.array([0.1, 0.2, 0.29])
+    (one, turned), (two, turned_too) = record.poses(motion, at), record.poses(other, at)
+    assert np.abs(one - two).max() < 3e-4 and np.abs(turned - turned_too).max() < 3e-3
+    plain = silent("cube", engine="drake")
+    found, _ = sliding(plain, np.array([1.0, 0, 0]))
+    assert found == pytest.approx(plain.drawn_thing().friction * G, rel=0.01)
+    ball = silent("ball", engine="drake")
+    e = float(things.restitution_of(ball.drawn_thing().damping_ratio))
+    assert bounce(ball, 1.5) == pytest.approx(e, rel=0.15)
+    assert bounce(ball, 3.0) < bounce(ball, 1.5) < bounce(ball, 0.5)
+    drag = silent("ball", "linear_drag", engine="drake")
+    times, position, _, start, values = high(drag)
+    fallen = start.velocity_m_s[0] * (1 - np.exp(-values["c"] * times[-1])) / values["c"]
+    assert position[-1, 0] - position[0, 0] == pytest.approx(fallen, rel=1e-3)
+    with pytest.raises(ValueError, match="stribeck_friction: not with drake"):
+        motion_of(silent("cube", "stribeck_friction", engine="drake"))
+    truth = hidden_effects.make_capture(tmp_path / "a", small(engine="drake"))
+    assert json.loads(truth.read_text())["engine"]["comes_with"] == ["velocity_restitution"]
+
+
+def test_the_cases_of_drake() -> None:
+    stages = [hidden_effects.drake_cases(stage) for stage in ("development", "report")]
+    for found in stages:
+        assert len({case.name for case in found}) == len(found)
+        assert all(case.engine == "drake" and drake_engine.possible(case.drawn_effects()) for case in found)
+        assert sum(not case.effects for case in found) == 40
+    everything = [case.seed for stage in ("development", "report") for case in hidden_effects.cases(stage)]
+    assert len({case.seed for found in stages for case in found} | set(everything)) == len(everything) + 2 * len(found)
+
+
 def test_the_list_of_cases() -> None:
     stages = [hidden_effects.cases(stage) for stage in ("development", "report")]
     for found in stages:
@@ -384,6 +423,20 @@ def test_the_list_of_cases() -> None:
     more = hidden_effects.cases("report", repeats=2, nulls=3)
     assert {case.name for case in more} > {case.name for case in stages[1] if case.effects}
     assert set(stages[1]) & set(more) == {case for case in stages[1] if case in more}
+
+
+def test_the_rough_cases(tmp_path: Path) -> None:
+    found = hidden_effects.rough_cases("development", nulls=8)
+    assert len(found) == 16 and sum(case.centroid_only for case in found) == 6
+    assert all(case.thing == "ball" for case in found if case.centroid_only)
+    assert not {case.seed for case in found} & {case.seed for case in hidden_effects.cases("development")}
+    case = next(case for case in found if case.effects == ("magnus_lift",))
+    hidden_effects.make_capture(tmp_path / "a", replace(case, train=1, test=1))
+    capture = Capture.open(tmp_path / "a")
+    check_capture(capture)
+    track = capture.tracks("000")["ball"]
+    assert track.quat_wxyz is None and capture.manifest.bodies[0].mass_kg is None
+    assert np.diff(track.time_s).max() > 2.5 / case.rate_hz and np.ptp(np.diff(track.time_s)) > 0.5 / case.rate_hz
 
 
 def test_wrong_cases_are_refused() -> None:

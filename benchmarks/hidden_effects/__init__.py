@@ -8,15 +8,27 @@ from cgwm's where a real one would. From `benchmarks/`:
 
     python -m hidden_effects list --stage report
     python -m hidden_effects make OUT --stage development --only ball/magnus_lift
+    python -m hidden_effects make OUT --list drake         # the second truth: pip install drake
 """
 
 from . import contact, flight, measured, unknown
 from .case import Case
-from .plan import KNOWN, PAIRS, UNKNOWN, cases
+from .plan import KNOWN, PAIRS, UNKNOWN, cases, drake_cases, rough_cases
 from .record import make_capture
 from .registry import EFFECTS
 
 TRUTHS = (flight, contact, measured, unknown)
 """The modules of the effects, which enter them in the registry."""
 
-__all__ = ["EFFECTS", "KNOWN", "PAIRS", "TRUTHS", "UNKNOWN", "Case", "cases", "make_capture"]
+__all__ = [
+    "EFFECTS",
+    "KNOWN",
+    "PAIRS",
+    "TRUTHS",
+    "UNKNOWN",
+    "Case",
+    "cases",
+    "drake_cases",
+    "make_capture",
+    "rough_cases",
+]

@@ -1,7 +1,7 @@
 """List the cases of a stage, or make their captures.
 
 python -m hidden_effects list [--stage report] [--only cube/com_offset]
-python -m hidden_effects make OUT [--stage report] [--only cube/com_offset]
+python -m hidden_effects make OUT [--stage report] [--only cube/com_offset] [--list drake]
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from . import cases, make_capture
+from . import cases, drake_cases, make_capture, rough_cases
+
+LISTS = {"all": cases, "drake": drake_cases, "rough": rough_cases}
 
 
 def main() -> int:
@@ -21,10 +23,11 @@ def main() -> int:
     parser.add_argument("--stage", choices=("development", "report"), default="development")
     parser.add_argument("--only", default="", help="part of the name")
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--list", choices=LISTS, default="all", dest="which")
     words = parser.parse_args()
     if words.what == "make" and words.out is None:
         parser.error("where to? name a directory: make OUT")
-    for case in cases(words.stage, words.repeats):
+    for case in LISTS[words.which](words.stage, words.repeats):
         if words.only not in case.name:
             continue
         if words.what == "make":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Case:
         effects: Names from `EFFECTS`; none for a null.
         magnitude: Of all effects.
         seed: Of the body, the effects' numbers, the throws and the noise.
-        law: The contact's law, 1 or 2 (see `mechanics`).
+        law: The contact's law, 1 or 2 (see `mujoco_engine`); drake has one of its own.
         protocol: Kinds of motion.
         train: Number of training episodes.
         test: Number of test episodes.
@@ -37,6 +38,7 @@ class Case:
         outliers: Share of the samples that are grossly wrong (2 to 10 cm, and 20 to 60 degrees).
         gaps: Number of gaps of 3 to 8 samples in every episode.
         uneven: Spread of the times, in sampling intervals (0.3: each time off by up to that).
+        engine: The truth.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Case:
     outliers: float = 0.0
     gaps: int = 0
     uneven: float = 0.0
+    engine: Literal["mujoco", "drake"] = "mujoco"
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.effects if name not in EFFECTS]

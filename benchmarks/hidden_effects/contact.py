@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .mechanics import STEP_S, Hidden, Mechanics, Moment, Wrench, cross
-from .registry import Array, hidden_effect, horizontal, sign
-from .things import Thing, damping_ratio_of, restitution_of
+from .mechanics import STEP_S, Hidden, Mechanics, Moment, Wrench
+from .registry import hidden_effect, horizontal, sign
+from .rotation import cross
+from .things import Array, Thing, damping_ratio_of, restitution_of
 
 _STRIBECK_SPEED_M_S = 0.4
 _ADHESION_GAP_M = 0.002
@@ -81,9 +82,13 @@ def anisotropic_friction(thing: Thing, size: float, rng: np.random.Generator) ->
 
 @hidden_effect("friction_patch", "contact", 0.12, 0.3)
 def friction_patch(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A disc of 0.2 m radius near the origin with another friction: higher, or where it is small lower too."""
+    """A disc near the origin with another friction: higher, or where it is small lower too.
+
+    Its radius is 0.2 m; 0.5 m with its edge near the origin for a ball, which soon rolls and then feels nothing of it.
+    """
     change = size if size > 0.2 else size * sign(rng)
-    middle, radius = rng.uniform(0.05, 0.2) * horizontal(rng), 0.2
+    radius, near, far = (0.5, 0.3, 0.5) if thing.kind == "ball" else (0.2, 0.05, 0.2)
+    middle = rng.uniform(near, far) * horizontal(rng)
     inside = max(thing.friction + change, _LEAST_FRICTION)
 
     def touch(now: Moment, friction: Array, ratio: Array) -> None:

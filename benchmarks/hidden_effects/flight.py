@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from .mechanics import Hidden, Mechanics, Moment, Wrench, cross
-from .registry import direction, hidden_effect, horizontal, sign, turn
+from .mechanics import Hidden, Mechanics, Moment, Wrench
+from .registry import direction, hidden_effect, horizontal, sign
+from .rotation import cross, turn
 from .things import Thing
 
 NONE = np.zeros(3)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from .mechanics import Hidden
-from .registry import Array, direction, hidden_effect, horizontal, sign, turn
-from .things import Thing
+from .registry import direction, hidden_effect, horizontal, sign
+from .rotation import turn
+from .things import Array, Thing
 
 
 @hidden_effect("length_scale", "measurement", 0.01, 0.03)

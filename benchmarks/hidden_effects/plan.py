@@ -30,7 +30,30 @@ PAIRS: tuple[tuple[Kind, tuple[str, str]], ...] = (
     ("ball", ("gravity_tilt", "torsional_friction")),
 )
 RATES_HZ = (60.0, 100.0, 148.0)
+DRAKE: tuple[tuple[Kind, str], ...] = (
+    ("cube", "linear_drag"),
+    ("ball", "magnus_lift"),
+    ("cube", "com_offset"),
+    ("ball", "gravity_tilt"),
+    ("cube", "spin_damping"),
+    ("cube", "viscous_friction"),
+    ("cube", "length_scale"),
+    ("ball", "gust"),
+)
+"""Effects that the second engine hides, too."""
+ROUGH: tuple[tuple[Kind, tuple[str, ...]], ...] = (
+    ("cube", ("linear_drag",)),
+    ("cube", ("com_offset",)),
+    ("cube", ("anisotropic_friction",)),
+    ("ball", ("spin_damping",)),
+    ("ball", ("magnus_lift",)),
+    ("ball", ("quadratic_drag",)),
+    ("ball", ("gravity_tilt",)),
+    ("ball", ("gust",)),
+)
+"""Effects that are hidden in rough measurements, too; those of the last four have centroids only."""
 SIZES: tuple[Size, ...] = ("small", "large")
+THINGS: tuple[Kind, ...] = ("cube", "ball")
 NULLS = 200
 
 
@@ -49,21 +72,49 @@ def cases(stage: Stage, repeats: int = 1, nulls: int = NULLS, noise: Noise = "sp
     """
     if stage not in ("development", "report"):
         raise ValueError(f"stage '{stage}'; there are development and report")
-    found = []
-    for name in (*KNOWN, *UNKNOWN):
-        for thing in EFFECTS[name].things:
-            for size in SIZES:
-                found += [(thing, (name,), size, k) for k in range(repeats)]
-    for thing, pair in PAIRS:
-        found += [(thing, pair, "large", k) for k in range(repeats)]
-    for k in range(nulls):
-        found.append((("cube", "ball")[k // 2 % 2], (), "large", k))
-    return [_case(stage, noise, *entry) for entry in found]
+    found = [
+        _case(stage, noise, thing, (name,), size, k)
+        for name in (*KNOWN, *UNKNOWN)
+        for thing in EFFECTS[name].things
+        for size in SIZES
+        for k in range(repeats)
+    ]
+    found += [_case(stage, noise, thing, pair, "large", k) for thing, pair in PAIRS for k in range(repeats)]
+    return found + [_case(stage, noise, THINGS[k // 2 % 2], (), "large", k) for k in range(nulls)]
 
 
-def _case(stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int) -> Case:
+def drake_cases(stage: Stage, repeats: int = 1, nulls: int = 40, noise: Noise = "spread") -> list[Case]:
+    """Return cases whose truth is drake: nulls, and eight effects, small and large; see `cases`."""
+    found = [
+        _case(stage, noise, thing, (name,), size, k, "/drake")
+        for thing, name in DRAKE
+        for size in SIZES
+        for k in range(repeats)
+    ]
+    found += [_case(stage, noise, THINGS[k % 2], (), "large", k, "/drake") for k in range(nulls)]
+    return [replace(case, engine="drake", law=1) for case in found]
+
+
+def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = "spread") -> list[Case]:
+    """Return cases measured roughly: 2 % outliers, a gap in every episode, uneven times, no mass; see `cases`.
+
+    Large effects; of `ROUGH`'s last four and of every second null of a ball there are centroids only.
+    """
+    found = [
+        (_case(stage, noise, thing, names, "large", k, "/rough"), place >= len(ROUGH) - 4)
+        for place, (thing, names) in enumerate(ROUGH)
+        for k in range(repeats)
+    ]
+    found += [(_case(stage, noise, THINGS[k // 2 % 2], (), "large", k, "/rough"), k % 4 == 3) for k in range(nulls)]
+    rough = {"outliers": 0.02, "gaps": 1, "uneven": 0.3, "mass_given": False}
+    return [replace(case, centroid_only=centroids, **rough) for case, centroids in found]
+
+
+def _case(
+    stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int, list_: str = ""
+) -> Case:
     what = f"{'+'.join(effects)}/{size}" if effects else "null"
-    name = f"{stage}/{thing}/{what}/{k}"
+    name = f"{stage}{list_}/{thing}/{what}/{k}"
     code = crc32(name.encode())
     # the last bit tells the stages apart, whatever the names
     seed = 2 * (code // 2) + (stage == "report")

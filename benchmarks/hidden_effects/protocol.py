@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 
 from .mechanics import Start
-from .registry import direction, horizontal
+from .registry import direction, horizontal, sign
+from .rotation import rotation_of
 from .things import Array, Thing
 
 Motion = Literal["throw", "slide", "drop", "roll"]
@@ -22,18 +23,21 @@ _GAP_M = 2e-4
 
 def motions(protocol: Protocol, train: int, test: int) -> list[Motion]:
     """Return the kinds of motion of the training and then the test episodes; both splits begin their cycles anew."""
-    if protocol in _ALONE:
-        return [_ALONE[protocol] for _ in range(train + test)]
-    return [_TRAIN[k % len(_TRAIN)] for k in range(train)] + [_TEST[k % len(_TEST)] for k in range(test)]
+    alone = _ALONE.get(protocol)
+    if alone is not None:
+        return [alone for _ in range(train + test)]
+    return [*(_TRAIN[k % len(_TRAIN)] for k in range(train)), *(_TEST[k % len(_TEST)] for k in range(test))]
 
 
 def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
     """Return a first state; paths pass within some centimetres of the world's origin, with any heading.
 
     throw: from 0.25 to 0.6 m at 1 to 2.5 m/s, up to 2 m/s upwards, spin of up to 15 rad/s about any axis.
-    slide: flat on the ground at 0.8 to 2 m/s, a box turning by up to 5 rad/s; a ball with spin of up to 20 rad/s.
+    slide: flat on the ground at 0.8 to 2 m/s, a box turning at 1 to 5 rad/s about the vertical; a ball with spin
+        of 5 to 20 rad/s about the vertical, and as much forwards or backwards.
     drop: from 0.2 to 0.8 m, turned by chance, hardly moving.
-    roll: a ball that rolls at 0.4 to 1.3 m/s while it turns about the vertical, or a box that tumbles over its edges.
+    roll: a ball that rolls at 0.4 to 1.3 m/s while it turns at 3 to 10 rad/s about the vertical, or a box that tumbles
+        over its edges.
     """
     heading, up = horizontal(rng), np.array([0.0, 0.0, 1.0])
     spin = rng.uniform(3, 15) * direction(rng)
@@ -47,29 +51,19 @@ def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
     elif motion == "slide":
         velocity, height, ahead = rng.uniform(0.8, 2.0) * heading, _GAP_M, 0.3
         if thing.kind == "cube":
-            quat, spin = _yaw(rng), rng.uniform(-5, 5) * up
+            quat, spin = _yaw(rng), sign(rng) * rng.uniform(1, 5) * up
         else:
-            spin = rng.uniform(-20, 20) * np.cross(up, heading) + rng.uniform(-20, 20) * up
+            spin = sign(rng) * rng.uniform(5, 20) * np.cross(up, heading) + sign(rng) * rng.uniform(5, 20) * up
     else:
         speed = rng.uniform(0.4, 1.3) if thing.kind == "ball" else rng.uniform(0.8, 1.4)
         velocity, ahead = speed * heading, 0.4
-        spin = speed / thing.size_m * np.cross(up, heading) + rng.uniform(-10, 10) * up * (thing.kind == "ball")
+        spin = speed / thing.size_m * np.cross(up, heading)
+        spin = spin + sign(rng) * rng.uniform(3, 10) * up * (thing.kind == "ball")
         height = _GAP_M if thing.kind == "ball" else rng.uniform(0.02, 0.06)
     place = rng.uniform(-0.05, 0.05, 3) * (1.0, 1.0, 0.0) - ahead * velocity * (1.0, 1.0, 0.0)
-    rotation = rotations(quat[None])[0]
+    rotation = rotation_of(quat)
     place[2] = height + _depth(thing, rotation)
     return Start(place, quat, velocity, rotation.T @ spin)
-
-
-def rotations(quat_wxyz: Array) -> Array:
-    """Return the rotation matrices (T, 3, 3) of unit quaternions (T, 4)."""
-    w, x, y, z = quat_wxyz.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, -1) for row in rows], -2).astype(np.float64)
 
 
 def _depth(thing: Thing, rotation: Array) -> float:

@@ -15,13 +15,14 @@ from cgwm.schemas import Body, BoxShape, CaptureManifest, Ground, Shape, World
 from cgwm.schemas.capture import Measurement, SphereShape
 from numpy.typing import NDArray
 
-from . import mechanics
+from . import drake_engine, mechanics, mujoco_engine
 from .case import Case
 from .mechanics import Hidden, Mechanics, Motion
-from .protocol import draw_start, motions, rotations
+from .protocol import draw_start, motions
+from .rotation import rotations
 from .things import Array, Thing, restitution_of
 
-NAME = {"cube": "cube", "ball": "ball"}
+ENGINES: dict[str, Any] = {"mujoco": mujoco_engine, "drake": drake_engine}
 
 
 def make_capture(directory: Path | str, case: Case, truth: Path | str | None = None, overwrite: bool = False) -> Path:
@@ -42,6 +43,7 @@ def make_capture(directory: Path | str, case: Case, truth: Path | str | None = N
         raise ValueError(f"the truth {path} would lie in the capture {directory}")
     thing, hidden = case.drawn_thing(), case.drawn_effects()
     world = mechanics.build(Mechanics.of(thing, case.law), hidden)
+    engine = ENGINES[case.engine]
     kinds = motions(case.protocol, case.train, case.test)
     names = [f"{k:03d}" for k in range(len(kinds))]
     episodes: dict[str, Any] = {}
@@ -50,9 +52,9 @@ def make_capture(directory: Path | str, case: Case, truth: Path | str | None = N
         (folder / "tracks").mkdir()
         for name, kind in zip(names, kinds, strict=True):
             start = draw_start(thing, kind, case.rng(f"start {name}"))
-            motion = mechanics.simulate(world, hidden, start, case.length_s)
+            motion = engine.simulate(world, hidden, start, case.length_s)
             track, wrong = measured(case, hidden, motion, case.rng(f"noise {name}"))
-            (folder / "tracks" / f"{name}.csv").write_text(tracks_csv({NAME[case.thing]: track}), encoding="utf-8")
+            (folder / "tracks" / f"{name}.csv").write_text(tracks_csv({case.thing: track}), encoding="utf-8")
             touched = motion.time_s[motion.touching]
             episodes[name] = {
                 "motion": kind,
@@ -80,7 +82,7 @@ def measured(
     times = np.arange(count, dtype=float)
     times[1:-1] += case.uneven * rng.uniform(-1, 1, max(count - 2, 0))
     times /= case.rate_hz
-    position, rotation = _poses(motion, times / clock)
+    position, rotation = poses(motion, times / clock)
     for effect in hidden:
         if effect.observe:
             position, rotation = effect.observe(position, rotation)
@@ -101,7 +103,7 @@ def measured(
     return track, wrong[keep]
 
 
-def _poses(motion: Motion, times: Array) -> tuple[Array, Array]:
+def poses(motion: Motion, times: Array) -> tuple[Array, Array]:
     """Return positions (T, 3) and rotations (T, 3, 3) at true times."""
     row = np.searchsorted(motion.time_s, times, side="right").clip(1, len(motion.time_s) - 1)
     before, after = motion.time_s[row - 1], motion.time_s[row]
@@ -125,7 +127,7 @@ def _manifest(case: Case, thing: Thing, names: list[str]) -> CaptureManifest:
     shape = Shape(sphere=ball) if thing.kind == "ball" else Shape(box=box)
     moments = tuple(float(value) for value in thing.inertia_kg_m2)
     body = Body(
-        name=NAME[case.thing],
+        name=case.thing,
         mass_kg=thing.mass_kg if case.mass_given else None,
         inertia_kg_m2=moments if case.inertia_given else None,
         com_m=(0.0, 0.0, 0.0) if case.inertia_given else None,
@@ -165,7 +167,7 @@ def _truth(case: Case, thing: Thing, hidden: list[Hidden], episodes: dict[str, A
             "damping_ratio": thing.damping_ratio,
             "restitution": float(restitution_of(thing.damping_ratio)),
         },
-        "engine": mechanics.version(),
+        "engine": ENGINES[case.engine].facts(thing),
         "episodes": episodes,
     }
 

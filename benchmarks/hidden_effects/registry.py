@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .mechanics import Hidden
-from .things import Kind, Thing
+from .things import Array, Kind, Thing
 
-Array = NDArray[np.float64]
 Size = Literal["small", "large"]
 Acts = Literal["flight", "contact", "measurement", "unknown"]
 Draw = Callable[[Thing, float, np.random.Generator], Hidden]
@@ -89,11 +87,3 @@ def direction(rng: np.random.Generator) -> Array:
 def sign(rng: np.random.Generator) -> float:
     """Return 1 or -1."""
     return float(rng.choice([-1.0, 1.0]))
-
-
-def turn(vector: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a rotation vector [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector / angle if angle else np.zeros(3)
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew

@@ -80,4 +80,4 @@ _RESTITUTIONS = restitution_of(_RATIOS)
 
 def damping_ratio_of(restitution: float | Array) -> Array:
     """Return the damping ratio that gives a restitution above 0.14, by interpolation."""
-    return np.interp(restitution, _RESTITUTIONS[::-1], _RATIOS[::-1])
+    return np.asarray(np.interp(restitution, _RESTITUTIONS[::-1], _RATIOS[::-1]))

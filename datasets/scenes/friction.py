@@ -94,7 +94,7 @@ def _friction_along(friction: Array, along: Array) -> Array:
     """Return the friction (n,) along unit vectors (n, 2), of cones with the half axes (n, 2)."""
     if (friction[:, 0] == friction[:, 1]).all():
         return friction[:, 0]
-    return 1 / np.sqrt(((along / friction) ** 2).sum(1))
+    return 1 / np.sqrt(((along / friction) ** 2).sum(1).clip(1e-6))  # no direction where nothing slips
 
 
 def _cross(a: Array, b: Array) -> Array:

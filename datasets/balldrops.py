@@ -1,0 +1,128 @@
+"""Import of balls that fall 35 m (briandesilva/discovery-of-physics-from-data): heights at 15 Hz, two drops a ball.
+
+What the files say: the height above the ground by time, weights and circumferences. What is made of it here:
+
+- The position is (0, 0, height): nothing was measured sideways. A fit sees no motion there, so that an estimate of the
+  noise from all three coordinates comes out too small by the root of 3.
+- Each ball is a group. Pooled, all drops are one body without a mass: what differs between the balls is for parameters
+  of effects that are shared within a group. Its shape is a sphere of their median radius, which touches nothing: there
+  is no ground, since the tracks end about 12 m above it.
+- One ball alone (`only`) has its own mass and radius, where they were measured.
+- The first drop of each ball is the split "train", the second is "test".
+- The measured velocity is a difference of the heights, and left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ..schemas import Body, InputDataError, Shape, World
+from ..schemas.capture import SphereShape
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .recordings import Recording, Units, write_recordings
+
+BALL = "ball"
+_OUNCE_KG = 0.028349523125
+_COLUMNS = ("ball", "Drop #", "Time (s)", "Height (m)")
+_TABLE = "balls.txt"
+_TODO = "get the data of github.com/briandesilva/discovery-of-physics-from-data."
+
+
+def import_balldrops(
+    source: Path | str, out: Path | str, only: str | None = None, overwrite: bool = False
+) -> ImportResult:
+    """Write the drops as a capture of centroid tracks, one episode a drop, one group a ball.
+
+    Args:
+        source: `ball_drops.csv`, or the directory that holds it and `balls.txt`.
+        out: The capture directory to write.
+        only: One ball, by its name in the capture, for example "bowling-ball".
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If the source is not such data, or there is no such ball.
+        UsageError: If `out` exists, before anything is read.
+    """
+    source = Path(source)
+    path = source / "ball_drops.csv" if source.is_dir() else source
+    with new_directory(out, overwrite) as directory:
+        recordings = _drops(path)
+        balls = list(dict.fromkeys(str(recording.group) for recording in recordings))
+        if only is not None and only not in balls:
+            raise InputDataError(f"{path}: no ball '{only}'.", f"{', '.join(balls)}.")
+        recordings = [recording for recording in recordings if only in (None, recording.group)]
+        table = _table(path.with_name(_TABLE))
+        known = [table.get(_key(ball), (None, None)) for ball in balls if only in (None, ball)]
+        radii = [radius for _, radius in known if radius is not None]
+        if not radii:
+            raise InputDataError(f"{path.with_name(_TABLE)}: no circumference of {only or 'any ball'}.", todo=_TODO)
+        shape = Shape(sphere=SphereShape(radius_m=float(np.median(radii))))
+        body = Body(name=BALL, mass_kg=known[0][0] if only else None, shape=shape)
+        splits = {
+            split: tuple(r.name for r in recordings if r.name.endswith("-1") == (split == "train"))
+            for split in ("train", "test")
+        }
+        return write_recordings(directory, out, World(), (body,), recordings, splits)
+
+
+def _drops(path: Path) -> list[Recording]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream)
+            lacking = [column for column in _COLUMNS if column not in (reader.fieldnames or ())]
+            rows = [] if lacking else list(reader)
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.", todo=_TODO) from None
+    except (UnicodeDecodeError, csv.Error):
+        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+    if lacking or not rows:
+        what = f"no column '{lacking[0]}'" if lacking else "no rows"
+        raise InputDataError(f"{path}: {what}.", f"{', '.join(_COLUMNS)}.", _TODO)
+    drops: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for line, row in enumerate(rows, 2):
+        name = "-".join(row["ball"].lower().split())
+        try:
+            number = str(int(row["Drop #"]))
+            sample = float(row["Time (s)"]), float(row["Height (m)"])
+        except (TypeError, ValueError):
+            raise InputDataError(f"{path}, line {line}: no drop number, time and height.", "numbers.") from None
+        drops.setdefault((name, number), []).append(sample)
+    recordings = []
+    for (name, number), samples in drops.items():
+        values = np.array(samples)
+        position = np.c_[np.zeros((len(values), 2)), values[:, 1]]
+        track = Units("m").track(f"{path}: {name}, drop {number}", values[:, 0], position)
+        recordings.append(Recording(f"{name}-{number}", {BALL: track}, name))
+    return recordings
+
+
+def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
+    """Return mass [kg] and radius [m] by ball; None where it was not measured ("??")."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.", todo=_TODO) from None
+    table = {}
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if number == 1 or not words:
+            continue
+        try:
+            name, weight, circumference = words
+            mass = None if weight == "??" else float(weight) * _OUNCE_KG
+            radius = None if circumference == "??" else float(circumference) * 0.01 / (2 * math.pi)
+        except ValueError:
+            raise InputDataError(f"{path}, line {number}: '{line.strip()}'.", "ball, ounces, centimetres.") from None
+        table[_key(name)] = mass, radius
+    return table
+
+
+def _key(name: str) -> str:
+    """Return a ball's name as both files have it: they differ in spelling."""
+    plain = name.lower().replace("-", "").replace("whiffle", "wiffle")
+    return plain.removesuffix("ball") if "wiffle" in plain else plain

@@ -1,0 +1,204 @@
+"""Import of plain CSV tracks: a file, or a folder with one file an episode, columns by their names."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import Body, InputDataError, did_you_mean
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .recordings import SI, Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .tracks import Track
+
+Array = NDArray[np.float64]
+
+COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz")
+"""What a column may be; `body`, and the four of the orientation, may be absent."""
+_REQUIRED = ("time", "px", "py", "pz")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_NAMES = {
+    "time": ("time", "t", "timestamp", "timestamps", "stamp"),
+    "body": ("body", "object", "rigid_body"),
+    **{f"p{axis}": (f"p{axis}", axis, f"t{axis}", f"pos_{axis}", f"position_{axis}") for axis in "xyz"},
+    **{f"q{part}": (f"q{part}", f"q_{part}", f"quat_{part}", f"orientation_{part}") for part in "wxyz"},
+}
+_UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
+_LENGTHS, _TIMES = ("m", "cm", "mm", "in"), ("s", "ms", "us", "ns")
+
+
+def import_csv(
+    source: Path | str,
+    out: Path | str,
+    columns: Mapping[str, str] | None = None,
+    units: Units = SI,
+    body: str = "body",
+    up: Literal["z", "y"] = "z",
+    n_train: int | None = None,
+    n_test: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> ImportResult:
+    """Write CSV tracks as a capture. Shape, mass and ground are for you to add to its manifest.
+
+    The first line names the columns; commas, semicolons or tabs separate them. Names are known in several spellings
+    (time, t, timestamp; px, x, tx, pos_x; qw, quat_w, ...), and may end in their unit: `x_mm`, `Time (ms)`.
+    Lines without a position are gaps. Each file's times begin at zero.
+
+    Args:
+        source: A file, or a folder of .csv files, each an episode.
+        out: The capture directory to write.
+        columns: From one of `COLUMNS` to the column's name in the file, where it has another.
+        units: Of the numbers, where the columns do not say it.
+        body: Name of the body, where there is no column for it.
+        up: Which axis points up; gravity is set against it, numbers stay.
+        n_train: Number of episodes to fit on; None: 60 %.
+        n_test: Number of episodes to test on; None: the others.
+        seed: Of the permutation.
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If a file is no such track, or its numbers cannot be seconds and metres.
+        UsageError: If `out` exists, before anything is read.
+    """
+    with new_directory(out, overwrite) as directory:
+        for name in columns or {}:
+            if name not in COLUMNS:
+                raise InputDataError(
+                    f"--columns: '{name}' is nothing that a column can be.",
+                    f"{', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}",
+                )
+        files = track_files(Path(source), (".csv",))
+        names = episode_names([path.stem for path in files])
+        recordings = [
+            Recording(name, from_zero(_tracks(path, columns or {}, units, body)))
+            for name, path in zip(names, files, strict=True)
+        ]
+        bodies = dict.fromkeys(name for recording in recordings for name in recording.tracks)
+        splits = drawn_splits(recordings, n_train, n_test, seed)
+        return write_recordings(directory, out, upright(up), map(_body, bodies), recordings, splits)
+
+
+def track_files(source: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the file, or the files with one of the suffixes in a folder, sorted by name.
+
+    Raises:
+        InputDataError: If there is none.
+    """
+    if source.is_file():
+        return [source]
+    files = sorted(path for path in source.glob("*") if path.suffix.lower() in suffixes and path.is_file())
+    if not files:
+        what = f"no {' or '.join(suffixes)} files" if source.is_dir() else "no such file or directory"
+        raise InputDataError(f"{source}: {what}.", f"a {' or '.join(suffixes)} file, or a folder of them.")
+    return files
+
+
+@dataclass(frozen=True)
+class _Header:
+    """Where the columns of a file are, and the units that their names tell."""
+
+    index: dict[str, int]
+    units: Units
+
+
+def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> dict[str, Track]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+    first, _, _ = text.partition("\n")
+    separator = max(",;\t", key=first.count)
+    rows = list(csv.reader(text.splitlines(), delimiter=separator))
+    header = _header(path, rows[0] if rows else [], columns, units)
+    by_body: dict[str, list[list[float]]] = {}
+    wanted = [name for name in COLUMNS if name in header.index and name != "body"]
+    for line, row in enumerate(rows[1:], 2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(rows[0]):
+            raise InputDataError(
+                f"{path}, line {line}: {len(row)} values under {len(rows[0])} columns.", todo="correct the line."
+            )
+        name = row[header.index["body"]].strip() if "body" in header.index else body
+        by_body.setdefault(name, []).append([_number(path, line, row, header, key) for key in wanted])
+    if not by_body:
+        raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
+    tracks = {}
+    for name, values in by_body.items():
+        table = np.array(values)
+        quat = table[:, 4:8] if table.shape[1] > 4 else None
+        tracks[name] = header.units.track(f"{path}: {name}", table[:, 0], table[:, 1:4], quat)
+    return tracks
+
+
+def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Units) -> _Header:
+    names = [name.strip() for name in found]
+    index = {key: k for key in COLUMNS if (k := _place(path, names, key, columns)) is not None}
+    lacking = [key for key in _REQUIRED if key not in index]
+    if not lacking and any(key in index for key in _QUATERNION):
+        lacking = [key for key in _QUATERNION if key not in index]
+    if lacking:
+        raise InputDataError(
+            f"{path}: no column for '{lacking[0]}' among {', '.join(names) or 'none'}.",
+            f"a header line with {', '.join(_REQUIRED)}, and all of {', '.join(_QUATERNION)} or none.",
+            f"name it: --columns {lacking[0]}=NAME.",
+        )
+    for kind, legal, keys in (("length", _LENGTHS, _REQUIRED[1:]), ("time", _TIMES, _REQUIRED[:1])):
+        told = {unit for key in keys if (unit := _plain(names[index[key]])[1]) in legal}
+        told |= {getattr(units, kind)} - {None}
+        if len(told) > 1:
+            raise InputDataError(
+                f"{path}: units of {kind} that differ: {', '.join(sorted(told))}.", "one unit for all columns."
+            )
+        units = replace(units, **{kind: next(iter(told), None)})
+    return _Header(index, units)
+
+
+def _place(path: Path, names: list[str], key: str, columns: Mapping[str, str]) -> int | None:
+    """Return the column that is `key`, or None."""
+    if key in columns:
+        if columns[key] not in names:
+            raise InputDataError(
+                f"{path}: no column '{columns[key]}' (--columns {key}={columns[key]}).", f"{', '.join(names)}."
+            )
+        return names.index(columns[key])
+    hits = [k for k, name in enumerate(names) if _plain(name)[0] in _NAMES[key]]
+    if len(hits) > 1:
+        raise InputDataError(
+            f"{path}: '{names[hits[0]]}' and '{names[hits[1]]}' may both be '{key}'.",
+            "one.",
+            f"choose: --columns {key}=NAME.",
+        )
+    return hits[0] if hits else None
+
+
+def _plain(name: str) -> tuple[str, str]:
+    """Return a column's name in small letters without its unit, and the unit or an empty string."""
+    name = name.strip().lower()
+    found = _UNIT.match(name)
+    return (found[1].strip(" _").replace(" ", "_"), found[2]) if found else (name.replace(" ", "_"), "")
+
+
+def _number(path: Path, line: int, row: list[str], header: _Header, key: str) -> float:
+    cell = row[header.index[key]].strip()
+    try:
+        return float(cell) if cell or key == "time" else float("nan")
+    except ValueError:
+        shown = f"'{cell}' is no number" if cell else "the time is missing"
+        raise InputDataError(
+            f"{path}, line {line}: {key}: {shown}.", "numbers; empty where nothing was seen."
+        ) from None
+
+
+def _body(name: str) -> Body:
+    return Body(name=name)

@@ -1,0 +1,132 @@
+"""Import of poses from HDF5: every group with times and positions is an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import Body, InputDataError, did_you_mean
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .csv_tracks import track_files
+from .recordings import SI, Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .tracks import Track
+
+Array = NDArray[np.float64]
+
+SETS = ("time", "position", "quat_wxyz", "quat_xyzw")
+"""What a set may be; at most one of the two orientations."""
+_NAMES = {
+    "time": ("time", "time_s", "t", "timestamp", "timestamps"),
+    "position": ("position", "position_m", "positions", "pos", "translation", "p"),
+    "quat_wxyz": ("quat_wxyz", "quaternion_wxyz"),
+    "quat_xyzw": ("quat_xyzw", "quaternion_xyzw"),
+}
+_WIDTHS = {"time": (), "position": (3,), "quat_wxyz": (4,), "quat_xyzw": (4,)}
+
+
+def import_hdf5(
+    source: Path | str,
+    out: Path | str,
+    columns: Mapping[str, str] | None = None,
+    units: Units = SI,
+    body: str = "body",
+    up: Literal["z", "y"] = "z",
+    n_train: int | None = None,
+    n_test: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> ImportResult:
+    """Write poses as a capture. Shape, mass and ground are for you to add to its manifest.
+
+    An episode is a group that holds a set of times (T,) and one of positions (T, 3), and may hold one of quaternions
+    (T, 4), whose order its name must tell. Each episode's times begin at zero.
+
+    Args:
+        source: A file, or a folder of .h5 and .hdf5 files.
+        out: The capture directory to write.
+        columns: From one of `SETS` to the set's name in a group (or its path, such as `obs/pos`), where it has another.
+        units: Where the numbers are others than metres and seconds.
+        body: Name of the body.
+        up: Which axis points up; gravity is set against it, numbers stay.
+        n_train: Number of episodes to fit on; None: 60 %.
+        n_test: Number of episodes to test on; None: the others.
+        seed: Of the permutation.
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If a file has no such groups, or its numbers cannot be seconds and metres.
+        UsageError: If `out` exists, before anything is read.
+    """
+    with new_directory(out, overwrite) as directory:
+        for name in columns or {}:
+            if name not in SETS:
+                raise InputDataError(
+                    f"--columns: '{name}' is nothing that a set can be.",
+                    f"{', '.join(SETS)}.{did_you_mean(name, SETS)}",
+                )
+        files = track_files(Path(source), (".h5", ".hdf5"))
+        found = [(path, name, track) for path in files for name, track in _episodes(path, columns or {}, units)]
+        several = len(files) > 1
+        names = episode_names([f"{path.stem}-{name}" if several else name for path, name, _ in found])
+        recordings = [
+            Recording(name, from_zero({body: track})) for name, (_, _, track) in zip(names, found, strict=True)
+        ]
+        splits = drawn_splits(recordings, n_train, n_test, seed)
+        return write_recordings(directory, out, upright(up), (Body(name=body),), recordings, splits)
+
+
+def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tuple[str, Track]]:
+    tracks: list[tuple[str, Track]] = []
+    seen: list[str] = []
+    try:
+        with h5py.File(path, "r") as file:
+            groups: list[h5py.Group] = [file]
+            file.visititems(lambda _, item: groups.append(item) if isinstance(item, h5py.Group) else seen.append(_))
+            for group in groups:
+                sets = {key: _set(path, group, key, columns) for key in SETS}
+                if sets["time"] is None or sets["position"] is None:
+                    continue
+                where = f"{path}: {group.name}"
+                quat = _orientation(where, group, sets["quat_wxyz"], sets["quat_xyzw"])
+                track = units.track(where, sets["time"], sets["position"], quat)
+                tracks.append((str(group.name).strip("/").replace("/", "-") or path.stem, track))
+    except OSError as error:
+        raise InputDataError(f"{path}: not an HDF5 file that can be read: {str(error)[:120]}.") from None
+    if not tracks:
+        shown = ", ".join(seen[:8]) + (", ..." if len(seen) > 8 else "")
+        raise InputDataError(
+            f"{path}: no group with times and positions; there are {shown or 'no sets'}.",
+            "groups with 'time' (T,), 'position' (T, 3) and, where measured, 'quat_wxyz' or 'quat_xyzw' (T, 4).",
+            "name them: --columns time=NAME,position=NAME,quat_wxyz=NAME.",
+        )
+    return tracks
+
+
+def _set(path: Path, group: h5py.Group, key: str, columns: Mapping[str, str]) -> Array | None:
+    for name in (columns[key],) if key in columns else _NAMES[key]:
+        item = group.get(name)
+        if isinstance(item, h5py.Dataset):
+            if item.dtype.kind not in "fiu" or item.shape[1:] != _WIDTHS[key] or item.ndim != 1 + len(_WIDTHS[key]):
+                wanted = "(T, " + ", ".join(map(str, _WIDTHS[key])) + ")" if _WIDTHS[key] else "(T,)"
+                raise InputDataError(f"{path}: {item.name} has the shape {item.shape}.", f"numbers, {wanted}.")
+            return np.asarray(item, np.float64)
+    return None
+
+
+def _orientation(where: str, group: h5py.Group, wxyz: Array | None, xyzw: Array | None) -> Array | None:
+    if wxyz is not None and xyzw is not None:
+        raise InputDataError(f"{where}: quaternions in both orders.", "one set of them.")
+    unsaid = [name for name in ("quat", "quaternion", "orientation", "rotation") if name in group]
+    if wxyz is None and xyzw is None and unsaid:
+        raise InputDataError(
+            f"{where}: '{unsaid[0]}' does not say whether w comes first.",
+            "quat_wxyz or quat_xyzw.",
+            f"add --columns quat_wxyz={unsaid[0]} or quat_xyzw={unsaid[0]}.",
+        )
+    return wxyz if xyzw is None else xyzw[:, [3, 0, 1, 2]]

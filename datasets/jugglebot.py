@@ -1,0 +1,189 @@
+"""Import of the throws of Jugglebot (Project-DeepBlue-Juggling/Jugglebot): a machine throws a ball, 300 Hz, centroids.
+
+A session is an export of the capture system (.json, millimetres) or an .npz of it (metres). In each track the machine
+holds the ball, throws it, it flies, hits the floor once and rolls off. Here
+
+- an episode begins where the ball has left the machine, which is its time zero, and ends (`end_s`) before it hits the
+  floor; what comes after stays in the track, and moving `end_s` takes it in;
+- both are found in the data: the part around the top of the flight that accelerates like a thrown ball is fitted by a
+  quartic in time, and grown to where the measurement leaves it;
+- there is no ground: the floor is at another height in each session, and what is known of it is where the ball turned;
+- sessions are groups, and each is split by itself.
+"""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import Body, InputDataError, Shape, World
+from ..schemas.capture import SphereShape
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .recordings import Recording, drawn_splits, episode_names, write_recordings
+from .tracks import Track
+
+Array = NDArray[np.float64]
+
+BALL = "ball"
+RADIUS_M = 0.035
+GRAVITY_M_S2 = 9.81
+
+_HALF_WINDOW_S, _TOLERANCE_M_S2 = 0.05, 2.0
+"""A quadratic over this much to both sides tells flight from everything else, by its acceleration."""
+_LEAVES_M, _MARGIN = 0.0015, 5
+"""Flight ends where the measurement leaves the fit by so much (noise is 0.4 mm), less some samples."""
+_SHORTEST_S = 0.3
+_TODO = "get the recordings of github.com/Project-DeepBlue-Juggling/Jugglebot."
+
+
+def import_jugglebot(
+    source: Path | str,
+    out: Path | str,
+    only: str | None = None,
+    n_train: int | None = None,
+    n_test: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> ImportResult:
+    """Write the throws as a capture of centroid tracks, one episode a throw, one group a session.
+
+    Args:
+        source: A session's .json or .npz, or a directory of them; of two with one name the .npz is read.
+        out: The capture directory to write.
+        only: The name of one session.
+        n_train: Number of throws to fit on; None: 60 %.
+        n_test: Number of throws to test on; None: the others.
+        seed: Of the permutation within each session.
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If the source is not such data, or a track has no flight.
+        UsageError: If `out` exists, before anything is read.
+    """
+    with new_directory(out, overwrite) as directory:
+        sessions = _sessions(Path(source), only)
+        recordings = []
+        for path, session in zip(sessions, episode_names([path.stem for path in sessions]), strict=True):
+            throws = _read_npz(path) if path.suffix == ".npz" else _read_json(path)
+            for number, (time, position) in enumerate(throws):
+                where = f"{path}: throw {number}"
+                recordings.append(_throw(where, f"{session}-{number:02d}", session, time, position))
+        splits = drawn_splits(recordings, n_train, n_test, seed)
+        ball = Body(name=BALL, shape=Shape(sphere=SphereShape(radius_m=RADIUS_M)))
+        return write_recordings(directory, out, World(), (ball,), recordings, splits)
+
+
+def flight(time: Array, position: Array) -> tuple[int, int]:
+    """Return the first and the last sample of the free flight around the highest point.
+
+    Args:
+        time: Times [s], shape (T,).
+        position: Positions [m], z up, shape (T, 3).
+
+    Raises:
+        ValueError: If nothing there flies for 0.3 s.
+    """
+
+    def flies(k: int) -> bool:
+        near = np.abs(time - time[k]) < _HALF_WINDOW_S
+        if np.count_nonzero(near) < 10:
+            return False
+        acceleration = 2 * np.polyfit(time[near] - time[k], position[near], 2)[0]
+        return float(np.hypot(np.hypot(*acceleration[:2]), acceleration[2] + GRAVITY_M_S2)) < _TOLERANCE_M_S2
+
+    top = int(np.argmax(position[:, 2]))
+    first = next((k for k in range(top, len(time)) if time[k] < time[top] + 0.1 and flies(k)), -1)
+    if first < 0:
+        raise ValueError("nothing flies at the highest point")
+    last = first
+    while first > 0 and flies(first - 1):
+        first -= 1
+    while last < len(time) - 1 and flies(last + 1):
+        last += 1
+    middle = time[(first + last) // 2]
+    fit = np.polyfit(time[first : last + 1] - middle, position[first : last + 1], 4)
+    powers = (time - middle)[:, None] ** np.arange(4, -1, -1)
+    on = np.linalg.norm(position - powers @ fit, axis=1) < _LEAVES_M
+    while first > 1 and on[first - 2 : first].any():  # one sample off alone is noise
+        first -= 1
+    while last < len(time) - 2 and on[last + 1 : last + 3].any():
+        last += 1
+    first, last = first + _MARGIN, last - _MARGIN
+    if last <= first or time[last] - time[first] < _SHORTEST_S:
+        raise ValueError(f"the flight takes less than {_SHORTEST_S:g} s")
+    return first, last
+
+
+def _throw(where: str, name: str, session: str, time: Array, position: Array) -> Recording:
+    seen = np.isfinite(position).all(1)
+    time, position = time[seen], position[seen]
+    try:
+        if len(time) < 20 or (np.diff(time) <= 0).any():
+            raise ValueError(f"{len(time)} samples, or times that do not increase")
+        first, last = flight(time, position)
+    except ValueError as error:
+        raise InputDataError(f"{where}: {error}.", "a ball that is thrown and falls, z up.", _TODO) from None
+    track = Track(time[first:] - time[first], position[first:])
+    return Recording(name, {BALL: track}, session, end_s=round(float(time[last] - time[first]), 6))
+
+
+def _sessions(source: Path, only: str | None) -> list[Path]:
+    files = [source] if source.is_file() else [*source.glob("*.json"), *source.glob("*.npz")]
+    by_name = {path.stem: path for path in files if path.suffix in (".json", ".npz")}  # .npz comes last and stays
+    if not by_name:
+        what = "no sessions of Jugglebot" if source.exists() else "no such file or directory"
+        raise InputDataError(f"{source}: {what}.", "a session's .json or .npz, or a directory of them.", _TODO)
+    if only is not None and only not in by_name:
+        raise InputDataError(f"{source}: no session '{only}'.", f"{', '.join(sorted(by_name))}.")
+    return [path for name, path in sorted(by_name.items()) if only in (None, name)]
+
+
+def _read_npz(path: Path) -> list[tuple[Array, Array]]:
+    """Return times [s] and positions [m] of the throws."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            offsets, rows = archive["offsets"].astype(np.int64), archive["txyz"].astype(np.float64)
+    except KeyError as error:
+        raise InputDataError(f"{path}: no array {error}.", "offsets, txyz.", _TODO) from None
+    except Exception as error:  # numpy and zipfile raise many kinds
+        raise InputDataError(f"{path}: not an .npz that can be read: {error}.") from None
+    sound = rows.ndim == 2 and rows.shape[1] == 4 and len(offsets) > 1
+    if not sound or offsets[0] != 0 or offsets[-1] != len(rows) or (np.diff(offsets) <= 0).any():
+        raise InputDataError(
+            f"{path}: 'txyz' has the shape {rows.shape}, 'offsets' {offsets.shape}.",
+            "(rows, 4), and offsets that grow from 0 to the number of rows.",
+            _TODO,
+        )
+    return [(rows[a:b, 0], rows[a:b, 1:]) for a, b in pairwise(offsets.tolist())]
+
+
+def _read_json(path: Path) -> list[tuple[Array, Array]]:
+    """Return the same of an export: parts of consecutive frames, positions in millimetres."""
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8-sig"))
+        rate = float(data["Timebase"]["Frequency"])
+        throws = []
+        for marker in data["Markers"]:
+            times, positions = [], []
+            for part in marker["Parts"]:
+                values = np.array([row[:3] for row in part["Values"]], np.float64).reshape(-1, 3)
+                times.append((part["Range"]["Start"] + np.arange(len(values))) / rate)
+                positions.append(1e-3 * values)
+            throws.append((np.concatenate(times), np.concatenate(positions)))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputDataError(f"{path}: not a .json that can be read: {error}.") from None
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputDataError(
+            f"{path}: not an export of Qualisys' tracks: {type(error).__name__}: {error}.",
+            "Timebase.Frequency, and Markers with Parts of Range.Start and Values in mm.",
+            _TODO,
+        ) from None
+    if not throws:
+        raise InputDataError(f"{path}: no markers.", todo=_TODO)
+    return throws

@@ -1,0 +1,219 @@
+"""What importers of tracks share: recordings on the way to a capture, their units, and how they are split."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas import QUATERNION_NORM_TOLERANCE, Body, CaptureManifest, InputDataError, World
+from ..schemas.capture import Episode
+from ..schemas.imports import ImportResult
+from .manifest import write_manifest
+from .progress import note, progress
+from .tracks import Track, tracks_csv
+
+Array = NDArray[np.float64]
+LengthUnit = Literal["m", "cm", "mm", "in"]
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+_LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
+"""Beyond these, numbers without a stated unit are not believed to be seconds and metres."""
+_TRAIN_SHARE = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One episode on its way to a capture: its tracks by body, and what the manifest says of it.
+
+    Attributes:
+        name: Of the episode.
+        tracks: By body.
+        group: The session that it belongs to.
+        start_s: Ignore what was measured before [s].
+        end_s: Ignore what was measured after [s].
+    """
+
+    name: str
+    tracks: dict[str, Track]
+    group: str | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+
+    @property
+    def entry(self) -> Episode:
+        """What the manifest says of the episode."""
+        return Episode(group=self.group, start_s=self.start_s, end_s=self.end_s)
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of recorded numbers; None: metres and seconds, unless that cannot be.
+
+    Quaternions are brought to unit length where their norm is off by no more than the tolerance.
+    """
+
+    length: LengthUnit | None = None
+    time: TimeUnit | None = None
+
+    def track(self, where: str, time: Array, position: Array, quat_wxyz: Array | None = None) -> Track:
+        """Return a track in metres and seconds, its times as they are (in seconds).
+
+        Samples without a position (not finite) are left out, as gaps are allowed.
+
+        Args:
+            where: What the numbers come from, for messages.
+            time: Shape (T,), in the unit of time.
+            position: Shape (T, 3), in the unit of length.
+            quat_wxyz: Shape (T, 4), or None for a centroid.
+
+        Raises:
+            InputDataError: If fewer than two samples are left, times do not increase, are not finite or step so far
+                that they are no seconds, positions spread so far that they are no metres, or quaternions are not unit.
+        """
+        seen = np.asarray(np.isfinite(position).all(1))
+        if quat_wxyz is not None:
+            seen &= np.isfinite(quat_wxyz).all(1)
+        if (gaps := int(np.count_nonzero(~seen))) > 0:
+            note(f"{where}: {gaps} of {len(seen)} samples have no pose and are left out")
+        time, position = time[seen], position[seen]
+        if len(time) < 2:
+            raise InputDataError(f"{where}: {len(time)} samples with a pose.", "at least 2.")
+        if not np.isfinite(time).all():
+            raise InputDataError(f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.")
+        self._check(where, time, position)
+        quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
+        return Track(time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat)
+
+    def _check(self, where: str, time: Array, position: Array) -> None:
+        steps = np.diff(time)
+        if (bad := np.flatnonzero(steps <= 0)).size:
+            k = int(bad[0])
+            raise InputDataError(
+                f"{where}: time {time[k + 1]:.9g} comes after {time[k]:.9g}.",
+                "times that increase from sample to sample.",
+                "sort the samples and remove duplicates.",
+            )
+        step, spread = float(np.median(steps)), float(np.ptp(position, axis=0).max())
+        if self.time is None and step >= _SLOWEST_STEP_S:
+            unit = "ms" if step < 500 else "us" if step < 5e5 else "ns"
+            raise InputDataError(
+                f"{where}: from sample to sample the time grows by {step:.6g}: hardly seconds.",
+                "seconds, or another unit that is named.",
+                f"add --time-unit {unit} (or, if these are seconds: --time-unit s).",
+            )
+        if self.length is None and spread > _LONGEST_PATH_M:
+            raise InputDataError(
+                f"{where}: positions spread over {spread:.6g}: hardly metres.",
+                "metres, or another unit that is named.",
+                "add --length-unit mm (or, if these are metres: --length-unit m).",
+            )
+
+
+SI = Units()
+"""Metres and seconds, unless that cannot be."""
+
+
+def from_zero(tracks: Mapping[str, Track]) -> dict[str, Track]:
+    """Return the tracks with the earliest time of all of them as time zero: clocks often count from 1970."""
+    first = min(float(track.time_s[0]) for track in tracks.values())
+    return {body: Track(track.time_s - first, track.position_m, track.quat_wxyz) for body, track in tracks.items()}
+
+
+def episode_names(stems: Sequence[str]) -> list[str]:
+    """Return legal, distinct names of episodes for names of files."""
+    names: list[str] = []
+    for stem in stems:
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "-", stem).strip("-.") or "episode"
+        count = 1
+        while (chosen := name if count == 1 else f"{name}-{count}") in names:
+            count += 1
+        names.append(chosen)
+    return names
+
+
+def drawn_splits(
+    recordings: Sequence[Recording], n_train: int | None, n_test: int | None, seed: int
+) -> dict[str, tuple[str, ...]]:
+    """Return the splits: each group permuted by the seed, then groups in turn; the first are "train", the next "test".
+
+    Args:
+        recordings: The episodes.
+        n_train: Number of training episodes; None: 60 % of those that are not asked for as tests.
+        n_test: Number of test episodes; None: all others.
+        seed: Of `numpy.random.default_rng`.
+
+    Raises:
+        InputDataError: If there are fewer episodes.
+    """
+    rng = np.random.default_rng(seed)
+    groups: dict[str | None, list[str]] = {}
+    for recording in recordings:
+        groups.setdefault(recording.group, []).append(recording.name)
+    shuffled = [[names[k] for k in rng.permutation(len(names))] for names in groups.values()]
+    longest = max(map(len, shuffled))
+    order = [names[k] for k in range(longest) for names in shuffled if k < len(names)]
+    if n_train is None:
+        n_train = len(order) - n_test if n_test is not None else math.ceil(_TRAIN_SHARE * len(order))
+    n_test = len(order) - n_train if n_test is None else n_test
+    if n_train < 1 or n_test < 0 or n_train + n_test > len(order):
+        raise InputDataError(
+            f"{max(n_train, 0)} training and {max(n_test, 0)} test episodes of {len(order)} recordings.",
+            f"at least 1 to train on, and no more than {len(order)} together.",
+        )
+    splits = {"train": tuple(order[:n_train]), "test": tuple(order[n_train : n_train + n_test])}
+    return {name: episodes for name, episodes in splits.items() if episodes}
+
+
+def write_recordings(
+    directory: Path,
+    out: Path | str,
+    world: World,
+    bodies: Iterable[Body],
+    recordings: Sequence[Recording],
+    splits: dict[str, tuple[str, ...]],
+) -> ImportResult:
+    """Write the manifest and the tracks into an empty directory that becomes `out`."""
+    manifest = CaptureManifest(
+        format="cgwm-capture/1",
+        world=world,
+        bodies=tuple(bodies),
+        splits=splits,
+        episodes={recording.name: recording.entry for recording in recordings if recording.entry != Episode()},
+    )
+    write_manifest(directory / "capture.toml", manifest)
+    (directory / "tracks").mkdir()
+    for recording in progress(recordings, "recordings", unit="recording"):
+        (directory / "tracks" / f"{recording.name}.csv").write_text(tracks_csv(recording.tracks), encoding="utf-8")
+    return ImportResult(
+        capture=str(out),
+        episodes=len(recordings),
+        samples=sum(len(track) for recording in recordings for track in recording.tracks.values()),
+        splits={name: len(episodes) for name, episodes in splits.items()},
+    )
+
+
+def upright(up: Literal["z", "y"]) -> World:
+    """Return a world without a ground whose gravity points against an axis; numbers stay as they are."""
+    return World(gravity_m_s2=(0.0, 0.0, -9.81) if up == "z" else (0.0, -9.81, 0.0))
+
+
+def _unit(where: str, quat_wxyz: Array) -> Array:
+    norm = np.linalg.norm(quat_wxyz, axis=1)
+    off = np.abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE
+    if off.any():
+        raise InputDataError(
+            f"{where}: {np.count_nonzero(off)} of {len(norm)} quaternions have another norm than 1, "
+            f"the first {norm[off][0]:.4f}.",
+            f"norm 1 within {QUATERNION_NORM_TOLERANCE:g}.",
+            "normalise the quaternions where they are made.",
+        )
+    return quat_wxyz / norm[:, None]

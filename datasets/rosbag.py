@@ -1,0 +1,142 @@
+"""Import of poses from ROS bags (ROS 1 .bag, ROS 2 directories, .mcap) by the library rosbags, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ..schemas import Body, InputDataError, UsageError, did_you_mean
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .progress import note
+from .recordings import Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .tracks import Track
+
+POSES = {
+    "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    "geometry_msgs/msg/TransformStamped": "transform",
+    "nav_msgs/msg/Odometry": "pose.pose",
+}
+"""Types of messages that hold a pose and its time, and where it is in them."""
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+"""A list of TransformStamped, of several frames."""
+
+
+def import_rosbag(
+    source: Path | str,
+    out: Path | str,
+    topic: str | None = None,
+    body: str = "body",
+    up: Literal["z", "y"] = "z",
+    n_train: int | None = None,
+    n_test: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> ImportResult:
+    """Write the poses of one topic as a capture, one episode a bag.
+
+    Shape, mass and ground are for you to add to its manifest.
+
+    The time of a pose is that of its header. A pose that stands twice with one time counts once.
+
+    Args:
+        source: A bag, or a folder of bags.
+        out: The capture directory to write.
+        topic: Its name; may be left out where a bag has one topic of poses. Of transforms: `/tf:child_frame`.
+        body: Name of the body.
+        up: Which axis points up; gravity is set against it, numbers stay.
+        n_train: Number of episodes to fit on; None: 60 %.
+        n_test: Number of episodes to test on; None: the others.
+        seed: Of the permutation.
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If there is no such bag or topic, or its poses are no track.
+        UsageError: If `out` exists, before anything is read; or if rosbags is not installed.
+    """
+    try:
+        import_module("rosbags.highlevel")
+    except ImportError:
+        raise UsageError("ROS bags need the package rosbags.", todo="pip install 'cgwm[ros]'.") from None
+    with new_directory(out, overwrite) as directory:
+        bags = _bags(Path(source))
+        names = episode_names([path.stem for path in bags])
+        recordings = [
+            Recording(name, from_zero({body: _track(path, topic)})) for name, path in zip(names, bags, strict=True)
+        ]
+        splits = drawn_splits(recordings, n_train, n_test, seed)
+        return write_recordings(directory, out, upright(up), (Body(name=body),), recordings, splits)
+
+
+def _bags(source: Path) -> list[Path]:
+    def is_bag(path: Path) -> bool:
+        return path.suffix in (".bag", ".mcap") if path.is_file() else (path / "metadata.yaml").is_file()
+
+    bags = [source] if is_bag(source) else sorted(filter(is_bag, source.glob("*")))
+    if not bags:
+        what = "no ROS bags" if source.exists() else "no such file or directory"
+        raise InputDataError(
+            f"{source}: {what}.", "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them."
+        )
+    return bags
+
+
+def _track(path: Path, topic: str | None) -> Track:
+    rosbags: Any = import_module("rosbags.highlevel")
+    stores: Any = import_module("rosbags.typesys")
+    try:
+        with rosbags.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as reader:
+            name, frame = _chosen(path, reader, topic)
+            rows = list(_poses(reader, name, frame))
+    except (rosbags.AnyReaderError, OSError) as error:
+        raise InputDataError(f"{path}: not a ROS bag that can be read: {str(error)[:160]}.") from None
+    if not rows:
+        shown = f" of '{frame}'" if frame else ""
+        raise InputDataError(f"{path}: no poses{shown} on {name}.", todo="choose another: --topic NAME.")
+    table = np.array(rows)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    fresh = np.r_[True, np.diff(table[:, 0]) > 0]
+    if not fresh.all():
+        note(f"{path}: {np.count_nonzero(~fresh)} poses have the time of the one before and are left out")
+    table = table[fresh]
+    first = table[0, 0]
+    return Units("m", "s").track(f"{path}: {name}", 1e-9 * (table[:, 0] - first), table[:, 1:4], table[:, 4:])
+
+
+def _chosen(path: Path, reader: Any, topic: str | None) -> tuple[str, str]:
+    """Return the topic, and the child frame where it holds transforms."""
+    kinds = {connection.topic: connection.msgtype for connection in reader.connections}
+    poses = sorted(name for name, kind in kinds.items() if kind in POSES)
+    name, _, frame = (topic or "").partition(":")
+    if topic is None and len(poses) == 1:
+        name = poses[0]
+    if name in poses or (frame and kinds.get(name) == TRANSFORMS):
+        return name, frame
+    transforms = [f"{name}:CHILD_FRAME" for name, kind in kinds.items() if kind == TRANSFORMS]
+    legal = [*poses, *sorted(transforms)]
+    found = f"no topic of poses '{topic}'" if topic else f"{len(poses)} topics of poses"
+    nearest = did_you_mean(topic or "", legal)
+    raise InputDataError(f"{path}: {found}.", f"{', '.join(legal) or 'none is in it'}.{nearest}", "add --topic NAME.")
+
+
+def _poses(reader: Any, topic: str, frame: str) -> Iterator[list[float]]:
+    """Yield time [ns], position [m] and quat_wxyz; times in ns since 1970 are exact to 256 ns as floats."""
+    connections = [connection for connection in reader.connections if connection.topic == topic]
+    for connection, _, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        for one in message.transforms if connection.msgtype == TRANSFORMS else (message,):
+            if frame and one.child_frame_id != frame:
+                continue
+            pose = one
+            for part in POSES.get(connection.msgtype, "transform").split("."):
+                pose = getattr(pose, part)
+            place = pose.translation if hasattr(pose, "translation") else pose.position
+            turn = pose.rotation if hasattr(pose, "rotation") else pose.orientation
+            stamp = one.header.stamp
+            time = float(stamp.sec * 1_000_000_000 + stamp.nanosec)
+            yield [time, place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]

@@ -1,0 +1,81 @@
+"""Import of trajectories in the format of the TUM RGB-D benchmark: `timestamp tx ty tz qx qy qz qw` a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..schemas import Body, InputDataError
+from ..schemas.imports import ImportResult
+from .atomic import new_directory
+from .csv_tracks import track_files
+from .recordings import SI, Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .tracks import Track
+
+
+def import_tum(
+    source: Path | str,
+    out: Path | str,
+    units: Units = SI,
+    body: str = "body",
+    up: Literal["z", "y"] = "z",
+    n_train: int | None = None,
+    n_test: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> ImportResult:
+    """Write trajectories as a capture. Shape, mass and ground are for you to add to its manifest.
+
+    Seconds, metres and unit quaternions with w last, as the format says; lines with # are comments. Each file's times
+    begin at zero. A trajectory of a camera is no pose of a body: what is imported must be T_world_body.
+
+    Args:
+        source: A file, or a folder of .txt and .tum files, each an episode.
+        out: The capture directory to write.
+        units: Where the numbers are others than metres and seconds.
+        body: Name of the body.
+        up: Which axis points up; gravity is set against it, numbers stay.
+        n_train: Number of episodes to fit on; None: 60 %.
+        n_test: Number of episodes to test on; None: the others.
+        seed: Of the permutation.
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If a file is no such trajectory, or its numbers cannot be seconds and metres.
+        UsageError: If `out` exists, before anything is read.
+    """
+    with new_directory(out, overwrite) as directory:
+        files = track_files(Path(source), (".txt", ".tum"))
+        names = episode_names([path.stem for path in files])
+        recordings = [
+            Recording(name, from_zero({body: _track(path, units)})) for name, path in zip(names, files, strict=True)
+        ]
+        splits = drawn_splits(recordings, n_train, n_test, seed)
+        return write_recordings(directory, out, upright(up), (Body(name=body),), recordings, splits)
+
+
+def _track(path: Path, units: Units) -> Track:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != 8:
+            raise InputDataError(
+                f"{path}, line {number}: '{line.strip()[:60]}'.", "8 numbers: timestamp tx ty tz qx qy qz qw."
+            )
+        rows.append(values)
+    table = np.array(rows).reshape(-1, 8)
+    return units.track(str(path), table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])
