@@ -43,7 +43,7 @@ def diagnose(
 
 
 def _summary(result: DiagnoseResult) -> str:
-    from .output import table, warnings
+    from .output import millimetres, table, warnings
 
     lines = [result.sentence]
     shown = [entry for entry in result.ranking if entry.effect in result.selected]
@@ -54,6 +54,10 @@ def _summary(result: DiagnoseResult) -> str:
         lines.append(
             f"flight, mean chi2 of what is left: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
         )
+    for entry in result.ranking:
+        if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
+            errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
+            lines.append(f"{entry.effect}: short predictions in episodes that it was not fitted to {errors}")
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
         lines.append(f"law of what is left: {terms}; organised by {result.residual_law.where}")

@@ -229,12 +229,15 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
             for p, v, s in zip(effect.parameters, evidence.test.estimate, std, strict=False)
         }
     unit = {p.name: p.unit for p in effect.parameters}
+    before, after = findings.errors.get(effect.name, (None, None))
     return RankedEffect(
         effect=evidence.candidate.spec,
         acts_in=(effect.phase,),
         judged_in=where,
         score_p=evidence.p_value,
         delta_bic=evidence.delta_bic,
+        cv_error_before_m=before,
+        cv_error_after_m=after,
         parameters=tuple(
             EffectEstimate(name=name, unit=unit[name], estimate=float(v), std_error=float(s))
             for name, (v, s) in numbers.items()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..physics.parameters import GROUND_SHIFT
 from ..physics.world import World
-from .candidates import Candidate, admissible, base_parameters, variants_of
+from .candidates import Candidate, Variant, admissible, base_parameters, variants_of
 from .linear import robust_excess
 from .prepared import Prepared
 from .refit import Refit, refit
@@ -199,14 +199,14 @@ def _bic(evidence: Evidence, seen: Picture) -> float:
     return len(evidence.candidate.effect.parameters) * math.log(max(seen.dof.sum(), 2.0))
 
 
-def _blind(variant: object, flight: Picture | None) -> bool:
+def _blind(variant: Variant, flight: Picture | None) -> bool:
     """Whether flight could not see an effect of a size that matters, which contact may then name."""
-    effect = variant.active.effect  # pyright: ignore[reportAttributeAccessIssue]
+    effect = variant.active.effect
     if effect.phase != "flight" or "ground" not in effect.needs:
         return False
     if flight is None:
         return True
-    columns = flight.columns(variant.parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    columns = flight.columns(variant.parameters)
     test = score_test(flight, columns)
     scale = np.array([p.scale for p in effect.parameters])
     return test.dof < len(columns) or bool((np.sqrt(np.diag(test.covariance)) > BLIND * scale).any())

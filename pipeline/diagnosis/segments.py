@@ -19,7 +19,7 @@ from ..estimation.trajectory import STATE_SIZE, TrajectoryResiduals, retract, st
 from ..physics.contact import ContactLaw
 from ..physics.dispatch import rollout as rolled_out
 from ..physics.driven import Drive
-from ..physics.measured import true_times
+from ..physics.measured import measure, true_times
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
 from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
@@ -141,20 +141,25 @@ class Segments:
         rows = torch.cat([r for r, _ in parts])
         return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
 
-    def rollout(
-        self,
-        record_contacts: bool = False,
-        parameters: Sequence[Parameter] = (),
-        values: Tensor | None = None,
-    ) -> Rollout:
+    def rollout(self, record_contacts: bool = False) -> Rollout:
         """Return the true motion of the segments from their states."""
-        world = self.world
-        if values is not None:
-            columns = [p.decode(values[..., k]).reshape(-1) for k, p in enumerate(parameters)]
-            world = apply_parameters(world, parameters, torch.stack(columns, -1))
-        seen = self.observations
+        world, seen = self.world, self.observations
         with torch.no_grad():
             return rolled_out(world, seen.state, true_times(world, seen.times_s), seen.drives, record_contacts)
+
+    def positions(self, parameters: Sequence[Parameter] = (), values: Tensor | None = None) -> Tensor:
+        """Return the positions (B, T, nf, 3) [m] of the free bodies as they would be measured.
+
+        Args:
+            parameters: Numbers of the world that are set.
+            values: Their values in fitted coordinates, (B, P).
+        """
+        world, seen = self.world, self.observations
+        if parameters and values is not None:
+            decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(parameters)], -1)
+            world = apply_parameters(world, parameters, decoded)
+        with torch.no_grad():
+            return measure(world, seen.state, seen.times_s, seen.drives).position_m[:, :, list(seen.free)]
 
     def moved(self, change: Tensor) -> Segments:
         """Return the segments with their states moved by changes (B, S)."""

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ..physics.effects.effect import ActiveEffect
+from ..physics.parameters import Parameter
 from ..physics.world import World
 from .candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of
 from .refit import Refit, refit
@@ -124,17 +125,19 @@ def fill(
     short = [e for e in significant if e.test.statistic >= SHORTLIST_SHARE * most]
     short = sorted(short, key=lambda e: (_penalty(e) * _log(seen) - e.test.statistic, e.name))[: SHORTLIST + 2]
     before = refit([flight], world, base_parameters(world, "flight"))
-    done = [refitted(e, [flight], world, before, math.exp(_log(seen))) for e in short]
+    done = [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in short]
     done = sorted(done, key=lambda e: (e.delta_bic, e.name))
     done = [e for e in done if e.delta_bic is not None and e.delta_bic < 0]
     if not done:
         return Slot(tuple(evidence), tuple(evidence[:1]), False)
     names = {e.name: e for e in done}
     ranking = [*done, *(e for e in evidence if e.name not in names)]
-    return Slot(tuple(ranking), tuple(_equals(done, seen, kept, variants)), True)
+    return Slot(tuple(ranking), tuple(_equals(done, seen, kept, variants, dispersion)), True)
 
 
-def refitted(evidence: Evidence, parts: Sequence[Segments], world: World, before: Refit, count: float) -> Evidence:
+def refitted(
+    evidence: Evidence, parts: Sequence[Segments], world: World, before: Refit, count: float, dispersion: float
+) -> Evidence:
     """Return the evidence with a refit of the effect beside the model's numbers.
 
     Args:
@@ -143,6 +146,7 @@ def refitted(evidence: Evidence, parts: Sequence[Segments], world: World, before
         world: The world without it.
         before: The refit of that.
         count: Number of measured numbers, for the penalty of BIC.
+        dispersion: By what factor variances exceed those of the noise.
     """
     effect = evidence.candidate.effect
     like = world.gravity[0, :1]
@@ -157,13 +161,17 @@ def refitted(evidence: Evidence, parts: Sequence[Segments], world: World, before
     known = {p.name: rest[k] for k, p in enumerate(before.parameters)}
     begun = torch.stack([*(known[p.name] for p in others), *values.to(torch.float64)])
     after = refit(parts, added, [*others, *own], begun)
-    bic = after.cost - before.cost + len(own) * math.log(count)
+    bic = (after.cost - before.cost) / dispersion + len(own) * math.log(count)
     numbers = {p.name.partition(".")[2]: after.number(p.name) for p in own}
     return replace(evidence, refitted=after, delta_bic=bic, numbers=numbers)
 
 
 def _equals(
-    done: Sequence[Evidence], seen: Picture, candidates: Sequence[Candidate], variants: Sequence[Variant]
+    done: Sequence[Evidence],
+    seen: Picture,
+    candidates: Sequence[Candidate],
+    variants: Sequence[Variant],
+    dispersion: float,
 ) -> list[Evidence]:
     """Return the best and what explains the data as well as it."""
     best = done[0]
@@ -171,7 +179,7 @@ def _equals(
     found = [best]
     for other in done[1:]:
         assert other.refitted is not None and other.delta_bic is not None
-        worse = other.refitted.cost - best.refitted.cost
+        worse = (other.refitted.cost - best.refitted.cost) / dispersion
         more = len(other.candidate.effect.parameters) > len(best.candidate.effect.parameters)
         close = other.delta_bic - best.delta_bic < ALIAS_CHI2 if more else worse < ALIAS_CHI2
         if more and not close and worse < ALIAS_CHI2:
@@ -191,9 +199,8 @@ def _contains(
     return canonical_correlation(seen, columns[0], columns[1]) > CONTAINED
 
 
-def _clamped(parameter: object, value: torch.Tensor) -> torch.Tensor:
-    low, high = parameter.bounds  # pyright: ignore[reportAttributeAccessIssue]
-    return value.clamp(low, high)
+def _clamped(parameter: Parameter, value: torch.Tensor) -> torch.Tensor:
+    return value.clamp(*parameter.bounds)
 
 
 def _penalty(evidence: Evidence) -> int:

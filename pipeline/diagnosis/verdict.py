@@ -10,11 +10,12 @@ from ..physics.effects.effect import ActiveEffect
 from ..physics.world import World
 from .candidates import Candidate, base_parameters
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
+from .forecast import held_out_errors
 from .prepared import Prepared
 from .refit import refit
 from .segments import Segments, fit_states, world_for
 from .slots import Evidence, Slot, fill
-from .wrench import Omnibus, omnibus, residual_wrenches
+from .wrench import Omnibus, dispersion, omnibus, residual_wrenches
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
 
@@ -48,9 +49,8 @@ class Findings:
     """All that a diagnosis finds.
 
     before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
-    candidates, the best first; contact: all contact evidence; world: with the selected effects; flight: the segments
-    with states fitted by it; base: the world without
-    them.
+    candidates, the best first; contact: all contact evidence; world: with the selected effects; base: without them;
+    errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect.
     """
 
     verdict: VerdictName
@@ -61,9 +61,9 @@ class Findings:
     ranking: tuple[Evidence, ...]
     contact: tuple[ContactEvidence, ...]
     world: World
-    flight: Segments | None
     contact_chi2: float | None
     base: World
+    errors: dict[str, tuple[float, float]]
 
     @property
     def judged_in_contact(self) -> set[str]:
@@ -75,10 +75,11 @@ class Findings:
 
 def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
     """Return what is missing of a world, from prepared episodes alone."""
-    before = worst_omnibus(prepared, world)
-    slots, after_flight, flight = _flight_search(prepared, world, candidates)
-    chosen, contact, final, chi2 = _with_contact(prepared, world, after_flight, slots, candidates)
-    after = worst_omnibus(prepared, final) if chosen else before
+    scatter = _dispersion(prepared, world)
+    before = worst_omnibus(prepared, world, scatter)
+    slots, after_flight, flight = _flight_search(prepared, world, candidates, scatter)
+    chosen, contact, final, chi2, fitted = _with_contact(prepared, world, after_flight, slots, candidates)
+    after = worst_omnibus(prepared, final, scatter) if chosen else before
     remaining = after is not None and after.statistic > OMNIBUS_LIMIT and after.p_value < OMNIBUS_P
     verdict: VerdictName = "none_missing"
     if remaining and _explained(before, after) < ENOUGH_SHARE:
@@ -88,19 +89,39 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     elif chosen:
         verdict = "missing_effect"
     ranking = _ranking(chosen, slots, contact)
+    errors = {}
+    for one in chosen if verdict != "unexplained" else []:
+        segments = flight if one.where == "flight" else fitted
+        if segments is not None:
+            errors[one.evidence.name] = held_out_errors(segments, final, one.evidence.name)
     return Findings(
-        verdict, tuple(chosen), remaining, before, after, tuple(ranking), tuple(contact), final, flight, chi2, world
+        verdict,
+        tuple(chosen),
+        remaining,
+        before,
+        after,
+        tuple(ranking),
+        tuple(contact),
+        final,
+        chi2,
+        world,
+        errors,
     )
 
 
-def worst_omnibus(prepared: Prepared, world: World) -> Omnibus | None:
+def worst_omnibus(prepared: Prepared, world: World, scatter: float) -> Omnibus | None:
     """Return the omnibus statistic of flight over all lengths of pieces, the one with the smallest p-value."""
     found = []
     for longest_s in OMNIBUS_S:
         pieces = prepared.pieces(world, longest_s)
         if pieces is not None:
-            found.append(omnibus(residual_wrenches(pieces)))
+            found.append(omnibus(residual_wrenches(pieces), scatter))
     return min(found, key=lambda one: (one.p_value, -one.statistic)) if found else None
+
+
+def _dispersion(prepared: Prepared, world: World) -> float:
+    pieces = prepared.pieces(world, OMNIBUS_S[-1])
+    return 1.0 if pieces is None else dispersion(pieces, residual_wrenches(pieces))
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
@@ -111,14 +132,14 @@ def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
 
 
 def _flight_search(
-    prepared: Prepared, world: World, candidates: Sequence[Candidate]
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float
 ) -> tuple[list[Slot], World, Segments | None]:
     """Return the slots that effects fill in flight, the world with the best of each, and the segments there."""
     flight, slots, current = prepared.flight, [], world
     if flight is None:
         return [], world, None
     while len(slots) < MOST_EFFECTS:
-        slot = fill(flight, current, candidates, prepared.groups, prepared.turned)
+        slot = fill(flight, current, candidates, prepared.groups, prepared.turned, scatter)
         if not slot.flagged:
             slots = slots or [slot]
             break
@@ -131,7 +152,7 @@ def _flight_search(
         for place in range(len(filled) - 1):
             without = _without(current, filled[place].best.name)
             states = fit_states(replace(flight, world=world_for("flight", without)))
-            slot = fill(states, without, candidates, prepared.groups, prepared.turned)
+            slot = fill(states, without, candidates, prepared.groups, prepared.turned, scatter)
             refitted = slot.best.refitted
             if slot.flagged and refitted is not None:
                 filled[place] = slot
@@ -142,8 +163,8 @@ def _flight_search(
 
 def _with_contact(
     prepared: Prepared, world: World, after_flight: World, slots: Sequence[Slot], candidates: Sequence[Candidate]
-) -> tuple[list[Chosen], list[ContactEvidence], World, float | None]:
-    """Return the selected effects, the evidence of contact, the world with them, and contact's chi2 / dof."""
+) -> tuple[list[Chosen], list[ContactEvidence], World, float | None, Segments | None]:
+    """Return the selected effects, the evidence of contact, the world with them, chi2 / dof and segments of contact."""
     filled = [slot for slot in slots if slot.flagged]
     open_slots = [slot for slot in filled if len(slot.equals) > 1]
     clear_world = after_flight
@@ -152,7 +173,7 @@ def _with_contact(
     fitted = fitted_contact(prepared, clear_world)
     if fitted is None:
         chosen = [Chosen(slot.best, slot.equals, "flight") for slot in filled]
-        return chosen, [], after_flight, None
+        return chosen, [], after_flight, None, None
     base, contact = fitted
     final, chosen = after_flight, []
     for slot in filled:
@@ -177,8 +198,8 @@ def _with_contact(
         number = {p.name: (v, s) for p, v, s in final[1]}
         first = replace(named[0].evidence, numbers=number)
         chosen[-1] = Chosen(first, (first, *chosen[-1].equals[1:]), "contact")
-        return chosen, evidence, final[0], chi2
-    return chosen, evidence, replace(final, contact=base.world.contact), chi2
+        return chosen, evidence, final[0], chi2, contact
+    return chosen, evidence, replace(final, contact=base.world.contact), chi2, contact
 
 
 def _named(evidence: Sequence[ContactEvidence]) -> list[ContactEvidence]:

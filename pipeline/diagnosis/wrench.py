@@ -127,12 +127,23 @@ def wrench_windows(
     return residual_wrenches(fit_states(Segments.of("flight", world, whole, windows, noise)))
 
 
-def omnibus(found: ResidualWrenches) -> Omnibus:
-    """Return the test that all residual wrenches vanish; of windows that do not overlap."""
+def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:
+    """Return the test that all residual wrenches vanish; of windows that do not overlap, see `dispersion`."""
     score = np.einsum("nij,nj->ni", found.information, found.wrench)
-    chi2 = float(np.einsum("ni,ni->", score, found.wrench))
+    chi2 = float(np.einsum("ni,ni->", score, found.wrench)) / scatter
     dof = float(np.einsum("nij,nji->", found.information, found.covariance))
     return Omnibus(chi2 / max(dof, 1e-9), dof, float(chi2_law.sf(chi2, max(dof, 1e-9))))
+
+
+def dispersion(segments: Segments, found: ResidualWrenches) -> float:
+    """Return by what factor short pieces scatter more than the stated noise, whatever wrench acts on each; at least 1.
+
+    Noise that is correlated from frame to frame, as of filtered tracks, shows here.
+    """
+    chi2 = float(segments.residuals([], segments.world.gravity.new_zeros(0), jacobian=False)[0].square().sum())
+    gained = float(np.einsum("ni,nij,nj->", found.wrench, found.information, found.wrench))
+    taken = float(np.einsum("nij,nji->", found.information, found.covariance))
+    return max(1.0, (chi2 - gained) / max(float(segments.dof.sum()) - taken, 1.0))
 
 
 def organisers(found: ResidualWrenches) -> list[Organiser]:

@@ -1,0 +1,62 @@
+"""Errors of predictions where an effect was not fitted: its numbers from other episodes, states from the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..physics.parameters import Parameter, effect_parameters
+from ..physics.world import World
+from .candidates import base_values
+from .linear import linearised
+from .segments import Segments, fit_states, world_for
+
+KNOWN_SHARE = 0.5
+"""The state is fitted to this share of a segment's frames; the error is that of the rest."""
+
+
+def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[float, float]:
+    """Return the mean error [m] of predictions without an effect and with it.
+
+    The numbers of the effect that predict an episode come from the other episodes, by one step from the estimate of
+    all.
+
+    Args:
+        segments: With states fitted by the world.
+        world: The world with the effect at its estimate.
+        effect: Its name.
+    """
+    without = replace(world, effects=tuple(a for a in world.effects if a.effect.name != effect))
+    parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
+    with_it = replace(segments, world=world_for(segments.kind, world))
+    values = _by_others(with_it, parameters, base_values(world, parameters))
+    before = replace(segments, world=world_for(segments.kind, without))
+    return _error(before, [], values.new_zeros(0)), _error(with_it, parameters, values)
+
+
+def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
+    """Return the parameters (B, P) of each segment as the other episodes tell them."""
+    linear = linearised(segments, parameters, values)
+    prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(values))
+    episode = torch.tensor([item.episode for item in segments.items])
+    bounds = torch.tensor([p.limits for p in parameters]).to(values)
+    found = torch.empty(len(episode), len(parameters)).to(values)
+    for number in episode.unique().tolist():
+        others = episode != number
+        step = torch.linalg.solve(linear.information[others].sum(0) + prior, linear.score[others].sum(0))
+        found[~others] = (values + step).clamp(bounds[:, 0], bounds[:, 1])
+    return found
+
+
+def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> float:
+    seen = segments.observations
+    known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])
+    early = (torch.arange(seen.times_s.shape[1]) < known[:, None])[..., None].to(seen.seen)
+    start = replace(segments, observations=replace(seen, seen=seen.seen * early, turned=seen.turned * early))
+    fitted = fit_states(start, parameters, values, search=False)
+    away = (fitted.positions(parameters, values) - seen.position_m).norm(dim=-1)
+    late = seen.seen * (1 - early)
+    return float((away * late).sum() / late.sum().clamp_min(1.0))
