@@ -1,0 +1,271 @@
+"""Does `cgwm diagnose` name what is hidden, and nothing where nothing is? Captures whose truth is another engine.
+
+    python benchmarks/diagnose.py --stage development --workers 2 [--nulls 20] [--only cube/com_offset] [--list rough]
+    python benchmarks/diagnose.py --stage report --table
+
+Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
+diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
+--effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never by
+the stage report, whose seeds are others. Results are stored case by case and taken up again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cgwm.datasets.capture import Capture
+from cgwm.datasets.models import read_model
+from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.eval import evaluate_model
+from cgwm.pipeline.fit import fit
+from cgwm.pipeline.physics.effects.registry import FLIGHT_ALIASES
+from cgwm.schemas import CgwmError, PhysConfig
+from hidden_effects import EFFECTS, Case, cases, drake_cases, make_capture, rough_cases
+from store import Store, timed
+
+FAMILIES: tuple[set[str], ...] = (
+    {"linear_drag", "quadratic_drag", "wind"},
+    {"gravity_tilt", "frame_tilt", "constant_force", "wind"},
+    {"gravity_scale", "buoyancy", "length_scale", "clock_scale", "constant_force"},
+    {"com_offset", "marker_offset"},
+    {"friction_patch", "anisotropic_friction", "stribeck_friction", "viscous_friction"},
+    {"ground_magnet", "adhesion"},
+    {"rolling_resistance", "torsional_friction", "spin_damping"},
+)
+"""Effects that do much the same: to name one for another is a smaller fault."""
+RIGHT = ("exact", "class", "exact, and more")
+COLUMNS = ("exact", "class", "exact, and more", "family", "wrong", "unexplained", "silent", "refused")
+
+
+def judged(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
+    """Return how a diagnosis stands to the truth: one of `COLUMNS`, or for a null `right` or `false alarm`."""
+    if "refused" in found:
+        return "refused"
+    verdict = found["verdict"]
+    if not case.effects:
+        return "right" if verdict == "none_missing" else "false alarm"
+    if verdict == "none_missing":
+        return "silent"
+    if all(EFFECTS[name].acts == "unknown" for name in case.effects):
+        return "exact" if verdict == "unexplained" else "class" if found["remaining_unexplained"] else "wrong"
+    return "unexplained" if verdict == "unexplained" else _named(case, truth, found)
+
+
+def _named(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
+    """Return how the effects that were named stand to the true ones."""
+    selected = list(found["selected"])
+    groups = {name: next((set(group) for group in found["aliases"] if name in group), {name}) for name in selected}
+    along = {name for effect in truth["effects"] for name in effect["comes_with"]}
+    along |= set(truth["engine"].get("comes_with", ()))
+    marks = {_mark(name, groups) for name in case.effects}
+    if marks == {"exact"}:
+        return "exact, and more" if set(selected) - {*case.effects, *along} else "exact"
+    if marks <= {"exact", "class"}:
+        return "class"
+    return "family" if marks & {"exact", "class", "family"} else "wrong"
+
+
+def _mark(name: str, groups: dict[str, set[str]]) -> str:
+    """Return how an effect was named: alone; in a group of what it cannot be told apart from, and no more; nearly."""
+    if groups.get(name) == {name}:
+        return "exact"
+    for group in groups.values():
+        if name in group and any(group <= set(aliases) for aliases in FLIGHT_ALIASES):
+            return "class"
+    near = {other for family in FAMILIES if name in family for other in family}
+    return "family" if any(name in group or near & group for group in groups.values()) else "wrong"
+
+
+def measure(case: Case, refit: bool) -> dict[str, Any]:
+    """Make the capture of a case, fit it, diagnose it, and judge the verdict."""
+    with tempfile.TemporaryDirectory() as folder:
+        capture, base = Path(folder) / "capture", Path(folder) / "m0"
+        truth = json.loads(make_capture(capture, case).read_text(encoding="utf-8"))
+        began = time.perf_counter()
+        fit(capture, base, stage="phys-geo", phys_config=PhysConfig())
+        fitted = time.perf_counter()
+        try:
+            found = diagnose(base, capture).model_dump(mode="json")
+        except CgwmError as error:
+            found = {"refused": error.found}
+        seconds = {"fit": round(fitted - began, 1), "diagnose": round(time.perf_counter() - fitted, 1)}
+        mark = judged(case, truth, found)
+        row: dict[str, Any] = {
+            "case": case.name,
+            "thing": case.thing,
+            "effects": list(case.effects),
+            "magnitude": case.magnitude if case.effects else "null",
+            "law": case.law,
+            "engine": case.engine,
+            "rate_hz": case.rate_hz,
+            "position_std_m": case.position_std_m,
+            "judged": mark,
+            "seconds": seconds,
+            "truth": [{key: effect[key] for key in ("name", "values")} for effect in truth["effects"]],
+            "found": _brief(found),
+        }
+        if refit and mark in RIGHT and found["selected"]:
+            row |= _added(capture, base, Path(folder) / "m1", found["selected"])
+        return row
+
+
+def _brief(found: dict[str, Any]) -> dict[str, Any]:
+    if "refused" in found:
+        return found
+    keys = ("verdict", "selected", "aliases", "remaining_unexplained", "contact_chi2", "flight_before", "flight_after")
+    return {key: found[key] for key in keys} | {
+        "ranking": found["ranking"][:6],
+        "residual_law": found["residual_law"],
+        "next_experiment": found["next_experiment"],
+    }
+
+
+def _added(capture: Path, base: Path, child: Path, effects: Sequence[str]) -> dict[str, Any]:
+    """Fit the model again with the effects, and return the errors on the test split before and after."""
+    config = PhysConfig(effects=tuple(effects))
+    try:
+        model = fit(capture, child, stage="phys-geo", parent=base, phys_config=config)
+    except CgwmError as error:
+        return {"refit_failed": error.found}
+    opened = Capture.open(capture, splits=("test",))
+    errors = {}
+    for when, path in (("before", base), ("after", child)):
+        result = evaluate_model(read_model(path), opened).result
+        errors[when] = {
+            "open_loop_m": result.translation_error_m.median,
+            "state_fitted_m": None if result.state_fitted_residual_m is None else result.state_fitted_residual_m.median,
+        }
+    own = {p.name: [p.estimate, p.interval_95] for p in model.parameters if "." in p.name and p.interval_95}
+    return {"errors": errors, "estimates": own}
+
+
+def run(todo: Sequence[Case], store: Store, workers: int, refit: bool, deadline: float) -> None:
+    """Measure what is missing; no case is begun after the deadline."""
+    waiting: dict[Future[dict[str, Any]], Case] = {}
+    queue = [case for case in todo if store.known(case.name) is None]
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        while queue or waiting:
+            while queue and len(waiting) < workers and time.monotonic() < deadline:
+                case = queue.pop(0)
+                large = refit and case.magnitude == "large" and bool(case.effects)
+                waiting[pool.submit(_timed, case, large)] = case
+            if not waiting:
+                break
+            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                case = waiting.pop(future)
+                error = future.exception()
+                failed = {"case": case.name, "judged": "failed", "failed": f"{type(error).__name__}: {error}"}
+                store.add(case.name, future.result() if error is None else failed)
+
+
+def _timed(case: Case, refit: bool) -> dict[str, Any]:
+    return timed(lambda: measure(case, refit))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the confusion table, what false alarms said, and what adding the right effect did."""
+    lines = ["| cases | n | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        if row.get("effects"):
+            acts = {EFFECTS[name].acts for name in row["effects"]}
+            kind = "pairs" if len(row["effects"]) > 1 else next(iter(acts))
+            groups.setdefault(f"{kind}, {row['magnitude']}", []).append(row)
+    for name, some in sorted(groups.items()):
+        counts = Counter(row["judged"] for row in some)
+        lines.append(f"| {name} | {len(some)} | " + " | ".join(str(counts[column]) for column in COLUMNS) + " |")
+    nulls = [row for row in rows if row.get("magnitude") == "null"]
+    alarms = [row for row in nulls if row["judged"] == "false alarm"]
+    lines.append(
+        f"\nNulls: {len(alarms)} false alarms of {len(nulls)}; 95 % bound {100 * _bound(alarms, nulls):.1f} %."
+    )
+    lines += [f"- {row['case']}: {row['found']['verdict']} {', '.join(row['found']['selected'])}" for row in alarms]
+    lines += ["", "Not right:"]
+    for row in rows:
+        if row.get("effects") and row["judged"] not in RIGHT:
+            said = row.get("found", {})
+            named = ", ".join(said.get("selected", ())) or said.get("refused", row.get("failed", ""))[:80]
+            lines.append(f"- {row['case']}: {row['judged']} ({said.get('verdict', 'no verdict')} {named})")
+    added = [row for row in rows if "errors" in row]
+    for key in ("open_loop_m", "state_fitted_m"):
+        pairs = [(row["errors"]["before"][key], row["errors"]["after"][key]) for row in added]
+        ratios = [after / before for before, after in pairs if before and after]
+        if ratios:
+            low, middle, high = np.percentile(ratios, (25, 50, 75))
+            lines.append(
+                f"\nTest split after / before, {key}: median {middle:.2f} ({low:.2f} to {high:.2f}), n {len(ratios)}"
+            )
+    held = [yes for row in added for yes in _covered(row)]
+    if held:
+        lines.append(f"\n95 % intervals of the added numbers that hold the truth: {sum(held)} of {len(held)}.")
+    seconds = [row["seconds"]["diagnose"] for row in rows if "seconds" in row]
+    if seconds:
+        lines.append(f"\nSeconds for a diagnosis: median {np.median(seconds):.1f}, at most {max(seconds):.1f}.")
+    return "\n".join(lines)
+
+
+def _bound(alarms: Sequence[Any], nulls: Sequence[Any]) -> float:
+    """Return the upper 95 % bound of the rate (Clopper & Pearson)."""
+    from scipy.stats import beta
+
+    return float(beta.ppf(0.95, len(alarms) + 1, max(len(nulls) - len(alarms), 1e-9))) if nulls else 1.0
+
+
+def _covered(row: dict[str, Any]) -> list[bool]:
+    """Return for each number of the added effects that the truth has by the same name whether its interval holds it."""
+    found = []
+    for effect in row["truth"]:
+        for name, value in effect["values"].items():
+            estimate = row["estimates"].get(f"{effect['name']}.{name}")
+            if estimate is not None and isinstance(value, float):
+                low, high = estimate[1]
+                found.append(low <= value <= high)
+    return found
+
+
+def main() -> int:
+    """Measure what is missing of the cases, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--stage", choices=("development", "report"), default="development")
+    parser.add_argument("--list", choices=("all", "rough", "drake"), default="all", help="which cases")
+    parser.add_argument("--nulls", type=int, default=200)
+    parser.add_argument("--only", default="", help="cases whose names contain this")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after this time")
+    parser.add_argument("--no-refit", action="store_true", help="do not add the effects found")
+    parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
+    parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
+    parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
+    given = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
+    if given.list == "all":
+        chosen = cases(given.stage, nulls=given.nulls)
+    else:
+        chosen = rough_cases(given.stage) if given.list == "rough" else drake_cases(given.stage, nulls=given.nulls)
+    chosen = [case for case in chosen if given.only in case.name]
+    store = Store("diagnose", given.store, given.any_commit)
+    if not given.table:
+        # every kind of case early, so that a run that is cut off tells of all
+        order = np.random.default_rng(0).permutation(len(chosen))
+        deadline = time.monotonic() + given.seconds
+        run([chosen[k] for k in order], store, given.workers, not given.no_refit, deadline)
+    names = {case.name for case in chosen}
+    print(table([row for row in store.results() if row["key"] in names]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
