@@ -5,8 +5,8 @@
 
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
---effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never by
-the stage report, whose seeds are others. Results are stored case by case and taken up again.
+--effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
+by the stage report, whose seeds are others. Results are stored case by case and taken up again.
 """
 
 from __future__ import annotations
