@@ -367,7 +367,9 @@ def fit_states(
     for trial in starts[1:]:
         best, cost = _better(best, cost, trial, costs_of(trial, parameters, given))
     best, cost = _descended(best, parameters, given, count)
-    bad = torch.nonzero(cost > BAD_FIT * segments.dof)[:, 0].tolist()
+    share = cost / segments.dof.clamp_min(1.0)
+    # where the law misses everything by far more than the noise, only the worst can be at the wrong minimum
+    bad = torch.nonzero(share > BAD_FIT * share.nanmedian().clamp_min(1.0))[:, 0].tolist()
     if len(starts) > 1 and bad:  # all starts of all of them in one batch
         several = _joined([trial.select(bad) for trial in starts])
         chosen = given if given.ndim == 1 else given[bad].repeat(len(starts), 1)
