@@ -8,7 +8,7 @@ from typing import Literal
 
 from ..physics.effects.effect import ActiveEffect
 from ..physics.world import World
-from .candidates import Candidate, base_parameters
+from .candidates import Candidate, base_parameters, base_values
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
 from .forecast import held_out_errors
 from .prepared import Prepared
@@ -34,6 +34,8 @@ largest of 12 without an effect was 6, that of a wrong name 20 (viscous friction
 of effects of a size that matters 12 to 184 where they were right."""
 CONTACT_T = 1.0
 """And where the mean gain of held-out episodes is above this many of its standard errors."""
+CONFIRMED = 2.0
+"""And where a refit leaves it this many standard errors away from nothing."""
 CONTACT_LEAD = 0.5
 """Another effect in contact with this share of the best one's score leaves the two unseparated."""
 
@@ -195,12 +197,11 @@ def _with_contact(
     evidence = contact_evidence(contact, base.world, candidates, prepared.groups, prepared.turned)
     named = _named(evidence)
     if named:
-        chosen.append(Chosen(named[0].evidence, tuple(one.evidence for one in named), "contact"))
-        final = _added(base.world, contact, named[0].evidence)
-        number = {p.name: (v, s) for p, v, s in final[1]}
-        first = replace(named[0].evidence, numbers=number)
-        chosen[-1] = Chosen(first, (first, *chosen[-1].equals[1:]), "contact")
-        return chosen, evidence, final[0], chi2, contact
+        found, numbers = _added(base.world, contact, named[0].evidence)
+        if any(abs(value) > CONFIRMED * error for value, error in numbers.values()):
+            first = replace(named[0].evidence, numbers=numbers)
+            equals = (first, *(one.evidence for one in named[1:]))
+            return [*chosen, Chosen(first, equals, "contact")], evidence, found, chi2, contact
     return chosen, evidence, replace(final, contact=base.world.contact), chi2, contact
 
 
@@ -212,7 +213,7 @@ def _named(evidence: Sequence[ContactEvidence]) -> list[ContactEvidence]:
     return [one for one in fit if one.score > CONTACT_LEAD * fit[0].score]
 
 
-def _added(world: World, contact: Segments, evidence: Evidence):
+def _added(world: World, contact: Segments, evidence: Evidence) -> tuple[World, dict[str, tuple[float, float]]]:
     """Return the world with an effect refitted in contact, and its parameters with estimate and standard error."""
     effect = evidence.candidate.effect
     added = replace(
@@ -222,10 +223,15 @@ def _added(world: World, contact: Segments, evidence: Evidence):
     parameters = [
         p for p in base_parameters(added, "contact") if "." not in p.name or p.name.startswith(f"{effect.name}.")
     ]
-    found = refit([contact], added, parameters)
+    known = dict(zip((p.name for p in effect.parameters), evidence.test.estimate.tolist(), strict=False))
+    start = base_values(added, parameters)
+    for k, p in enumerate(parameters):
+        if p.name.startswith(f"{effect.name}."):  # from the score test's step: a rough valley hides it from neutral
+            start[k] = min(max(known[p.name.partition(".")[2]], p.bounds[0]), p.bounds[1])
+    found = refit([contact], added, parameters, start)
     own = [p for p in parameters if p.name.startswith(f"{effect.name}.")]
-    numbers = [(p.name.partition(".")[2], *found.number(p.name)) for p in own]
-    return found.world, [(replace(p, name=n), v, s) for p, (n, v, s) in zip(own, numbers, strict=True)]
+    numbers = {p.name.partition(".")[2]: found.number(p.name) for p in own}
+    return found.world, numbers
 
 
 def _without(world: World, name: str) -> World:
