@@ -110,6 +110,13 @@ def with_variants(world: World, variants: Sequence[Variant], kind: Kind) -> tupl
     return everything, [p for p in effect_parameters(everything) if p.name in names]
 
 
+def without_effect(world: World, name: str) -> World:
+    """Return the world without an effect, and without what acts through it."""
+    left = tuple(active for active in world.effects if active.effect.name != name)
+    drag = any("drag" in active.effect.provides for active in left)
+    return replace(world, effects=tuple(active for active in left if drag or "drag" not in active.effect.needs))
+
+
 def base_parameters(world: World, kind: Kind) -> list[Parameter]:
     """Return the numbers of a model that are fitted along: those of its effects, and in contact those of contact."""
     own = effect_parameters(world)

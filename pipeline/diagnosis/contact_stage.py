@@ -91,11 +91,13 @@ def separated(
     ]
     seen = picture(contact, world, picked, groups, robust=False)
     seen = reweighted(seen, [k for v in picked for k in seen.columns(v.parameters)])
+    # what the contact law misses anyway says nothing against an effect
+    misfit = max(1.0, float((seen.weight * seen.chi2).sum() / (seen.weight * seen.dof).sum()))
     gains = []
     for evidence, variant in zip(equals, picked, strict=True):
         assert evidence.numbers is not None
         value = np.array([evidence.numbers[p.name][0] for p in evidence.candidate.effect.parameters])
-        gains.append(_gains_at(seen, seen.columns(variant.parameters), value))
+        gains.append(_gains_at(seen, seen.columns(variant.parameters), value) / misfit)
     total = np.array([float(e.refitted.cost) if e.refitted else math.inf for e in equals])
     total = total - np.array([g.sum() for g in gains])
     order = sorted(range(len(equals)), key=lambda k: (total[k] + _bic(equals[k], seen), equals[k].name))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..physics.parameters import Parameter, effect_parameters
 from ..physics.world import World
-from .candidates import base_values
+from .candidates import base_values, without_effect
 from .linear import linearised
 from .segments import Segments, fit_states, world_for
 
@@ -29,7 +29,7 @@ def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[floa
         world: The world with the effect at its estimate.
         effect: Its name.
     """
-    without = replace(world, effects=tuple(a for a in world.effects if a.effect.name != effect))
+    without = without_effect(world, effect)
     parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
     with_it = replace(segments, world=world_for(segments.kind, world))
     values = _by_others(with_it, parameters, base_values(world, parameters))

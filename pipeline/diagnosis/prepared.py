@@ -12,6 +12,7 @@ from torch import Tensor
 from ..estimation.noise import estimate_noise
 from ..estimation.observations import Observations
 from ..physics.world import World
+from .carried import carried_frames
 from .noise import flight_noise, without_outliers
 from .phases import is_round
 from .segments import Segment, Segments, cut_episodes, fit_states, whole_episodes
@@ -78,8 +79,16 @@ def prepare(
     whole = whole_episodes(world, episodes)
     turned = bool(whole.turned.any())
     flight, contact, clear = cut_episodes(world, whole, noise)
+    carried = carried_frames(world, whole, flight, noise)
+    if bool(carried.any()):
+        flight, contact, clear = cut_episodes(world, whole, noise, carried)
+        warnings.append(
+            f"{int(carried.sum())} frames look like flight by the shape and the ground, but nothing falls in them: "
+            "they count as contact. Check the ground's height, the shape and where the marker is."
+        )
     noise = _agreed(given, flight_noise(whole, flight), noise, warnings)
     whole, outliers, touched = without_outliers(whole, flight, noise)
+    touched |= carried
     if outliers or bool(touched.any()):
         flight, contact, clear = cut_episodes(world, whole, noise, touched)
         noise = _agreed(given, flight_noise(whole, flight), noise, [])

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from ..physics.effects.effect import ActiveEffect
 from ..physics.world import World
-from .candidates import Candidate, base_parameters, base_values
+from .bundles import DRAGS, drag_in_wind
+from .candidates import Candidate, base_parameters, base_values, without_effect
+from .consistency import consistency
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
 from .forecast import held_out_errors
 from .prepared import Prepared
 from .refit import refit
 from .segments import Segments, fit_states, world_for
-from .slots import Evidence, Slot, fill
+from .slots import ALIAS_CHI2, Evidence, Slot, fill
 from .wrench import Omnibus, dispersion, omnibus, residual_wrenches
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
@@ -85,9 +88,13 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     slots, after_flight, flight = _flight_search(prepared, world, candidates, scatter)
     chosen, contact, final, chi2, fitted = _with_contact(prepared, world, after_flight, slots, candidates)
     after = worst_omnibus(prepared, final, scatter) if chosen else before
-    remaining = after is not None and after.statistic > OMNIBUS_LIMIT and after.p_value < OMNIBUS_P
+    in_flight = [slot.best.name for slot in slots if slot.flagged]
+    alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
+    doubtful = alike is not None and alike.doubtful
+    left = after is not None and after.statistic > OMNIBUS_LIMIT and after.p_value < OMNIBUS_P
+    remaining = left or doubtful
     verdict: VerdictName = "none_missing"
-    if remaining and _explained(before, after) < ENOUGH_SHARE:
+    if doubtful or (left and _explained(before, after) < ENOUGH_SHARE):
         verdict = "unexplained"
     elif any(len(one.equals) > 1 for one in chosen):
         verdict = "not_separable"
@@ -153,9 +160,14 @@ def _flight_search(
         slots.append(slot)
         current, flight = refitted.world, refitted.segments[0]
     filled = [slot for slot in slots if slot.flagged]
-    if len(filled) > 1:  # the first were chosen before the others were known
-        for place in range(len(filled) - 1):
-            without = _without(current, filled[place].best.name)
+    if len(filled) > 1:
+        bundled = _bundled(prepared, world, filled, candidates, scatter)
+        if bundled is not None:
+            return bundled
+        for place in range(len(filled) - 1):  # the first were chosen before the others were known
+            without = without_effect(current, filled[place].best.name)
+            if len(without.effects) < len(current.effects) - 1:
+                continue  # another effect acts through this one
             states = fit_states(replace(flight, world=world_for("flight", without)))
             slot = fill(states, without, candidates, prepared.groups, prepared.turned, scatter)
             refitted = slot.best.refitted
@@ -166,6 +178,25 @@ def _flight_search(
     return slots, current, flight
 
 
+def _bundled(
+    prepared: Prepared, world: World, filled: Sequence[Slot], candidates: Sequence[Candidate], scatter: float
+) -> tuple[list[Slot], World, Segments] | None:
+    """Return a drag in wind in place of what was found, where that explains the flights better."""
+    last = filled[-1].best.refitted
+    if prepared.flight is None or last is None or not any(slot.best.name in DRAGS for slot in filled):
+        return None
+    count = float(prepared.flight.dof.sum())
+    present = {a.effect.name for a in world.effects}
+    kept = [candidate for candidate in candidates if candidate.effect.name not in present]
+    bundle = drag_in_wind(prepared.flight, world, kept, count, scatter)
+    numbers = sum(len(slot.best.candidate.effect.parameters) for slot in filled)
+    if bundle is None or bundle.total > last.cost / scatter + numbers * math.log(count) - ALIAS_CHI2:
+        return None
+    rest = filled[0].evidence
+    slots = [Slot((one, *rest), (one,), True) for one in (bundle.drag, bundle.wind)]
+    return slots, bundle.refitted.world, bundle.refitted.segments[0]
+
+
 def _with_contact(
     prepared: Prepared, world: World, after_flight: World, slots: Sequence[Slot], candidates: Sequence[Candidate]
 ) -> tuple[list[Chosen], list[ContactEvidence], World, float | None, Segments | None]:
@@ -174,7 +205,7 @@ def _with_contact(
     open_slots = [slot for slot in filled if len(slot.equals) > 1]
     clear_world = after_flight
     for slot in open_slots:
-        clear_world = _without(clear_world, slot.best.name)
+        clear_world = without_effect(clear_world, slot.best.name)
     fitted = fitted_contact(prepared, clear_world)
     if fitted is None:
         chosen = [Chosen(slot.best, slot.equals, "flight") for slot in filled]
@@ -234,16 +265,12 @@ def _added(world: World, contact: Segments, evidence: Evidence) -> tuple[World, 
     return found.world, numbers
 
 
-def _without(world: World, name: str) -> World:
-    return replace(world, effects=tuple(a for a in world.effects if a.effect.name != name))
-
-
 def _replaced(world: World, old: Evidence, new: Evidence) -> World:
     """Return the world with one effect in the place of another, at its refitted numbers."""
     if old.name == new.name or new.refitted is None:
         return world
     own = next(a for a in new.refitted.world.effects if a.effect.name == new.name)
-    return replace(world, effects=(*_without(world, old.name).effects, own))
+    return replace(world, effects=(*without_effect(world, old.name).effects, own))
 
 
 def _ranking(chosen: Sequence[Chosen], slots: Sequence[Slot], contact: Sequence[ContactEvidence]) -> list[Evidence]:

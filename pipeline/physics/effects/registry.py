@@ -57,6 +57,10 @@ FLIGHT_ALIASES: tuple[dict[str, str], ...] = (
     {"com_offset": "", "marker_offset": ""},
 )
 """Effects that are the same thing exactly in free flight alone, each with the condition under which it is."""
+CONTACT_ALIASES: tuple[frozenset[str], ...] = (
+    frozenset({"gravity_scale", "buoyancy", "clock_scale", "constant_force"}),
+)
+"""Of these, those that rigid contact does not tell apart either: weight, and with it friction, scales alike."""
 _HOOKS = ("world", "flow", "wrench", "contact", "times", "observe")
 
 
