@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ..physics.effects.effect import ActiveEffect
+from ..physics.effects.registry import CONTACT_ALIASES
 from ..physics.world import World
 from .bundles import DRAGS, drag_in_wind
 from .candidates import Candidate, base_parameters, base_values, without_effect
@@ -178,6 +179,13 @@ def _flight_search(
     return slots, current, flight
 
 
+def _with_aliases(kept: Sequence[Evidence], equals: Sequence[Evidence]) -> list[Evidence]:
+    """Return what contact left of equals, with those that rigid contact cannot tell from it."""
+    names = {one.name for one in kept}
+    names |= {name for group in CONTACT_ALIASES if group & names for name in group}
+    return [*kept, *(one for one in equals if one.name in names and one not in kept)]
+
+
 def _bundled(
     prepared: Prepared, world: World, filled: Sequence[Slot], candidates: Sequence[Candidate], scatter: float
 ) -> tuple[list[Slot], World, Segments] | None:
@@ -215,7 +223,8 @@ def _with_contact(
     for slot in filled:
         equals = list(slot.equals)
         if len(equals) > 1:
-            equals, _ = separated(equals, contact, base.world, prepared.groups)
+            kept, _ = separated(equals, contact, base.world, prepared.groups)
+            equals = _with_aliases(kept, equals)
             final = _replaced(final, slot.best, equals[0])
         chosen.append(Chosen(equals[0], tuple(equals), "flight"))
     final = replace(final, contact=base.world.contact)
