@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...schemas import CompareResult, ErrorSummary
 from .charts import decades
 
 _WIDTH, _HEIGHT = 1060, 360
@@ -27,6 +28,45 @@ class Rung:
     errors_mm: Mapping[str, float]
     floor_mm: float | None = None
     fitted_mm: float | None = None
+
+
+LADDER_WORDS = (
+    "Each model sees the first 0.1 s of an episode; the rest is one uninterrupted prediction. State-fitted: the "
+    "start is fitted to the whole episode, so what is left is what the model cannot follow even from the best "
+    "start. Noise of the start alone: the error that the uncertainty of the start would bring to a perfect model."
+)
+"""What the ladder shows, for those who read a page for the first time."""
+_LEGEND = (
+    ("median", "median over the episodes"),
+    ("episode", "one episode"),
+    ("fitted", "state-fitted residual (median)"),
+    ("floor", "noise of the start alone (median)"),
+    ("zero", "without a model (medians)"),
+)
+
+
+def error_ladder(result: CompareResult, names: Sequence[str]) -> tuple[str, str]:
+    """Return the ladder of a comparison and its legend, as HTML; the style is `replay_script.REPLAY_STYLE`."""
+    rungs = [
+        Rung(
+            name,
+            {e.episode: 1e3 * e.translation_error_m for e in model.per_episode},
+            _median_mm(model.state_noise_floor_m),
+            _median_mm(model.state_fitted_residual_m),
+        )
+        for model, name in zip(result.models, names, strict=True)
+    ]
+    zeros = {
+        f"{name} object": 1e3 * figures["translation_error_m"]["median"]
+        for name, figures in result.models[0].baselines.items()
+        if figures.get("translation_error_m")
+    }
+    legend = "".join(f'<span><i class="{style}"></i>{words}</span>' for style, words in _LEGEND)
+    return f'<div class="scroll">{ladder_svg(rungs, zeros)}</div>', f'<div class="legend">{legend}</div>'
+
+
+def _median_mm(summary: ErrorSummary | None) -> float | None:
+    return None if summary is None else 1e3 * summary.median
 
 
 def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:

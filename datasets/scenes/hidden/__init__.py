@@ -6,6 +6,7 @@ from cgwm's where a real one would.
 
 from . import contact, flight, measured, unknown
 from .case import Case
+from .mystery import draw_mystery, make_mystery, open_sealed
 from .plan import KNOWN, PAIRS, UNKNOWN, cases, rough_cases
 from .record import ENGINES, make_capture
 from .registry import EFFECTS
@@ -22,6 +23,9 @@ __all__ = [
     "UNKNOWN",
     "Case",
     "cases",
+    "draw_mystery",
     "make_capture",
+    "make_mystery",
+    "open_sealed",
     "rough_cases",
 ]
