@@ -34,6 +34,8 @@ from .staged import StagedRun
 SEALED, DIAGNOSIS = "sealed.json", "diagnosis.json"
 BASE, CHILD = "m0", "m1"
 SPLIT = "test"
+STEP_S = 0.002
+"""Twice the step of `cgwm fit`, for half the time."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def run_mystery(
         seed: Draws the body, what is hidden, the throws and the noise.
         device: auto, cpu or cuda.
         overwrite: Replace what is at `out`.
-        physics: Settings of both fits; seed and device are filled in.
+        physics: Settings of both fits, default those of `cgwm fit` with steps of 2 ms; seed and device are filled in.
 
     Returns:
         What stands in `report.json`.
@@ -70,7 +72,7 @@ def run_mystery(
     """
     resolve_device(device)  # a wrong device is better told now than after minutes
     case = draw_mystery(seed)
-    settings = (physics or PhysConfig()).model_dump() | {"seed": seed, "device": device}
+    settings = (physics or PhysConfig(step_s=STEP_S)).model_dump() | {"seed": seed, "device": device}
     with new_directory(Path(out), overwrite) as folder:
         run = _Mystery(folder, Path(out), PhysConfig.model_validate(settings), seed, device)
         with run.stage("make the capture"):
@@ -127,6 +129,7 @@ def _result(
         body=capture.body_names[0],
         train_episodes=len(capture.episodes("train")),
         test_episodes=len(capture.episodes(SPLIT)),
+        settings=" ".join(f"--set phys-geo.{name}={value}" for name, value in _changed(run.physics).items()),
         diagnosis=diagnosis,
         parameters=tuple(_compared(parameter, hidden) for parameter in own),
         comparison=comparison,
@@ -141,6 +144,12 @@ def _result(
             for message in file.warnings
         ),
     )
+
+
+def _changed(physics: PhysConfig) -> dict[str, object]:
+    """Return what differs from the settings of `cgwm fit`, the device aside."""
+    usual = PhysConfig().model_dump()
+    return {k: v for k, v in physics.model_dump().items() if v != usual[k] and k not in ("device", "effects")}
 
 
 def _compared(parameter: Parameter, hidden: Sequence[HiddenEffect]) -> ComparedParameter:

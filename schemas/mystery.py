@@ -46,6 +46,8 @@ class MysteryResult(FileModel):
     body: str
     train_episodes: int
     test_episodes: int
+    settings: str
+    """Options of both fits that differ from those of `cgwm fit`."""
     diagnosis: DiagnoseResult
     parameters: tuple[ComparedParameter, ...]
     """The numbers of the added effects, with the true ones where the same effect was hidden."""

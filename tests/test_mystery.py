@@ -115,6 +115,7 @@ def test_the_whole_loop(solved: tuple[Path, MysteryResult]) -> None:
     base, child = result.comparison.models
     assert (base.model, child.model) == ("m0", "m1") and child.effects == ("magnus_lift",)
     assert child.translation_error_m.median < 0.5 * base.translation_error_m.median
+    assert "--set phys-geo.population=8" in result.settings and "phys-geo.step_s=0.002" in result.settings
     (number,) = result.parameters
     assert number.parameter.name == "magnus_lift.s" and abs(number.true_value) == 0.04
     assert number.parameter.estimate == pytest.approx(number.true_value, rel=0.1)

@@ -31,7 +31,6 @@ def mystery_html(result: MysteryResult) -> str:
     body = [
         f"<h1>cgwm demo · scene mystery · seed {result.seed}</h1>",
         paragraph(_opening(result), "verdict"),
-        _warnings([*result.warnings, *result.comparison.warnings]),
         _fit(result),
         _fails(result),
         _diagnosis(result),
@@ -66,10 +65,10 @@ def _commands(*lines: str) -> str:
 def _fit(result: MysteryResult) -> str:
     return section(
         "1. Fit a model",
-        _commands("cgwm fit capture --out m0"),
+        _commands(f"cgwm fit capture --out m0 {result.settings}"),
         paragraph(
             f"From {result.train_episodes} tracked episodes: a rigid body that flies freely and touches the ground by "
-            "a spring, a damper and Coulomb friction. Nothing else is in it."
+            "a spring, a damper and Coulomb friction. Nothing else is in it. (The setting halves the time of the demo.)"
         ),
     )
 
@@ -126,20 +125,25 @@ def _diagnosis(result: MysteryResult) -> str:
 
 def _candidate(entry: RankedEffect) -> list[str]:
     numbers = "<br>".join(
-        f"<code>{text(p.name)}</code> = {number(p.estimate)} ± {number(p.std_error, 2)} {text(p.unit)}"
+        f"<code>{text(p.name)}</code> = {number(p.estimate)} ± {number(p.std_error, 2)}{_unit(p.unit)}"
         for p in entry.parameters[:3]
     )
-    p = "< 1e−300" if entry.score_p < _LEAST_P else number(entry.score_p, 2)
+    # number() takes what is below 1e-12 for a zero; a p-value may be that small
+    p = "< 1e-300" if entry.score_p < _LEAST_P else f"{entry.score_p:.1g}"
     before, after = entry.cv_error_before_m, entry.cv_error_after_m
     gain = "" if before is None or after is None else f"{fixed(before, 2, 1e3)} → {fixed(after, 2, 1e3)} mm"
     return [
         f"<code>{text(entry.effect)}</code>",
         text(", ".join(entry.acts_in)),
         text(entry.judged_in),
-        text(p),
+        text(p.replace("-", "−")),
         numbers + ("<br>…" if len(entry.parameters) > 3 else ""),
         gain,
     ]
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {text(unit)}"
 
 
 def _added(result: MysteryResult) -> str:
@@ -155,7 +159,7 @@ def _added(result: MysteryResult) -> str:
     ]
     return section(
         "4. Add it",
-        _commands(f"cgwm fit capture --from m0 --effects {','.join(selected)} --out m1"),
+        _commands(f"cgwm fit capture --from m0 --effects {','.join(selected)} --out m1 {result.settings}"),
         paragraph("A child of m0 with the effect in it, and all numbers fitted anew."),
         table(["number", "estimate", "95 % interval", "unit"], rows, numeric=(1, 2)),
     )
@@ -243,8 +247,9 @@ def _files(result: MysteryResult) -> str:
     rows = [[text(kind), f"<code>{text(path)}</code>"] for kind, path in result.paths.items()]
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
     return section(
-        "Files and times",
+        "Files, warnings and times",
         table(["what", "where"], rows),
+        _warnings([*result.warnings, *result.comparison.warnings]),
         paragraph(f"On {result.device}: {times}.", "soft"),
     )
 
