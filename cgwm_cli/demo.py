@@ -64,7 +64,7 @@ def _story(result: MysteryResult, out: Path) -> str:
         lines.append(f"add       m1, with {listed}")
         lines.append(f"compare   {result.comparison.verdict}")
     truth = [
-        ", ".join(f"{name} = {quantity(v) if isinstance(v, float) else v}" for name, v in effect.values.items())
+        ", ".join(f"{name} = {v if isinstance(v, list) else quantity(v)}" for name, v in effect.values.items())
         for effect in result.hidden
     ]
     lines.append(f"hidden    {result.sentence}" + "".join(f" True: {words}." for words in truth))

@@ -155,7 +155,7 @@ def _changed(physics: PhysConfig) -> dict[str, object]:
 def _compared(parameter: Parameter, hidden: Sequence[HiddenEffect]) -> ComparedParameter:
     true = {f"{effect.name}.{key}": value for effect in hidden for key, value in effect.values.items()}
     value, span = true.get(parameter.name), parameter.interval_95
-    if not isinstance(value, float):
+    if value is None or isinstance(value, list):
         return ComparedParameter(parameter=parameter)
     covered = None if span is None else span[0] <= value <= span[1]
     return ComparedParameter(parameter=parameter, true_value=value, covered=covered)

@@ -11,7 +11,6 @@ import numpy as np
 
 from ...schemas import CompareResult, ErrorSummary
 from .charts import decades
-from .page import number
 
 _WIDTH, _HEIGHT = 1060, 360
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60, 150, 28, 44
@@ -113,7 +112,7 @@ def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:
                     f'<line class="{style}" x1="{x - half:.1f}" x2="{x + half:.1f}" y1="{at:.1f}" y2="{at:.1f}">'
                     f"<title>{words}: {value:.2f} mm</title></line>"
                 )
-        parts.append(f'<text class="value" x="{x + 12:.1f}" y="{y(median) - 8:.1f}">{number(median)} mm</text>')
+        parts.append(f'<text class="value" x="{x + 12:.1f}" y="{y(median) - 8:.1f}">{_figure(median)} mm</text>')
         parts.append(f'<text class="name" x="{x:.1f}" y="{bottom + 20}" text-anchor="middle">{_text(rung.name)}</text>')
     parts.append(f'<path class="line median" d="M{"L".join(medians)}"/>')
     parts += [f'<circle class="median" cx="{m.split()[0]}" cy="{m.split()[1]}" r="5"/>' for m in medians]
@@ -128,7 +127,7 @@ def _zeros(zeros_mm: Mapping[str, float], y: _Scale, right: float) -> list[str]:
         label = min(at + 4, last - _LABEL_HEIGHT)
         last = label
         parts.append(f'<line class="zero" x1="{_LEFT}" x2="{right}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(f'<text x="{right + 6}" y="{label:.1f}">{_text(name)}: {number(value)}</text>')
+        parts.append(f'<text x="{right + 6}" y="{label:.1f}">{_text(name)}: {_figure(value)}</text>')
     return parts
 
 
@@ -136,11 +135,15 @@ def _episodes(rungs: Sequence[Rung], columns: Sequence[float], y: _Scale) -> lis
     parts = []
     for episode in dict.fromkeys(name for rung in rungs for name in rung.errors_mm):
         known = [(x, r.errors_mm[episode]) for r, x in zip(rungs, columns, strict=True) if episode in r.errors_mm]
-        words = f"episode {episode}: " + ", ".join(number(value) for _, value in known) + " mm"
+        words = f"episode {episode}: " + ", ".join(_figure(value) for _, value in known) + " mm"
         path = "L".join(f"{x:.1f} {y(value):.1f}" for x, value in known)
         dots = "".join(f'<circle cx="{x:.1f}" cy="{y(value):.1f}" r="2.5"/>' for x, value in known)
         parts.append(f'<g class="episode"><title>{_text(words)}</title><path class="line" d="M{path}"/>{dots}</g>')
     return parts
+
+
+def _figure(value: float) -> str:
+    return f"{value:.0f}" if value >= 1e3 else f"{value:.3g}"
 
 
 def _text(words: str) -> str:

@@ -22,6 +22,7 @@ _STYLE = """
 .told .verdict { margin: 10px 0; }
 pre { background: var(--wash); border-radius: 8px; padding: 10px 14px; overflow-x: auto; margin: 12px 0; }
 """
+_LINK = '<p>Predicted beside measured motion, and every figure: <a href="compare.html">compare.html</a>.</p>'
 _GOOD = ("right", "right_class")
 
 
@@ -85,6 +86,7 @@ def _fails(result: MysteryResult) -> str:
             "data."
         ),
         _phases([base], ["m0"]),
+        "" if result.diagnosis.selected else _LINK,
     )
 
 
@@ -93,6 +95,9 @@ def _diagnosis(result: MysteryResult) -> str:
     best = found.ranking[:SHOWN]
     best = [*best, *(entry for entry in found.ranking[SHOWN:] if entry.effect in found.selected)]
     header = ["effect", "acts in", "judged in", "p", "estimate", "held-out error, without → with"]
+    rows = [_candidate(entry) for entry in best]
+    if not any(row[-1] for row in rows):
+        header, rows = header[:-1], [row[:-1] for row in rows]
     chosen = [k for k, entry in enumerate(best) if entry.effect in found.selected]
     pieces = [
         _commands("cgwm diagnose m0 capture"),
@@ -102,7 +107,7 @@ def _diagnosis(result: MysteryResult) -> str:
             "fitted and proved on episodes that their numbers were not fitted to. The test episodes stay closed. "
             f"{len(found.ranking)} were asked; these fit best:"
         ),
-        table(header, [_candidate(entry) for entry in best], strong=chosen),
+        table(header, rows, strong=chosen),
         paragraph(
             "p: of one candidate alone against a model without it. Where something large is missing, many candidates "
             "look better than none; the choice is between them.",
@@ -116,8 +121,8 @@ def _diagnosis(result: MysteryResult) -> str:
     if before is not None and after is not None:
         pieces.append(
             paragraph(
-                f"A force that is missing in flight would show as a mean χ² above 1: {number(before.statistic)} before"
-                + (f", {number(after.statistic)} with what was selected." if found.selected else ".")
+                f"A force that is missing in flight shows as a mean χ² above 1; it is {number(before.statistic)}"
+                + (f", and {number(after.statistic)} with what was named." if found.selected else ".")
             )
         )
     return section("3. Diagnose: what is missing?", *pieces)
@@ -174,7 +179,7 @@ def _compared(result: MysteryResult) -> str:
         *error_ladder(result.comparison, names),
         _phases(result.comparison.models, names),
         paragraph(LADDER_WORDS, "soft"),
-        '<p>Both motions beside the measured one, and every figure: <a href="compare.html">compare.html</a>.</p>',
+        _LINK,
     )
 
 
@@ -225,7 +230,7 @@ def _truth(effect: HiddenEffect) -> str:
 
 
 def _value(value: float | list[float]) -> str:
-    return number(value) if isinstance(value, float) else f"({', '.join(map(number, value))})"
+    return f"({', '.join(map(number, value))})" if isinstance(value, list) else number(value)
 
 
 def _beside(compared: ComparedParameter) -> list[str]:
