@@ -41,6 +41,7 @@ _PUBLIC = {
     "import_tum": ".datasets.tum",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
+    "run_mystery": ".pipeline.mystery",
     "synthesize": ".pipeline.synthesize",
     "validate": ".pipeline.validate",
 }
@@ -62,6 +63,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
     from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
+    from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
     from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
     from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
     from .schemas import (  # pyright: ignore[reportMissingImports]
@@ -106,6 +108,7 @@ __all__ = [
     "import_tum",
     "read_model",
     "run_demo",
+    "run_mystery",
     "synthesize",
     "validate",
 ]

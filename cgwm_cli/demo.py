@@ -1,4 +1,4 @@
-"""`cgwm demo`: the whole pipeline on a scene that it makes itself."""
+"""`cgwm demo`: the whole pipeline on a scene that it makes itself, or the loop from a model to what it lacks."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from .options import Debug, DeviceName, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
-    from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit
+    from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit, MysteryResult
 
 
 def demo(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The directory to write.", show_default=False)],
     scene: Annotated[
-        Literal["fall", "push"],
-        typer.Option("--scene", help="fall: an object dropped and bouncing; push: one pushed by a fingertip."),
+        Literal["fall", "push", "mystery"],
+        typer.Option(
+            "--scene",
+            help="fall: an object dropped and bouncing; push: one pushed by a fingertip; mystery: something is hidden "
+            "in the physics or the measurement, and found by fit, compare and diagnose.",
+        ),
     ] = "fall",
     renderer: Annotated[
         Literal["raycast"], typer.Option("--renderer", help="How the photos are made; raycast needs no OpenGL.")
@@ -34,9 +38,38 @@ def demo(
 ) -> None:
     """The whole pipeline on a scene that it makes itself, with a report at the end."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        if scene == "mystery":
+            from ..pipeline.mystery import run_mystery
+
+            emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
+            return
         from ..pipeline.demo import run_demo
 
         emit(run_demo(out, scene, seed, renderer, device, overwrite), lambda result: _summary(result, out))
+
+
+def _story(result: MysteryResult, out: Path) -> str:
+    """Tell the mystery in the order in which it was solved."""
+    from .output import millimetres, quantity, warnings
+
+    errors = [millimetres(model.translation_error_m.median) for model in result.comparison.models]
+    lines = [
+        f"fit       m0, from {result.train_episodes} episodes of a {result.body}",
+        f"compare   m0 errs by {errors[0]} on {result.test_episodes} episodes that it has not seen (median)",
+        f"diagnose  {result.diagnosis.sentence}",
+    ]
+    if result.diagnosis.selected:
+        numbers = [c.parameter for c in result.parameters]
+        listed = ", ".join(f"{p.name} = {quantity(p.estimate)} +- {quantity(p.std_error)} {p.unit}" for p in numbers)
+        lines.append(f"add       m1, with {listed}")
+        lines.append(f"compare   {result.comparison.verdict}")
+    truth = [
+        ", ".join(f"{name} = {v if isinstance(v, list) else quantity(v)}" for name, v in effect.values.items())
+        for effect in result.hidden
+    ]
+    lines.append(f"hidden    {result.sentence}" + "".join(f" True: {words}." for words in truth))
+    lines += [*warnings(result.warnings), f"{sum(result.seconds.values()):.0f} s."]
+    return "\n".join([*lines, f"Report: {out / result.paths['report']}"])
 
 
 def _summary(result: DemoResult, out: Path) -> str:

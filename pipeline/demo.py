@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import resource
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -17,12 +14,10 @@ from ..datasets.atomic import new_directory
 from ..datasets.capture import Capture
 from ..datasets.loader import RolloutReader
 from ..datasets.models import read_model
-from ..datasets.progress import note
 from ..datasets.scenes import TRUTH_MESH, make_scene, read_truth
 from ..schemas import (
     CalibrateConfig,
     CalibrationReport,
-    CgwmError,
     DatasetSummary,
     DemoResult,
     ImagesOnlyFit,
@@ -41,6 +36,7 @@ from .reporting.episodes import curves_of, strips_of
 from .reporting.pictures import RolloutTile, contact_sheet, small_png, telling, tiles
 from .reporting.verdict import targets_of, verdict_text
 from .sg_gs import resolve_device
+from .staged import StagedRun
 from .synthesize import synthesize
 
 ConfigT = TypeVar("ConfigT", CalibrateConfig, SplatConfig, PhysConfig, SynthesizeConfig)
@@ -77,35 +73,12 @@ class DemoSettings:
 
 
 @dataclass(frozen=True)
-class _Demo:
-    """What the stages share: `folder` is where they write, `name` what the user calls it."""
+class _Demo(StagedRun):
+    """A run of the demo, with what its stages share."""
 
-    folder: Path
-    name: Path
     settings: DemoSettings
     seed: int
     device: str
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Announce a stage, time it, and let its errors name it."""
-        note(f"demo: {name} ...")
-        began = time.perf_counter()
-        try:
-            yield
-        except CgwmError as error:
-            raise self._named(error, name) from None
-        self.seconds[name] = round(time.perf_counter() - began, 2)
-        note(f"demo: {name}: {self.seconds[name]:.1f} s")
-
-    def plain(self, message: str) -> str:
-        """Return a message without the name that the directory has while it is being written."""
-        return message.replace(str(self.folder), str(self.name))
-
-    def _named(self, error: CgwmError, stage: str) -> CgwmError:
-        found = f"the demo failed in the stage '{stage}' (nothing was left in {self.name}): {error.found}"
-        return type(error)(self.plain(found), self.plain(error.allowed), self.plain(error.todo))
 
 
 def run_demo(

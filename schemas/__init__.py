@@ -87,6 +87,7 @@ from .model import (
     Provenance,
     Solver,
 )
+from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .results import EpisodeErrors, ErrorSummary, EvalResult
 from .validation import ValidationReport
 
@@ -98,6 +99,7 @@ __all__ = [
     "PHASES",
     "QUATERNION_NORM_TOLERANCE",
     "ROLLOUTS_FORMAT",
+    "SEALED_FORMAT",
     "Body",
     "BodyCheck",
     "BodyModel",
@@ -136,6 +138,7 @@ __all__ = [
     "FitFile",
     "FlightTest",
     "Ground",
+    "HiddenEffect",
     "ImageVerdict",
     "ImagesOnlyFit",
     "ImportResult",
@@ -149,10 +152,12 @@ __all__ = [
     "Missing",
     "ModelComparison",
     "ModelFile",
+    "MysteryResult",
     "NextExperiment",
     "NotConvergedError",
     "NotEnoughMemoryError",
     "Organiser",
+    "Outcome",
     "PackageState",
     "PairFigures",
     "PairedDifference",
@@ -169,6 +174,7 @@ __all__ = [
     "ResidualLaw",
     "SamplingPlan",
     "Scale",
+    "SealedFile",
     "SelfCheckFigures",
     "Shape",
     "ShardEntry",

@@ -1,7 +1,6 @@
-"""Captures with hidden effects, by an independent truth: what `cgwm diagnose` is judged by.
+"""The captures with hidden effects of `cgwm.datasets.scenes.hidden`, as lists on the command line, and a second truth.
 
-Nothing here comes from `cgwm.pipeline`: MuJoCo moves the bodies, and the effects have their own formulas, which differ
-from cgwm's where a real one would. From `benchmarks/`:
+From `benchmarks/`:
 
     from hidden_effects import Case, cases, make_capture
     make_capture("out/a", Case("a", "cube", ("quadratic_drag",), "large", seed=1))   # out/a, out/a.truth.json
@@ -11,20 +10,27 @@ from cgwm's where a real one would. From `benchmarks/`:
     python -m hidden_effects make OUT --list drake         # the second truth: pip install drake
 """
 
-from . import contact, flight, measured, unknown
-from .case import Case
-from .plan import KNOWN, PAIRS, UNKNOWN, cases, drake_cases, rough_cases
-from .record import make_capture
-from .registry import EFFECTS
+from cgwm.datasets.scenes.hidden import (
+    EFFECTS,
+    ENGINES,
+    KNOWN,
+    PAIRS,
+    UNKNOWN,
+    Case,
+    cases,
+    make_capture,
+    rough_cases,
+)
 
-TRUTHS = (flight, contact, measured, unknown)
-"""The modules of the effects, which enter them in the registry."""
+from . import drake_engine
+from .drake_cases import drake_cases
+
+ENGINES["drake"] = drake_engine
 
 __all__ = [
     "EFFECTS",
     "KNOWN",
     "PAIRS",
-    "TRUTHS",
     "UNKNOWN",
     "Case",
     "cases",

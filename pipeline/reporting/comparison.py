@@ -11,7 +11,7 @@ from ..compared import ComparedModel
 from ..diagnosis.segments import CONTACT_S, FLIGHT_S
 from ..paired import LEAST_EPISODES
 from ..short_errors import FREEDOMS
-from .ladder import Rung, ladder_svg
+from .ladder import LADDER_WORDS, error_ladder
 from .page import facts, fixed, number, page, paragraph, section, table, text
 from .replay import Replay, replay_of
 from .replay_script import REPLAY_SCRIPT, REPLAY_STYLE
@@ -102,42 +102,11 @@ def _card(model: ModelComparison, name: str) -> str:
 
 
 def _ladder(result: CompareResult, names: Sequence[str]) -> str:
-    rungs = [
-        Rung(
-            name,
-            {e.episode: e.translation_error_m * _MM for e in model.per_episode},
-            _median_mm(model.state_noise_floor_m),
-            _median_mm(model.state_fitted_residual_m),
-        )
-        for model, name in zip(result.models, names, strict=True)
-    ]
-    first = result.models[0]
-    zeros = {
-        f"{name} object": figures["translation_error_m"]["median"] * _MM
-        for name, figures in first.baselines.items()
-        if figures.get("translation_error_m")
-    }
-    legend = "".join(
-        f'<span><i class="{style}"></i>{words}</span>'
-        for style, words in (
-            ("median", "median over the episodes"),
-            ("episode", "one episode"),
-            ("fitted", "state-fitted residual (median)"),
-            ("floor", "noise of the start alone (median)"),
-            ("zero", "without a model (medians)"),
-        )
-    )
-    words = (
-        "Each model sees the first 0.1 s of an episode; the rest is one uninterrupted prediction. State-fitted: the "
-        "start is fitted to the whole episode, so what is left is what the model cannot follow even from the best "
-        "start. Noise of the start alone: the error that the uncertainty of the start would bring to a perfect model."
-    )
     return section(
         "From model to model",
-        f'<div class="scroll">{ladder_svg(rungs, zeros)}</div>',
-        f'<div class="legend">{legend}</div>',
+        *error_ladder(result, names),
         _models(result, names),
-        paragraph(words, "soft"),
+        paragraph(LADDER_WORDS, "soft"),
         _pairs(result, names),
     )
 

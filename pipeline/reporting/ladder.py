@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...schemas import CompareResult, ErrorSummary
 from .charts import decades
 
 _WIDTH, _HEIGHT = 1060, 360
@@ -27,6 +28,45 @@ class Rung:
     errors_mm: Mapping[str, float]
     floor_mm: float | None = None
     fitted_mm: float | None = None
+
+
+LADDER_WORDS = (
+    "Each model sees the first 0.1 s of an episode; the rest is one uninterrupted prediction. State-fitted: the "
+    "start is fitted to the whole episode, so what is left is what the model cannot follow even from the best "
+    "start. Noise of the start alone: the error that the uncertainty of the start would bring to a perfect model."
+)
+"""What the ladder shows, for those who read a page for the first time."""
+_LEGEND = (
+    ("median", "median over the episodes"),
+    ("episode", "one episode"),
+    ("fitted", "state-fitted residual (median)"),
+    ("floor", "noise of the start alone (median)"),
+    ("zero", "without a model (medians)"),
+)
+
+
+def error_ladder(result: CompareResult, names: Sequence[str]) -> tuple[str, str]:
+    """Return the ladder of a comparison and its legend, as HTML; the style is `replay_script.REPLAY_STYLE`."""
+    rungs = [
+        Rung(
+            name,
+            {e.episode: 1e3 * e.translation_error_m for e in model.per_episode},
+            _median_mm(model.state_noise_floor_m),
+            _median_mm(model.state_fitted_residual_m),
+        )
+        for model, name in zip(result.models, names, strict=True)
+    ]
+    zeros = {
+        f"{name} object": 1e3 * figures["translation_error_m"]["median"]
+        for name, figures in result.models[0].baselines.items()
+        if figures.get("translation_error_m")
+    }
+    legend = "".join(f'<span><i class="{style}"></i>{words}</span>' for style, words in _LEGEND)
+    return f'<div class="scroll">{ladder_svg(rungs, zeros)}</div>', f'<div class="legend">{legend}</div>'
+
+
+def _median_mm(summary: ErrorSummary | None) -> float | None:
+    return None if summary is None else 1e3 * summary.median
 
 
 def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:
@@ -72,7 +112,7 @@ def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:
                     f'<line class="{style}" x1="{x - half:.1f}" x2="{x + half:.1f}" y1="{at:.1f}" y2="{at:.1f}">'
                     f"<title>{words}: {value:.2f} mm</title></line>"
                 )
-        parts.append(f'<text class="value" x="{x + 12:.1f}" y="{y(median) - 8:.1f}">{median:.3g} mm</text>')
+        parts.append(f'<text class="value" x="{x + 12:.1f}" y="{y(median) - 8:.1f}">{_figure(median)} mm</text>')
         parts.append(f'<text class="name" x="{x:.1f}" y="{bottom + 20}" text-anchor="middle">{_text(rung.name)}</text>')
     parts.append(f'<path class="line median" d="M{"L".join(medians)}"/>')
     parts += [f'<circle class="median" cx="{m.split()[0]}" cy="{m.split()[1]}" r="5"/>' for m in medians]
@@ -87,7 +127,7 @@ def _zeros(zeros_mm: Mapping[str, float], y: _Scale, right: float) -> list[str]:
         label = min(at + 4, last - _LABEL_HEIGHT)
         last = label
         parts.append(f'<line class="zero" x1="{_LEFT}" x2="{right}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(f'<text x="{right + 6}" y="{label:.1f}">{_text(name)}: {value:.3g}</text>')
+        parts.append(f'<text x="{right + 6}" y="{label:.1f}">{_text(name)}: {_figure(value)}</text>')
     return parts
 
 
@@ -95,11 +135,15 @@ def _episodes(rungs: Sequence[Rung], columns: Sequence[float], y: _Scale) -> lis
     parts = []
     for episode in dict.fromkeys(name for rung in rungs for name in rung.errors_mm):
         known = [(x, r.errors_mm[episode]) for r, x in zip(rungs, columns, strict=True) if episode in r.errors_mm]
-        words = f"episode {episode}: " + ", ".join(f"{value:.3g}" for _, value in known) + " mm"
+        words = f"episode {episode}: " + ", ".join(_figure(value) for _, value in known) + " mm"
         path = "L".join(f"{x:.1f} {y(value):.1f}" for x, value in known)
         dots = "".join(f'<circle cx="{x:.1f}" cy="{y(value):.1f}" r="2.5"/>' for x, value in known)
         parts.append(f'<g class="episode"><title>{_text(words)}</title><path class="line" d="M{path}"/>{dots}</g>')
     return parts
+
+
+def _figure(value: float) -> str:
+    return f"{value:.0f}" if value >= 1e3 else f"{value:.3g}"
 
 
 def _text(words: str) -> str:

@@ -30,17 +30,6 @@ PAIRS: tuple[tuple[Kind, tuple[str, str]], ...] = (
     ("ball", ("gravity_tilt", "torsional_friction")),
 )
 RATES_HZ = (60.0, 100.0, 148.0)
-DRAKE: tuple[tuple[Kind, str], ...] = (
-    ("cube", "linear_drag"),
-    ("ball", "magnus_lift"),
-    ("cube", "com_offset"),
-    ("ball", "gravity_tilt"),
-    ("cube", "spin_damping"),
-    ("cube", "viscous_friction"),
-    ("cube", "length_scale"),
-    ("ball", "gust"),
-)
-"""Effects that the second engine hides, too."""
 ROUGH: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     ("cube", ("linear_drag",)),
     ("cube", ("com_offset",)),
@@ -73,26 +62,14 @@ def cases(stage: Stage, repeats: int = 1, nulls: int = NULLS, noise: Noise = "sp
     if stage not in ("development", "report"):
         raise ValueError(f"stage '{stage}'; there are development and report")
     found = [
-        _case(stage, noise, thing, (name,), size, k)
+        planned_case(stage, noise, thing, (name,), size, k)
         for name in (*KNOWN, *UNKNOWN)
         for thing in EFFECTS[name].things
         for size in SIZES
         for k in range(repeats)
     ]
-    found += [_case(stage, noise, thing, pair, "large", k) for thing, pair in PAIRS for k in range(repeats)]
-    return found + [_case(stage, noise, THINGS[k // 2 % 2], (), "large", k) for k in range(nulls)]
-
-
-def drake_cases(stage: Stage, repeats: int = 1, nulls: int = 40, noise: Noise = "spread") -> list[Case]:
-    """Return cases whose truth is drake: nulls, and eight effects, small and large; see `cases`."""
-    found = [
-        _case(stage, noise, thing, (name,), size, k, "/drake")
-        for thing, name in DRAKE
-        for size in SIZES
-        for k in range(repeats)
-    ]
-    found += [_case(stage, noise, THINGS[k % 2], (), "large", k, "/drake") for k in range(nulls)]
-    return [replace(case, engine="drake", law=1) for case in found]
+    found += [planned_case(stage, noise, thing, pair, "large", k) for thing, pair in PAIRS for k in range(repeats)]
+    return found + [planned_case(stage, noise, THINGS[k // 2 % 2], (), "large", k) for k in range(nulls)]
 
 
 def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = "spread") -> list[Case]:
@@ -101,18 +78,31 @@ def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = 
     Large effects; of `ROUGH`'s last four and of every second null of a ball there are centroids only.
     """
     found = [
-        (_case(stage, noise, thing, names, "large", k, "/rough"), place >= len(ROUGH) - 4)
+        (planned_case(stage, noise, thing, names, "large", k, "/rough"), place >= len(ROUGH) - 4)
         for place, (thing, names) in enumerate(ROUGH)
         for k in range(repeats)
     ]
-    found += [(_case(stage, noise, THINGS[k // 2 % 2], (), "large", k, "/rough"), k % 4 == 3) for k in range(nulls)]
+    found += [
+        (planned_case(stage, noise, THINGS[k // 2 % 2], (), "large", k, "/rough"), k % 4 == 3) for k in range(nulls)
+    ]
     rough = {"outliers": 0.02, "gaps": 1, "uneven": 0.3, "mass_given": False}
     return [replace(case, centroid_only=centroids, **rough) for case, centroids in found]
 
 
-def _case(
+def planned_case(
     stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int, list_: str = ""
 ) -> Case:
+    """Return one case of a list; its seed comes from its name, and so does not depend on what else is listed.
+
+    Args:
+        stage: As of `cases`, like `noise`.
+        noise: How roughly it is measured.
+        thing: The body.
+        effects: What is hidden; none for a null.
+        size: Of the effects.
+        k: Number of the repetition.
+        list_: Name of a list beside the first, with a slash before it.
+    """
     what = f"{'+'.join(effects)}/{size}" if effects else "null"
     name = f"{stage}{list_}/{thing}/{what}/{k}"
     code = crc32(name.encode())

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.scenes.friction import CoulombFriction
 
+from ..friction import CoulombFriction
 from .mechanics import STEP_S, Hidden, Mechanics, Motion, Reader, Start
 from .things import Array, Thing
 

@@ -8,21 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.atomic import new_directory, new_file
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.tracks import Track, tracks_csv
-from cgwm.schemas import Body, BoxShape, CaptureManifest, Ground, Shape, World
-from cgwm.schemas.capture import Measurement, SphereShape
 from numpy.typing import NDArray
 
-from . import drake_engine, mechanics, mujoco_engine
+from ....schemas import Body, BoxShape, CaptureManifest, Ground, Shape, World
+from ....schemas.capture import Measurement, SphereShape
+from ...atomic import new_directory, new_file
+from ...manifest import write_manifest
+from ...tracks import Track, tracks_csv
+from . import mechanics, mujoco_engine
 from .case import Case
 from .mechanics import Hidden, Mechanics, Motion
 from .protocol import draw_start, motions
 from .rotation import rotations
 from .things import Array, Thing, restitution_of
 
-ENGINES: dict[str, Any] = {"mujoco": mujoco_engine, "drake": drake_engine}
+ENGINES: dict[str, Any] = {"mujoco": mujoco_engine}
+"""The truths by name, modules with `simulate` and `facts`; the benchmark enters a second one."""
 
 
 def make_capture(directory: Path | str, case: Case, truth: Path | str | None = None, overwrite: bool = False) -> Path:
@@ -36,11 +37,16 @@ def make_capture(directory: Path | str, case: Case, truth: Path | str | None = N
 
     Returns:
         The file of the truth.
+
+    Raises:
+        ValueError: If the truth would lie in the capture, or there is no such engine.
     """
     directory = Path(directory)
     path = Path(truth) if truth is not None else directory.with_name(f"{directory.name}.truth.json")
     if path.resolve().is_relative_to(directory.resolve()):
         raise ValueError(f"the truth {path} would lie in the capture {directory}")
+    if case.engine not in ENGINES:
+        raise ValueError(f"no engine '{case.engine}'; there are {', '.join(ENGINES)}")
     thing, hidden = case.drawn_thing(), case.drawn_effects()
     world = mechanics.build(Mechanics.of(thing, case.law), hidden)
     engine = ENGINES[case.engine]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -38,7 +37,7 @@ class Case:
         outliers: Share of the samples that are grossly wrong (2 to 10 cm, and 20 to 60 degrees).
         gaps: Number of gaps of 3 to 8 samples in every episode.
         uneven: Spread of the times, in sampling intervals (0.3: each time off by up to that).
-        engine: The truth.
+        engine: The truth, one of `record.ENGINES`.
     """
 
     name: str
@@ -61,7 +60,7 @@ class Case:
     outliers: float = 0.0
     gaps: int = 0
     uneven: float = 0.0
-    engine: Literal["mujoco", "drake"] = "mujoco"
+    engine: str = "mujoco"
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.effects if name not in EFFECTS]

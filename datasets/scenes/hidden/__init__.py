@@ -1,0 +1,31 @@
+"""Captures with hidden effects, by an independent truth: what `cgwm diagnose` is judged by, and `cgwm demo` walks on.
+
+Nothing here knows of `cgwm.pipeline`: MuJoCo moves the bodies, and the effects have their own formulas, which differ
+from cgwm's where a real one would.
+"""
+
+from . import contact, flight, measured, unknown
+from .case import Case
+from .mystery import draw_mystery, make_mystery, open_sealed
+from .plan import KNOWN, PAIRS, UNKNOWN, cases, rough_cases
+from .record import ENGINES, make_capture
+from .registry import EFFECTS
+
+TRUTHS = (flight, contact, measured, unknown)
+"""The modules of the effects, which enter them in the registry."""
+
+__all__ = [
+    "EFFECTS",
+    "ENGINES",
+    "KNOWN",
+    "PAIRS",
+    "TRUTHS",
+    "UNKNOWN",
+    "Case",
+    "cases",
+    "draw_mystery",
+    "make_capture",
+    "make_mystery",
+    "open_sealed",
+    "rough_cases",
+]

@@ -1,0 +1,73 @@
+"""The mystery of a seed: a case whose effect is drawn, and the truth of it in a sealed file."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....schemas import HiddenEffect, InputDataError, SealedFile, UsageError, read_json
+from .case import Case
+from .record import make_capture
+from .things import Kind
+
+CHOICES: tuple[tuple[Kind, str], ...] = (
+    ("ball", "magnus_lift"),
+    ("cube", "linear_drag"),
+    ("ball", "quadratic_drag"),
+    ("ball", "spin_damping"),
+    ("cube", "com_offset"),
+    ("ball", "gravity_tilt"),
+    ("ball", "rolling_resistance"),
+    ("cube", "anisotropic_friction"),
+    ("cube", "torsional_friction"),
+    ("cube", "clock_scale"),
+    ("ball", "length_scale"),
+    ("ball", "marker_offset"),
+)
+"""Body and effect: six that act in flight, three in contact, three in the measurement."""
+NOTHING = 0.15
+"""Probability that nothing is hidden: then to find nothing is right."""
+HOW_TO_OPEN = "The report tells it at its end. Otherwise: decode zlib_base64 by base64, then decompress it by zlib."
+
+
+def draw_mystery(seed: int) -> Case:
+    """Return the case of a seed: a body, and an effect or none; six episodes to learn from, four to predict.
+
+    Raises:
+        UsageError: If the seed is negative.
+    """
+    if seed < 0:
+        raise UsageError(f"the seed is {seed}.", "integers >= 0.")
+    rng = np.random.default_rng([seed, *b"mystery"])
+    nothing = rng.random() < NOTHING
+    thing, effect = CHOICES[int(rng.integers(len(CHOICES)))]
+    return Case("mystery", thing, () if nothing else (effect,), "large", seed, noise_given=True)
+
+
+def make_mystery(capture: Path, sealed: Path, case: Case) -> None:
+    """Write the capture of a case, and what is hidden into a sealed file; nothing in the capture tells it."""
+    truth = make_capture(capture, case, sealed.with_name(f".{sealed.name}.open"))
+    content = truth.read_bytes()
+    truth.unlink()
+    packed = base64.b64encode(zlib.compress(content, 9)).decode("ascii")
+    file = SealedFile(how_to_open=HOW_TO_OPEN, zlib_base64=packed)
+    sealed.write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def open_sealed(path: Path) -> tuple[HiddenEffect, ...]:
+    """Return what is hidden.
+
+    Raises:
+        InputDataError: If the file is no sealed one.
+    """
+    try:
+        content: dict[str, Any] = json.loads(zlib.decompress(base64.b64decode(read_json(path, SealedFile).zlib_base64)))
+        found = content["effects"]
+        return tuple(HiddenEffect(name=e["name"], values=e["values"], form=e["form"]) for e in found)
+    except (ValueError, zlib.error, KeyError) as error:
+        raise InputDataError(f"{path}: its content cannot be opened ({error}).", todo="make it again.") from None

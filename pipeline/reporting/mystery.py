@@ -1,0 +1,267 @@
+"""The page of the mystery: five steps from a model to what it lacked, and last what had been hidden."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ...schemas import ComparedParameter, HiddenEffect, ModelComparison, MysteryResult, RankedEffect
+from .charts import interval_svg
+from .ladder import LADDER_WORDS, error_ladder
+from .page import fixed, number, page, paragraph, section, table, text
+from .replay_script import REPLAY_STYLE
+
+REPORT_HTML = "report.html"
+REPORT_JSON = "report.json"
+
+SHOWN = 8
+"""So many candidates are listed."""
+_LEAST_P = 1e-300
+_STYLE = """
+.told { border: 1px solid var(--line); border-radius: 8px; padding: 6px 20px 14px; margin: 16px 0; }
+.told .verdict { margin: 10px 0; }
+pre { background: var(--wash); border-radius: 8px; padding: 10px 14px; overflow-x: auto; margin: 12px 0; }
+"""
+_LINK = '<p>Predicted beside measured motion, and every figure: <a href="compare.html">compare.html</a>.</p>'
+_GOOD = ("right", "right_class")
+
+
+def mystery_html(result: MysteryResult) -> str:
+    """Return the whole page."""
+    added = bool(result.diagnosis.selected)
+    body = [
+        f"<h1>cgwm demo · scene mystery · seed {result.seed}</h1>",
+        paragraph(_opening(result), "verdict"),
+        _fit(result),
+        _fails(result),
+        _diagnosis(result),
+        _added(result),
+        _compared(result) if added else "",
+        _hidden(result),
+        _files(result),
+    ]
+    title = f"cgwm demo: mystery, seed {result.seed}"
+    return page(title, [part for part in body if part], REPLAY_STYLE + _STYLE)
+
+
+def _opening(result: MysteryResult) -> str:
+    return (
+        f"A {result.body} was thrown, pushed and dropped {result.train_episodes + result.test_episodes} times in "
+        "another simulator, perhaps with something in its physics or in its measurement that a textbook leaves out. "
+        "What, if anything? The answer lay in a sealed file until all of this had been computed."
+    )
+
+
+def _warnings(messages: Sequence[str]) -> str:
+    return f'<div class="warnings">{"".join(paragraph(m) for m in messages)}</div>' if messages else ""
+
+
+def _commands(*lines: str) -> str:
+    return f"<pre><code>{text(chr(10).join(lines))}</code></pre>"
+
+
+# The five steps
+
+
+def _fit(result: MysteryResult) -> str:
+    return section(
+        "1. Fit a model",
+        _commands(f"cgwm fit capture --out m0 {result.settings}"),
+        paragraph(
+            f"From {result.train_episodes} tracked episodes: a rigid body that flies freely and touches the ground by "
+            "a spring, a damper and Coulomb friction. Nothing else is in it. (The setting halves the time of the demo.)"
+        ),
+    )
+
+
+def _fails(result: MysteryResult) -> str:
+    base = result.comparison.models[0]
+    return section(
+        "2. Compare it with the measurement",
+        _commands("cgwm compare m0 capture"),
+        paragraph(
+            f"On {result.test_episodes} episodes that the fit has not seen it errs by "
+            f"{_mm(base.translation_error_m.median)} (median). Short predictions, each from the start that fits it "
+            "best, tell where: their errors in units of the measurement noise, about 1 where the model explains the "
+            "data."
+        ),
+        _phases([base], ["m0"]),
+        "" if result.diagnosis.selected else _LINK,
+    )
+
+
+def _diagnosis(result: MysteryResult) -> str:
+    found = result.diagnosis
+    best = found.ranking[:SHOWN]
+    best = [*best, *(entry for entry in found.ranking[SHOWN:] if entry.effect in found.selected)]
+    header = ["effect", "acts in", "judged in", "p", "estimate", "held-out error, without → with"]
+    rows = [_candidate(entry) for entry in best]
+    if not any(row[-1] for row in rows):
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    chosen = [k for k, entry in enumerate(best) if entry.effect in found.selected]
+    pieces = [
+        _commands("cgwm diagnose m0 capture"),
+        paragraph(found.sentence, "verdict"),
+        paragraph(
+            "Each candidate is asked whether the training episodes would rather have it than not; the best few are "
+            "fitted and proved on episodes that their numbers were not fitted to. The test episodes stay closed. "
+            f"{len(found.ranking)} were asked; these fit best:"
+        ),
+        table(header, rows, strong=chosen),
+        paragraph(
+            "p: of one candidate alone against a model without it. Where something large is missing, many candidates "
+            "look better than none; the choice is between them.",
+            "soft",
+        ),
+    ]
+    if found.aliases:
+        groups = "; ".join(", ".join(group) for group in found.aliases)
+        pieces.append(paragraph(f"These data cannot tell apart: {groups}."))
+    before, after = found.flight_before, found.flight_after
+    if before is not None and after is not None:
+        pieces.append(
+            paragraph(
+                f"A force that is missing in flight shows as a mean χ² above 1; it is {number(before.statistic)}"
+                + (f", and {number(after.statistic)} with what was named." if found.selected else ".")
+            )
+        )
+    return section("3. Diagnose: what is missing?", *pieces)
+
+
+def _candidate(entry: RankedEffect) -> list[str]:
+    numbers = "<br>".join(
+        f"<code>{text(p.name)}</code> = {number(p.estimate)} ± {number(p.std_error, 2)}{_unit(p.unit)}"
+        for p in entry.parameters[:3]
+    )
+    # number() takes what is below 1e-12 for a zero; a p-value may be that small
+    p = "< 1e-300" if entry.score_p < _LEAST_P else f"{entry.score_p:.1g}"
+    before, after = entry.cv_error_before_m, entry.cv_error_after_m
+    gain = "" if before is None or after is None else f"{fixed(before, 2, 1e3)} → {fixed(after, 2, 1e3)} mm"
+    return [
+        f"<code>{text(entry.effect)}</code>",
+        text(", ".join(entry.acts_in)),
+        text(entry.judged_in),
+        text(p.replace("-", "−")),
+        numbers + ("<br>…" if len(entry.parameters) > 3 else ""),
+        gain,
+    ]
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {text(unit)}"
+
+
+def _added(result: MysteryResult) -> str:
+    selected = result.diagnosis.selected
+    if not selected:
+        return section(
+            "4. Add it",
+            paragraph("Nothing was named, so nothing is added, and there is no second model to compare."),
+        )
+    rows = [
+        [f"<code>{text(p.name)}</code>", number(p.estimate), _span(p.interval_95), text(p.unit)]
+        for p in (compared.parameter for compared in result.parameters)
+    ]
+    return section(
+        "4. Add it",
+        _commands(f"cgwm fit capture --from m0 --effects {','.join(selected)} --out m1 {result.settings}"),
+        paragraph("A child of m0 with the effect in it, and all numbers fitted anew."),
+        table(["number", "estimate", "95 % interval", "unit"], rows, numeric=(1, 2)),
+    )
+
+
+def _compared(result: MysteryResult) -> str:
+    names = [model.model for model in result.comparison.models]
+    return section(
+        "5. Compare again",
+        _commands("cgwm compare m0 m1 capture"),
+        paragraph(result.comparison.verdict, "verdict"),
+        *error_ladder(result.comparison, names),
+        _phases(result.comparison.models, names),
+        paragraph(LADDER_WORDS, "soft"),
+        _LINK,
+    )
+
+
+def _phases(models: Sequence[ModelComparison], names: Sequence[str]) -> str:
+    """Return a table of short predictions by phase, in units of the noise, a bar for each."""
+    known = [
+        (phase, [model.by_phase[phase] for model in models])
+        for phase in models[0].by_phase
+        if models[0].by_phase[phase] is not None
+    ]
+    rows, largest = [], 1.0
+    for phase, figures in known:
+        roots = [math.sqrt(f.reduced_chi2) if f is not None and f.reduced_chi2 else None for f in figures]
+        largest = max([largest, *(root for root in roots if root)])
+        rows.append((phase, figures[0].frames if figures[0] else 0, roots))
+
+    def cell(root: float | None) -> str:
+        if root is None:
+            return "–"
+        return f'{root:.2f} × noise<span class="bar" style="width:{100 * root / largest:.1f}%"></span>'
+
+    cells = [[text(phase), str(frames), *map(cell, roots)] for phase, frames, roots in rows]
+    return f'<div class="bars">{table(["phase", "frames", *names], cells, numeric=(1,))}</div>'
+
+
+# The seal
+
+
+def _hidden(result: MysteryResult) -> str:
+    mark = "good" if result.outcome in _GOOD else "bad"
+    pieces = [paragraph(result.sentence, f"verdict {mark}")]
+    pieces += [_truth(effect) for effect in result.hidden]
+    told = [compared for compared in result.parameters if compared.true_value is not None]
+    if told:
+        rows = [_beside(compared) for compared in told]
+        header = ["number", "found", "95 % interval", "", "true", "unit", ""]
+        pieces.append(table(header, rows, numeric=(1, 2, 4)))
+    if result.outcome == "silent":
+        pieces.append(
+            paragraph("An effect is not named where it moves the body by less than what the contact model may err by.")
+        )
+    return section("What was hidden", f'<div class="told">{"".join(pieces)}</div>')
+
+
+def _truth(effect: HiddenEffect) -> str:
+    values = ", ".join(f"{name} = {_value(value)}" for name, value in effect.values.items())
+    return f"<p><code>{text(effect.name)}</code>: {text(effect.form)}; {text(values)} (SI units).</p>"
+
+
+def _value(value: float | list[float]) -> str:
+    return f"({', '.join(map(number, value))})" if isinstance(value, list) else number(value)
+
+
+def _beside(compared: ComparedParameter) -> list[str]:
+    p = compared.parameter
+    drawn = interval_svg(p.estimate, p.interval_95, compared.true_value) if p.interval_95 else ""
+    word = {True: "in the interval", False: '<span class="bad">outside the interval</span>', None: ""}
+    return [
+        f"<code>{text(p.name)}</code>",
+        number(p.estimate),
+        _span(p.interval_95),
+        drawn,
+        number(compared.true_value),
+        text(p.unit),
+        word[compared.covered],
+    ]
+
+
+def _files(result: MysteryResult) -> str:
+    rows = [[text(kind), f"<code>{text(path)}</code>"] for kind, path in result.paths.items()]
+    times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
+    return section(
+        "Files, warnings and times",
+        table(["what", "where"], rows),
+        _warnings([*result.warnings, *result.comparison.warnings]),
+        paragraph(f"On {result.device}: {times}.", "soft"),
+    )
+
+
+def _span(interval: tuple[float, float] | None) -> str:
+    return f"{number(interval[0])} to {number(interval[1])}" if interval else "–"
+
+
+def _mm(value: float) -> str:
+    return f"{fixed(value, 1, 1e3)} mm"
