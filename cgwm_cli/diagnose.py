@@ -7,19 +7,28 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import Debug, Json, Quiet
+from .options import Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
-    from ..schemas import DiagnoseResult, RankedEffect
+    from ..schemas import DiagnoseResult, NextExperiment, RankedEffect
 
 SHOWN = 8
 """So many candidates are listed; --json has all."""
+THROWS_SHOWN = 3
+"""And so many throws."""
 
 
 def diagnose(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture with tracks.", show_default=False)],
+    capture: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CAPTURE",
+            help="The capture.",
+            show_default=False,
+        ),
+    ],
     split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to look at.")] = "train",
     candidates: Annotated[
         str,
@@ -30,6 +39,25 @@ def diagnose(
             show_default=False,
         ),
     ] = "",
+    throws: Annotated[
+        Path | None,
+        typer.Option(
+            "--throws",
+            metavar="FILE",
+            help="Throws among which to look for the next one: a TOML file of [[throws]] tables.",
+            show_default="about 30 that a hand can make",
+        ),
+    ] = None,
+    save_law: Annotated[
+        Path | None,
+        typer.Option(
+            "--save-law",
+            metavar="FILE.py",
+            help="Write the law of what no candidate explains as an effect of your own.",
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -39,7 +67,7 @@ def diagnose(
         from ..pipeline.diagnose import diagnose as work
 
         wanted = [name.strip() for name in candidates.split(",") if name.strip()]
-        emit(work(model, capture, split, wanted), _summary)
+        emit(work(model, capture, split, wanted, throws, save_law, overwrite), _summary)
 
 
 def _summary(result: DiagnoseResult) -> str:
@@ -61,9 +89,26 @@ def _summary(result: DiagnoseResult) -> str:
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
         lines.append(f"law of what is left: {terms}; organised by {result.residual_law.where}")
-    if result.selected:
-        lines.append(f"Next: cgwm fit CAPTURE --from MODEL --effects {','.join(result.selected)} --out NEW")
+    if result.next_experiment is not None:
+        lines += _experiment(result.next_experiment)
+    if result.saved_law is not None:
+        lines.append(f"Wrote {result.saved_law.rpartition(':')[0]}.")
+    added = [*result.selected, *([result.saved_law] if result.saved_law is not None else [])]
+    if added:
+        lines.append(f"Next: cgwm fit CAPTURE --from MODEL --effects {','.join(added)} --out NEW")
     return "\n".join([*lines, *warnings(result.warnings)])
+
+
+def _experiment(found: NextExperiment) -> list[str]:
+    if not found.ranked:
+        return [f"To tell them apart: {found.what}."]
+    gain = f"some {found.ranked[0]['order_of_magnitude']:g} nats"
+    lines = [f"To tell {' and '.join(found.separates)} apart: {found.what} ({gain} to expect)."]
+    lines += [
+        f"  {entry['rank']}. {entry['what']} (some {entry['order_of_magnitude']:g} nats)"
+        for entry in found.ranked[1:THROWS_SHOWN]
+    ]
+    return lines
 
 
 def _row(entry: RankedEffect) -> list[str]:

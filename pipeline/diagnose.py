@@ -23,22 +23,21 @@ from ..schemas import (
     UsageError,
 )
 from .diagnosis.candidates import Candidate, admissible
+from .diagnosis.episodes import diagnosed_episodes
+from .diagnosis.law_file import require_law_file, save_law
+from .diagnosis.next_throw import next_experiment
 from .diagnosis.phases import size_of
 from .diagnosis.prepared import Prepared, prepare
 from .diagnosis.residual_law import residual_law
 from .diagnosis.segments import whole_episodes
 from .diagnosis.slots import Evidence
+from .diagnosis.throws import DEFAULT, Throw, read_throws, throws_of
 from .diagnosis.verdict import Findings, find
 from .diagnosis.wrench import Omnibus, organisers, wrench_windows
 from .estimation.warmup import clearance
-from .phys_geo import track_episodes
 from .physics.effects.registry import effect_names, load_effect
 from .physics.world import World
 
-MIN_EPISODES = 3
-"""Fewer leave nothing to hold out: what helps one episode would be proved by that episode."""
-MAX_EPISODES = 40
-"""Of more episodes so many, evenly spread, are looked at: everything missing shows in them."""
 LONGEST_STEP_S = 0.2
 """Slower tracks show no flight; those in milliseconds look so."""
 MOST_SUNK = 0.2
@@ -50,34 +49,49 @@ def diagnose(
     capture: Path,
     split: str = "train",
     candidates: Sequence[str] = (),
+    throws: Path | None = None,
+    save_law_to: Path | None = None,
+    overwrite: bool = False,
 ) -> DiagnoseResult:
     """Find what a fitted model lacks of measured motions; no episode outside the split is opened.
 
     Args:
         model: MODEL, with fitted physics.
-        capture: The capture, with tracks.
+        capture: The capture, with tracks, or with videos in which the model's fit found the poses.
         split: The episodes to look at; cross-validation is among them.
         candidates: Effects beside the built-in ones, `file.py:Class` or names of entry points.
+        throws: A TOML file of throws among which to look for the next one; None for those that a hand can make.
+        save_law_to: Where to write the residual law as an effect of one's own; None for nowhere.
+        overwrite: Replace that file.
 
     Raises:
-        InputDataError: If the data cannot carry a verdict: what is lacking, and what to do.
-        UsageError: If there is no such split or effect.
+        InputDataError: If the data cannot carry a verdict: what is lacking, and what to do; or if there is no residual
+            law to save.
+        UsageError: If there is no such split or effect, or the file exists.
     """
+    if save_law_to is not None:
+        require_law_file(save_law_to, overwrite)
+    compared = throws_of(DEFAULT) if throws is None else read_throws(throws)
     loaded = read_model(model)
     opened = Capture.open(capture, splits=(split,))
     world = _world(loaded, opened)
     library = library_of(candidates)
-    episodes = _episodes(loaded, opened, split)
-    _refuse_strange(world, episodes, opened)
-    groups = _groups(opened, [name for name, _ in episodes])
-    measured = opened.manifest.measurement
-    known = (measured.position_std_m, measured.rotation_std_rad)
-    prepared = prepare(world, episodes, known, groups)
-    return report(prepared, world, library)
+    found = diagnosed_episodes(loaded, opened, split)
+    _refuse_strange(world, found.episodes, opened)
+    groups = _groups(opened, [name for name, _ in found.episodes])
+    prepared = prepare(world, found.episodes, found.noise, groups)
+    prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
+    result = report(prepared, world, library, compared)
+    if save_law_to is None:
+        return result
+    saved = save_law(result, save_law_to, overwrite)
+    return result.model_copy(update={"saved_law": saved})
 
 
-def report(prepared: Prepared, world: World, library: Sequence[Candidate]) -> DiagnoseResult:
-    """Return the diagnosis of prepared episodes."""
+def report(
+    prepared: Prepared, world: World, library: Sequence[Candidate], throws: Sequence[Throw] = ()
+) -> DiagnoseResult:
+    """Return the diagnosis of prepared episodes; throws: among which to look for the next one."""
     if prepared.flight is None and not prepared.contact_items:
         raise InputDataError(
             "no part of the tracks is long enough to be followed by the model: neither six frames of flight nor of "
@@ -99,6 +113,7 @@ def report(prepared: Prepared, world: World, library: Sequence[Candidate]) -> Di
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
         aliases=tuple(tuple(e.candidate.spec for e in group) for group in groups),
+        next_experiment=next_experiment(prepared, findings, throws),
         residual_law=law,
         episodes=len(prepared.names),
         phases={"flight": int(clear.sum()), "contact": seen - int(clear.sum())},
@@ -144,19 +159,6 @@ def _world(model: Model, capture: Capture) -> World:
     if ground is None or world.ground_offset is None:
         return world
     return replace(world, ground_offset=torch.full_like(world.ground_offset, ground.offset_m))
-
-
-def _episodes(model: Model, capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
-    moving = [body.name for body in model.file.bodies if body.motion != "fixed"]
-    episodes = [(name, tracks) for name, tracks in track_episodes(capture, split) if set(moving) <= set(tracks)]
-    if len(episodes) < MIN_EPISODES:
-        raise InputDataError(
-            f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all that moves.",
-            f"at least {MIN_EPISODES}: what helps one has to be proved on others.",
-            "record more, or name another split with --split.",
-        )
-    chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
-    return [episodes[k] for k in chosen]
 
 
 def _groups(capture: Capture, names: Sequence[str]) -> list[int]:

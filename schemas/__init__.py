@@ -62,6 +62,8 @@ from .diagnose import (
     NextExperiment,
     RankedEffect,
     ResidualLaw,
+    ThrowGrid,
+    ThrowsFile,
 )
 from .doctor import DoctorReport, Missing, PackageState
 from .errors import (
@@ -183,6 +185,8 @@ __all__ = [
     "SplatCheck",
     "SplatConfig",
     "SynthesizeConfig",
+    "ThrowGrid",
+    "ThrowsFile",
     "UsageError",
     "ValidationReport",
     "Video",

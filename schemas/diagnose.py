@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from .base import FileModel
 
@@ -43,10 +45,46 @@ class NextExperiment(FileModel):
     """The motion that tells rivals apart best."""
 
     what: str
+    """In words: a throw, or what to do where no throw tells them apart."""
     initial_state: dict[str, Any]
+    """position_m, quat_wxyz, velocity_m_s, omega_body_rad_s; empty where no throw tells the rivals apart."""
     separates: tuple[str, ...]
     expected_gain_nats: float
+    """Expected rise of the log-likelihood ratio of the pair of rivals that the throw separates least, of those that a
+    throw can separate, for either of them being true, added. It is linearised: an order of magnitude."""
+    not_separated: tuple[str, ...] = ()
+    """Rivals that none of the throws tells apart."""
     ranked: tuple[dict[str, Any], ...] = ()
+    """All throws, the best first: rank, what, initial_state, expected_gain_nats, order_of_magnitude (a power of 10)."""
+
+
+Several = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
+Angles = Annotated[tuple[float, ...], Field(min_length=1)]
+
+
+class ThrowGrid(FileModel):
+    """`[[throws]]`: all combinations of what is given."""
+
+    on_ground: bool = False
+    """The body starts on the ground, and slides or rolls; its height and elevation count for nothing."""
+    height_m: Several = (0.4,)
+    """Of the body's lowest point over the ground at the start."""
+    speed_m_s: Several = (2.0,)
+    """0: the body is dropped."""
+    elevation_deg: Angles = (0.0,)
+    """Of the velocity over the horizontal."""
+    heading_deg: Angles = (0.0,)
+    """Of the velocity about the vertical, from the world's x towards y."""
+    spin_rad_s: Several = (0.0,)
+    spin_axis: Annotated[tuple[Literal["up", "along", "across"], ...], Field(min_length=1)] = ("across",)
+    """Against gravity; along the heading; horizontally across it."""
+    duration_s: Annotated[float, Field(gt=0, le=10)] = 0.6
+
+
+class ThrowsFile(FileModel):
+    """The TOML file of `cgwm diagnose --throws`."""
+
+    throws: Annotated[tuple[ThrowGrid, ...], Field(min_length=1)]
 
 
 class LawTerm(FileModel):
@@ -92,6 +130,8 @@ class DiagnoseResult(FileModel):
     """Groups of effects that these data cannot tell apart, a selected one the first of each."""
     next_experiment: NextExperiment | None = None
     residual_law: ResidualLaw | None = None
+    saved_law: str | None = None
+    """What to pass to `fit --effects` for the residual law, where it was saved."""
     episodes: int
     phases: dict[str, int] = {}
     """Number of frames in flight and in contact."""

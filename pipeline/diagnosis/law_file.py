@@ -1,0 +1,151 @@
+"""A residual law as an effect's file of one's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...datasets.atomic import new_file, refuse_existing
+from ...schemas import DiagnoseResult, InputDataError, LawTerm, ResidualLaw, UsageError
+from ..physics.effects.registry import BUILT_IN
+
+CLASS = "ResidualLaw"
+AXES = {"x": 0, "y": 1, "z": 2}
+DAMPING = {"-u": ("u", 1.0), "-|u| u": ("u", 2.0), "-omega": ("omega", 1.0), "-|omega| omega": ("omega", 2.0)}
+"""Vector and exponent of the terms that damp a motion."""
+SELECTED_TERMS = {
+    "linear_drag": ("-u",),
+    "quadratic_drag": ("-|u| u",),
+    "magnus_lift": ("omega x u",),
+    "spin_damping": ("-omega",),
+    "constant_force": ("x", "y", "z"),
+}
+"""Terms that a selected effect already has: the fit would not know which of the two is which."""
+LIMIT = 100.0
+"""The fit may go to so many times what was found."""
+
+TEMPLATE = '''"""The law that `cgwm diagnose` found in what a model leaves: cgwm fit CAPTURE --effects {file}:{kind}."""
+
+from __future__ import annotations
+
+import torch
+
+from cgwm.pipeline.physics.effects import BodyMotion, Effect, EffectParameter, Values, Wrench, length
+
+
+class {kind}(Effect):
+    """{formula}; u: velocity, omega: angular velocity, world frame."""
+
+    name = "{name}"
+    summary = "What a model left in flight, found by regression."
+    formula = "{formula}"
+    parameters = (
+{parameters}
+    )
+    phase = "flight"
+    needs = {needs}
+    reveals = "free flights as different as can be; the residual was organised by: {where}"
+    source = "cgwm diagnose, sparse regression of the residual wrench"
+
+    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
+        """Return the wrench of an acceleration and an angular acceleration."""
+        u, omega = motion.velocity, motion.omega
+        a, alpha = torch.zeros_like(u), torch.zeros_like(omega)
+{lines}
+        torque = (motion.inertia @ alpha[..., None]).squeeze(-1)
+        return Wrench(force=motion.mass[:, None] * a, torque=torque)
+'''
+
+
+def require_law_file(path: Path, overwrite: bool) -> None:
+    """Refuse a file that could not be written, before the work.
+
+    Raises:
+        UsageError: If the name does not end with .py, or the file exists and `overwrite` is not set.
+    """
+    if path.suffix != ".py":
+        raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
+    refuse_existing(path, overwrite)
+
+
+def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str:
+    """Write the residual law of a diagnosis as an effect, and return what to pass to `fit --effects`.
+
+    Terms that are those of a selected effect are left out: the two are fitted together.
+
+    Args:
+        result: The diagnosis.
+        path: The Python file.
+        overwrite: Replace what is there.
+
+    Raises:
+        InputDataError: If there is no law, or none of the known terms is in it.
+        UsageError: See :func:`require_law_file`.
+    """
+    require_law_file(path, overwrite)
+    law = result.residual_law
+    known = {term for name in result.selected for term in SELECTED_TERMS.get(name, ())}
+    terms = () if law is None else tuple(term for term in law.terms if term.term not in known)
+    if law is None or not terms:
+        what = "has no residual law" if law is None else "leaves a residual that follows none of the known terms"
+        raise InputDataError(
+            f"{path}: nothing to save: the diagnosis {what}. It says: {result.sentence}",
+            "--save-law where something unexplained remains in flight.",
+            "leave --save-law out, and see the whole diagnosis.",
+        )
+    with new_file(path, overwrite) as partial:
+        partial.write_text(law_source(law.model_copy(update={"terms": terms}), path), encoding="utf-8")
+    return f"{path}:{CLASS}"
+
+
+def law_source(law: ResidualLaw, path: Path) -> str:
+    """Return the text of an effect's file."""
+    parameters, lines, formulas = [], [], {"a": "", "alpha": ""}
+    for number, term in enumerate(law.terms, 1):
+        name = f"c{number}"
+        target, formula, code, unit = _term(term, law, name)
+        formulas[target] += formula if formulas[target] == "" else f" {formula}".replace(" -", " - ", 1)
+        size = abs(term.coefficient)
+        sign = ", nonnegative=True" if term.term in DAMPING and term.coefficient > 0 else ""
+        parameters += [
+            f"        # found: {term.coefficient:.3g} +- {term.std_error:.2g}",
+            f'        EffectParameter("{name}", "{unit}", scale={0.5 * size:.3g}, limit={LIMIT * size:.3g}{sign}),',
+        ]
+        lines.append(f'        {target} = {target} {code.replace("VALUE", f"""values["{name}"][:, None]""")}')
+    stem = path.stem
+    spins = any("omega" in term.term for term in law.terms)
+    return TEMPLATE.format(
+        file=path.name,
+        kind=CLASS,
+        name=stem if stem.isidentifier() and stem not in BUILT_IN else "residual_law",
+        formula=", ".join(f"{target} = {text}" for target, text in formulas.items() if text),
+        parameters="\n".join(parameters),
+        needs='("spin",)' if spins else "()",
+        where=law.where,
+        lines="\n".join(lines),
+    )
+
+
+def _term(term: LawTerm, law: ResidualLaw, name: str) -> tuple[str, str, str, str]:
+    """Return what a term adds to, its formula, its code with VALUE for its number, and the number's unit."""
+    if term.term in AXES:
+        return "a", f"+{name} {term.term}", f"+ VALUE * torch.eye(3).to(u)[{AXES[term.term]}]", term.unit
+    if term.term == "omega x u":
+        return "a", f"+{name} omega x u", "+ VALUE * torch.linalg.cross(omega, u)", term.unit
+    vector, own = DAMPING[term.term]
+    best, low, high = law.exponent.get(term.term, (own, own, own))
+    power = own if low <= own <= high else best
+    target = "a" if vector == "u" else "alpha"
+    if power == 1.0:
+        return target, f"-{name} {vector}", f"- VALUE * {vector}", term.unit if own == power else "1/s"
+    # below 1 the direction jumps where the motion ends: rounded off there
+    size = f"length({vector})" if power > 1 else f"(length({vector}) + 1e-3)"
+    unit = term.unit if own == power else _unit(vector, power)
+    factor = size if power == 2.0 else f"{size} ** {power - 1:g}"
+    shown = f"|{vector}|" if power == 2.0 else f"|{vector}|^{power - 1:g}"
+    return target, f"-{name} {shown} {vector}", f"- VALUE * {factor} * {vector}", unit
+
+
+def _unit(vector: str, power: float) -> str:
+    """Return the unit of c in c |v|^(p - 1) v, an acceleration."""
+    length = "m" if vector == "u" else "rad"
+    return f"{length}^{1 - power:g} s^{power - 2:g}"
