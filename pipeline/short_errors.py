@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..schemas import PHASES, Phase
+from .diagnosis.cuts import whole_episodes
 from .diagnosis.phases import phases_of
 from .diagnosis.prepared import Prepared
-from .diagnosis.segments import Segments, costs_of, fit_states, whole_episodes
+from .diagnosis.segment_batch import Segments
+from .diagnosis.segments import fit_states
 from .estimation.observations import Observations
 from .estimation.trajectory import state_prior
-from .physics.world import State, World
+from .physics.world import World
 
 if TYPE_CHECKING:
     from .prediction import Episode
@@ -26,14 +28,6 @@ Array = NDArray[np.float64]
 
 FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
 """Of a residual: position in the world frame, rotation vector in the body frame."""
-BAD_FIT = 1.3
-"""A contact segment with a reduced chi-square above this is fitted from other starts too."""
-DRAWS, STARTS = 32, 2
-"""States that are drawn about the fitted one, and so many of them, the best, that are fitted."""
-START_SPREAD = 3.0
-"""Of the draws, in units of what the noise makes of a state between two frames."""
-MOST_SEARCHED = 64
-"""Segments searched in one batch."""
 DIVERGED = 1e4
 """Residual of a short prediction that diverged, in units of the noise."""
 
@@ -104,7 +98,7 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
     if prepared.flight is not None:
         flight = fit_states(Segments.of("flight", world, whole, prepared.flight.items, noise))
     if prepared.contact_items:
-        contact = _searched(Segments.of("contact", world, whole, prepared.contact_items, noise))
+        contact = fit_states(Segments.of("contact", world, whole, prepared.contact_items, noise))
     names = [name for name, _ in episodes]
     phases = phases_of(names, whole, prepared.clear, contact)
     own = tuple(world.bodies[k].name for k in whole.free)
@@ -131,40 +125,6 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
         found[one.episode].phase[:] = _placed(places, covered, one.clear)
         found[one.episode].cause[:] = _causes(found[one.episode])
     return ShortFit(whole, contact, found)
-
-
-def _searched(contact: Segments) -> Segments:
-    """Return contact segments with their states fitted, those that fit badly from several starts.
-
-    Whether a corner strikes before or after the next one makes minima of their own; what is left there would be taken
-    for the model's fault.
-    """
-    fitted = fit_states(contact)
-    nothing = torch.zeros(0).to(fitted.world.gravity)
-    best = costs_of(fitted, (), nothing)
-    bad = (best > BAD_FIT * fitted.dof).nonzero()[:, 0].tolist()
-    position, rotation = fitted.noise
-    step = float(fitted.observations.times_s.diff(dim=1).median())
-    spread = [std for std in (position, rotation, position / step, rotation / step) for _ in range(3)]
-    spreads = START_SPREAD * torch.tensor(spread).to(nothing).repeat(len(fitted.observations.free))
-    generator = torch.Generator().manual_seed(0)
-    fields = fitted.observations.state.__dataclass_fields__
-    states = {key: getattr(fitted.observations.state, key).clone() for key in fields}
-    for first in range(0, len(bad), MOST_SEARCHED):
-        places = bad[first : first + MOST_SEARCHED]
-        drawn = fitted.select([place for place in places for _ in range(DRAWS)])
-        change = torch.randn(len(drawn.items), len(spreads), generator=generator, dtype=torch.float64)
-        drawn = drawn.moved(spreads * change.to(spreads))
-        order = costs_of(drawn, (), nothing).unflatten(0, (len(places), DRAWS)).argsort(1)[:, :STARTS]
-        rows = (torch.arange(len(places))[:, None] * DRAWS + order).flatten().tolist()
-        tried = fit_states(drawn.select(rows), search=False)
-        found = costs_of(tried, (), nothing).unflatten(0, (len(places), STARTS))
-        for k, place in enumerate(places):
-            choice = int(found[k].argmin())
-            if float(found[k, choice]) < float(best[place]):
-                for key, target in states.items():
-                    target[place] = getattr(tried.observations.state, key)[k * STARTS + choice]
-    return replace(fitted, observations=replace(fitted.observations, state=State(**states)))
 
 
 def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: dict[str, ShortErrors]) -> None:

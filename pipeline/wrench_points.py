@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas import Organiser, Phase
+from .diagnosis.cuts import Segment
 from .diagnosis.prepared import Prepared
-from .diagnosis.segments import Segment
 from .diagnosis.wrench import coordinates_of, organisers, wrench_windows
 from .physics.world import World
 from .short_errors import ShortErrors, ShortFit

@@ -11,12 +11,14 @@ import torch
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.diagnosis.candidates import Candidate, variants_of
 from cgwm.pipeline.diagnosis.contact_stage import fitted_contact, separated
+from cgwm.pipeline.diagnosis.cuts import cut_episodes, whole_episodes
 from cgwm.pipeline.diagnosis.noise import flight_noise, without_outliers
 from cgwm.pipeline.diagnosis.phases import phases_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
 from cgwm.pipeline.diagnosis.residual_law import residual_law
 from cgwm.pipeline.diagnosis.score import picture, score_test
-from cgwm.pipeline.diagnosis.segments import Segments, cut_episodes, fit_states, whole_episodes
+from cgwm.pipeline.diagnosis.segment_batch import Segments
+from cgwm.pipeline.diagnosis.segments import fit_states
 from cgwm.pipeline.diagnosis.slots import Slot, fill
 from cgwm.pipeline.diagnosis.wrench import omnibus, organisers, residual_wrenches, wrench_windows
 from cgwm.pipeline.physics.effects import load_effect
@@ -115,17 +117,20 @@ def test_score_tests_in_flight_are_calibrated() -> None:
     world = world_with(ground=False)
     chosen = [c for c in LIBRARY if c.spec in ("linear_drag", "magnus_lift", "gravity_tilt", "length_scale")]
     variants = variants_of(chosen, world.gravity[0, :1])
+    # all data sets as one batch, each of two episodes
+    episodes = [episode for seed in range(100) for episode in tosses(world, 100 + seed, count=2, duration_s=0.15)]
+    whole = whole_episodes(world, episodes)
+    flight, _, _ = cut_episodes(world, whole, NOISE)
+    fitted = fit_states(Segments.of("flight", world, whole, flight, NOISE), iterations=3)
+    seen = picture(fitted, world, variants, [0] * len(episodes), robust=False)
     found: list[list[float]] = []
     wholes: list[float] = []
     for seed in range(100):
-        episodes = tosses(world, 100 + seed, count=2, duration_s=0.15)
-        whole = whole_episodes(world, episodes)
-        flight, _, _ = cut_episodes(world, whole, NOISE)
-        fitted = fit_states(Segments.of("flight", world, whole, flight, NOISE), iterations=3)
-        seen = picture(fitted, world, variants, [0, 0], robust=False)
-        found.append([score_test(seen, seen.columns(v.parameters)).p_value for v in variants])
+        own = replace(seen, weight=(seen.episode // 2 == seed).astype(float))
+        found.append([score_test(own, own.columns(v.parameters)).p_value for v in variants])
         if seed < 50:
-            wholes.append(omnibus(residual_wrenches(fitted)).p_value)
+            mine = [k for k, item in enumerate(fitted.items) if item.episode // 2 == seed]
+            wholes.append(omnibus(residual_wrenches(fitted.select(mine))).p_value)
     for values in (*np.array(found).T, np.array(wholes)):
         # 0.1 % of uniform samples are farther away
         assert kstest(values, "uniform").pvalue > 1e-3

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..estimation.observations import Observations
 from ..physics.world import World
-from .segments import Segment
+from .cuts import Segment
 
 MOST_LIFT = 0.5
 """Share of gravity: where so much of it does not act, something carries the body. No effect in the air is so strong."""

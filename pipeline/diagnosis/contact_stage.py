@@ -22,7 +22,8 @@ from .linear import robust_excess
 from .prepared import Prepared
 from .refit import Refit, refit
 from .score import Picture, gain_by_episode, picture, score_test
-from .segments import Segments, fit_states, world_for
+from .segment_batch import Segments, world_for
+from .segments import fit_states
 from .slots import Evidence
 
 Array = NDArray[np.float64]

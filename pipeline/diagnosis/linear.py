@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..estimation.trajectory import state_prior
 from ..physics.parameters import Parameter
-from .segments import Segments
+from .segment_batch import Segments
 
 ROBUST_EXCESS = 20.0
 """k of rho(e) = 2 k log(1 + e / 2k) for the excess e = chi2 - dof of a contact segment: what the contact law misses of
@@ -43,7 +43,11 @@ def linearised(segments: Segments, parameters: Sequence[Parameter], values: Tens
     """Return the linear picture of segments; values (P,) or (B, P) in fitted coordinates."""
     rows, jacobian = segments.residuals(parameters, values)
     assert jacobian is not None
-    count = len(parameters)
+    return projected(segments, rows, jacobian, len(parameters))
+
+
+def projected(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) -> Linear:
+    """Return the linear picture from residuals (B, F, 6) and their Jacobian (B, F, 6, P + S), with P = count."""
     error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
     flat = torch.nan_to_num(jacobian.flatten(1, 2), posinf=0.0, neginf=0.0)
     by_value, by_state = flat[..., :count], flat[..., count:]

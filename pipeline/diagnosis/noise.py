@@ -12,7 +12,7 @@ from torch import Tensor
 from ..estimation.noise import FLOOR_M, FLOOR_RAD, MAD_TO_STD
 from ..estimation.observations import Observations
 from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
-from .segments import Segment
+from .cuts import Segment
 
 WINDOW = 9
 """Frames of a window that a cubic follows in free flight: 0.09 s at 100 Hz, within 0.1 mm for 6 mm at 20 rad/s."""

@@ -13,9 +13,11 @@ from ..estimation.noise import estimate_noise
 from ..estimation.observations import Observations
 from ..physics.world import World
 from .carried import carried_frames
+from .cuts import Segment, cut_episodes, whole_episodes
 from .noise import flight_noise, without_outliers
 from .phases import is_round
-from .segments import Segment, Segments, cut_episodes, fit_states, whole_episodes
+from .segment_batch import Segments
+from .segments import fit_states
 
 if TYPE_CHECKING:
     from ...datasets.tracks import Track

@@ -14,7 +14,8 @@ from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import World
 from .candidates import base_values
 from .linear import Linear, linearised, robust_excess, summed
-from .segments import Segments, better_of, world_for
+from .segment_batch import Segments, world_for
+from .segments import best_of
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ def refit(
         ]
         # through contact, states do not always follow in a straight line
         trial = [
-            better_of(before, after, parameters, moved) if after.kind == "contact" else after
+            best_of(before, [after.observations.state], parameters, moved) if after.kind == "contact" else after
             for before, after in zip(parts, trial, strict=True)
         ]
         seen = [linearised(part, parameters, moved) for part in trial]

@@ -20,15 +20,17 @@ from scipy.stats import norm
 
 from ..physics.parameters import Parameter
 from ..physics.world import World
-from .candidates import Variant, base_parameters, base_values, with_variants
-from .linear import Linear, linearised
-from .segments import Segments, world_for
+from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
+from .linear import Linear, projected
+from .segment_batch import Segments, world_for
 
 Array = NDArray[np.float64]
 
 MEASURED = 0.04
 """A direction is measured where its standard error is below five widths of the parameters' priors: information times
 their variance above this."""
+PART_ROLLOUTS = 700
+"""Rollouts of candidates in one world: more effects at once cost more than the calls that they save."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +95,37 @@ def picture(
         robust: Whether segments that fit badly count less.
     """
     base = base_parameters(world, segments.kind)
-    everything, more = with_variants(world, variants, segments.kind)
-    parameters = [*base, *more]
+    variants = [variant for variant in variants if acts_in(variant, segments.kind)]
+    parameters = [*base, *with_variants(world, variants, segments.kind)[1]]
     if not parameters:
         raise ValueError("no candidate acts in these segments")
-    at = replace(segments, world=world_for(segments.kind, everything))
-    linear = linearised(at, parameters, base_values(everything, parameters))
+    at = replace(segments, world=world_for(segments.kind, world))
+    rows, jacobian = at.residuals(base, base_values(world, base))
+    assert jacobian is not None
+    columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
+    # at neutral a candidate does nothing, so that each part of them has a world, and rollouts, of its own
+    for part in _parts(variants, segments):
+        beside, numbers = with_variants(world, part, segments.kind)
+        at = replace(segments, world=world_for(segments.kind, beside))
+        slopes = at.slopes(numbers, base_values(beside, numbers), rows)
+        columns |= {p.name: slopes[..., k] for k, p in enumerate(numbers)}
+    own = torch.stack([columns[p.name] for p in parameters], -1)
+    linear = projected(segments, rows, torch.cat((own, jacobian[..., len(base) :]), -1), len(parameters))
     return _picture(linear, segments, parameters, len(base), groups, robust)
+
+
+def _parts(variants: Sequence[Variant], segments: Segments) -> list[list[Variant]]:
+    """Return candidates in parts of one batch each: every rollout pays for all effects of its world."""
+    most = max(1, PART_ROLLOUTS // len(segments.items))
+    parts: list[list[Variant]] = []
+    count = most
+    for variant in variants:
+        if count + len(variant.parameters) > most:
+            parts.append([])
+            count = 0
+        parts[-1].append(variant)
+        count += len(variant.parameters)
+    return parts
 
 
 def _picture(

@@ -16,8 +16,10 @@ from ..physics.effects.effect import ActiveEffect, BodyMotion, Effect, EffectPar
 from ..physics.parameters import effect_parameters
 from ..physics.rotation import quat_rotate
 from ..physics.world import World
+from .cuts import Segment
 from .linear import linearised
-from .segments import Segment, Segments, fit_states
+from .segment_batch import Segments
+from .segments import fit_states
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...schemas import PHASES, CompareResult, ErrorSummary, ModelComparison, PairedDifference
 from ..compared import ComparedModel
-from ..diagnosis.segments import CONTACT_S, FLIGHT_S
+from ..diagnosis.cuts import CONTACT_S, FLIGHT_S
 from ..paired import LEAST_EPISODES
 from ..short_errors import FREEDOMS
 from .ladder import LADDER_WORDS, error_ladder

@@ -1,0 +1,215 @@
+"""Segments of episodes as a batch, each with a state of its own: their residuals under a world, and the Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ..estimation.observations import Observations
+from ..estimation.trajectory import STATE_SIZE, TrajectoryResiduals, retract
+from ..physics.contact import ContactLaw
+from ..physics.dispatch import rollout as rolled_out
+from ..physics.dispatch import rollouts_at_once
+from ..physics.measured import measure, true_times
+from ..physics.parameters import Parameter, apply_parameters
+from ..physics.rollout import Rollout
+from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..physics.world import State, World
+from .cuts import Segment
+
+Kind = Literal["flight", "contact"]
+
+FLIGHT_STEP_S = 0.0025
+"""Largest step in flight, where nothing is stiff; the error of a drag of 1 / s is 0.1 %."""
+START_FRAMES = (2, 4, 7)
+"""A contact segment's state is searched from straight lines through so many frames (pitfall P2)."""
+PARAMETER_STEP = 0.04
+"""Differences by parameters in contact, in widths of their priors: a fifth of what matters."""
+CONTACT_STEP_S = 0.002
+"""Largest step in contact, and at most half the contact time: the law does not depend on the step."""
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Segments of one kind as a batch.
+
+    kind; world: in which they are rolled out; items (B); observations (B): their frames, padded, with the state that
+    is the best known; noise: standard deviations of the tracks (position [m], rotation [rad]).
+    """
+
+    kind: Kind
+    world: World
+    items: tuple[Segment, ...]
+    observations: Observations
+    noise: tuple[float, float]
+
+    @staticmethod
+    def of(kind: Kind, world: World, whole: Observations, items: Sequence[Segment], noise: tuple[float, float]):
+        """Cut whole episodes; the states are first guesses, see :func:`fit_states`."""
+        cut = _windows(whole, items)
+        found = Segments(kind, world_for(kind, world), tuple(items), cut, noise)
+        return found.with_state(line_state(found, START_FRAMES[1]))
+
+    @property
+    def lengths(self) -> list[int]:
+        """Number of frames of each segment."""
+        return [item.last - item.first + 1 for item in self.items]
+
+    @property
+    def dof(self) -> Tensor:
+        """Degrees of freedom (B,) of each segment: its numbers measured, less those of its state that they show."""
+        seen = self.observations
+        moved, turned = seen.seen.sum(1), seen.turned.sum(1)
+        free = 3 * (moved - 2).clamp_min(0) + 3 * (turned - 2).clamp_min(0)
+        return free.sum(-1)
+
+    def select(self, items: Sequence[int]) -> Segments:
+        """Return some of the segments."""
+        picked = tuple(self.items[i] for i in items)
+        return replace(self, items=picked, observations=self.observations.select(items))
+
+    def with_state(self, state: State) -> Segments:
+        """Return the segments with other states."""
+        return replace(self, observations=replace(self.observations, state=state))
+
+    def in_states(self, states: Sequence[State]) -> Segments:
+        """Return the segments once in each of several states (B), as one batch."""
+        every = self.select(list(range(len(self.items))) * len(states))
+        return every.with_state(State.joined(*states))
+
+    def chunks(self, directions: int) -> list[list[int]]:
+        """Return the places of the segments in equal parts that fit one batch with so many directions."""
+        count = len(self.items)
+        number = max(1, -(-count * directions // rollouts_at_once(self.world)))
+        size = -(-count // number)
+        return [list(range(k, min(k + size, count))) for k in range(0, count, size)]
+
+    def residuals(
+        self, parameters: Sequence[Parameter], values: Tensor, jacobian: bool = True
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return residuals (B, T nf, 6) in sigmas and, if wanted, their Jacobian (B, T nf, 6, P + S).
+
+        It is one of differences: in contact they see past the roughness of a step, and in flight, which is smooth,
+        they cost a third of exact derivatives and agree with them to 1e-4.
+
+        Args:
+            parameters: Which numbers of the world are differentiated.
+            values: In fitted coordinates, shape (P,), or (B, P) for values of each segment.
+            jacobian: Whether it is wanted; columns of parameters first, then of the state change.
+        """
+        size = STATE_SIZE * len(self.observations.free)
+        steps = [_difference(p) for p in parameters]
+        parts = []
+        for places in self.chunks(2 * size + len(parameters) + 1 if jacobian else 1):
+            some = self.observations.select(places)
+            problem = TrajectoryResiduals(self.world, parameters, some, *self.noise, True, steps)
+            shared = values if values.ndim == 1 else values[places]
+            parts.append(problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian))
+        rows = torch.cat([r for r, _ in parts])
+        return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
+
+    def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
+        """Return differences (B, T nf, 6, P) of the residuals by parameters alone.
+
+        Args:
+            parameters: By which.
+            values: Where, in fitted coordinates, shape (P,).
+            rows: The residuals there.
+        """
+        steps = torch.tensor([_difference(p)[1] for p in parameters]).to(values)
+        every = self.in_states([self.observations.state] * len(parameters))
+        moved = (values + torch.diag(steps)).repeat_interleave(len(self.items), 0)
+        high = every.residuals(parameters, moved, jacobian=False)[0].unflatten(0, (len(parameters), -1))
+        slopes = (high - rows) / steps[:, None, None, None]
+        return torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
+
+    def rollout(self, record_contacts: bool = False) -> Rollout:
+        """Return the true motion of the segments from their states."""
+        world, seen = self.world, self.observations
+        with torch.no_grad():
+            return rolled_out(world, seen.state, true_times(world, seen.times_s), seen.drives, record_contacts)
+
+    def positions(self, parameters: Sequence[Parameter] = (), values: Tensor | None = None) -> Tensor:
+        """Return the positions (B, T, nf, 3) [m] of the free bodies as they would be measured.
+
+        Args:
+            parameters: Numbers of the world that are set.
+            values: Their values in fitted coordinates, (B, P).
+        """
+        world, seen = self.world, self.observations
+        if parameters and values is not None:
+            decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(parameters)], -1)
+            world = apply_parameters(world, parameters, decoded)
+        with torch.no_grad():
+            return measure(world, seen.state, seen.times_s, seen.drives).position_m[:, :, list(seen.free)]
+
+    def moved(self, change: Tensor) -> Segments:
+        """Return the segments with their states moved by changes (B, S)."""
+        return self.with_state(retract(self.observations.state, change, self.observations.free))
+
+
+def _difference(parameter: Parameter) -> tuple[float, float]:
+    """Return how far down and up a parameter is moved for its derivative; up alone, as many may not be below 0."""
+    return 0.0, PARAMETER_STEP * parameter.prior[1]
+
+
+def world_for(kind: Kind, world: World) -> World:
+    """Return the world in which segments of a kind are rolled out: flight needs no contact and takes longer steps."""
+    if kind == "contact":
+        half = 0.5 * float(world.contact.contact_time_s.min()) if isinstance(world.contact, ContactLaw) else 0.0
+        return replace(world, step_s=max(world.step_s, min(CONTACT_STEP_S, half)))
+    return replace(world, touching=False, step_s=max(world.step_s, FLIGHT_STEP_S))
+
+
+def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
+    """Return the frames of segments as a batch, padded to the longest; states are still those of whole episodes."""
+    rows = torch.tensor([item.episode for item in items])
+    lengths = torch.tensor([item.last - item.first + 1 for item in items])
+    first = torch.tensor([item.first for item in items])
+    offset = torch.arange(int(lengths.max()))
+    place = first[:, None] + torch.minimum(offset, lengths[:, None] - 1)
+    inside = (offset < lengths[:, None]).to(whole.times_s)
+    times = whole.times_s[rows[:, None], place]
+    step = (times[:, -1] - times[:, 0]) / (lengths - 1)
+    times = times + step[:, None] * (offset - lengths[:, None] + 1).clamp_min(0)
+    picked = {key: getattr(whole, key)[rows[:, None], place] for key in ("position_m", "quat_wxyz", "seen", "turned")}
+    picked |= {key: picked[key] * inside[..., None] for key in ("seen", "turned")}
+    drives = {name: drive.select(rows) for name, drive in whole.drives.items()}
+    state = whole.state.at(rows)
+    names = tuple(whole.names[item.episode] for item in items)
+    return replace(whole, names=names, times_s=times, drives=drives, state=state, **picked)
+
+
+def line_state(segments: Segments, frames: int) -> State:
+    """Return states at the first frames from straight lines through so many frames; in flight with gravity."""
+    seen, world = segments.observations, segments.world
+    state = seen.state
+    fields = [value.clone() for value in vars(state).values()]
+    t = (seen.times_s - seen.times_s[:, :1])[:, :frames]
+    fall = 0.5 * t.square()[..., None] * world.gravity[:, None] if segments.kind == "flight" else torch.zeros(1)
+    for column, body in enumerate(seen.free):
+        moved, turned = seen.seen[:, :frames, column], seen.turned[:, :frames, column]
+        fields[0][:, body], fields[2][:, body] = _line(t, seen.position_m[:, :frames, column] - fall, moved)
+        at = turned.argmax(1)  # the first measured orientation
+        item = torch.arange(len(at))
+        base = seen.quat_wxyz[item, at, column]
+        turn = quat_log(quat_multiply(quat_conjugate(base[:, None]), seen.quat_wxyz[:, :frames, column]))
+        angle, omega = _line(t, turn, turned)
+        known = (turned.sum(1) >= 2)[:, None]
+        fields[1][:, body] = torch.where(known, quat_multiply(base, quat_exp(angle)), base)
+        fields[3][:, body] = torch.where(known, omega, torch.zeros_like(omega))
+    return State(*fields)
+
+
+def _line(t: Tensor, values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return value at 0 and slope, each (B, 3), of weighted straight lines through values (B, n, 3) at t (B, n)."""
+    total = weight.sum(1).clamp_min(1.0)[:, None]
+    mean = (weight[..., None] * values).sum(1) / total
+    middle = (weight * t).sum(1)[:, None] / total
+    away = weight * (t - middle)
+    slope = (away[..., None] * values).sum(1) / away.square().sum(1).clamp_min(1e-12)[:, None]
+    return mean - middle * slope, slope
