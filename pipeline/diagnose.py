@@ -23,13 +23,13 @@ from ..schemas import (
     UsageError,
 )
 from .diagnosis.candidates import Candidate, admissible
+from .diagnosis.cuts import whole_episodes
 from .diagnosis.episodes import diagnosed_episodes
 from .diagnosis.law_file import require_law_file, save_law
 from .diagnosis.next_throw import next_experiment
 from .diagnosis.phases import size_of
 from .diagnosis.prepared import Prepared, prepare
 from .diagnosis.residual_law import residual_law
-from .diagnosis.segments import whole_episodes
 from .diagnosis.slots import Evidence
 from .diagnosis.throws import DEFAULT, Throw, read_throws, throws_of
 from .diagnosis.verdict import Findings, find

@@ -17,10 +17,11 @@ from ..physics.parameters import PRIOR_SCALES
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
 from .candidates import Variant, acts_in, base_parameters
+from .cuts import Segment, cut_episodes, whole_episodes
 from .phases import is_round
 from .prepared import Prepared
 from .score import picture
-from .segments import Kind, Segment, Segments, cut_episodes, whole_episodes
+from .segment_batch import Kind, Segments
 from .throws import Throw, states_of
 
 Array = NDArray[np.float64]

@@ -17,7 +17,8 @@ from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, se
 from .forecast import held_out_errors
 from .prepared import Prepared
 from .refit import refit
-from .segments import Segments, fit_states, world_for
+from .segment_batch import Segments, world_for
+from .segments import fit_states
 from .slots import ALIAS_CHI2, Evidence, Slot, fill
 from .wrench import Omnibus, dispersion, omnibus, residual_wrenches
 
