@@ -107,6 +107,7 @@ def test_a_fast_throw_tells_drags_apart_and_a_slow_drop_does_not() -> None:
     before = odds(prepared, world)
     after = [odds(prepare(world, [*data, *thrown(truth, [r.throw], 9)], NOISE), world) for r in (ranked[0], ranked[-1])]
     assert after[0] - before > 3 * max(after[1] - before, 1.0)
+    assert ranked[0].least[pair] / 3 < after[0] - before < 3 * ranked[0].by_pair[pair]
 
 
 def test_the_next_experiment_names_the_throw_and_its_state() -> None:
@@ -145,8 +146,9 @@ def test_where_no_throw_helps_it_says_what_does() -> None:
     assert "no throw tells com_offset and marker_offset apart" in found.what
 
 
-def test_a_throw_that_adds_nothing_new_gains_nothing() -> None:
-    one = RankedThrow(THROWS[0], {}, {("a", "b"): 5.0, ("a", "c"): 2.0})
+def test_the_gain_is_that_of_the_pair_that_is_separated_least() -> None:
+    one = RankedThrow(THROWS[0], {}, {("a", "b"): 5.0, ("a", "c"): 2.0}, {("a", "b"): 1.0, ("a", "c"): 1.5})
+    assert one.least_gain([("a", "b"), ("a", "c")]) == 1.0
     assert one.gain([("a", "b")]) == 5.0 and one.gain([("a", "b"), ("a", "c")]) == 2.0 and one.gain([]) == 0.0
 
 
