@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 NEAR_BIC = 2 * math.log(1000)
 """A second effect within these odds of the first is its rival, though it was not called its equal."""
 ENOUGH_NATS = 3.0
-"""Less than this, odds of 20, separates nothing."""
+"""Less than this, odds of 20, whichever of two is true, separates nothing: one that contains the other always gains a
+little if it is true, for the noise of its own numbers."""
 NEARLY = 1.15
 """Gains within this factor are not told apart: they are estimates."""
 OTHERWISE = {
@@ -114,7 +115,7 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Thr
         return None
     ranked = ranked_throws(prepared, rivals, throws, findings.contact_chi2)
     pairs = list(itertools.combinations(rivals.names, 2))
-    open_pairs = [pair for pair in pairs if max((r.by_pair[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
+    open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
     closed = {name for pair in pairs if pair not in open_pairs for name in pair}
     words = [_otherwise(e) for e in rivals.evidence if e.candidate.spec in closed]
     left = tuple(name for name in rivals.names if name in closed)
