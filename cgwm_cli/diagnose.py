@@ -102,8 +102,8 @@ def _summary(result: DiagnoseResult) -> str:
 def _experiment(found: NextExperiment) -> list[str]:
     if not found.ranked:
         return [f"To tell them apart: {found.what}."]
-    gain = f"some {found.ranked[0]['order_of_magnitude']:g} nats"
-    lines = [f"To tell {' and '.join(found.separates)} apart: {found.what} ({gain} to expect)."]
+    lines = [f"To tell {' and '.join(found.separates)} apart: {found.what}."]
+    lines.append(f"  1. {found.ranked[0]['what']} (some {found.ranked[0]['order_of_magnitude']:g} nats to expect)")
     lines += [
         f"  {entry['rank']}. {entry['what']} (some {entry['order_of_magnitude']:g} nats)"
         for entry in found.ranked[1:THROWS_SHOWN]

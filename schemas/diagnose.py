@@ -50,12 +50,16 @@ class NextExperiment(FileModel):
     """position_m, quat_wxyz, velocity_m_s, omega_body_rad_s; empty where no throw tells the rivals apart."""
     separates: tuple[str, ...]
     expected_gain_nats: float
-    """Expected rise of the log-likelihood ratio of the pair of rivals that the throw separates least, of those that a
-    throw can separate, for either of them being true, added. It is linearised: an order of magnitude."""
+    """Worth of the throw for the pair of rivals that it separates least, of those that a throw can separate: the
+    expected rises of the log-likelihood ratio if one is true and if the other is, added. Linearised, and from rough
+    estimates: good for ranks."""
+    least_gain_nats: float = 0.0
+    """The smaller of the two."""
     not_separated: tuple[str, ...] = ()
     """Rivals that none of the throws tells apart."""
     ranked: tuple[dict[str, Any], ...] = ()
-    """All throws, the best first: rank, what, initial_state, expected_gain_nats, order_of_magnitude (a power of 10)."""
+    """All throws, the best first: rank, what, initial_state, expected_gain_nats, least_gain_nats, and its
+    order_of_magnitude (a power of 10; 0 below 1)."""
 
 
 Several = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]

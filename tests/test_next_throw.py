@@ -14,7 +14,7 @@ from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.diagnosis.candidates import Candidate
 from cgwm.pipeline.diagnosis.law_file import law_source, save_law
-from cgwm.pipeline.diagnosis.next_throw import RankedThrow, Rivals, next_experiment, ranked_throws
+from cgwm.pipeline.diagnosis.next_throw import RankedThrow, Rivals, next_experiment, ranked_throws, rivals_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
 from cgwm.pipeline.diagnosis.refit import refit
 from cgwm.pipeline.diagnosis.score import ScoreTest
@@ -107,6 +107,7 @@ def test_a_fast_throw_tells_drags_apart_and_a_slow_drop_does_not() -> None:
     before = odds(prepared, world)
     after = [odds(prepare(world, [*data, *thrown(truth, [r.throw], 9)], NOISE), world) for r in (ranked[0], ranked[-1])]
     assert after[0] - before > 3 * max(after[1] - before, 1.0)
+    assert ranked[0].least[pair] / 3 < after[0] - before < 3 * ranked[0].by_pair[pair]
 
 
 def test_the_next_experiment_names_the_throw_and_its_state() -> None:
@@ -137,6 +138,9 @@ def test_where_no_throw_helps_it_says_what_does() -> None:
     assert found.what.startswith("no throw tells com_offset and marker_offset apart") and "balance" in found.what
     assert found.initial_state == {} and found.expected_gain_nats == 0.0
     assert found.not_separated == ("com_offset", "marker_offset")
+    # nothing can be thrown
+    found = next_experiment(prepared, findings(world, *equals), [])
+    assert found is not None and found.what.startswith("com_offset: balance") and not found.ranked
     # a third rival can be told apart by a throw, these two still cannot
     found = next_experiment(prepared, findings(world, *equals, evidence("linear_drag", c=0.4)), THROWS)
     assert found is not None
@@ -145,8 +149,38 @@ def test_where_no_throw_helps_it_says_what_does() -> None:
     assert "no throw tells com_offset and marker_offset apart" in found.what
 
 
-def test_a_throw_that_adds_nothing_new_gains_nothing() -> None:
-    one = RankedThrow(THROWS[0], {}, {("a", "b"): 5.0, ("a", "c"): 2.0})
+def test_rivals_are_equals_or_what_comes_close_behind() -> None:
+    world = world_with("ball", {"linear_drag": {"c": 0.3}})
+    first, second = evidence("linear_drag", c=0.3), evidence("quadratic_drag", k=0.2)
+    alone = replace(findings(world, first), verdict="missing_effect")
+    assert rivals_of(alone) is None
+    near = rivals_of(replace(alone, ranking=(first, replace(second, delta_bic=-40.0))))
+    assert near is not None and near.names == ("linear_drag", "quadratic_drag")
+    assert near.world.effects == ()  # none of them
+    assert rivals_of(replace(alone, ranking=(first, replace(second, delta_bic=-30.0)))) is None
+    equals = rivals_of(findings(world, first, second))
+    assert equals is not None and equals.names == near.names
+    assert rivals_of(replace(findings(world, first, second), verdict="unexplained")) is None
+
+
+def test_the_command_says_what_to_throw_next(tmp_path: Path) -> None:
+    truth = world_with("ball", {"gravity_tilt": {"tilt_x": 0.02}})
+    root, throws = tmp_path / "capture", tmp_path / "throws.toml"
+    model = write_capture(root, truth, tosses(truth, 3, 5, 0.35, height_m=(1.0, 1.4)), test=1)
+    throws.write_text(
+        "[[throws]]\nspeed_m_s = [2.0]\nheight_m = [2.5]\n[[throws]]\non_ground = true\nspeed_m_s = [1.0, 3.0]\n"
+    )
+    done = CliRunner().invoke(app, ["diagnose", str(model), str(root), "--throws", str(throws)])
+    assert done.exit_code == 0, done.output
+    # the measured frame is tilted, or gravity: where the ground is touched, its height tells
+    assert "To tell gravity_tilt and frame_tilt and constant_force apart: let it slide over the ground" in done.stdout
+    assert "no throw tells gravity_tilt and constant_force apart: gravity_tilt: put a spirit level" in done.stdout
+    assert "  2. let it slide over the ground" in done.stdout
+
+
+def test_the_gain_is_that_of_the_pair_that_is_separated_least() -> None:
+    one = RankedThrow(THROWS[0], {}, {("a", "b"): 5.0, ("a", "c"): 2.0}, {("a", "b"): 1.0, ("a", "c"): 1.5})
+    assert one.least_gain([("a", "b"), ("a", "c")]) == 1.0
     assert one.gain([("a", "b")]) == 5.0 and one.gain([("a", "b"), ("a", "c")]) == 2.0 and one.gain([]) == 0.0
 
 

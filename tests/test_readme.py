@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cgwm.cli.app import app
 from cgwm.cli.settings import StageSettings
+from cgwm.pipeline.diagnosis.throws import read_throws
 from cgwm.schemas import CaptureManifest, InputDataError, PhysConfig, SplatConfig, read_toml
 from typer.main import get_command
 
@@ -21,7 +22,7 @@ def blocks(language: str) -> list[str]:
 
 
 def test_the_manifest_is_legal(tmp_path: Path) -> None:
-    (text,) = blocks("toml")
+    text, _ = blocks("toml")
     path = tmp_path / "capture.toml"
     path.write_text(text)
     manifest = read_toml(path, CaptureManifest)
@@ -30,13 +31,21 @@ def test_the_manifest_is_legal(tmp_path: Path) -> None:
 
 
 def test_the_error_is_what_is_printed(tmp_path: Path) -> None:
-    (text,) = blocks("toml")
+    text, _ = blocks("toml")
     path = tmp_path / "capture.toml"
     path.write_text(text.replace("mass_kg", "mass"))
     with pytest.raises(InputDataError) as error:
         read_toml(path, CaptureManifest)
     message = str(error.value).replace(str(tmp_path), "capture")
     assert f"```\n{message}\n```" in README
+
+
+def test_the_throws_are_legal(tmp_path: Path) -> None:
+    _, text = blocks("toml")
+    path = tmp_path / "throws.toml"
+    path.write_text(text)
+    # without spin its axis counts for nothing
+    assert len(read_throws(path)) == 2 * 2 * 3 + 2 * 2
 
 
 @pytest.mark.parametrize("line", COMMANDS)

@@ -3,7 +3,8 @@
 Rivals A and B with estimates th. Data with information M let A's effect be seen beside everything that could stand for
 it, S = the model's numbers and B, by NC_A|B(M) = th_A' (M_AA - M_AS M_SS^-1 M_SA) th_A, the noncentrality of the test
 of A against B: twice the expected log-likelihood ratio if A is true. A throw adds its information, and is worth
-1/2 [dNC_A|B + dNC_B|A] (T-optimality: Atkinson & Fedorov 1975), the sum of both directions in nats.
+1/2 [dNC_A|B + dNC_B|A] (T-optimality: Atkinson & Fedorov 1975), in nats: the sum of what it gives if A is true and
+if B is. One of the two may be a tenth of the other, so the smaller one is said beside it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ Array = NDArray[np.float64]
 NEAR_BIC = 2 * math.log(1000)
 """A second effect within these odds of the first is its rival, though it was not called its equal."""
 ENOUGH_NATS = 3.0
-"""Less than this, odds of 20, separates nothing."""
+"""Less than this, odds of 20, whichever of two is true, separates nothing: one that contains the other always gains a
+little if it is true, for the noise of its own numbers."""
 NEARLY = 1.15
 """Gains within this factor are not told apart: they are estimates."""
 OTHERWISE = {
@@ -67,15 +69,24 @@ class Rivals:
 
 @dataclass(frozen=True)
 class RankedThrow:
-    """A throw and its gain [nats] for each pair of rivals; state: as a report has it."""
+    """A throw and its gain [nats] for each pair of rivals.
+
+    state: as a report has it; by_pair: both directions added; least: the log-likelihood ratio to expect if that one of
+    the two is true that shows less.
+    """
 
     throw: Throw
     state: dict[str, list[float]]
     by_pair: dict[tuple[str, str], float]
+    least: dict[tuple[str, str], float]
 
     def gain(self, pairs: Sequence[tuple[str, str]]) -> float:
         """Return the gain for the pair that is separated least."""
         return min((self.by_pair[pair] for pair in pairs), default=0.0)
+
+    def least_gain(self, pairs: Sequence[tuple[str, str]]) -> float:
+        """Return what is gained in any case, for the pair that is separated least."""
+        return min((self.least[pair] for pair in pairs), default=0.0)
 
     def order(self, pairs: Sequence[tuple[str, str]]) -> tuple[float, ...]:
         """Return what throws are sorted by: gains that are nearly equal count as equal, and the simpler throw wins."""
@@ -104,7 +115,7 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Thr
         return None
     ranked = ranked_throws(prepared, rivals, throws, findings.contact_chi2)
     pairs = list(itertools.combinations(rivals.names, 2))
-    open_pairs = [pair for pair in pairs if max((r.by_pair[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
+    open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
     closed = {name for pair in pairs if pair not in open_pairs for name in pair}
     words = [_otherwise(e) for e in rivals.evidence if e.candidate.spec in closed]
     left = tuple(name for name in rivals.names if name in closed)
@@ -117,14 +128,14 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Thr
     rest = f"; no throw tells {' and '.join(left)} apart: {'; '.join(words)}" if left else ""
     entries = []
     for place, one in enumerate(ranked):
-        gain = one.gain(open_pairs)
         entries.append(
             {
                 "rank": place + 1,
                 "what": one.throw.what,
                 "initial_state": one.state,
-                "expected_gain_nats": float(f"{gain:.3g}"),
-                "order_of_magnitude": magnitude(gain),
+                "expected_gain_nats": float(f"{one.gain(open_pairs):.3g}"),
+                "least_gain_nats": float(f"{one.least_gain(open_pairs):.3g}"),
+                "order_of_magnitude": magnitude(one.least_gain(open_pairs)),
             }
         )
     separates = {name for pair in open_pairs for name in pair}
@@ -133,6 +144,7 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Thr
         initial_state=best.state,
         separates=tuple(name for name in rivals.names if name in separates),
         expected_gain_nats=float(f"{best.gain(open_pairs):.3g}"),
+        least_gain_nats=float(f"{best.least_gain(open_pairs):.3g}"),
         not_separated=left,
         ranked=tuple(entries),
     )
@@ -171,19 +183,21 @@ def ranked_throws(
     for item, (throw, more) in enumerate(zip(chosen, added, strict=True)):
         if more is None:
             continue
-        gains = {}
+        gains, least = {}, {}
         for a, b in itertools.combinations(range(len(variants)), 2):
-            after, before = (_noncentrality(m, sizes, rivals, variants, (a, b)) for m in (known + more, known))
-            gains[rivals.names[a], rivals.names[b]] = max(0.0, 0.5 * (after - before))
-        found.append(RankedThrow(throw, described(state, item, world.free[0]), gains))
+            after, before = (_noncentralities(m, sizes, rivals, variants, (a, b)) for m in (known + more, known))
+            both = 0.5 * (after - before).clip(0.0)
+            pair = rivals.names[a], rivals.names[b]
+            gains[pair], least[pair] = float(both.sum()), float(both.min())
+        found.append(RankedThrow(throw, described(state, item, world.free[0]), gains, least))
     return sorted(found, key=lambda r: r.order(list(r.by_pair)))
 
 
-def _noncentrality(
+def _noncentralities(
     information: Array, layout: Layout, rivals: Rivals, variants: Sequence[Variant], pair: tuple[int, int]
-) -> float:
-    """Return NC_A|B + NC_B|A. The priors of S keep what was not measured from standing for everything."""
-    total = 0.0
+) -> Array:
+    """Return NC_A|B and NC_B|A. The priors of S keep what was not measured from standing for everything."""
+    found = []
     for a, b in (pair, pair[::-1]):
         own = [layout.names.index(name) for name in variants[a].parameters]
         beside = [*range(layout.base), *(layout.names.index(name) for name in variants[b].parameters)]
@@ -191,8 +205,8 @@ def _noncentrality(
         mixed = information[np.ix_(beside, own)]
         reduced = information[np.ix_(own, own)] - mixed.T @ np.linalg.solve(inner, mixed)
         value = _estimate(rivals.evidence[a])
-        total += float(value @ reduced @ value)
-    return total
+        found.append(float(value @ reduced @ value))
+    return np.array(found)
 
 
 def _estimate(evidence: Evidence) -> Array:

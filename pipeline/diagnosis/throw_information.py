@@ -112,7 +112,11 @@ def information_of_throws(
     if not prepared.turned and not is_round(world.bodies[body]):
         contact = []
     total = np.zeros((len(fine), len(layout.names), len(layout.names)))
-    for kind, items, share in (("flight", flight, scale), ("contact", contact, scale / discount)):
+    parts: list[tuple[Kind, list[Segment], float]] = [
+        ("flight", flight, scale),
+        ("contact", contact, scale / discount),
+    ]
+    for kind, items, share in parts:
         if items:
             segments = _at_truth(Segments.of(kind, world, whole, items, prepared.noise), true, fine)
             found = _embedded(segments, world, variants, layout)
