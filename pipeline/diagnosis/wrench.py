@@ -73,7 +73,7 @@ class ResidualWrenches:
     @property
     def covariance(self) -> Array:
         """Covariances (n, 6, 6)."""
-        return np.linalg.inv(self.information + np.eye(6) / WEAK_STD**2)
+        return np.linalg.inv(self.information + np.eye(6) / WEAK_STD**2).astype(np.float64)
 
 
 @dataclass(frozen=True)
