@@ -26,7 +26,7 @@ def test_drag_and_tilt_halve_what_is_left_of_throws_that_the_fit_never_saw(tmp_p
     if data is None or not (data / "jugglebot").is_dir():
         pytest.skip("the throws of Jugglebot are not there: set CGWM_SHARED_DATA to the folder of measured data")
     capture, base, better = tmp_path / "capture", tmp_path / "m0", tmp_path / "m1"
-    import_jugglebot(data / "jugglebot", capture, only="session7", n_train=4, n_test=3)
+    import_jugglebot(data / "jugglebot", capture, only="session7", n_train=3, n_test=2)
     fit(capture, base)
     effects = PhysConfig(effects=("quadratic_drag", "gravity_tilt"))
     model = fit(capture, better, "phys-geo", base, phys_config=effects)
