@@ -386,7 +386,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
                 found.constants,
             ),
             "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
-            "warnings": (*file.warnings, *found.warnings),
+            "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
         }
     )
 

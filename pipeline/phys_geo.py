@@ -9,12 +9,15 @@
 5. With few episodes, multiple shooting from several starts, the search's among them: states and parameters together,
    and ties between short segments that give where the contact model misses something. With many episodes the search
    alone: their mean is smooth, and their scatter gives the intervals.
+
+Where nothing touches anything in any episode there is no contact to search for: its numbers stay at their priors, and
+only effects are fitted.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,12 +31,13 @@ from ..datasets.progress import progress
 from ..datasets.tracks import Track
 from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
 from ..schemas import Parameter as FittedParameter
+from .diagnosis.segments import world_for
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.shooting import Prior as ShotPrior
 from .estimation.shooting import Shooting
-from .estimation.warmup import estimate_states, warmup_frames
+from .estimation.warmup import estimate_states, flight_frames, warmup_frames
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
@@ -78,6 +82,11 @@ long."""
 ENOUGH_EPISODES = 8
 """From this many episodes on the search alone is used: their mean is smooth, and their scatter gives the intervals
 without trusting the model."""
+
+NEVER_TOUCHES = (
+    "nothing touches anything in these episodes: the numbers of the contact stand at their priors; what can be fitted "
+    "are effects that act in flight."
+)
 
 
 @dataclass(frozen=True)
@@ -151,7 +160,13 @@ def fit_physics(
     free_tracks = [
         tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
     ]
-    estimated = estimate_noise(free_tracks)
+    chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
+    searched = [episodes[i] for i in chosen]
+    observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
+    flying = len(observations.free) == 1 and bool(
+        flight_frames(world, observations)[observations.seen[..., 0] > 0].all()
+    )
+    estimated = estimate_noise(free_tracks, flying)
     sigma = (noise[0] or estimated[0], noise[1] or estimated[1])
     # the search over few episodes cannot tell the ground's height from the way of bouncing; shooting can
     height = world.ground_normal is not None and len(episodes) >= ENOUGH_EPISODES
@@ -162,39 +177,41 @@ def fit_physics(
         mass = fit_mass_distribution(world, episodes, [(p, p.prior[0]) for p in names], sigma)
         world = mass.world
     if effect_parameters(world):
-        effects = _fit_effects(world, episodes, names, sigma)
-        world = effects.world
-    chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
-    searched = [episodes[i] for i in chosen]
+        # flight needs no contact and no short steps
+        effects = _fit_effects(
+            world_for("flight", world) if flying else world, episodes, [] if flying else names, sigma
+        )
+        world = replace(effects.world, touching=world.touching, step_s=world.step_s)
     observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
     warm = warmup_frames(world, observations, config.warmup_s)
     observations, _ = estimate_states(world, observations, warm, sigma)
 
-    floor = _noise_floor(world, observations, sigma)
-    search = _search(world, observations, warm, names, floor, config)
-    if not math.isfinite(search.lowest):
-        raise NotConvergedError(
-            "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
-        )
     record: dict[str, Any] = {
         "episodes": len(episodes),
         "search_episodes": len(searched),
         "noise_estimated": {"position_m": estimated[0], "rotation_rad": estimated[1]},
-        "search_open_loop_m": search.history,
-        "search_effective_samples": search.effective_samples,
     }
     if mass is not None:
         record["mass_distribution"] = mass.record
     if effects is not None:
         record["effects"] = effects.record
     starts: dict[str, tuple[float, State]] = {}
-    best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
-    if covariance is None:
-        names, best, covariance, starts = _shot(
-            world, searched, (observations, warm), names, search, sigma, config, record
-        )
-    record["correlation"] = _correlation(covariance).tolist()
-    found = physics_fit(world, names, best, covariance, sigma, record)
+    if flying:
+        found = _never_touching(world, names, sigma, _open_loop(world, observations, warm, names), record)
+    else:
+        search = _search(world, observations, warm, names, _noise_floor(world, observations, sigma), config)
+        if not math.isfinite(search.lowest):
+            raise NotConvergedError(
+                "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
+            )
+        record |= {"search_open_loop_m": search.history, "search_effective_samples": search.effective_samples}
+        best, covariance = search.mean, episode_covariance(search, search.mean, ENOUGH_EPISODES)
+        if covariance is None:
+            names, best, covariance, starts = _shot(
+                world, searched, (observations, warm), names, search, sigma, config, record
+            )
+        record["correlation"] = _correlation(covariance).tolist()
+        found = physics_fit(world, names, best, covariance, sigma, record)
     more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
     known = [*effect_parameters(world), *(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
     return replace(
@@ -205,6 +222,21 @@ def fit_physics(
         effects=effects,
         starts=starts,
     )
+
+
+def _never_touching(
+    world: World,
+    names: list[Parameter],
+    sigma: tuple[float, float],
+    open_loop: Callable[[np.ndarray], np.ndarray],
+    record: dict[str, Any],
+) -> PhysicsFit:
+    """Return a fit whose contact stands at the middles of its priors: a search would return the luck of its draws."""
+    middle = np.array([p.encode(p.prior[0]) for p in names])
+    record["search_open_loop_m"] = [float(open_loop(middle[None]).mean())]
+    found = physics_fit(world, names, middle, np.diag([p.prior[1] ** 2 for p in names]), sigma, record)
+    unseen = [warning for warning in found.warnings if "not observable" in warning]
+    return replace(found, warnings=(NEVER_TOUCHES, *unseen))
 
 
 def _fit_effects(

@@ -159,6 +159,33 @@ def test_friction_of_a_body_that_never_touches_is_not_observable() -> None:
     fit = fit_physics(world, [("000", {"box": flight})], PhysConfig(population=48, generations=3), NOISE)
     assert {p.name: p.state for p in fit.parameters}["friction"] == "not_observable"
     assert any("friction is not observable" in warning and "sliding" in warning for warning in fit.warnings)
+    assert any("nothing touches anything" in warning for warning in fit.warnings)
+
+
+def test_many_flights_alone_tell_nothing_about_contact() -> None:
+    """The scatter of episodes that never touch is none, and would make a tight interval about a chance value."""
+    flights = [(str(seed), {"box": toss(seed, duration_s=0.15, height=2.0)}) for seed in range(8)]
+    fit = fit_physics(world_of(box_body(), ground=False), flights, PhysConfig(population=12, generations=2), NOISE)
+    states = {p.name: p.state for p in fit.parameters}
+    assert all(states[name] == "not_observable" for name in ("friction", "contact_time_s", "damping_ratio"))
+
+
+def test_the_noise_of_heights_alone_is_that_of_the_heights() -> None:
+    generator = np.random.default_rng(0)
+    time = np.arange(40) / 15
+    position = np.zeros((40, 3))
+    position[:, 2] = 48 - 4.9 * time**2 + generator.normal(0, 0.03, 40)
+    assert 0.01 < estimate_noise([Track(time, position)])[0] < 0.06  # with x and y it would be nothing
+
+
+def test_errors_that_last_for_many_frames_count_as_noise_of_a_flying_centroid() -> None:
+    generator = np.random.default_rng(0)
+    time = np.arange(280) / 300
+    slow = np.stack([np.convolve(generator.normal(0, 1, 300), np.ones(21) / 21**0.5, "valid") for _ in range(3)], 1)
+    position = np.outer(time**2, [0.0, 0.0, -4.9]) + 4e-4 * slow
+    tracks = [Track(time, position)]
+    assert estimate_noise(tracks)[0] < 1e-4  # short windows follow them
+    assert 2e-4 < estimate_noise(tracks, flying=True)[0] < 5e-4
 
 
 def test_many_tosses_give_the_ground_height_too() -> None:

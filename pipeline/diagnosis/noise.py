@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..estimation.noise import FLOOR_M, FLOOR_RAD, MAD_TO_STD
+from ..estimation.noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, moves
 from ..estimation.observations import Observations
 from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
 from .cuts import Segment
@@ -17,6 +17,8 @@ from .cuts import Segment
 WINDOW = 9
 """Frames of a window that a cubic follows in free flight: 0.09 s at 100 Hz, within 0.1 mm for 6 mm at 20 rad/s."""
 DEGREE = 3
+SLOW_DEGREE = 7
+"""Orders from the fourth to this one of a window hold slow errors and next to nothing of a flight."""
 OUTLIER_SIGMAS = 6.0
 """A frame so far from the cubic through the others of its window is no measurement: 2e-9 of normal ones lie there."""
 KEEP_SIGMAS = 4.0
@@ -28,10 +30,36 @@ def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float 
     """Return the standard deviations of position [m] and rotation [rad], per axis; None where too little is flight.
 
     Each window of consecutive frames is fitted by a cubic; residuals are scaled to the same variance, those beyond
-    `KEEP_SIGMAS` of a first, robust estimate are left out.
+    `KEEP_SIGMAS` of a first, robust estimate are left out. Windows of a body whose orientation was measured are short:
+    turning about a point beside its centre of mass, it does not follow a long cubic.
     """
     position, rotation = _residuals(whole, flight)
     return _spread(position, FLOOR_M), _spread(rotation, FLOOR_RAD)
+
+
+def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
+    """Return by what factor the variance of slow errors of a centroid exceeds that of all; 1 where it is unknown.
+
+    Independent errors have the same variance in every orthogonal polynomial over a window; those that last for many
+    frames have more in the low orders, which are what forces are found by.
+    """
+    slow, all_orders = [], []
+    for segment in flight:
+        for column in range(len(whole.free)):
+            if bool(whole.turned[segment.episode, :, column].any()):
+                continue
+            for chosen in _frames(whole, segment, column, 0):
+                if len(chosen) <= SLOW_DEGREE + 1:
+                    continue
+                t = whole.times_s[segment.episode, chosen].numpy()
+                values = _positions(whole, segment.episode, column, chosen)
+                q, _ = np.linalg.qr(np.vander((t - t.mean()) / (t[-1] - t[0]), SLOW_DEGREE + 1, increasing=True))
+                parts = (q.T @ values)[DEGREE + 1 :]
+                left = values - q[:, : DEGREE + 1] @ (q.T @ values)[: DEGREE + 1]
+                slow.append((parts**2).mean())
+                all_orders.append((left**2).sum() / (len(t) - DEGREE - 1) / values.shape[1])
+    # medians: a window with a bounce or an outlier in it shall not count for more than others
+    return max(1.0, float(np.median(slow) / max(np.median(all_orders), FLOOR_M**2))) if len(slow) >= 10 else 1.0
 
 
 def without_outliers(
@@ -72,13 +100,18 @@ def without_outliers(
 def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarray, np.ndarray]:
     found = []
     for kind in (0, 1):
-        parts = [away.ravel() for _, _, _, away in _windows(whole, flight, kind, step=WINDOW // 2)]
+        parts = [
+            _cubic(whole, segment.episode, column, chosen, kind).ravel()
+            for segment in flight
+            for column in range(len(whole.free))
+            for chosen in _frames(whole, segment, column, kind)
+        ]
         found.append(np.concatenate(parts) if parts else np.zeros(0))
     return found[0], found[1]
 
 
 def _windows(whole: Observations, flight: Sequence[Segment], kind: int, step: int = 2):
-    """Yield segment, body, frames and standardised residuals (n, 3) [m or rad] of a cubic, window by window."""
+    """Yield segment, body, frames and standardised residuals (n, 1 to 3) [m or rad] of a cubic, window by window."""
     mask = (whole.seen, whole.turned)[kind]
     for segment in flight:
         for column in range(len(whole.free)):
@@ -90,10 +123,30 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int, step: in
                 yield segment, column, chosen.numpy(), _cubic(whole, segment.episode, column, chosen, kind)
 
 
+def _frames(whole: Observations, segment: Segment, column: int, kind: int) -> list[Tensor]:
+    """Return the frames of half-overlapping windows of a flight: long ones where no orientation was measured."""
+    mask = (whole.seen, whole.turned)[kind]
+    frames = torch.arange(segment.first, segment.last + 1)
+    frames = frames[mask[segment.episode, frames, column] > 0]
+    if len(frames) <= DEGREE + 2:
+        return []
+    length = WINDOW
+    if not bool(whole.turned[segment.episode, :, column].any()):
+        step = float(whole.times_s[segment.episode, frames].diff().median())
+        length = max(WINDOW, round(LONG_S / step))
+    return [frames[start : start + length] for start in range(0, max(len(frames) - length, 0) + 1, length // 2)]
+
+
+def _positions(whole: Observations, episode: int, column: int, frames: Tensor) -> np.ndarray:
+    """Return the measured coordinates (n, 1 to 3) [m]: those that ever change in the episode."""
+    measured = whole.position_m[episode, whole.seen[episode, :, column] > 0, column].numpy()
+    return whole.position_m[episode, frames, column].numpy()[:, moves(measured)]
+
+
 def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> np.ndarray:
     t = whole.times_s[episode, frames].numpy()
     if kind == 0:
-        values = whole.position_m[episode, frames, column].numpy()
+        values = _positions(whole, episode, column, frames)
     else:
         quat = whole.quat_wxyz[episode, frames, column]
         values = quat_log(quat_multiply(quat_conjugate(quat[len(quat) // 2]), quat)).numpy()

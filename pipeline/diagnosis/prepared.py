@@ -14,7 +14,7 @@ from ..estimation.observations import Observations
 from ..physics.world import World
 from .carried import carried_frames
 from .cuts import Segment, cut_episodes, whole_episodes
-from .noise import flight_noise, without_outliers
+from .noise import flight_noise, slow_noise, without_outliers
 from .phases import is_round
 from .segment_batch import Segments
 from .segments import fit_states
@@ -31,8 +31,9 @@ class Prepared:
     """Episodes ready for tests.
 
     names (E); groups (E): session of each episode; whole (E): all frames; clear (E, T): frames surely in flight; noise:
-    position [m], rotation [rad]; flight: segments with fitted states, None where there are none; contact_items: the
-    contact segments; outliers: frames left out; turned: whether orientations were measured; warnings.
+    position [m], rotation [rad]; slow: by what factor the variance of slow errors of a centroid exceeds that of all;
+    flight: segments with fitted states, None where there are none; contact_items: the contact segments; outliers:
+    frames left out; turned: whether orientations were measured; warnings.
     """
 
     names: tuple[str, ...]
@@ -40,6 +41,7 @@ class Prepared:
     whole: Observations
     clear: Tensor
     noise: tuple[float, float]
+    slow: float
     flight: Segments | None
     contact_items: tuple[Segment, ...]
     outliers: int
@@ -107,6 +109,7 @@ def prepare(
         whole,
         clear,
         noise,
+        slow_noise(whole, flight),
         fitted,
         tuple(contact),
         outliers,

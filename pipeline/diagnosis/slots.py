@@ -162,7 +162,8 @@ def refitted(
     begun = torch.stack([*(known[p.name] for p in others), *values.to(torch.float64)])
     after = refit(parts, added, [*others, *own], begun)
     bic = (after.cost - before.cost) / dispersion + len(own) * math.log(count)
-    numbers = {p.name.partition(".")[2]: after.number(p.name) for p in own}
+    found = {p.name.partition(".")[2]: after.number(p.name) for p in own}
+    numbers = {name: (value, std * math.sqrt(dispersion)) for name, (value, std) in found.items()}
     return replace(evidence, refitted=after, delta_bic=bic, numbers=numbers)
 
 

@@ -135,7 +135,7 @@ def worst_omnibus(prepared: Prepared, world: World, scatter: float) -> Omnibus |
 
 def _dispersion(prepared: Prepared, world: World) -> float:
     pieces = prepared.pieces(world, OMNIBUS_S[-1])
-    return 1.0 if pieces is None else dispersion(pieces, residual_wrenches(pieces))
+    return 1.0 if pieces is None else max(prepared.slow, dispersion(pieces, residual_wrenches(pieces)))
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:

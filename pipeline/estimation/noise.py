@@ -13,29 +13,47 @@ if TYPE_CHECKING:
 
 WINDOW = 5
 """Frames of a window; short enough for free flight to be a parabola in position and rotation."""
+LONG_FRAMES, LONG_S = 9, 0.3
+"""Length of a window of a centroid's flight. A marker that wanders over a ball, or a filter, makes errors that last
+for many frames, which a short parabola follows. A cubic follows a drag of 0.03 / m at 6 m/s within 0.02 mm."""
 MAD_TO_STD = 1.4826
 FLOOR_M, FLOOR_RAD = 1e-5, 1e-4
 """Smallest noise admitted: noiseless tracks would give infinite weights."""
 
 
-def estimate_noise(tracks: Iterable[Track]) -> tuple[float, float]:
+def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> tuple[float, float]:
     """Return the standard deviations of position [m] and rotation [rad], for each axis.
 
     Each window of consecutive frames is fitted by a parabola in position and in rotation vector (a tumbling body turns
     at a changing rate); the
     residuals' median absolute deviation, scaled for the degrees of freedom used up, ignores the few windows that hold
-    an impact.
+    an impact. A coordinate that never changes was not measured, and has no part in it.
+
+    Args:
+        tracks: Of free bodies.
+        flying: Whether they are in free flight all the time: windows of centroids are then as long as errors that last
+            for many frames, which a short parabola follows.
     """
     positions, rotations = [], []
     for track in tracks:
-        for first in range(0, len(track.time_s) - WINDOW + 1, WINDOW // 2):
-            rows = slice(first, first + WINDOW)
+        window, degree = WINDOW, 2
+        if flying and track.quat_wxyz is None:
+            window = max(LONG_FRAMES, round(LONG_S / float(np.median(np.diff(track.time_s)))))
+            window, degree = min(window, len(track.time_s)), 3
+        for first in range(0, len(track.time_s) - window + 1, max(window // 2, 1)):
+            rows = slice(first, first + window)
             t = track.time_s[rows] - track.time_s[rows].mean()
-            positions.append(_residual(t, track.position_m[rows], degree=2))
+            positions.append(_residual(t, track.position_m[rows][:, moves(track.position_m)], degree).ravel())
             if track.quat_wxyz is not None:
                 turn = Rotation.from_quat(track.quat_wxyz[rows], scalar_first=True)
-                rotations.append(_residual(t, (turn[WINDOW // 2].inv() * turn).as_rotvec(), degree=2))
+                rotations.append(_residual(t, (turn[WINDOW // 2].inv() * turn).as_rotvec(), degree).ravel())
     return max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD)
+
+
+def moves(position_m: np.ndarray) -> np.ndarray:
+    """Return which coordinates (3) of a track (T, 3) ever change; all, where none does."""
+    changes = np.ptp(position_m, axis=0) > 0
+    return changes if changes.any() else np.ones(3, bool)
 
 
 def _residual(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:

@@ -1,0 +1,146 @@
+"""The loop of fit, effect, fit, compare on measured data: throws, drops, tosses of a cube (docs/real-data.md).
+
+    python benchmarks/real_data.py [--only throws|drops|cube] [--pictures FOLDER]
+
+Each model is fitted to the split "train", and the errors are those of the split "test". Bars: on throws, by session,
+and on drops pooled over the balls the median state-fitted residual falls by half.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cgwm.datasets.balldrops import import_balldrops
+from cgwm.datasets.capture import Capture
+from cgwm.datasets.contactnets import import_contactnets
+from cgwm.datasets.jugglebot import import_jugglebot
+from cgwm.datasets.models import read_model
+from cgwm.pipeline.eval import Evaluation, evaluate_model
+from cgwm.pipeline.fit import fit
+from cgwm.schemas import PhysConfig
+from store import Store, shared_data
+
+HALF = 0.5
+SESSIONS = ("session3_timing", "session7")
+BALLS = (
+    "baseball",
+    "blue-basketball",
+    "green-basketball",
+    "volleyball",
+    "bowling-ball",
+    "tennis-ball",
+    "yellow-whiffle-ball",
+)
+STEPS = {
+    "throws": (("quadratic_drag",), ("gravity_tilt",)),
+    "drops": (("quadratic_drag",),),
+    "cube": (("com_offset", "inertia_shape"),),
+}
+"""Effects that are added, model by model."""
+CUBE_TOSSES = 20
+"""For training, and as many for the test."""
+
+
+def walk(kind: str, capture: Path, folder: Path) -> tuple[dict[str, Any], list[Evaluation]]:
+    """Fit the base model and those with effects, and evaluate each on the split "test"."""
+    models = [folder / f"{capture.name}-m0"]
+    fit(capture, models[0])
+    for added in STEPS[kind]:
+        models.append(folder / f"{capture.name}-m{len(models)}")
+        fit(capture, models[-1], "phys-geo", models[-2], phys_config=PhysConfig(effects=added))
+    opened = Capture.open(capture, splits=("test",))
+    found = [evaluate_model(read_model(model), opened) for model in models]
+    rows = []
+    for path, evaluation in zip(models, found, strict=True):
+        one, file = evaluation.result, read_model(path).file
+        rows.append(
+            {
+                "effects": [effect.name for effect in file.effects],
+                "parameters": {p.name: (p.estimate, p.interval_95) for p in file.parameters if "." in p.name},
+                "noise_m": file.measurement_std.get("position_m"),
+                "translation_error_m": one.translation_error_m.median,
+                "state_fitted_m": [e.state_fitted_residual_m for e in one.per_episode],
+                "state_noise_floor_m": one.state_noise_floor_m and one.state_noise_floor_m.median,
+            }
+        )
+    return {"models": rows}, found
+
+
+def picture(path: Path, title: str, names: Sequence[str], found: Sequence[Evaluation]) -> None:
+    """Draw the open-loop errors of all test episodes against time, a panel for each model."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.2 * len(found), 2.6), layout="constrained")
+    panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for panel, name, evaluation in zip(panels, names, found, strict=True):
+        for episode in evaluation.episodes:
+            seen = episode.prediction
+            panel.plot(seen.time_s, 1e3 * seen.translation_error_m()[:, 0], lw=0.8, color="#2a6f97", alpha=0.7)
+        panel.set_title(name, fontsize=9)
+        panel.set_xlabel("time [s]", fontsize=8)
+        panel.tick_params(labelsize=8)
+    panels[0].set_ylabel("open-loop error [mm]", fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
+
+
+def pooled(rows: Sequence[dict[str, Any]], model: int) -> float:
+    """Return the median state-fitted residual [m] of a model over the test episodes of several captures."""
+    values = [value for row in rows for value in row["models"][model]["state_fitted_m"] if value is not None]
+    return float(np.median(values))
+
+
+def main() -> int:
+    """Measure what is wanted; return 1 if a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=tuple(STEPS))
+    parser.add_argument("--pictures", type=Path)
+    given = parser.parse_args()
+    data = shared_data()
+    if data is None:
+        print("no measured data: set CGWM_SHARED_DATA to the folder that holds them.")
+        return 0
+    store, met = Store("real_data"), []
+    makers: dict[str, dict[str, Callable[[Path], object]]] = {
+        "throws": {s: lambda out, s=s: import_jugglebot(data / "jugglebot", out, only=s) for s in SESSIONS},
+        "drops": {b: lambda out, b=b: import_balldrops(data / "balldrops", out, only=b) for b in BALLS},
+        "cube": {
+            "cube": lambda out: import_contactnets(
+                data / "cube_tosses" / "cube_tosses_si.npz", out, n_train=CUBE_TOSSES, n_test=CUBE_TOSSES
+            )
+        },
+    }
+    for kind, captures in makers.items():
+        if given.only not in (None, kind):
+            continue
+        rows = []
+        for name, make in captures.items():
+
+            def measure(kind: str = kind, name: str = name, make: Callable[[Path], object] = make) -> dict[str, Any]:
+                with tempfile.TemporaryDirectory() as folder:
+                    make(Path(folder) / name)
+                    figures, found = walk(kind, Path(folder) / name, Path(folder))
+                if given.pictures is not None:
+                    labels = ["base", *("+ " + ", ".join(added) for added in STEPS[kind])]
+                    picture(given.pictures / f"{name}.png", name, labels, found)
+                return figures
+
+            rows.append(store.result(f"{kind} {name}", measure))
+            if kind == "throws":
+                met.append(pooled(rows[-1:], -1) <= HALF * pooled(rows[-1:], 0))
+        before, after = pooled(rows, 0), pooled(rows, -1)
+        print(f"{kind}: state-fitted residual {1e3 * before:.1f} mm, then {1e3 * after:.1f} mm")
+        if kind == "drops":
+            met.append(after <= HALF * before)
+    print(f"{sum(met)} of {len(met)} bars met")
+    return 0 if all(met) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
