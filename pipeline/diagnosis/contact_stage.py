@@ -1,8 +1,8 @@
 """What contact says: which of several equals in flight it leaves, and whether an effect of contact is missing.
 
-No contact law is exact, so that a textbook p-value finds an effect in most data that have none. Variances are scaled by
-the misfit that is there anyway, segments that no candidate helps count less, the effect has to help episodes that it
-was not fitted to, and the threshold is what data without an effect reach.
+No contact law is exact, so that a textbook p-value finds an effect in most data that have none. Every contact has
+numbers of its own about those of all, segments that no candidate helps count less, the effect has to help episodes that
+it was not fitted to, and the threshold is what data without an effect reach.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_law
 
 from ..physics.parameters import GROUND_SHIFT
 from ..physics.world import World
@@ -21,7 +22,8 @@ from .candidates import Candidate, Variant, admissible, base_parameters, variant
 from .linear import robust_excess
 from .prepared import Prepared
 from .refit import Refit, refit
-from .score import Picture, gain_by_episode, picture, score_test
+from .robust import RobustFit, robust_fit, robust_gains, with_own_numbers
+from .score import Picture, ScoreTest, picture, score_test
 from .segment_batch import Segments, world_for
 from .segments import fit_states
 from .slots import Evidence
@@ -40,8 +42,8 @@ BLIND = 1.0
 class ContactEvidence:
     """An effect in contact: its evidence, and what the decision rests on.
 
-    score: the statistic over the misfit, less the penalty of BIC; gain: of all held-out episodes together; t: their
-    mean in its standard errors.
+    score: the fall of the robust loss, less the penalty of BIC; gain: of all held-out episodes together; t: their mean
+    in its standard errors.
     """
 
     evidence: Evidence
@@ -136,32 +138,40 @@ def contact_evidence(
     variants = [v for v in variants if v.active.effect.phase == "contact" or _blind(v, flight)]
     if not variants:
         return []
-    seen = picture(contact, world, variants, groups, robust=True)
-    misfit = max(1.0, float((seen.weight * seen.chi2).sum() / (seen.weight * seen.dof).sum()))
+    seen = with_own_numbers(picture(contact, world, variants, groups, robust=True))
+    base = list(range(seen.base))
+    without = robust_fit(seen, base)
     penalty = math.log(max(seen.dof.sum(), 2.0))
-    best: dict[int, ContactEvidence] = {}
+    best: dict[int, tuple[float, Variant, RobustFit]] = {}
     tries: dict[int, int] = {}
     for variant in variants:
         columns = seen.columns(variant.parameters)
-        test = score_test(seen, columns, dispersion=misfit)
-        gains = gain_by_episode(seen, columns) / misfit
+        found = robust_fit(seen, [*base, *columns])
         tries[variant.place] = tries.get(variant.place, 0) + 1
-        evidence = Evidence(kept[variant.place], variant.constants, test, test.p_value, tuple(gains.tolist()))
-        score = test.statistic - test.dof * penalty if test.admissible else -math.inf
+        score = without.cost - found.cost - (len(found.value) - len(without.value)) * penalty
+        if variant.place not in best or score > best[variant.place][0]:
+            best[variant.place] = (score, variant, found)
+    results = []
+    for place, (score, variant, found) in best.items():
+        test = _test(found, without)
+        gains = robust_gains(seen, base, seen.columns(variant.parameters))
+        p_value = min(1.0, test.p_value * tries[place])
+        evidence = Evidence(kept[place], variant.constants, test, p_value, tuple(gains.tolist()))
         spread = gains.std(ddof=1) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
         t = float(gains.mean() / spread) if spread > 0 else 0.0
-        found = ContactEvidence(evidence, score, float(gains.sum()), t)
-        if variant.place not in best or found.score > best[variant.place].score:
-            best[variant.place] = found
-    results = [
-        replace(
-            one,
-            score=one.score - 2 * math.log(tries[place]),
-            evidence=replace(one.evidence, p_value=min(1.0, one.evidence.p_value * tries[place])),
-        )
-        for place, one in best.items()
-    ]
+        lowered = score - 2 * math.log(tries[place]) if test.admissible else -math.inf
+        results.append(ContactEvidence(evidence, lowered, float(gains.sum()), t))
     return sorted(results, key=lambda one: (-one.score, one.evidence.name))
+
+
+def _test(found: RobustFit, without: RobustFit) -> ScoreTest:
+    """Return the fit of an effect as a test; its p-value takes the robust loss for twice a log-likelihood."""
+    count = len(without.value)
+    estimate, statistic = found.value[count:], max(0.0, without.cost - found.cost)
+    covariance = np.linalg.inv(found.information)[count:, count:].astype(np.float64)
+    # at a bound an effect does nothing: its sign would have to be the other
+    acts = bool((estimate != 0.0).any())
+    return ScoreTest(statistic, len(estimate), float(chi2_law.sf(statistic, len(estimate))), estimate, covariance, acts)
 
 
 def reweighted(seen: Picture, columns: Sequence[int]) -> Picture:

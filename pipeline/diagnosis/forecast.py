@@ -17,6 +17,8 @@ from .segments import fit_states
 
 KNOWN_SHARE = 0.5
 """The state is fitted to this share of a segment's frames; the error is that of the rest."""
+ITERATIONS = 3
+"""Steps of that fit, which begins at the state of all frames."""
 
 
 def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[float, float]:
@@ -57,7 +59,7 @@ def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) 
     known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])
     early = (torch.arange(seen.times_s.shape[1]) < known[:, None])[..., None].to(seen.seen)
     start = replace(segments, observations=replace(seen, seen=seen.seen * early, turned=seen.turned * early))
-    fitted = fit_states(start, parameters, values, search=False)
+    fitted = fit_states(start, parameters, values, ITERATIONS, search=False)
     away = (fitted.positions(parameters, values) - seen.position_m).norm(dim=-1)
     late = seen.seen * (1 - early)
     return float((away * late).sum() / late.sum().clamp_min(1.0))

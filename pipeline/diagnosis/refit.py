@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 ITERATIONS = 6
 FALL = 0.05
 """A refit ends when the cost falls by less: a twentieth of a standard error of one number."""
+FALL_SHARE = 1e-3
+"""Or by less than this share of it: where the law misses far more than the noise, less is roughness."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def refit(
         if found < cost:
             fall, cost, damping = cost - found, found, damping / 5
             parts, pictures, values = trial, seen, moved
-            if fall < FALL:
+            if fall < max(FALL, FALL_SHARE * cost):
                 break
         else:
             damping *= 20

@@ -165,9 +165,9 @@ def score_test(
         dispersion: By what factor variances are larger than those of the noise.
     """
     beside = list(range(seen.base)) if nuisance is None else list(nuisance)
-    information, score = _sums(seen, [*beside, *columns])
-    width = _widths(seen, [*beside, *columns])
-    count = len(width) - len(_widths(seen, columns))
+    information, score = sums(seen, [*beside, *columns])
+    width = widths(seen, [*beside, *columns])
+    count = len(width) - len(widths(seen, columns))
     size = len(width) - count
     reduced, slope = _eliminate(information, score, count)
     estimate, covariance, statistic, rank = _solve(reduced, slope, width[count:])
@@ -199,9 +199,9 @@ def gain_by_episode(seen: Picture, columns: Sequence[int], nuisance: Sequence[in
             if not chosen:
                 parts.append(0.0)
                 continue
-            information, score = _sums(others, chosen)
-            x = _solve(information, score, _widths(seen, chosen))[0]
-            mine, slope = _sums(replace(own, prior=np.zeros_like(own.prior)), chosen)
+            information, score = sums(others, chosen)
+            x = _solve(information, score, widths(seen, chosen))[0]
+            mine, slope = sums(replace(own, prior=np.zeros_like(own.prior)), chosen)
             parts.append(float(2 * slope @ x - x @ mine @ x))
         gains.append(parts[0] - parts[1])
     return np.array(gains)
@@ -213,26 +213,32 @@ def canonical_correlation(seen: Picture, a: Sequence[int], b: Sequence[int]) -> 
     The largest canonical correlation of their blocks of the information.
     """
     beside = list(range(seen.base))
-    information, score = _sums(seen, [*beside, *a, *b])
+    information, score = sums(seen, [*beside, *a, *b])
     reduced, _ = _eliminate(information, score, len(beside))
     n = len(a)
     roots = [_inverse_root(block) for block in (reduced[:n, :n], reduced[n:, n:])]
     return float(np.clip(np.linalg.svd(roots[0].T @ reduced[:n, n:] @ roots[1], compute_uv=False).max(), 0.0, 1.0))
 
 
-def _sums(seen: Picture, columns: Sequence[int]) -> tuple[Array, Array]:
-    """Return information and score of chosen parameters, one of each for every session or episode where they say so."""
+def sums(seen: Picture, columns: Sequence[int], beside: Array | None = None) -> tuple[Array, Array]:
+    """Return information and score of chosen parameters, one of each for every session or episode where they say so.
+
+    Args:
+        seen: The picture.
+        columns: Places of the parameters.
+        beside: Information on the numbers beside the data; that of the picture by default.
+    """
     chosen = list(columns)
     m = seen.information[:, chosen][:, :, chosen] * seen.weight[:, None, None]
     g = seen.score[:, chosen] * seen.weight[:, None]
-    places, prior = _layout(seen, chosen)
-    information, score = np.diag(prior), np.zeros(len(prior))
+    places, prior = layout(seen, chosen)
+    information, score = np.diag(prior if beside is None else beside), np.zeros(len(prior))
     np.add.at(score, places, g)
     np.add.at(information, (places[:, :, None], places[:, None, :]), m)
     return information, score
 
 
-def _layout(seen: Picture, columns: Sequence[int]) -> tuple[NDArray[np.int64], Array]:
+def layout(seen: Picture, columns: Sequence[int]) -> tuple[NDArray[np.int64], Array]:
     """Return the place (B, k) of each parameter of each segment among the numbers, and their prior information."""
     places, count = np.zeros((len(seen.episode), len(columns)), np.int64), 0
     prior: list[float] = []
@@ -248,9 +254,9 @@ def _layout(seen: Picture, columns: Sequence[int]) -> tuple[NDArray[np.int64], A
     return places, np.array(prior)
 
 
-def _widths(seen: Picture, columns: Sequence[int]) -> Array:
-    """Return the widths of the priors of the numbers that `_sums` gives."""
-    places, prior = _layout(seen, columns)
+def widths(seen: Picture, columns: Sequence[int]) -> Array:
+    """Return the widths of the priors of the numbers that `sums` gives."""
+    places, prior = layout(seen, columns)
     widths = np.ones(len(prior))
     for k, column in enumerate(columns):
         widths[places[:, k]] = seen.parameters[column].prior[1]
