@@ -127,6 +127,9 @@ def _brief(found: dict[str, Any]) -> dict[str, Any]:
     keys = ("verdict", "selected", "aliases", "remaining_unexplained", "contact_chi2", "flight_before", "flight_after")
     return {key: found[key] for key in keys} | {
         "ranking": found["ranking"][:6],
+        "contact": {
+            one["effect"]: one["contact_score"] for one in found["ranking"] if one["contact_score"] is not None
+        },
         "residual_law": found["residual_law"],
         "next_experiment": found["next_experiment"],
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -237,6 +238,7 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
         acts_in=(effect.phase,),
         judged_in=where,
         score_p=evidence.p_value,
+        contact_score=next((_finite(c.score) for c in findings.contact if c.evidence.name == effect.name), None),
         delta_bic=evidence.delta_bic,
         cv_error_before_m=before,
         cv_error_after_m=after,
@@ -246,6 +248,10 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
         ),
         constants=evidence.constants,
     )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _flight_test(found: Omnibus | None) -> FlightTest | None:

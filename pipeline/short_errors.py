@@ -15,8 +15,8 @@ from ..schemas import PHASES, Phase
 from .diagnosis.cuts import whole_episodes
 from .diagnosis.phases import phases_of
 from .diagnosis.prepared import Prepared
-from .diagnosis.segment_batch import Segments
-from .diagnosis.segments import fit_states
+from .diagnosis.segment_states import fit_states
+from .diagnosis.segments import Segments
 from .estimation.observations import Observations
 from .estimation.trajectory import state_prior
 from .physics.world import World

@@ -32,6 +32,8 @@ class RankedEffect(FileModel):
     """p-value of the score test, corrected for the grid of the effect's constants, not for the number of candidates.
     In flight it assumes normal noise, independent from frame to frame, and nothing else; in contact variances are
     scaled by the misfit of the contact law, and the verdict does not rest on it."""
+    contact_score: float | None = None
+    """What the verdict in contact rests on: the fall of the robust loss less the penalty of BIC."""
     delta_bic: float | None = None
     """BIC of the refit less that of the model without it, on the episodes that it was fitted to; negative is better."""
     cv_error_before_m: float | None = None

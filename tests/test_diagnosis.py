@@ -17,8 +17,8 @@ from cgwm.pipeline.diagnosis.phases import phases_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
 from cgwm.pipeline.diagnosis.residual_law import residual_law
 from cgwm.pipeline.diagnosis.score import picture, score_test
-from cgwm.pipeline.diagnosis.segment_batch import Segments
-from cgwm.pipeline.diagnosis.segments import fit_states
+from cgwm.pipeline.diagnosis.segment_states import fit_states
+from cgwm.pipeline.diagnosis.segments import Segments
 from cgwm.pipeline.diagnosis.slots import Slot, fill
 from cgwm.pipeline.diagnosis.wrench import omnibus, organisers, residual_wrenches, wrench_windows
 from cgwm.pipeline.physics.effects import load_effect

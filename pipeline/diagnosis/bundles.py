@@ -18,7 +18,7 @@ from ..physics.world import World
 from .candidates import Candidate, base_parameters
 from .refit import Refit, refit
 from .score import ScoreTest
-from .segment_batch import Segments
+from .segments import Segments
 from .slots import Evidence
 
 DRAGS = ("linear_drag", "quadratic_drag")

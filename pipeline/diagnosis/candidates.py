@@ -13,7 +13,7 @@ from torch import Tensor
 from ..physics.effects.effect import ActiveEffect, Effect
 from ..physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, effect_parameters
 from ..physics.world import World
-from .segment_batch import Kind
+from .segments import Kind
 
 
 @dataclass(frozen=True)

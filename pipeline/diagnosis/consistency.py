@@ -17,7 +17,7 @@ from scipy.stats import chi2 as chi2_law
 from ..physics.world import World
 from .candidates import base_values
 from .score import MEASURED, Picture, picture
-from .segment_batch import Segments
+from .segments import Segments
 
 Array = NDArray[np.float64]
 

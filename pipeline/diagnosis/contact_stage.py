@@ -24,8 +24,8 @@ from .prepared import Prepared
 from .refit import Refit, refit
 from .robust import RobustFit, robust_fit, robust_gains, with_own_numbers
 from .score import Picture, ScoreTest, picture, score_test
-from .segment_batch import Segments, world_for
-from .segments import fit_states
+from .segment_states import fit_states
+from .segments import Segments, world_for
 from .slots import Evidence
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from ..physics.parameters import Parameter, effect_parameters
 from ..physics.world import World
 from .candidates import base_values, without_effect
 from .linear import linearised
-from .segment_batch import Segments, world_for
-from .segments import fit_states
+from .segment_states import fit_states
+from .segments import Segments, world_for
 
 KNOWN_SHARE = 0.5
 """The state is fitted to this share of a segment's frames; the error is that of the rest."""

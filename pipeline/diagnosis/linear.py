@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..estimation.trajectory import state_prior
 from ..physics.parameters import Parameter
-from .segment_batch import Segments
+from .segments import Segments
 
 ROBUST_EXCESS = 20.0
 """k of rho(e) = 2 k log(1 + e / 2k) for the excess e = chi2 - dof of a contact segment: what the contact law misses of

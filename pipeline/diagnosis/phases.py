@@ -21,7 +21,7 @@ from ..physics.rotation import quat_to_matrix
 from ..physics.world import Body, World
 
 if TYPE_CHECKING:
-    from .segment_batch import Segments
+    from .segments import Segments
 
 PhaseName = Literal["flight", "impact", "sliding", "rolling", "sticking", "rest"]
 PHASES: tuple[PhaseName, ...] = ("flight", "impact", "sliding", "rolling", "sticking", "rest")

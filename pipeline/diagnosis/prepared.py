@@ -16,8 +16,8 @@ from .carried import carried_frames
 from .cuts import Segment, cut_episodes, whole_episodes
 from .noise import flight_noise, slow_noise, without_outliers
 from .phases import is_round
-from .segment_batch import Segments
-from .segments import fit_states
+from .segment_states import fit_states
+from .segments import Segments
 
 if TYPE_CHECKING:
     from ...datasets.tracks import Track

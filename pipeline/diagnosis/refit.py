@@ -14,8 +14,8 @@ from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import World
 from .candidates import base_values
 from .linear import Linear, linearised, robust_excess, summed
-from .segment_batch import Segments, world_for
-from .segments import best_of
+from .segment_states import best_of
+from .segments import Segments, world_for
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from ..physics.parameters import Parameter
 from ..physics.world import World
 from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
 from .linear import Linear, projected
-from .segment_batch import Segments, world_for
+from .segments import Segments, world_for
 
 Array = NDArray[np.float64]
 

@@ -1,164 +1,215 @@
-"""The states of segments, fitted to their frames by a world."""
+"""Segments of episodes as a batch, each with a state of its own: their residuals under a world, and the Jacobian."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from ..estimation.trajectory import STATE_SIZE, state_prior
-from ..physics.parameters import Parameter
-from ..physics.world import State
-from .cuts import whole_episodes
-from .segment_batch import START_FRAMES, Segments, line_state, world_for
+from ..estimation.observations import Observations
+from ..estimation.trajectory import STATE_SIZE, TrajectoryResiduals, retract
+from ..physics.contact import ContactLaw
+from ..physics.dispatch import rollout as rolled_out
+from ..physics.dispatch import rollouts_at_once
+from ..physics.measured import measure, true_times
+from ..physics.parameters import Parameter, apply_parameters
+from ..physics.rollout import Rollout
+from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..physics.world import State, World
+from .cuts import Segment
 
-__all__ = ["Segments", "best_of", "costs_of", "fit_states", "whole_episodes", "world_for"]
+Kind = Literal["flight", "contact"]
 
-BAD_FIT = 1.3
-"""A contact segment that fits worse than this [chi2 / dof] is fitted again from other starts."""
-DRAWS, STARTS = 32, 3
-"""States that are drawn about the fitted one, and so many of them and of the straight lines, the best, that are fitted.
-
-Whether a corner strikes before or after the next one makes minima of their own; what is left there would be taken for
-the model's fault (pitfall P2)."""
-DRAW_SPREAD = 3.0
-"""Of the draws, in units of what the noise makes of a state between two frames."""
-FALL, MAX_DAMPING = 0.02, 1e3
-"""A descent ends when chi2 falls by less, or no step but a tiny one lowers it."""
-ITERATIONS = {"flight": 5, "contact": 5}
-SEARCH_ITERATIONS = 6
+FLIGHT_STEP_S = 0.0025
+"""Largest step in flight, where nothing is stiff; the error of a drag of 1 / s is 0.1 %."""
+START_FRAMES = (2, 4, 7)
+"""A contact segment's state is searched from straight lines through so many frames (pitfall P2)."""
+PARAMETER_STEP = 0.04
+"""Differences by parameters in contact, in widths of their priors: a fifth of what matters."""
+CONTACT_STEP_S = 0.002
+"""Largest step in contact, and at most half the contact time: the law does not depend on the step."""
 
 
-def fit_states(
-    segments: Segments,
-    parameters: Sequence[Parameter] = (),
-    values: Tensor | None = None,
-    iterations: int | None = None,
-    search: bool = True,
-) -> Segments:
-    """Fit the state of each segment by Levenberg-Marquardt, each with a damping of its own.
+@dataclass(frozen=True)
+class Segments:
+    """Segments of one kind as a batch.
 
-    Args:
-        segments: With states to start from.
-        parameters: Numbers of the world that are set, not fitted.
-        values: Their values in fitted coordinates, (P,) or (B, P).
-        iterations: Most steps.
-        search: Whether, through contact, to start from straight lines through several numbers of frames too, and to
-            fit those that still fit badly from other starts.
+    kind; world: in which they are rolled out; items (B); observations (B): their frames, padded, with the state that
+    is the best known; noise: standard deviations of the tracks (position [m], rotation [rad]).
     """
-    given = torch.zeros(0).to(segments.world.gravity) if values is None else values
-    count = ITERATIONS[segments.kind] if iterations is None else iterations
-    several = search and segments.kind == "contact"
-    best = segments
-    if several:
-        lines = [line_state(segments, frames) for frames in START_FRAMES]
-        best = best_of(segments, lines, parameters, given)
-    best, cost = _descended(best, parameters, given, count)
-    share = cost / segments.dof.clamp_min(1.0)
-    # where the law misses everything by far more than the noise, only the worst can be at the wrong minimum
-    bad = torch.nonzero(share > BAD_FIT * share.nanmedian().clamp_min(1.0))[:, 0].tolist()
-    if several and bad:
-        best = _searched(best, cost, bad, parameters, given)
-    return best
+
+    kind: Kind
+    world: World
+    items: tuple[Segment, ...]
+    observations: Observations
+    noise: tuple[float, float]
+
+    @staticmethod
+    def of(kind: Kind, world: World, whole: Observations, items: Sequence[Segment], noise: tuple[float, float]):
+        """Cut whole episodes; the states are first guesses, see :func:`fit_states`."""
+        cut = _windows(whole, items)
+        found = Segments(kind, world_for(kind, world), tuple(items), cut, noise)
+        return found.with_state(line_state(found, START_FRAMES[1]))
+
+    @property
+    def lengths(self) -> list[int]:
+        """Number of frames of each segment."""
+        return [item.last - item.first + 1 for item in self.items]
+
+    @property
+    def dof(self) -> Tensor:
+        """Degrees of freedom (B,) of each segment: its numbers measured, less those of its state that they show."""
+        seen = self.observations
+        moved, turned = seen.seen.sum(1), seen.turned.sum(1)
+        free = 3 * (moved - 2).clamp_min(0) + 3 * (turned - 2).clamp_min(0)
+        return free.sum(-1)
+
+    def select(self, items: Sequence[int]) -> Segments:
+        """Return some of the segments."""
+        picked = tuple(self.items[i] for i in items)
+        return replace(self, items=picked, observations=self.observations.select(items))
+
+    def with_state(self, state: State) -> Segments:
+        """Return the segments with other states."""
+        return replace(self, observations=replace(self.observations, state=state))
+
+    def in_states(self, states: Sequence[State]) -> Segments:
+        """Return the segments once in each of several states (B), as one batch."""
+        every = self.select(list(range(len(self.items))) * len(states))
+        return every.with_state(State.joined(*states))
+
+    def chunks(self, directions: int) -> list[list[int]]:
+        """Return the places of the segments in equal parts that fit one batch with so many directions."""
+        count = len(self.items)
+        number = max(1, -(-count * directions // rollouts_at_once(self.world)))
+        size = -(-count // number)
+        return [list(range(k, min(k + size, count))) for k in range(0, count, size)]
+
+    def residuals(
+        self, parameters: Sequence[Parameter], values: Tensor, jacobian: bool = True
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return residuals (B, T nf, 6) in sigmas and, if wanted, their Jacobian (B, T nf, 6, P + S).
+
+        It is one of differences: in contact they see past the roughness of a step, and in flight, which is smooth,
+        they cost a third of exact derivatives and agree with them to 1e-4.
+
+        Args:
+            parameters: Which numbers of the world are differentiated.
+            values: In fitted coordinates, shape (P,), or (B, P) for values of each segment.
+            jacobian: Whether it is wanted; columns of parameters first, then of the state change.
+        """
+        size = STATE_SIZE * len(self.observations.free)
+        steps = [_difference(p) for p in parameters]
+        parts = []
+        for places in self.chunks(2 * size + len(parameters) + 1 if jacobian else 1):
+            some = self.observations.select(places)
+            problem = TrajectoryResiduals(self.world, parameters, some, *self.noise, True, steps)
+            shared = values if values.ndim == 1 else values[places]
+            parts.append(problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian))
+        rows = torch.cat([r for r, _ in parts])
+        return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
+
+    def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
+        """Return differences (B, T nf, 6, P) of the residuals by parameters alone.
+
+        Args:
+            parameters: By which.
+            values: Where, in fitted coordinates, shape (P,).
+            rows: The residuals there.
+        """
+        steps = torch.tensor([_difference(p)[1] for p in parameters]).to(values)
+        every = self.in_states([self.observations.state] * len(parameters))
+        moved = (values + torch.diag(steps)).repeat_interleave(len(self.items), 0)
+        high = every.residuals(parameters, moved, jacobian=False)[0].unflatten(0, (len(parameters), -1))
+        slopes = (high - rows) / steps[:, None, None, None]
+        return torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
+
+    def rollout(self, record_contacts: bool = False) -> Rollout:
+        """Return the true motion of the segments from their states."""
+        world, seen = self.world, self.observations
+        with torch.no_grad():
+            return rolled_out(world, seen.state, true_times(world, seen.times_s), seen.drives, record_contacts)
+
+    def positions(self, parameters: Sequence[Parameter] = (), values: Tensor | None = None) -> Tensor:
+        """Return the positions (B, T, nf, 3) [m] of the free bodies as they would be measured.
+
+        Args:
+            parameters: Numbers of the world that are set.
+            values: Their values in fitted coordinates, (B, P).
+        """
+        world, seen = self.world, self.observations
+        if parameters and values is not None:
+            decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(parameters)], -1)
+            world = apply_parameters(world, parameters, decoded)
+        with torch.no_grad():
+            return measure(world, seen.state, seen.times_s, seen.drives).position_m[:, :, list(seen.free)]
+
+    def moved(self, change: Tensor) -> Segments:
+        """Return the segments with their states moved by changes (B, S)."""
+        return self.with_state(retract(self.observations.state, change, self.observations.free))
 
 
-def costs_of(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
-    """Return the sum of squares (B,) of the residuals, in sigmas; infinite where a rollout diverged."""
-    return _costs(segments.residuals(parameters, values, jacobian=False)[0])
+def _difference(parameter: Parameter) -> tuple[float, float]:
+    """Return how far down and up a parameter is moved for its derivative; up alone, as many may not be below 0."""
+    return 0.0, PARAMETER_STEP * parameter.prior[1]
 
 
-def best_of(segments: Segments, others: Sequence[State], parameters: Sequence[Parameter], values: Tensor) -> Segments:
-    """Return the segments, each in its own state or the one of others that fits better; all are rolled out at once."""
-    every = segments.in_states([segments.observations.state, *others])
-    chosen = values if values.ndim == 1 else values.repeat(1 + len(others), 1)
-    place = costs_of(every, parameters, chosen).unflatten(0, (1 + len(others), -1)).argmin(0)
-    return segments.with_state(every.observations.state.at(place * len(place) + torch.arange(len(place))))
+def world_for(kind: Kind, world: World) -> World:
+    """Return the world in which segments of a kind are rolled out: flight needs no contact and takes longer steps."""
+    if kind == "contact":
+        half = 0.5 * float(world.contact.contact_time_s.min()) if isinstance(world.contact, ContactLaw) else 0.0
+        return replace(world, step_s=max(world.step_s, min(CONTACT_STEP_S, half)))
+    return replace(world, touching=False, step_s=max(world.step_s, FLIGHT_STEP_S))
 
 
-def _searched(
-    segments: Segments, cost: Tensor, bad: Sequence[int], parameters: Sequence[Parameter], values: Tensor
-) -> Segments:
-    """Return the segments with the states of the bad ones fitted from the best of many starts, where that is better."""
-    own, count = segments.select(bad), len(bad)
-    given = values if values.ndim == 1 else values[list(bad)]
-    starts = [line_state(own, frames) for frames in START_FRAMES]
-    starts += [own.moved(change).observations.state for change in _draws(own)]
-    every = own.in_states(starts)
-    costs = costs_of(every, parameters, given if given.ndim == 1 else given.repeat(len(starts), 1))
-    order = costs.unflatten(0, (len(starts), count)).argsort(0)[:STARTS]
-    tried = every.select((order * count + torch.arange(count)).flatten().tolist())
-    chosen = given if given.ndim == 1 else given.repeat(STARTS, 1)
-    tried, found = _descended(tried, parameters, chosen, SEARCH_ITERATIONS)
-    least, place = found.unflatten(0, (STARTS, count)).min(0)
-    fitted = own.with_state(tried.observations.state.at(place * count + torch.arange(count)))
-    return _placed(segments, bad, _merged(least < cost[list(bad)], fitted, own))
+def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
+    """Return the frames of segments as a batch, padded to the longest; states are still those of whole episodes."""
+    rows = torch.tensor([item.episode for item in items])
+    lengths = torch.tensor([item.last - item.first + 1 for item in items])
+    first = torch.tensor([item.first for item in items])
+    offset = torch.arange(int(lengths.max()))
+    place = first[:, None] + torch.minimum(offset, lengths[:, None] - 1)
+    inside = (offset < lengths[:, None]).to(whole.times_s)
+    times = whole.times_s[rows[:, None], place]
+    step = (times[:, -1] - times[:, 0]) / (lengths - 1)
+    times = times + step[:, None] * (offset - lengths[:, None] + 1).clamp_min(0)
+    picked = {key: getattr(whole, key)[rows[:, None], place] for key in ("position_m", "quat_wxyz", "seen", "turned")}
+    picked |= {key: picked[key] * inside[..., None] for key in ("seen", "turned")}
+    drives = {name: drive.select(rows) for name, drive in whole.drives.items()}
+    state = whole.state.at(rows)
+    names = tuple(whole.names[item.episode] for item in items)
+    return replace(whole, names=names, times_s=times, drives=drives, state=state, **picked)
 
 
-def _draws(segments: Segments) -> Tensor:
-    """Return changes of states (D, B, S) drawn about nothing, of the size that the noise of two frames makes."""
-    position, rotation = segments.noise
-    step = float(segments.observations.times_s.diff(dim=1).median())
-    spread = [std for std in (position, rotation, position / step, rotation / step) for _ in range(3)]
-    bodies = len(segments.observations.free)
-    width = DRAW_SPREAD * torch.tensor(spread).to(segments.world.gravity).repeat(bodies)
-    generator = torch.Generator().manual_seed(0)
-    # the draws of a segment do not depend on which others are drawn for
-    drawn = torch.randn(DRAWS, 1, STATE_SIZE * bodies, generator=generator, dtype=torch.float64).to(width)
-    return (width * drawn).expand(-1, len(segments.items), -1)
+def line_state(segments: Segments, frames: int) -> State:
+    """Return states at the first frames from straight lines through so many frames; in flight with gravity."""
+    seen, world = segments.observations, segments.world
+    state = seen.state
+    fields = [value.clone() for value in vars(state).values()]
+    t = (seen.times_s - seen.times_s[:, :1])[:, :frames]
+    fall = 0.5 * t.square()[..., None] * world.gravity[:, None] if segments.kind == "flight" else torch.zeros(1)
+    for column, body in enumerate(seen.free):
+        moved, turned = seen.seen[:, :frames, column], seen.turned[:, :frames, column]
+        fields[0][:, body], fields[2][:, body] = _line(t, seen.position_m[:, :frames, column] - fall, moved)
+        at = turned.argmax(1)  # the first measured orientation
+        item = torch.arange(len(at))
+        base = seen.quat_wxyz[item, at, column]
+        turn = quat_log(quat_multiply(quat_conjugate(base[:, None]), seen.quat_wxyz[:, :frames, column]))
+        angle, omega = _line(t, turn, turned)
+        known = (turned.sum(1) >= 2)[:, None]
+        fields[1][:, body] = torch.where(known, quat_multiply(base, quat_exp(angle)), base)
+        fields[3][:, body] = torch.where(known, omega, torch.zeros_like(omega))
+    return State(*fields)
 
 
-def _descended(
-    segments: Segments, parameters: Sequence[Parameter], values: Tensor, iterations: int
-) -> tuple[Segments, Tensor]:
-    """Return the segments with their states at a minimum near by, and the costs (B,) there."""
-    prior = torch.diag(state_prior(len(segments.observations.free))).to(segments.world.gravity)
-    rows, jacobian = segments.residuals(parameters, values)
-    cost = _costs(rows)
-    damping = torch.full_like(cost, 1e-4)
-    active = list(range(len(segments.items)))
-    for _ in range(iterations):
-        assert jacobian is not None
-        flat = torch.nan_to_num(jacobian[..., len(parameters) :].flatten(1, 2), posinf=0.0, neginf=0.0)
-        error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
-        normal = flat.transpose(1, 2) @ flat + prior
-        slope = (flat.transpose(1, 2) @ error[..., None]).squeeze(-1)
-        own = damping[active][:, None] * normal.diagonal(dim1=1, dim2=2)
-        step = -torch.linalg.solve(normal + torch.diag_embed(own), slope)
-        some = segments.select(active)
-        trial = some.moved(step)
-        new_rows, slopes = trial.residuals(parameters, values if values.ndim == 1 else values[active])
-        assert slopes is not None
-        fall = cost[active] - _costs(new_rows)
-        better = fall > 0
-        segments = _placed(segments, active, _merged(better, trial, some))
-        cost = _put(cost, active, torch.where(better, _costs(new_rows), cost[active]))
-        damping = _put(damping, active, torch.where(better, damping[active] / 8, damping[active] * 10))
-        goes_on = torch.where(better, fall > FALL, damping[active] < MAX_DAMPING)
-        rows = torch.where(better[:, None, None], new_rows, rows)[goes_on]
-        jacobian = torch.where(better[:, None, None, None], slopes, jacobian)[goes_on]
-        active = [item for item, more in zip(active, goes_on.tolist(), strict=True) if more]
-        if not active:
-            break
-    return segments, cost
-
-
-def _costs(rows: Tensor) -> Tensor:
-    return torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
-
-
-def _merged(choice: Tensor, first: Segments, second: Segments) -> Segments:
-    """Return the segments with the states of the first where chosen (B,), of the second elsewhere."""
-    rows = torch.arange(len(choice)) + torch.where(choice, 0, len(choice))
-    return second.with_state(State.joined(first.observations.state, second.observations.state).at(rows))
-
-
-def _placed(segments: Segments, places: Sequence[int], some: Segments) -> Segments:
-    """Return the segments with the states of some of them replaced."""
-    rows = torch.arange(len(segments.items))
-    rows[list(places)] = len(rows) + torch.arange(len(places))
-    return segments.with_state(State.joined(segments.observations.state, some.observations.state).at(rows))
-
-
-def _put(values: Tensor, places: Sequence[int], some: Tensor) -> Tensor:
-    return values.index_copy(0, torch.tensor(places), some)
+def _line(t: Tensor, values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return value at 0 and slope, each (B, 3), of weighted straight lines through values (B, n, 3) at t (B, n)."""
+    total = weight.sum(1).clamp_min(1.0)[:, None]
+    mean = (weight[..., None] * values).sum(1) / total
+    middle = (weight * t).sum(1)[:, None] / total
+    away = weight * (t - middle)
+    slope = (away[..., None] * values).sum(1) / away.square().sum(1).clamp_min(1e-12)[:, None]
+    return mean - middle * slope, slope

@@ -19,7 +19,7 @@ from ..physics.world import World
 from .candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of
 from .refit import Refit, refit
 from .score import Picture, ScoreTest, canonical_correlation, gain_by_episode, picture, score_test
-from .segment_batch import Segments
+from .segments import Segments
 
 ALPHA = 0.002
 """Level of all flight tests of a diagnosis together (Bonferroni over the candidates and their grids)."""

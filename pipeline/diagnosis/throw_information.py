@@ -21,7 +21,7 @@ from .cuts import Segment, cut_episodes, whole_episodes
 from .phases import is_round
 from .prepared import Prepared
 from .score import picture
-from .segment_batch import Kind, Segments
+from .segments import Kind, Segments
 from .throws import Throw, states_of
 
 Array = NDArray[np.float64]

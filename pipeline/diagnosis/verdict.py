@@ -17,8 +17,8 @@ from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, se
 from .forecast import held_out_errors
 from .prepared import Prepared
 from .refit import refit
-from .segment_batch import Segments, world_for
-from .segments import fit_states
+from .segment_states import fit_states
+from .segments import Segments, world_for
 from .slots import ALIAS_CHI2, Evidence, Slot, fill
 from .wrench import Omnibus, dispersion, omnibus, residual_wrenches
 

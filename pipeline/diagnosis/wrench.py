@@ -18,8 +18,8 @@ from ..physics.rotation import quat_rotate
 from ..physics.world import World
 from .cuts import Segment
 from .linear import linearised
-from .segment_batch import Segments
-from .segments import fit_states
+from .segment_states import fit_states
+from .segments import Segments
 
 Array = NDArray[np.float64]
 

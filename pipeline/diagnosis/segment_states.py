@@ -1,0 +1,164 @@
+"""The states of segments, fitted to their frames by a world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..estimation.trajectory import STATE_SIZE, state_prior
+from ..physics.parameters import Parameter
+from ..physics.world import State
+from .cuts import whole_episodes
+from .segments import START_FRAMES, Segments, line_state, world_for
+
+__all__ = ["Segments", "best_of", "costs_of", "fit_states", "whole_episodes", "world_for"]
+
+BAD_FIT = 1.3
+"""A contact segment that fits worse than this [chi2 / dof] is fitted again from other starts."""
+DRAWS, STARTS = 32, 3
+"""States that are drawn about the fitted one, and so many of them and of the straight lines, the best, that are fitted.
+
+Whether a corner strikes before or after the next one makes minima of their own; what is left there would be taken for
+the model's fault (pitfall P2)."""
+DRAW_SPREAD = 3.0
+"""Of the draws, in units of what the noise makes of a state between two frames."""
+FALL, MAX_DAMPING = 0.02, 1e3
+"""A descent ends when chi2 falls by less, or no step but a tiny one lowers it."""
+ITERATIONS = {"flight": 5, "contact": 5}
+SEARCH_ITERATIONS = 6
+
+
+def fit_states(
+    segments: Segments,
+    parameters: Sequence[Parameter] = (),
+    values: Tensor | None = None,
+    iterations: int | None = None,
+    search: bool = True,
+) -> Segments:
+    """Fit the state of each segment by Levenberg-Marquardt, each with a damping of its own.
+
+    Args:
+        segments: With states to start from.
+        parameters: Numbers of the world that are set, not fitted.
+        values: Their values in fitted coordinates, (P,) or (B, P).
+        iterations: Most steps.
+        search: Whether, through contact, to start from straight lines through several numbers of frames too, and to
+            fit those that still fit badly from other starts.
+    """
+    given = torch.zeros(0).to(segments.world.gravity) if values is None else values
+    count = ITERATIONS[segments.kind] if iterations is None else iterations
+    several = search and segments.kind == "contact"
+    best = segments
+    if several:
+        lines = [line_state(segments, frames) for frames in START_FRAMES]
+        best = best_of(segments, lines, parameters, given)
+    best, cost = _descended(best, parameters, given, count)
+    share = cost / segments.dof.clamp_min(1.0)
+    # where the law misses everything by far more than the noise, only the worst can be at the wrong minimum
+    bad = torch.nonzero(share > BAD_FIT * share.nanmedian().clamp_min(1.0))[:, 0].tolist()
+    if several and bad:
+        best = _searched(best, cost, bad, parameters, given)
+    return best
+
+
+def costs_of(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
+    """Return the sum of squares (B,) of the residuals, in sigmas; infinite where a rollout diverged."""
+    return _costs(segments.residuals(parameters, values, jacobian=False)[0])
+
+
+def best_of(segments: Segments, others: Sequence[State], parameters: Sequence[Parameter], values: Tensor) -> Segments:
+    """Return the segments, each in its own state or the one of others that fits better; all are rolled out at once."""
+    every = segments.in_states([segments.observations.state, *others])
+    chosen = values if values.ndim == 1 else values.repeat(1 + len(others), 1)
+    place = costs_of(every, parameters, chosen).unflatten(0, (1 + len(others), -1)).argmin(0)
+    return segments.with_state(every.observations.state.at(place * len(place) + torch.arange(len(place))))
+
+
+def _searched(
+    segments: Segments, cost: Tensor, bad: Sequence[int], parameters: Sequence[Parameter], values: Tensor
+) -> Segments:
+    """Return the segments with the states of the bad ones fitted from the best of many starts, where that is better."""
+    own, count = segments.select(bad), len(bad)
+    given = values if values.ndim == 1 else values[list(bad)]
+    starts = [line_state(own, frames) for frames in START_FRAMES]
+    starts += [own.moved(change).observations.state for change in _draws(own)]
+    every = own.in_states(starts)
+    costs = costs_of(every, parameters, given if given.ndim == 1 else given.repeat(len(starts), 1))
+    order = costs.unflatten(0, (len(starts), count)).argsort(0)[:STARTS]
+    tried = every.select((order * count + torch.arange(count)).flatten().tolist())
+    chosen = given if given.ndim == 1 else given.repeat(STARTS, 1)
+    tried, found = _descended(tried, parameters, chosen, SEARCH_ITERATIONS)
+    least, place = found.unflatten(0, (STARTS, count)).min(0)
+    fitted = own.with_state(tried.observations.state.at(place * count + torch.arange(count)))
+    return _placed(segments, bad, _merged(least < cost[list(bad)], fitted, own))
+
+
+def _draws(segments: Segments) -> Tensor:
+    """Return changes of states (D, B, S) drawn about nothing, of the size that the noise of two frames makes."""
+    position, rotation = segments.noise
+    step = float(segments.observations.times_s.diff(dim=1).median())
+    spread = [std for std in (position, rotation, position / step, rotation / step) for _ in range(3)]
+    bodies = len(segments.observations.free)
+    width = DRAW_SPREAD * torch.tensor(spread).to(segments.world.gravity).repeat(bodies)
+    generator = torch.Generator().manual_seed(0)
+    # the draws of a segment do not depend on which others are drawn for
+    drawn = torch.randn(DRAWS, 1, STATE_SIZE * bodies, generator=generator, dtype=torch.float64).to(width)
+    return (width * drawn).expand(-1, len(segments.items), -1)
+
+
+def _descended(
+    segments: Segments, parameters: Sequence[Parameter], values: Tensor, iterations: int
+) -> tuple[Segments, Tensor]:
+    """Return the segments with their states at a minimum near by, and the costs (B,) there."""
+    prior = torch.diag(state_prior(len(segments.observations.free))).to(segments.world.gravity)
+    rows, jacobian = segments.residuals(parameters, values)
+    cost = _costs(rows)
+    damping = torch.full_like(cost, 1e-4)
+    active = list(range(len(segments.items)))
+    for _ in range(iterations):
+        assert jacobian is not None
+        flat = torch.nan_to_num(jacobian[..., len(parameters) :].flatten(1, 2), posinf=0.0, neginf=0.0)
+        error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
+        normal = flat.transpose(1, 2) @ flat + prior
+        slope = (flat.transpose(1, 2) @ error[..., None]).squeeze(-1)
+        own = damping[active][:, None] * normal.diagonal(dim1=1, dim2=2)
+        step = -torch.linalg.solve(normal + torch.diag_embed(own), slope)
+        some = segments.select(active)
+        trial = some.moved(step)
+        new_rows, slopes = trial.residuals(parameters, values if values.ndim == 1 else values[active])
+        assert slopes is not None
+        fall = cost[active] - _costs(new_rows)
+        better = fall > 0
+        segments = _placed(segments, active, _merged(better, trial, some))
+        cost = _put(cost, active, torch.where(better, _costs(new_rows), cost[active]))
+        damping = _put(damping, active, torch.where(better, damping[active] / 8, damping[active] * 10))
+        goes_on = torch.where(better, fall > FALL, damping[active] < MAX_DAMPING)
+        rows = torch.where(better[:, None, None], new_rows, rows)[goes_on]
+        jacobian = torch.where(better[:, None, None, None], slopes, jacobian)[goes_on]
+        active = [item for item, more in zip(active, goes_on.tolist(), strict=True) if more]
+        if not active:
+            break
+    return segments, cost
+
+
+def _costs(rows: Tensor) -> Tensor:
+    return torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
+
+
+def _merged(choice: Tensor, first: Segments, second: Segments) -> Segments:
+    """Return the segments with the states of the first where chosen (B,), of the second elsewhere."""
+    rows = torch.arange(len(choice)) + torch.where(choice, 0, len(choice))
+    return second.with_state(State.joined(first.observations.state, second.observations.state).at(rows))
+
+
+def _placed(segments: Segments, places: Sequence[int], some: Segments) -> Segments:
+    """Return the segments with the states of some of them replaced."""
+    rows = torch.arange(len(segments.items))
+    rows[list(places)] = len(rows) + torch.arange(len(places))
+    return segments.with_state(State.joined(segments.observations.state, some.observations.state).at(rows))
+
+
+def _put(values: Tensor, places: Sequence[int], some: Tensor) -> Tensor:
+    return values.index_copy(0, torch.tensor(places), some)
