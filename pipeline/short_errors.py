@@ -98,7 +98,7 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
     if prepared.flight is not None:
         flight = fit_states(Segments.of("flight", world, whole, prepared.flight.items, noise))
     if prepared.contact_items:
-        contact = fit_states(Segments.of("contact", world, whole, prepared.contact_items, noise))
+        contact = fit_states(Segments.of("contact", world, whole, prepared.contact_items, noise), thorough=True)
     names = [name for name, _ in episodes]
     phases = phases_of(names, whole, prepared.clear, contact)
     own = tuple(world.bodies[k].name for k in whole.free)
