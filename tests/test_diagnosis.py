@@ -10,6 +10,7 @@ import pytest
 import torch
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.diagnosis.candidates import Candidate, variants_of
+from cgwm.pipeline.diagnosis.consistency import consistency
 from cgwm.pipeline.diagnosis.contact_stage import fitted_contact, separated
 from cgwm.pipeline.diagnosis.cuts import cut_episodes, whole_episodes
 from cgwm.pipeline.diagnosis.noise import flight_noise, without_outliers
@@ -257,3 +258,53 @@ def test_data_that_carry_no_verdict_are_refused(tmp_path: Path) -> None:
     model = write_capture(tmp_path / "sunk", world, sunk)
     with pytest.raises(InputDataError, match="under the ground"):
         diagnose(model, tmp_path / "sunk")
+
+
+def test_a_drag_in_wind_is_found_as_the_two(tmp_path: Path) -> None:
+    hidden = world_with("ball", {"quadratic_drag": {"k": 0.3}, "wind": {"w_x": 3.0, "w_y": -1.0}})
+    episodes = tosses(hidden, 4, count=8, duration_s=0.6, height_m=(1.0, 2.0))
+    model = write_capture(tmp_path / "windy", hidden, episodes)
+    found = diagnose(model, tmp_path / "windy")
+    assert set(found.selected) == {"quadratic_drag", "wind"} and found.verdict == "missing_effect"
+    numbers = {p.name: p for one in found.ranking if one.effect in found.selected for p in one.parameters}
+    assert numbers["w_x"].estimate == pytest.approx(3.0, abs=4 * numbers["w_x"].std_error)
+    assert all(one.delta_bic is not None for one in found.ranking if one.effect in found.selected)
+
+
+def test_a_tilt_that_is_another_in_every_episode_is_no_tilt() -> None:
+    world = world_with("ball", ground=False)
+    one, other = (
+        tosses(world_with("ball", {"gravity_tilt": {"tilt_x": x, "tilt_y": y}}, False), seed, count=3)
+        for seed, x, y in ((1, 0.05, 0.0), (2, -0.03, 0.04))
+    )
+    alike = tosses(world_with("ball", {"gravity_tilt": {"tilt_x": 0.05, "tilt_y": 0.0}}, False), 2, count=3)
+    found = []
+    for second in (alike, other):
+        prepared = prepare(world, [*one, *((f"b{name}", tracks) for name, tracks in second)])
+        assert prepared.flight is not None
+        library = [Candidate("gravity_tilt", load_effect("gravity_tilt"))]
+        refitted = fill(prepared.flight, world, library, prepared.groups, True).best.refitted
+        assert refitted is not None
+        found.append(consistency(refitted.segments[0], refitted.world, ["gravity_tilt"], prepared.groups, 1.0))
+    same, changing = found
+    assert same is not None and not same.doubtful and same.share > 0.97
+    assert changing is not None and changing.doubtful
+
+
+def test_a_body_that_slides_above_the_ground_does_not_fly() -> None:
+    world = world_with("cube")
+    sliding = tosses(world_with("cube", {"frame_tilt": {"tilt_x": 0.0, "tilt_y": 0.0}}), 3, count=4, duration_s=1.0)
+    raised = [
+        (
+            name,
+            {
+                body: replace(track, position_m=track.position_m + np.array([0.0, 0.0, 0.02]))
+                for body, track in tracks.items()
+            },
+        )
+        for name, tracks in sliding
+    ]
+    prepared = prepare(world, raised)
+    assert any("nothing falls" in words for words in prepared.warnings)
+    flying = prepared.clear.float().mean(1)
+    assert float(flying.max()) < 0.75  # they rest on the ground at their ends

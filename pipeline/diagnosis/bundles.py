@@ -57,6 +57,7 @@ def drag_in_wind(
     velocity = flight.observations.state.velocity_m_s[:, flight.observations.free[0], :2]
     speed = float((velocity - torch.tensor(air).to(velocity)).norm(dim=1).mean())
     starts = {"linear_drag": {"linear_drag.c": drag}, "quadratic_drag": {"quadratic_drag.k": drag / max(speed, 0.1)}}
+    nothing = refit([flight], world, base_parameters(world, "flight"))
     found = []
     for name in DRAGS:
         if name not in by_name:
@@ -66,8 +67,8 @@ def drag_in_wind(
         both = _fitted(flight, world, [by_name[name], by_name[WIND]], start)
         numbers = len(by_name[name].effect.parameters) + len(by_name[WIND].effect.parameters)
         total = both.cost / dispersion + numbers * float(np.log(count))
-        gains = (float("inf"), (alone.cost - both.cost) / dispersion)
-        evidence = [_evidence(by_name[n], both, gain) for n, gain in zip((name, WIND), gains, strict=True)]
+        gains = tuple((without.cost - both.cost) / dispersion for without in (nothing, alone))
+        evidence = [_evidence(by_name[n], both, gain, count) for n, gain in zip((name, WIND), gains, strict=True)]
         found.append(Bundle(evidence[0], evidence[1], both, total))
     return min(found, key=lambda one: one.total, default=None)
 
@@ -89,13 +90,14 @@ def _own(world: World, name: str) -> float:
     return float(active.values[number][0])
 
 
-def _evidence(candidate: Candidate, fitted: Refit, gain: float) -> Evidence:
-    """Return the evidence of an effect of the bundle; gain: by how much chi2 falls with it."""
+def _evidence(candidate: Candidate, fitted: Refit, gain: float, count: float) -> Evidence:
+    """Return the evidence of an effect of the bundle; gain: by how much chi2 falls; count: see `drag_in_wind`."""
     effect = candidate.effect
     numbers = {p.name: fitted.number(f"{effect.name}.{p.name}") for p in effect.parameters}
     size = len(numbers)
+    penalty = size * float(np.log(count))
     estimate = np.array([value for value, _ in numbers.values()])
     covariance = np.diag([std**2 for _, std in numbers.values()])
-    p_value = 0.0 if np.isinf(gain) else float(chi2_law.sf(max(gain, 0.0), size))
+    p_value = float(chi2_law.sf(max(gain, 0.0), size))
     test = ScoreTest(gain, size, p_value, estimate, covariance, True)
-    return Evidence(candidate, {}, test, p_value, refitted=fitted, delta_bic=-gain, numbers=numbers)
+    return Evidence(candidate, {}, test, p_value, refitted=fitted, delta_bic=penalty - gain, numbers=numbers)
