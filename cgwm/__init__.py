@@ -28,6 +28,7 @@ _PUBLIC = {
     "UsageError": ".schemas",
     "calibrate": ".pipeline.calibrate",
     "compare": ".pipeline.compare",
+    "diagnose": ".pipeline.diagnose",
     "doctor": ".pipeline.doctor",
     "evaluate": ".pipeline.eval",
     "fit": ".pipeline.fit",
@@ -60,6 +61,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.calibrate import calibrate  # pyright: ignore[reportMissingImports]
     from .pipeline.compare import compare  # pyright: ignore[reportMissingImports]
     from .pipeline.demo import run_demo  # pyright: ignore[reportMissingImports]
+    from .pipeline.diagnose import diagnose  # pyright: ignore[reportMissingImports]
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
     from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
@@ -95,6 +97,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "compare",
+    "diagnose",
     "doctor",
     "evaluate",
     "fit",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import Debug, Json, Overwrite, Quiet
+from .options import Debug, DeviceName, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
@@ -57,6 +57,9 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
+    device: Annotated[
+        DeviceName, typer.Option("--device", help="Where rollouts run; auto takes a CUDA device where there is one.")
+    ] = "auto",
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -67,7 +70,7 @@ def diagnose(
         from ..pipeline.diagnose import diagnose as work
 
         wanted = [name.strip() for name in candidates.split(",") if name.strip()]
-        emit(work(model, capture, split, wanted, throws, save_law, overwrite), _summary)
+        emit(work(model, capture, split, wanted, throws, save_law, overwrite, device), _summary)
 
 
 def _summary(result: DiagnoseResult) -> str:

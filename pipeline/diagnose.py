@@ -38,6 +38,7 @@ from .diagnosis.wrench import Omnibus, organisers, wrench_windows
 from .estimation.warmup import clearance
 from .physics.effects.registry import effect_names, load_effect
 from .physics.world import World
+from .sg_gs import resolve_device
 
 LONGEST_STEP_S = 0.2
 """Slower tracks show no flight; those in milliseconds look so."""
@@ -53,6 +54,7 @@ def diagnose(
     throws: Path | None = None,
     save_law_to: Path | None = None,
     overwrite: bool = False,
+    device: str = "auto",
 ) -> DiagnoseResult:
     """Find what a fitted model lacks of measured motions; no episode outside the split is opened.
 
@@ -64,6 +66,7 @@ def diagnose(
         throws: A TOML file of throws among which to look for the next one; None for those that a hand can make.
         save_law_to: Where to write the residual law as an effect of one's own; None for nowhere.
         overwrite: Replace that file.
+        device: Where rollouts run: auto, cpu or cuda; what the kernel there cannot take runs on the CPU.
 
     Raises:
         InputDataError: If the data cannot carry a verdict: what is lacking, and what to do; or if there is no residual
@@ -75,7 +78,7 @@ def diagnose(
     compared = throws_of(DEFAULT) if throws is None else read_throws(throws)
     loaded = read_model(model)
     opened = Capture.open(capture, splits=(split,))
-    world = _world(loaded, opened)
+    world = replace(_world(loaded, opened), rolls_on=resolve_device(device).type)
     library = library_of(candidates)
     found = diagnosed_episodes(loaded, opened, split)
     _refuse_strange(world, found.episodes, opened)
