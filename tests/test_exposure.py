@@ -11,7 +11,7 @@ from cgwm.pipeline.exposure import estimate_exposures, fit_exposure
 from cgwm.pipeline.image_errors import expose
 from cgwm.schemas import Exposure
 from small_model import small_model
-from test_eval import EXPOSURE, add_video, truth, write_capture
+from thrown_cube import EXPOSURE, add_video, truth, write_capture
 
 
 @pytest.fixture(scope="module")
