@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import Debug, DeviceName, Json, Overwrite, Quiet
+from .options import AnyDevice, Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
@@ -25,9 +25,7 @@ def compare(
     warmup_s: Annotated[
         float, typer.Option("--warmup-s", help="Length of the start that the models may see [s].")
     ] = 0.1,
-    device: Annotated[
-        DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")
-    ] = "auto",
+    device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .options import Debug, DeviceName, Json, Overwrite, Quiet
+from .options import AnyDevice, Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ def demo(
         Literal["raycast"], typer.Option("--renderer", help="How the photos are made; raycast needs no OpenGL.")
     ] = "raycast",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Object, parameters and noise vary with it.")] = 0,
-    device: Annotated[
-        DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")
-    ] = "auto",
+    device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,

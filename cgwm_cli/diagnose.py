@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import Debug, DeviceName, Json, Overwrite, Quiet
+from .options import AnyDevice, Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
@@ -57,9 +57,7 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
-    device: Annotated[
-        DeviceName, typer.Option("--device", help="Where rollouts run; auto takes a CUDA device where there is one.")
-    ] = "auto",
+    device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import Debug, DeviceName, Json, Quiet
+from .options import AnyDevice, Debug, Json, Quiet
 from .run import running
 
 if TYPE_CHECKING:
@@ -23,9 +23,7 @@ def evaluate(
     warmup_s: Annotated[
         float, typer.Option("--warmup-s", help="Length of the start that the model may see [s].")
     ] = 0.1,
-    device: Annotated[
-        DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")
-    ] = "auto",
+    device: AnyDevice = "auto",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,

@@ -17,6 +17,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on s
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only (and the document of --json).")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Seed = Annotated[int | None, typer.Option("--seed", min=0, show_default="0", help="Seed of everything random.")]
+AnyDevice = Annotated[DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")]
+"""Of verbs without settings: nothing but the option says it."""
 Device = Annotated[
     DeviceName | None,
     typer.Option("--device", show_default="auto", help="auto takes a CUDA device where there is one."),

@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 from ..schemas import Body, InputDataError, did_you_mean
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
-from .recordings import SI, Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .recordings import (
+    SI,
+    Recording,
+    Units,
+    drawn_splits,
+    episode_names,
+    from_zero,
+    read_text,
+    track_files,
+    upright,
+    write_recordings,
+)
 from .tracks import Track
 
 Array = NDArray[np.float64]
@@ -86,21 +97,6 @@ def import_csv(
         return write_recordings(directory, out, upright(up), map(_body, bodies), recordings, splits)
 
 
-def track_files(source: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Return the file, or the files with one of the suffixes in a folder, sorted by name.
-
-    Raises:
-        InputDataError: If there is none.
-    """
-    if source.is_file():
-        return [source]
-    files = sorted(path for path in source.glob("*") if path.suffix.lower() in suffixes and path.is_file())
-    if not files:
-        what = f"no {' or '.join(suffixes)} files" if source.is_dir() else "no such file or directory"
-        raise InputDataError(f"{source}: {what}.", f"a {' or '.join(suffixes)} file, or a folder of them.")
-    return files
-
-
 @dataclass(frozen=True)
 class _Header:
     """Where the columns of a file are, and the units that their names tell."""
@@ -110,12 +106,7 @@ class _Header:
 
 
 def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> dict[str, Track]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+    text = read_text(path)
     first, _, _ = text.partition("\n")
     separator = max(",;\t", key=first.count)
     rows = list(csv.reader(text.splitlines(), delimiter=separator))

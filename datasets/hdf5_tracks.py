@@ -13,8 +13,17 @@ from numpy.typing import NDArray
 from ..schemas import Body, InputDataError, did_you_mean
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
-from .csv_tracks import track_files
-from .recordings import SI, Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .recordings import (
+    SI,
+    Recording,
+    Units,
+    drawn_splits,
+    episode_names,
+    from_zero,
+    track_files,
+    upright,
+    write_recordings,
+)
 from .tracks import Track
 
 Array = NDArray[np.float64]

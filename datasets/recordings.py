@@ -122,6 +122,35 @@ SI = Units()
 """Metres and seconds, unless that cannot be."""
 
 
+def track_files(source: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the file, or the files with one of the suffixes in a folder, sorted by name.
+
+    Raises:
+        InputDataError: If there is none.
+    """
+    if source.is_file():
+        return [source]
+    files = sorted(path for path in source.glob("*") if path.suffix.lower() in suffixes and path.is_file())
+    if not files:
+        what = f"no {' or '.join(suffixes)} files" if source.is_dir() else "no such file or directory"
+        raise InputDataError(f"{source}: {what}.", f"a {' or '.join(suffixes)} file, or a folder of them.")
+    return files
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file in UTF-8, with or without a byte order mark.
+
+    Raises:
+        InputDataError: If it cannot be read, or is no such text.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+
+
 def from_zero(tracks: Mapping[str, Track]) -> dict[str, Track]:
     """Return the tracks with the earliest time of all of them as time zero: clocks often count from 1970."""
     first = min(float(track.time_s[0]) for track in tracks.values())

@@ -10,8 +10,18 @@ import numpy as np
 from ..schemas import Body, InputDataError
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
-from .csv_tracks import track_files
-from .recordings import SI, Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .recordings import (
+    SI,
+    Recording,
+    Units,
+    drawn_splits,
+    episode_names,
+    from_zero,
+    read_text,
+    track_files,
+    upright,
+    write_recordings,
+)
 from .tracks import Track
 
 
@@ -57,14 +67,8 @@ def import_tum(
 
 
 def _track(path: Path, units: Units) -> Track:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
     rows = []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue

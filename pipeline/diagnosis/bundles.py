@@ -15,7 +15,7 @@ from scipy.stats import chi2 as chi2_law
 
 from ..physics.effects.effect import ActiveEffect
 from ..physics.world import World
-from .candidates import Candidate, base_parameters
+from .candidates import Candidate, base_parameters, base_values
 from .refit import Refit, refit
 from .score import ScoreTest
 from .segments import Segments
@@ -78,16 +78,10 @@ def _fitted(flight: Segments, world: World, added: Sequence[Candidate], start: d
     effects = tuple(ActiveEffect.of(candidate.effect, None, like) for candidate in added)
     full = replace(world, effects=(*world.effects, *effects))
     parameters = base_parameters(full, "flight")
-    values = torch.tensor(
-        [start.get(p.name, _own(full, p.name)) for p in parameters], dtype=torch.float64
-    )  # effects have no logarithmic numbers
-    return refit([flight], full, parameters, values.to(world.gravity), ITERATIONS)
-
-
-def _own(world: World, name: str) -> float:
-    effect, _, number = name.partition(".")
-    active = next(a for a in world.effects if a.effect.name == effect)
-    return float(active.values[number][0])
+    values = base_values(full, parameters)
+    for place, parameter in enumerate(parameters):
+        values[place] = start.get(parameter.name, values[place])  # effects have no logarithmic numbers
+    return refit([flight], full, parameters, values, ITERATIONS)
 
 
 def _evidence(candidate: Candidate, fitted: Refit, gain: float, count: float) -> Evidence:

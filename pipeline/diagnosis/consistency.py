@@ -16,7 +16,7 @@ from scipy.stats import chi2 as chi2_law
 
 from ..physics.world import World
 from .candidates import base_values
-from .score import MEASURED, Picture, picture
+from .score import Picture, picture, solved
 from .segments import Segments
 
 Array = NDArray[np.float64]
@@ -70,26 +70,16 @@ def _over(
 ) -> Consistency:
     chosen = list(columns)
     width = np.array([seen.parameters[k].prior[1] for k in chosen])
-    information = seen.information[:, chosen][:, :, chosen] * np.outer(width, width)
-    score = seen.score[:, chosen] * width
+    information, score = seen.information[:, chosen][:, :, chosen], seen.score[:, chosen]
     places = np.unique(unit, return_inverse=True)[1]
     by_unit, slopes = np.zeros((places.max() + 1, len(chosen), len(chosen))), np.zeros((places.max() + 1, len(chosen)))
     np.add.at(by_unit, places, information)
     np.add.at(slopes, places, score)
-    own = [_explained(m, g) for m, g in zip(by_unit, slopes, strict=True)]
-    common, rank = _explained(by_unit.sum(0), slopes.sum(0))
+    own = [solved(m, g, width)[2:] for m, g in zip(by_unit, slopes, strict=True)]
+    common, rank = solved(by_unit.sum(0), slopes.sum(0), width)[2:]
     statistic = max(sum(q for q, _ in own) - common, 0.0) / dispersion
     dof = sum(k for _, k in own) - rank
-    scaled = values / width
-    shared = float(scaled @ by_unit.sum(0) @ scaled) / dispersion
+    shared = float(values @ by_unit.sum(0) @ values) / dispersion
     excess = max(statistic - dof, 0.0)
     share = shared / (shared + excess) if shared + excess > 0 else 1.0
     return Consistency(statistic, dof, float(chi2_law.sf(statistic, dof)) if dof > 0 else 1.0, share)
-
-
-def _explained(information: Array, score: Array) -> tuple[float, int]:
-    """Return g' M^-1 g over the directions that are measured, and their number; scaled by the priors' widths."""
-    values, vectors = np.linalg.eigh(information)
-    kept = values > MEASURED
-    along = vectors[:, kept].T @ score
-    return float((along**2 / values[kept]).sum()), int(kept.sum())

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..estimation.least_squares import bound_stops
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import World
 from .candidates import base_values
@@ -131,7 +132,6 @@ def _normal(parts: Sequence[Segments], pictures: Sequence[Linear]) -> tuple[Tens
 
 def _step(matrix: Tensor, slope: Tensor, values: Tensor, bounds: Tensor, damping: float) -> Tensor:
     """Return a damped step; a parameter that a bound stops takes no part."""
-    blocked = ((values <= bounds[:, 0]) & (slope < 0)) | ((values >= bounds[:, 1]) & (slope > 0))
-    free = (~blocked).to(slope)
+    free = (~bound_stops(values, slope, bounds)).to(slope)
     damped = torch.diag(damping * matrix.diagonal() + (1 - free))
     return torch.linalg.solve(matrix * free[:, None] * free + damped, slope * free)

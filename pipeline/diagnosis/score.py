@@ -170,7 +170,7 @@ def score_test(
     count = len(width) - len(widths(seen, columns))
     size = len(width) - count
     reduced, slope = _eliminate(information, score, count)
-    estimate, covariance, statistic, rank = _solve(reduced, slope, width[count:])
+    estimate, covariance, statistic, rank = solved(reduced, slope, width[count:])
     statistic, covariance = statistic / dispersion, covariance * dispersion
     given = [seen.parameters[k] for k in columns]
     nonnegative = np.array([p.bounds[0] == 0.0 for p in given])
@@ -200,7 +200,7 @@ def gain_by_episode(seen: Picture, columns: Sequence[int], nuisance: Sequence[in
                 parts.append(0.0)
                 continue
             information, score = sums(others, chosen)
-            x = _solve(information, score, widths(seen, chosen))[0]
+            x = solved(information, score, widths(seen, chosen))[0]
             mine, slope = sums(replace(own, prior=np.zeros_like(own.prior)), chosen)
             parts.append(float(2 * slope @ x - x @ mine @ x))
         gains.append(parts[0] - parts[1])
@@ -272,7 +272,7 @@ def _eliminate(information: Array, score: Array, count: int) -> tuple[Array, Arr
     return information[count:, count:] - mixed @ information[:count, count:], score[count:] - mixed @ score[:count]
 
 
-def _solve(information: Array, score: Array, width: Array) -> tuple[Array, Array, float, int]:
+def solved(information: Array, score: Array, width: Array) -> tuple[Array, Array, float, int]:
     """Return estimate, covariance, statistic and rank, of the directions that were measured; widths (k,) of priors."""
     values, vectors = np.linalg.eigh(information * np.outer(width, width))
     kept = values > MEASURED

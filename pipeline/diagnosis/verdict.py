@@ -20,7 +20,7 @@ from .refit import refit
 from .segment_states import fit_states
 from .segments import Segments, world_for
 from .slots import ALIAS_CHI2, Evidence, Slot, fill
-from .wrench import Omnibus, dispersion, omnibus, residual_wrenches
+from .wrench import Omnibus, ResidualWrenches, dispersion, omnibus, residual_wrenches
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
 
@@ -85,11 +85,12 @@ class Findings:
 
 def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
     """Return what is missing of a world, from prepared episodes alone."""
-    scatter = _dispersion(prepared, world)
-    before = worst_omnibus(prepared, world, scatter)
+    pieces = _pieces(prepared, world)
+    scatter = max(prepared.slow, dispersion(*pieces[-1])) if pieces else 1.0
+    before = _worst_omnibus(pieces, scatter)
     slots, after_flight, flight = _flight_search(prepared, world, candidates, scatter)
     chosen, contact, final, chi2, fitted = _with_contact(prepared, world, after_flight, slots, candidates)
-    after = worst_omnibus(prepared, final, scatter) if chosen else before
+    after = _worst_omnibus(_pieces(prepared, final), scatter) if chosen else before
     in_flight = [slot.best.name for slot in slots if slot.flagged]
     alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
     doubtful = alike is not None and alike.doubtful
@@ -123,19 +124,16 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     )
 
 
-def worst_omnibus(prepared: Prepared, world: World, scatter: float) -> Omnibus | None:
+def _pieces(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
+    """Return the flights in pieces of each length of `OMNIBUS_S` with their residual wrenches; none without flight."""
+    cut = [pieces for longest_s in OMNIBUS_S if (pieces := prepared.pieces(world, longest_s)) is not None]
+    return [(pieces, residual_wrenches(pieces)) for pieces in cut]
+
+
+def _worst_omnibus(pieces: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
     """Return the omnibus statistic of flight over all lengths of pieces, the one with the smallest p-value."""
-    found = []
-    for longest_s in OMNIBUS_S:
-        pieces = prepared.pieces(world, longest_s)
-        if pieces is not None:
-            found.append(omnibus(residual_wrenches(pieces), scatter))
-    return min(found, key=lambda one: (one.p_value, -one.statistic)) if found else None
-
-
-def _dispersion(prepared: Prepared, world: World) -> float:
-    pieces = prepared.pieces(world, OMNIBUS_S[-1])
-    return 1.0 if pieces is None else max(prepared.slow, dispersion(pieces, residual_wrenches(pieces)))
+    found = [omnibus(wrenches, scatter) for _, wrenches in pieces]
+    return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
