@@ -37,6 +37,7 @@ from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
 from .estimation.shooting import Prior as ShotPrior
 from .estimation.shooting import Shooting
+from .estimation.tempering import tempered
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
@@ -74,8 +75,8 @@ SHOT_ITERATIONS = 12
 """Least number of steps in each descent of the shooting."""
 MODEL_EXCESS = 20.0
 """Where the ties do not hold down to what `shooting` allows, the contact model misses more than noise, and the errors
-of one episode are not independent: the covariance grows by this times the ties' misfit. Chosen on the built-in scenes
-fall 0 to 5 (MuJoCo's contact); data that the model explains have no misfit, and are not touched."""
+of one episode are not independent: what they tell shrinks by this times the ties' misfit (`tempered`). Chosen on the
+built-in scenes fall 0 to 5 (MuJoCo's contact); data that the model explains have no misfit, and are not touched."""
 MAX_EPISODES = 100
 """Of more episodes the search looks at so many, evenly spread: that is enough for four numbers, and it is what takes
 long."""
@@ -298,13 +299,13 @@ def _shot(
     )
     bar.close()
     shot = shots[0]
-    shared = shot.shared.numpy()
+    shared, covariance, growth = tempered(shot, prior, MODEL_EXCESS)
     cost = float(_open_loop(world, *batch, shot_names)(shared[None]).mean())
     keep = math.isfinite(shot.cost) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
     record |= {
         "shooting_costs": [one.cost for one in shots],
         "shooting_converged": shot.converged,
-        "shooting_misfit": {"ties": shot.misfit, "frames": shot.chi2},
+        "shooting_misfit": {"ties": shot.misfit, "frames": shot.chi2, "information_over": growth},
         "open_loop_m": {"search": search.lowest, "shooting": cost},
         "kept": "shooting" if keep else "search",
     }
@@ -314,7 +315,7 @@ def _shot(
         name: (float(time), shot.state.at([row]))
         for row, (name, time) in enumerate(zip(batch[0].names, batch[0].times_s[:, 0], strict=True))
     }
-    return shot_names, shared, (1 + MODEL_EXCESS * shot.misfit) * shot.covariance.numpy(), starts_found
+    return shot_names, shared, covariance, starts_found
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:
@@ -440,8 +441,8 @@ def physics_fit(
             f"that the errors of the contact model in one episode count as {ERRORS_PER_EPISODE:g} independent ones"
         )
         if record.get("kept") == "shooting":
-            grown = 1 + MODEL_EXCESS * record["shooting_misfit"]["ties"]
-            assumed = f"what the contact model misses in them makes variances {grown:.2g} times as large"
+            grown = record["shooting_misfit"]["information_over"]
+            assumed = f"what the contact model misses in them makes their information {grown:.2g} times smaller"
         warnings.append(f"with fewer than {ENOUGH_EPISODES} episodes the intervals rest on an assumption: {assumed}")
     return PhysicsFit(
         contact,

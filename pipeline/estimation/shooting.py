@@ -78,6 +78,11 @@ class Shot:
     chi2: float
     converged: bool
 
+    @property
+    def scale(self) -> float:
+        """By how much the variances in `covariance` have grown over those of the curvature."""
+        return max(1.0, self.misfit, self.chi2)
+
 
 @dataclass(frozen=True)
 class Shooting:
@@ -225,13 +230,12 @@ class Shooting:
 
     def _shot(self, linear: _Linear, shared: Tensor, states: State, costs: list[float], converged: bool) -> Shot:
         covariance = torch.linalg.pinv(linear.matrix, hermitian=True)
-        scale = max(1.0, linear.misfit, linear.chi2)
         count = len(shared)
         names = self.segments.names
         first = [row for row, name in enumerate(names) if row == 0 or names[row - 1] != name]
-        return Shot(
+        shot = Shot(
             shared,
-            scale * covariance[:count, :count],
+            covariance[:count, :count],
             states.at(first),
             linear.cost,
             costs,
@@ -239,6 +243,7 @@ class Shooting:
             linear.chi2,
             converged,
         )
+        return replace(shot, covariance=shot.scale * shot.covariance)
 
     def _solved(self, linear: _Linear, damping: Tensor, shared: Tensor) -> Tensor:
         """Return a damped step; a parameter that a bound stops takes no part."""
