@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from .base import FileModel
-from .results import EpisodeErrors, ErrorSummary
+from .results import OpenLoopErrors
 
 Phase = Literal["flight", "impact", "sliding", "rolling", "sticking", "rest"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
@@ -50,20 +50,11 @@ class Organiser(FileModel):
     """Of the excess of the residual wrench over its noise, the part that bins along the coordinate take away."""
 
 
-class ModelComparison(FileModel):
+class ModelComparison(OpenLoopErrors):
     """One model: open-loop errors as `cgwm eval` prints them, and short predictions in units of the noise."""
 
     model: str
     effects: tuple[str, ...] = ()
-    translation_error_m: ErrorSummary
-    rotation_error_deg: ErrorSummary | None = None
-    psnr_db: ErrorSummary | None = None
-    psnr_object_db: ErrorSummary | None = None
-    ssim: ErrorSummary | None = None
-    state_fitted_residual_m: ErrorSummary | None = None
-    state_noise_floor_m: ErrorSummary | None = None
-    baselines: dict[str, dict[str, Any]] = {}
-    """The open-loop figures for a frozen object and a ballistic one."""
     reduced_chi2: float | None = None
     """Of all short predictions."""
     by_phase: dict[Phase, PhaseFigures | None]
@@ -72,8 +63,6 @@ class ModelComparison(FileModel):
     """The worst first, one a segment."""
     wrench: tuple[Organiser, ...] = ()
     """What orders the residual wrench, the most telling coordinate first; empty where nothing is above the noise."""
-    per_episode: tuple[EpisodeErrors, ...] = ()
-    warnings: tuple[str, ...] = ()
 
 
 class PairedDifference(FileModel):

@@ -35,10 +35,9 @@ class EpisodeErrors(FileModel):
     state_noise_floor_m: float | None = None
 
 
-class EvalResult(FileModel):
-    """`cgwm eval --json`."""
+class OpenLoopErrors(FileModel):
+    """The open-loop errors of a model over episodes; null what was not measured."""
 
-    episodes: int
     translation_error_m: ErrorSummary
     rotation_error_deg: ErrorSummary | None = None
     psnr_db: ErrorSummary | None = None
@@ -50,3 +49,9 @@ class EvalResult(FileModel):
     """The same figures for a frozen object and a ballistic one."""
     per_episode: tuple[EpisodeErrors, ...] = ()
     warnings: tuple[str, ...] = ()
+
+
+class EvalResult(OpenLoopErrors):
+    """`cgwm eval --json`."""
+
+    episodes: int
