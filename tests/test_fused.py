@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import fused_host
@@ -19,7 +20,8 @@ from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
-from cgwm.pipeline.physics.fused import simulate_fused, unsupported
+from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
+from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
@@ -85,6 +87,10 @@ def agree(expected: Rollout, found: Rollout, tolerance: float) -> None:
             close(f"contact {name}", getattr(expected.contacts, name), getattr(found.contacts, name))
         for name in ("body_a", "body_b", "sliding"):
             assert torch.equal(getattr(found.contacts, name).cpu(), getattr(expected.contacts, name)), name
+
+
+def same_bits(expected: Rollout, found: Rollout) -> None:
+    assert all(torch.equal(getattr(expected, name), getattr(found, name)) for name in POSES)
 
 
 def tossed(count: int = 3, height: float = 0.08) -> State:
@@ -450,7 +456,11 @@ def crowded(count: int) -> World:
     return world_of(replace(one, on_plane=chosen), replace(two, on_plane=chosen))
 
 
-def test_the_torch_engine_is_taken_on_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_torch_engine_is_taken_on_a_cpu_without_a_compiler(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host, "compiler", lambda: None)
+    monkeypatch.setattr(dispatch, "compiler", lambda: None)
     world, state = world_of(box_body()), tossed(1)
     with caplog.at_level("INFO", "cgwm"):
         agree(
@@ -459,6 +469,68 @@ def test_the_torch_engine_is_taken_on_the_cpu(caplog: pytest.LogCaptureFixture) 
             0.0,
         )
     assert not caplog.records
+
+
+@NEEDS_COMPILER
+def test_the_kernel_is_taken_on_a_cpu_with_a_compiler(caplog: pytest.LogCaptureFixture) -> None:
+    world, state = world_of(box_body()), tossed(3)
+    dispatch._note.cache_clear()
+    with caplog.at_level("INFO", "cgwm"):
+        found = dispatch.rollout(world, state, times(0.2), None, True)
+        same_bits(found, simulate_on_host(world, state, times(0.2), None, True))
+        agree(simulate(world, state, times(0.2), None, True), found, 1e-9)
+        assert not caplog.records
+        sticky = replace(world, effects=(active("adhesion"),))
+        same_bits(simulate(sticky, state, times(0.05)), dispatch.rollout(sticky, state, times(0.05)))
+    assert [record.getMessage() for record in caplog.records] == [
+        "rollouts run in the torch engine, not in the fused kernel: the kernel does not have its effect 'adhesion'"
+    ]
+
+
+@NEEDS_COMPILER
+def test_threads_change_no_bit_on_the_cpu() -> None:
+    world, state = world_of(box_body()), tossed(100)
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(simulate_on_host(world, state, times(0.1)))
+    finally:
+        torch.set_num_threads(before)
+    same_bits(*found)
+
+
+@NEEDS_COMPILER
+def test_flight_alone_is_for_the_kernel_too() -> None:
+    world = replace(world_of(box_body()), touching=False, effects=(active("linear_drag", c=0.3),))
+    agree(simulate(world, tossed(5), times(0.5)), simulate_on_host(world, tossed(5), times(0.5)), 1e-12)
+    pulled = replace(world, effects=(active("ground_magnet", A=1.0, l=0.1),))
+    assert "its bodies do not touch anything" in (lacking(pulled) or "")
+
+
+def test_a_compiler_that_fails_leaves_the_torch_engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = tmp_path / "g++"
+    broken.write_text("#!/bin/sh\necho 'no room left' >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr(host, "compiler", lambda: str(broken))
+    monkeypatch.setattr(host, "_trial", host._trial.__wrapped__)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert lacking(world_of(box_body())) == f"the C++ compiler {broken} failed: no room left"
+
+
+@NEEDS_COMPILER
+def test_a_kernel_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = 'extern "C" int answer() { return 42; }'
+    assert host._built(source).answer() == 42
+    kept = list((tmp_path / "cgwm" / "kernels").iterdir())
+    assert [path.suffix for path in kept] == [".so"]
+    monkeypatch.setattr(host.subprocess, "run", None)
+    assert host._built(source).answer() == 42
+    (tmp_path / "cgwm" / "kernels").chmod(0o777)
+    with pytest.raises(TypeError):  # what others may have written is not loaded
+        host._built(source)
 
 
 def test_which_derivatives_want_the_torch_engine() -> None:

@@ -53,8 +53,6 @@ def reason_against(world: World) -> str | None:
         return "its numbers have several types" if len(kinds) > 1 else "its numbers are neither float32 nor float64"
     if not world.bodies:
         return "it has no bodies"
-    if not world.touching:
-        return "its bodies do not touch anything"
     reason = wrenches.reason_against(world)
     if reason is not None:
         return reason

@@ -30,6 +30,8 @@ def reason_against(world: World) -> str | None:
             return f"the kernel does not have its effect '{effect.name}'"
     if sum(isinstance(effect, GroundMagnet) for effect in acting) > 1:
         return "the kernel takes one ground_magnet, and it has several"
+    if has_magnet(world) and not world.touching:
+        return "the kernel finds the height for ground_magnet by contacts, and its bodies do not touch anything"
     return None
 
 
