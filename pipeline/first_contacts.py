@@ -7,7 +7,7 @@ at its start fitted too, they are smooth, and exact derivatives find in a few st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,11 +47,15 @@ UNOBSERVABLE_SHARE = 0.8
 
 @dataclass(frozen=True)
 class FirstContacts:
-    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`."""
+    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
+
+    constants: of effects, `effect.constant` by name.
+    """
 
     world: World
     parameters: tuple[FittedParameter, ...]
     record: dict[str, Any]
+    constants: dict[str, float] = field(default_factory=dict)
 
 
 def fit_first_contacts(

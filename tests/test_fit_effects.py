@@ -9,7 +9,7 @@ import torch
 from cgwm.datasets import Track
 from cgwm.datasets.models import read_model
 from cgwm.pipeline import first_contacts, phys_geo
-from cgwm.pipeline.fit_effects import fit_with_constants, fitted_effects, with_effects
+from cgwm.pipeline.fit_effects import fit_with_effects, fitted_effects, with_effects
 from cgwm.pipeline.physics import World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.measured import measure
@@ -47,9 +47,9 @@ def active(name: str, **values: float) -> ActiveEffect:
 def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)  # the search and the first contacts tell
     episodes = thrown(replace(boxes(), effects=(active("quadratic_drag", k=0.2),)), 4)
-    plain = fit_with_constants(boxes(), episodes, BRIEF, (5e-4, 1e-3))
+    plain = fit_with_effects(boxes(), episodes, BRIEF, (5e-4, 1e-3))
     world = replace(boxes(), effects=(active("quadratic_drag"),))
-    found = fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
+    found = fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3))
     drag = next(p for p in found.parameters if p.name == "quadratic_drag.k")
     assert drag.interval_95 is not None and drag.interval_95[0] < 0.2 < drag.interval_95[1]
     assert drag.estimate == pytest.approx(0.2, rel=0.25) and drag.unit == "1/m"
@@ -65,10 +65,10 @@ def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pyt
     episodes = thrown(replace(boxes(), effects=(active("ground_magnet", **truth),)), 1)
     brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "iterations": 1})
     world = replace(boxes(), effects=(active("ground_magnet"),))
-    found = fit_with_constants(world, episodes, brief, (5e-4, 1e-3))
-    tried = found.record["constants_tried"]
+    found = fit_with_effects(world, episodes, brief, (5e-4, 1e-3))
+    tried = found.record["effects"]["constants_tried"]
     assert [row[f"ground_magnet.{constant.name}"] for row in tried] == list(constant.grid)
-    best = min(tried, key=lambda row: row["open_loop_m"])
+    best = min(tried, key=lambda row: row["cost"])
     assert found.constants == {f"ground_magnet.{constant.name}": best[f"ground_magnet.{constant.name}"]}
 
 
@@ -76,7 +76,7 @@ def test_an_effect_that_lacks_what_it_needs_is_refused() -> None:
     episodes = thrown(boxes(ground=False), 1)
     world = replace(boxes(ground=False), effects=(active("ground_magnet"),))
     with pytest.raises(InputDataError, match="'ground_magnet' needs a ground in the manifest, and this capture has"):
-        fit_with_constants(world, episodes, BRIEF, (None, None))
+        fit_with_effects(world, episodes, BRIEF, (None, None))
 
 
 def test_effects_join_those_of_the_parent_and_take_their_fitted_values() -> None:
@@ -134,9 +134,9 @@ def test_what_a_fit_cannot_find_is_refused(tmp_path: Path) -> None:
     driven = replace(ball_body(name="tip"), motion="driven")
     world = replace(world_of(box_body(), driven), effects=(active("length_scale"),))
     with pytest.raises(InputDataError, match="'length_scale' with a driven body: its track is its command"):
-        fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
+        fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3))
     with pytest.raises(InputDataError, match=r"phys-geo.step_s is 5 ms(.|\n)*up to 3.1 ms"):
-        fit_with_constants(boxes(), episodes, BRIEF.model_copy(update={"step_s": 0.005}), (5e-4, 1e-3))
+        fit_with_effects(boxes(), episodes, BRIEF.model_copy(update={"step_s": 0.005}), (5e-4, 1e-3))
     model = read_model(write_small_model(tmp_path / "model"))
     for name, values, found in (
         ("linear_drag", {"c": -5.0}, "linear_drag.c is -5 1/s"),
