@@ -100,7 +100,7 @@ def pack(
         single, False, 1, record, bool(effects), wrenches.has_magnet(world), turned,
         tuple(body.free for body in world.bodies),
         tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
-        tuple(body.radii.shape[-1] for body in world.bodies), pairs,
+        tuple(body.radii.shape[-1] for body in world.bodies), pairs, surface=wrenches.has_surface(world),
     )  # fmt: skip
     return Packed(
         structure,
