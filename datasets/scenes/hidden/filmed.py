@@ -10,7 +10,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
@@ -31,21 +30,22 @@ SIZE_PX = (320, 240)
 FOCAL_PX = 420.0
 AWAY_M, HEIGHT_M = 2.4, 1.0
 """Of the cameras from the world's origin, about which all paths lie."""
-_SHIFT = 6
-"""Corners of a silhouette are drawn to 2^-6 of a pixel."""
+SUPERSAMPLED = 4
+"""So many points along and across a pixel tell how much of it is covered."""
 _BODY, _GROUND, _NOISE = (60, 130, 190), 150, 4.0
 
 
-def film_capture(directory: Path, case: Case, overwrite: bool = False) -> Path:
+def film_capture(directory: Path, case: Case, truth: Path | None = None, overwrite: bool = False) -> Path:
     """Write the capture of a case as videos with masks, and the truth beside it; return the file of the truth.
 
     Args:
         directory: The capture to write.
         case: What to make; its rate is the frame rate, and the noise of its tracks is not used.
-        overwrite: Replace it.
+        truth: Where the truth goes, see `make_capture`.
+        overwrite: Replace both.
     """
     exact = replace(case, position_std_m=1e-9, rotation_std_rad=1e-9)
-    path = make_capture(directory, exact, overwrite=overwrite)
+    path = make_capture(directory, exact, truth, overwrite)
     capture, cameras, thing = Capture.open(directory, check=False), video_cameras(case), case.drawn_thing()
     for names in capture.manifest.splits.values():
         for episode in names:
@@ -90,22 +90,26 @@ def silhouette(camera: Camera, points: Array) -> NDArray[np.uint8]:
     """Return the mask (height, width), 1 in the outline of convex points (n, 3) in the world; 0 elsewhere."""
     seen = (points - camera.T_world_cam[:3, 3]) @ camera.T_world_cam[:3, :3]
     pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
-    hull = pixels[ConvexHull(pixels).vertices]
-    # a pixel's middle lies at +0.5 in the camera's coordinates, at a whole number in OpenCV's; a pixel counts where
-    # more than half of it is covered, which a larger picture tells
-    scale = 4
-    large = np.zeros((scale * camera.height, scale * camera.width), np.uint8)
-    corners = ((scale * hull - 0.5) * 2**_SHIFT).round().astype(np.int32)
-    cv2.fillConvexPoly(large, corners, 1, shift=_SHIFT)
-    share = large.reshape(camera.height, scale, camera.width, scale).mean((1, 3))
-    return (share > 0.5).astype(np.uint8)
+    edges = ConvexHull(pixels).equations
+    # the middle of pixel 0 lies at 0.5; a pixel counts where most of the points spread over it lie inside
+    offsets = (np.arange(SUPERSAMPLED) + 0.5) / SUPERSAMPLED
+    low = np.floor(pixels.min(0)).astype(int).clip(0)
+    high = np.minimum(np.ceil(pixels.max(0)).astype(int), (camera.width, camera.height))
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    if (high <= low).any():
+        return mask
+    x, y = ((np.arange(a, b)[:, None] + offsets).ravel() for a, b in zip(low, high, strict=True))
+    inside = (edges[:, 0, None, None] * x + edges[:, 1, None, None] * y[:, None] + edges[:, 2, None, None] < 0).all(0)
+    share = inside.reshape(high[1] - low[1], SUPERSAMPLED, high[0] - low[0], SUPERSAMPLED).mean((1, 3))
+    mask[low[1] : high[1], low[0] : high[0]] = share > 0.5
+    return mask
 
 
 def _surface(thing: Thing) -> Array:
     if thing.kind == "cube":
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
         return signs * thing.half_extents_m
-    count = 2000
+    count = 400
     k = np.arange(count) + 0.5
     polar, around = np.arccos(1 - 2 * k / count), np.pi * (1 + np.sqrt(5)) * k
     on = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], 1)

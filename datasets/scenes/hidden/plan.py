@@ -50,7 +50,7 @@ FILMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     ("ball", ("gust",)),
 )
 """Effects that are hidden in captures with videos only; the last is in no library."""
-FILM_HZ, FILM_S, FILM_TEST = 60.0, 0.7, 2
+FILM_HZ, FILM_S, FILM_TEST = 40.0, 0.5, 2
 SIZES: tuple[Size, ...] = ("small", "large")
 THINGS: tuple[Kind, ...] = ("cube", "ball")
 NULLS = 200
@@ -100,7 +100,7 @@ def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = 
 
 
 def filmed_cases(stage: Stage) -> list[Case]:
-    """Return cases that are filmed: large effects, six throws of 0.7 s to learn from at 60 Hz; see `cases`."""
+    """Return cases that are filmed: large effects, six throws of 0.5 s to learn from at 40 Hz; see `cases`."""
     found = [planned_case(stage, "study", thing, names, "large", 0, "/video") for thing, names in FILMED]
     film = {"rate_hz": FILM_HZ, "length_s": FILM_S, "protocol": "throws", "test": FILM_TEST}
     return [replace(case, filmed=True, **film) for case in found]
