@@ -1,18 +1,24 @@
 """Effects in a fit: added by name, fitted with the rest, kept in the model, and used wherever the model is."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
 from cgwm.datasets.models import read_model
+from cgwm.datasets.tracks import write_tracks
 from cgwm.pipeline import first_contacts, phys_geo
+from cgwm.pipeline.estimation.search import SearchResult
+from cgwm.pipeline.fit import fit
 from cgwm.pipeline.fit_effects import fit_with_effects, fitted_effects, with_effects
-from cgwm.pipeline.physics import World, simulate
+from cgwm.pipeline.physics import ContactLaw, World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.measured import measure
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
 from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig, UsageError
 from small_model import write_small_model
 from worlds import F64, ball_body, box_body, state_of, times, world_of
@@ -153,3 +159,50 @@ def test_up_is_against_gravity_on_a_slope_too() -> None:
     start = state_of(((0, 0, 5.0), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
     rollout = simulate(replace(world, ground_normal=slope), start, times(0.1))
     assert rollout.velocity_m_s[0, -1, 0].tolist() == pytest.approx([0, 0, -0.881], abs=1e-9)
+
+
+def test_a_fit_that_was_begun_starts_at_the_worlds_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    law = ContactLaw(*(torch.tensor([value], dtype=F64) for value in (0.12, 0.02, 5.0)))
+    world = replace(boxes(), contact=law)
+    seen: list[tuple[list[float], int]] = []
+    search = phys_geo.importance_search
+
+    def noted(*arguments: Any, **more: Any) -> SearchResult:
+        seen.append((more["first"].tolist(), more["generations"]))
+        return search(*arguments, **more)
+
+    monkeypatch.setattr(phys_geo, "importance_search", noted)
+    episodes = thrown(boxes(), 1)
+    for begun in (True, False):
+        fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3), begun)
+    friction, contact_time, damping = CONTACT_PARAMETERS
+    assert seen[0][0] == [friction.encode(0.12), contact_time.encode(0.02), damping.encode(damping.bounds[1])]
+    assert seen[1][0] == [p.encode(p.prior[0]) for p in CONTACT_PARAMETERS]
+    assert [generations for _, generations in seen] == [2, 4]
+
+
+def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path) -> None:
+    """The parent's fit of the physics is gone, and so is what it warned of; what its photos showed is still true."""
+    root = tmp_path / "capture"
+    (root / "tracks").mkdir(parents=True)
+    text = ['format = "cgwm-capture/1"', "[world]", "ground = { normal = [0.0, 0.0, 1.0], offset_m = 0.0 }"]
+    text += ['[[bodies]]\nname = "box"\nmass_kg = 1.0', "shape = { sphere = { radius_m = 0.05 } }"]
+    text += ['[splits]\ntrain = ["0"]']
+    (root / "capture.toml").write_text("\n".join(text) + "\n")
+    write_tracks(root / "tracks" / "0.csv", thrown(boxes(), 1)[0][1])
+    brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "step_s": 0.003})
+    fit(root, tmp_path / "m0", stage="phys-geo", phys_config=brief)
+    path = tmp_path / "m0" / "model.json"
+    parent = json.loads(path.read_text())
+    record = json.loads((tmp_path / "m0" / "fit.json").read_text())["stages"]["phys-geo"]
+    assert record["warnings"] and set(record["warnings"]) <= set(parent["warnings"])
+    gone, kept = "the parent's contact time ended on its bound", "a photo is blurred"
+    record_path = tmp_path / "m0" / "fit.json"
+    changed = json.loads(record_path.read_text())
+    changed["stages"]["phys-geo"]["warnings"] = [gone]
+    record_path.write_text(json.dumps(changed))
+    path.write_text(json.dumps(parent | {"warnings": [gone, kept]}))
+    child = fit(root, tmp_path / "m1", stage="phys-geo", parent=tmp_path / "m0", phys_config=brief)
+    assert kept in child.warnings and gone not in child.warnings
+    assert len(set(child.warnings)) == len(child.warnings)
