@@ -12,7 +12,7 @@ from ..effects.adhesion import Adhesion
 from ..effects.anisotropic_friction import AnisotropicFriction
 from ..effects.buoyancy import Buoyancy
 from ..effects.constant_force import ConstantForce
-from ..effects.effect import Effect, vector
+from ..effects.effect import Effect, Values, vector
 from ..effects.friction_patch import FrictionPatch
 from ..effects.ground_magnet import GroundMagnet
 from ..effects.linear_drag import LinearDrag
@@ -116,7 +116,7 @@ def _surface(world: World, zero: Tensor) -> list[Tensor]:
     """Return the columns (1 or B, 1) of `Surface`; lengths and speeds of what does not act are 1."""
     law = world.contact
     assert isinstance(law, ContactLaw)  # see reason_against
-    values = {active.effect.__class__: active.values for active in world.effects if isinstance(active.effect, _SURFACE)}
+    values: dict[type[Effect], Values] = {type(active.effect): active.values for active in world.effects}
 
     def number(kind: type[Effect], name: str, otherwise: float = 0.0) -> Tensor:
         return values[kind][name][:, None] if kind in values else zero + otherwise
