@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ..compiler import compiler
 from .detection import pairs_of, slot_count
 from .devices import on_device
 from .driven import Drive
 from .fused import simulate_fused, unsupported
-from .fused.host import compiler, lacking, simulate_on_host
+from .fused.host import lacking, simulate_on_host
 from .rollout import Rollout, simulate
 from .world import State, World
 

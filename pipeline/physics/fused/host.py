@@ -10,7 +10,6 @@ import ctypes
 import hashlib
 import os
 import platform
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ...compiler import compiler
 from ..driven import Drive
 from ..rollout import Rollout
 from ..world import State, World
@@ -64,14 +64,6 @@ extern "C" void run(int threads, PARAMETERS) {
     for (std::thread& other : others) other.join();
 }
 """
-
-
-@cache
-def compiler() -> str | None:
-    """Return the path of a C++ compiler; None where there is none, or it would build another kind of library."""
-    if os.name != "posix":
-        return None
-    return next((found for name in ("g++", "clang++", "c++") if (found := shutil.which(name)) is not None), None)
 
 
 def lacking(world: World) -> str | None:
