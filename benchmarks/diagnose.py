@@ -25,7 +25,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from cgwm.datasets.capture import Capture
@@ -172,10 +172,11 @@ def _added(capture: Path, base: Path, child: Path, effects: Sequence[str], physi
     return {"errors": errors, "estimates": own, "child_cpu_s": round(time.process_time() - began, 1)}
 
 
-def timing(device: str) -> str:
+def timing(device: Literal["auto", "cpu", "cuda"]) -> str:
     """Return how long a diagnosis of ten tosses of 1 s takes: in a fresh process, and once more."""
     lines = ["| body | hidden | fit | diagnosis | again | verdict |", "|---|---|---|---|---|---|"]
-    for thing, effects in (("cube", ("quadratic_drag",)), ("cube", ()), ("ball", ("quadratic_drag",)), ("ball", ())):
+    things: tuple[Literal["cube", "ball"], ...] = ("cube", "ball")
+    for thing, effects in itertools.product(things, (("quadratic_drag",), ())):
         case = Case(f"timing/{thing}", thing, effects, seed=4, train=10)
         with tempfile.TemporaryDirectory() as folder:
             capture, base = Path(folder) / "capture", Path(folder) / "m0"
@@ -293,7 +294,7 @@ def main() -> int:
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
     parser.add_argument("--time", action="store_true", help="time diagnoses of ten tosses of 1 s, and no more")
-    parser.add_argument("--device", default="cpu", help="of --time: cpu or cuda")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of --time")
     given = parser.parse_args()
     if given.time:
         print(timing(given.device))

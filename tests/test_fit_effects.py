@@ -12,13 +12,15 @@ from cgwm.datasets import Track
 from cgwm.datasets.models import read_model
 from cgwm.datasets.tracks import write_tracks
 from cgwm.pipeline import first_contacts, phys_geo
+from cgwm.pipeline.effect_flights import fit_effect_flights
+from cgwm.pipeline.effect_windows import fit_effect_windows
 from cgwm.pipeline.estimation.search import SearchResult
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.fit_effects import fit_with_effects, fitted_effects, with_effects
 from cgwm.pipeline.physics import ContactLaw, World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.measured import measure
-from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, effect_parameters
 from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig, UsageError
 from small_model import write_small_model
 from worlds import F64, ball_body, box_body, state_of, times, world_of
@@ -206,3 +208,52 @@ def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path) -> Non
     child = fit(root, tmp_path / "m1", stage="phys-geo", parent=tmp_path / "m0", phys_config=brief)
     assert kept in child.warnings and gone not in child.warnings
     assert len(set(child.warnings)) == len(child.warnings)
+
+
+def test_effects_of_flight_are_found_in_flights_from_nothing() -> None:
+    truth = {"quadratic_drag": {"k": 0.4}, "wind": {"w_x": -1.5, "w_y": 2.0}}
+    hidden = tuple(active(name, **values) for name, values in truth.items())
+    episodes = thrown(replace(boxes(), effects=hidden), 4)
+    world = replace(boxes(), effects=tuple(active(name) for name in truth))
+    found = fit_effect_windows(world, episodes, [], (5e-4, 1e-3))
+    assert found.record["flights"] >= 4 and "windows" not in found.record
+    for parameter in found.parameters:
+        name, _, number = parameter.name.partition(".")
+        assert parameter.interval_95 is not None
+        assert parameter.interval_95[0] < truth[name][number] < parameter.interval_95[1]
+    estimate = {p.name: p.estimate for p in found.parameters}
+    assert estimate["quadratic_drag.k"] > 0.1 and estimate["wind.w_x"] < -0.5 and estimate["wind.w_y"] > 0.5
+
+
+def test_what_flights_show_stands_beside_effects_of_contact(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_contacts, "ITERATIONS", 2)
+    episodes = thrown(replace(boxes(), effects=(active("spin_damping", d=1.0),)), 3)
+    alone, beside = (
+        fit_effect_windows(replace(boxes(), effects=effects), episodes, [], (5e-4, 1e-3))
+        for effects in (
+            (active("spin_damping"),),
+            (active("viscous_friction"), active("spin_damping")),
+        )
+    )
+    assert beside.record["windows"] == 3 and beside.record["in_flight"]["flights"] >= 3
+    assert [p.name for p in beside.parameters] == ["spin_damping.d", "viscous_friction.c_v"]
+    assert beside.parameters[0] == alone.parameters[0]
+
+
+def test_flights_that_do_not_show_an_effect_give_nothing() -> None:
+    """Without orientations nothing tells of a spin."""
+    episodes = [(name, {"box": replace(t["box"], quat_wxyz=None)}) for name, t in thrown(boxes(), 3)]
+    world = replace(boxes(), effects=(active("spin_damping"),))
+    wanted = [(parameter, 0.5) for parameter in effect_parameters(world)]
+    assert fit_effect_flights(world, episodes, wanted, (5e-4, 1e-3)) is None
+
+
+def test_few_episodes_make_intervals_wider_where_they_scatter_and_never_narrower() -> None:
+    information = np.diag([100.0, 4.0])
+    alike, apart = np.zeros((3, 2)), np.array([[30.0, 0.0], [-30.0, 0.0], [0.0, 0.0]])
+    assert np.allclose(first_contacts.few_covariance(information, alike), np.diag([0.01, 0.25]))
+    # 2 * 30^2 / 100^2 of scatter, times 3 / 2 and (4.303 / 1.96)^2
+    wide = first_contacts.few_covariance(information, apart)
+    assert wide[0, 0] == pytest.approx(0.18 * 1.5 * (4.3027 / 1.96) ** 2, rel=1e-3) and wide[1, 1] == 0.25
+    many = np.tile(apart, (3, 1))
+    assert first_contacts.few_covariance(information, many)[0, 0] == pytest.approx(6 * 900 / 1e4)
