@@ -310,6 +310,8 @@ def _with_physics(
     start = model.file.model_copy(
         update={
             "contact": model.file.contact or ContactParameters(),
+            # one that an earlier fit moved would hide what moved it
+            "ground": capture.manifest.world.ground or model.file.ground,
             "solver": Solver(step_s=config.step_s),
             "effects": effects,
             "warnings": tuple(text for text in model.file.warnings if text not in stale),
