@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..schemas.doctor import DoctorReport, Missing, PackageState
+from .compiler import compiler
 
 _IMPORT_NAMES = {"opencv-python-headless": "cv2"}
 _CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
@@ -203,10 +204,17 @@ def _renderer(cuda: bool) -> str:
     return "Triton kernels (pip install 'cgwm[gpu]' for those in CUDA, 1.5 to 5 times faster)"
 
 
+def _rollouts() -> str:
+    if compiler() is None:
+        return "torch; a C++ compiler (g++ or clang++) would make those on the CPU about ten times as fast"
+    return "one kernel, compiled at run time"
+
+
 def _uses(cuda: tuple[str, ...], zstd: bool) -> dict[str, str]:
     return {
         "device": f"cuda ({cuda[0]})" if cuda else f"cpu, {cpu_cores()} cores",
         "renderer": _renderer(bool(cuda)),
+        "rollouts": _rollouts(),
         "photo_features": "COLMAP on the CPU, one thread (two runs agree bit for bit)",
         "demo_renderer": "ray casting, no OpenGL",
         "compression": "zstd" if zstd else "none: --set synthesize.compression=gzip works without the filter",

@@ -7,17 +7,18 @@ at its start fitted too, they are smooth, and exact derivatives find in a few st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import t as student
 from torch import Tensor
 
 from ..datasets.tracks import Track
 from ..schemas import Parameter as FittedParameter
-from .estimation.least_squares import Solution, minimise
+from .estimation.least_squares import minimise
 from .estimation.observations import Observations
 from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .estimation.warmup import flight_frames
@@ -47,11 +48,15 @@ UNOBSERVABLE_SHARE = 0.8
 
 @dataclass(frozen=True)
 class FirstContacts:
-    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`."""
+    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
+
+    constants: of effects, `effect.constant` by name.
+    """
 
     world: World
     parameters: tuple[FittedParameter, ...]
     record: dict[str, Any]
+    constants: dict[str, float] = field(default_factory=dict)
 
 
 def fit_first_contacts(
@@ -91,24 +96,34 @@ def fit_first_contacts(
         prior_information=state_prior(len(observations.free)),
     )
     count = len(wanted)
-    std_errors = np.sqrt(np.diag(_covariance(solution)))[:count]
+    std_errors = np.sqrt(np.diag(few_covariance(solution.information.numpy(), solution.scores.numpy())))[:count]
     found, coordinates = names[:count], solution.shared[:count]
     record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
     return FirstContacts(
-        _placed(world, found, coordinates),
+        placed(world, found, coordinates),
         tuple(described(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
         record,
     )
 
 
-def _covariance(solution: Solution) -> Array:
-    """Return the covariance (P, P): from the scatter of the episodes' gradients (Huber 1967), or for few the curvature.
+def few_covariance(information: Array, scores: Array) -> Array:
+    """Return the covariance (P, P) from the information (P, P) and the scatter of the episodes' gradients (E, P).
 
-    A scatter of a few episodes is no estimate; the curvature rests on `MODEL_ERROR`.
+    From `ENOUGH_EPISODES` on the scatter alone (Huber 1967). Of few it may be small by chance, and the curvature, which
+    rests on the noise, counts where it is wider. But what a model misses is missed in all frames of an episode alike,
+    and then the curvature is far too narrow: the scatter counts, with what few samples ask for (n / (n - 1), and
+    Student's t in the normal law's place).
     """
-    inverse = _pinv(solution.information.numpy())
-    scores = solution.scores.numpy()
-    return inverse if len(scores) < ENOUGH_EPISODES else inverse @ (scores.T @ scores) @ inverse
+    inverse = _pinv(information)
+    count = len(scores)
+    scatter = inverse @ (scores.T @ scores) @ inverse
+    if count >= ENOUGH_EPISODES:
+        return scatter
+    if count < 2:
+        return inverse
+    few = count / (count - 1) * (student.ppf(0.975, count - 1) / 1.96) ** 2
+    width = np.sqrt(np.maximum(1.0, few * np.diag(scatter) / np.diag(inverse).clip(1e-300)))
+    return inverse * np.outer(width, width)
 
 
 def _pinv(information: Array) -> Array:
@@ -131,7 +146,8 @@ def _windows(
     return Observations.of(world, picked, windows)
 
 
-def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:
+def placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:
+    """Return the world with parameters at fitted coordinates (P,)."""
     values = torch.stack([p.decode(z) for p, z in zip(names, coordinates, strict=True)])[None]
     moved = apply_parameters(world, names, values)
     bodies = [replace(b, com=b.com.clone(), inertia=b.inertia.clone()) for b in moved.bodies]
@@ -145,6 +161,7 @@ def described(parameter: Parameter, coordinate: float, std: float) -> FittedPara
         float(parameter.decode(torch.tensor(z, dtype=torch.float64)))
         for z in (coordinate, *(min(max(coordinate + k * 1.96 * std, low), high) for k in (-1, 1)))
     )
+    estimate = min(max(estimate, parameter.bounds[0]), parameter.bounds[1])  # rounding may lead past a bound
     state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
     if std > UNOBSERVABLE_SHARE * parameter.prior[1]:
         state = "not_observable"

@@ -37,7 +37,7 @@ from ..schemas import (
     UsageError,
 )
 from .checkpoint import Checkpoint
-from .fit_effects import fit_with_constants, fitted_effects, with_effects
+from .fit_effects import fit_with_effects, fitted_effects, with_effects
 from .memory import enough_memory
 from .phys_geo import PhysicsFit, track_episodes
 from .physics.effects.registry import load_effect
@@ -112,9 +112,7 @@ def fit(
         model = _start(opened, stage, parent, splat_config, checkpoint)
     if moves:
         with enough_memory(*_needs(phys_config)):
-            model = _with_physics(model, opened, split, phys_config, checkpoint)
-        file = model.file.model_copy(update={"warnings": (*model.file.warnings, *warnings)})
-        model = replace(model, file=file)
+            model = _with_physics(model, opened, split, phys_config, checkpoint, warnings)
     elif phys_config.effects:
         raise InputDataError(
             f"{opened.root}: --effects, but split '{split}' has no motion to fit them to.",
@@ -295,7 +293,9 @@ def _has_motion(capture: Capture, split: str) -> bool:
     return any(capture.tracks(name) or capture.videos(name) for name in episodes)
 
 
-def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint) -> Model:
+def _with_physics(
+    model: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warnings: Sequence[str]
+) -> Model:
     uses_photos = any(name in model.body_splats for name in capture.body_names)
     if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
         require_metric(capture.cameras)
@@ -305,8 +305,17 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
             'motion = "free" for the body whose physics is wanted.',
         )
     effects = with_effects(model.file.effects, config.effects)
+    # what an earlier fit of the physics warned of is not true of this one
+    stale = set(model.fit.stages.get("phys-geo", {}).get("warnings", ()))
     start = model.file.model_copy(
-        update={"contact": ContactParameters(), "solver": Solver(step_s=config.step_s), "effects": effects}
+        update={
+            "contact": model.file.contact or ContactParameters(),
+            # one that an earlier fit moved would hide what moved it
+            "ground": capture.manifest.world.ground or model.file.ground,
+            "solver": Solver(step_s=config.step_s),
+            "effects": effects,
+            "warnings": tuple(text for text in model.file.warnings if text not in stale),
+        }
     )
     ready = replace(model, file=start)
     world = replace(World.from_model(ready), rolls_on=resolve_device(config.device).type)
@@ -314,7 +323,7 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        found = fit_with_constants(world, track_episodes(capture, split), config, noise)
+        found = fit_with_effects(world, track_episodes(capture, split), config, noise, model.file.contact is not None)
     elif config.mass_distribution:
         raise UsageError(
             f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not show where the mass is.",
@@ -326,7 +335,9 @@ def _with_physics(model: Model, capture: Capture, split: str, config: PhysConfig
 
         both = config.supervise == "both"
         found = fit_physics_from_images(world, ready, capture, split, config, both, checkpoint)
+    found = replace(found, warnings=(*found.warnings, *warnings))
     record = found.record | {"seconds": round(time.perf_counter() - started, 2), "supervise": config.supervise}
+    record |= {"warnings": list(found.warnings)}
     fitted = _merge(start, found)
     fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
     ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)

@@ -1,19 +1,15 @@
-"""Effects in a fit: added to the model, their constants tried on their grids, their values written back."""
+"""Effects in a fit: added to the model, and their values written back."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-
-import torch
 
 from ..datasets.tracks import Track
 from ..schemas import EffectModel, InputDataError, PhysConfig, UsageError
 from ..schemas import Parameter as FittedParameter
 from .phys_geo import PhysicsFit, fit_physics
-from .physics.effects import ActiveEffect, load_effect
+from .physics.effects import load_effect
 from .physics.world import World
 
 
@@ -64,43 +60,21 @@ def fitted_effects(
     return tuple(effects)
 
 
-def fit_with_constants(
+def fit_with_effects(
     world: World,
     episodes: Sequence[tuple[str, dict[str, Track]]],
     config: PhysConfig,
     noise: tuple[float | None, float | None],
+    begun: bool = False,
 ) -> PhysicsFit:
-    """Fit the world, once for each combination of the constants of its effects, and return the best.
-
-    A constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be searched from there:
-    it is tried at each value of its grid, and the one with the lowest open-loop error on the fitted episodes is kept.
+    """Fit the world, see `fit_physics`, where its effects have what they need.
 
     Raises:
         InputDataError: If an effect needs what the world or the episodes do not have.
         NotConvergedError: If every rollout diverges.
     """
     _require_needs(world, episodes)
-    grids = [(active.effect.name, constant) for active in world.effects for constant in active.effect.constants]
-    best: PhysicsFit | None = None
-    tried = []
-    for values in itertools.product(*(constant.grid for _, constant in grids)):
-        chosen = {f"{effect}.{constant.name}": value for (effect, constant), value in zip(grids, values, strict=True)}
-        fit = fit_physics(_at(world, chosen), episodes, config, noise)
-        error = fit.record["search_open_loop_m"][-1]
-        tried.append(chosen | {"open_loop_m": error})
-        if best is None or error < best.record["search_open_loop_m"][-1]:
-            best = replace(fit, constants=chosen)
-    assert best is not None  # the product of no grids has one member
-    return best if not grids else replace(best, record=best.record | {"constants_tried": tried})
-
-
-def _at(world: World, constants: Mapping[str, float]) -> World:
-    effects = []
-    for active in world.effects:
-        own = {c.name: constants[f"{active.effect.name}.{c.name}"] for c in active.effect.constants}
-        like = next(iter(active.values.values()), torch.zeros(1))
-        effects.append(ActiveEffect.of(active.effect, active.values | own, like))
-    return replace(world, effects=tuple(effects))
+    return fit_physics(world, episodes, config, noise, begun)
 
 
 def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> None:

@@ -32,6 +32,7 @@ from ..datasets.tracks import Track
 from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
 from ..schemas import Parameter as FittedParameter
 from .diagnosis.segments import world_for
+from .effect_windows import fit_effect_windows
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
@@ -39,7 +40,7 @@ from .estimation.shooting import Prior as ShotPrior
 from .estimation.shooting import Shooting
 from .estimation.tempering import tempered
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
-from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
+from .first_contacts import FirstContacts, bound_warnings, described
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
@@ -63,6 +64,8 @@ MAX_ROLLOUTS = 1200
 """Rollouts in one batch of the search."""
 POPULATION = (24, 96)
 """Fewest and most samples in a generation, where the settings leave it open: about `MAX_ROLLOUTS` rollouts."""
+LEAST_GENERATIONS = 2
+"""Of a search that starts at the numbers of an earlier fit."""
 OPEN_LOOP_TOLERANCE = 3.0
 """The shot's estimate may raise the open-loop error by this factor before the search's own is kept: a search over
 three numbers bends them until one rough motion ends where it should."""
@@ -138,14 +141,17 @@ def fit_physics(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     config: PhysConfig,
     noise: tuple[float | None, float | None] = (None, None),
+    begun: bool = False,
 ) -> PhysicsFit:
     """Fit friction, contact time, damping ratio and ground height to measured tracks; where asked for, the mass too.
 
     Args:
-        world: The world with its geometry and inertia; its contact law is the start of the search.
+        world: The world with its geometry and inertia.
         episodes: Name and tracks by body of each training episode.
         config: The stage's settings.
         noise: Known measurement noise (position [m], rotation [rad]); estimated where None.
+        begun: Whether the world's contact numbers are those of an earlier fit: then the search starts there, and half
+            as many generations do; else it starts at the middles of the priors.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
@@ -172,15 +178,16 @@ def fit_physics(
     # the search over few episodes cannot tell the ground's height from the way of bouncing; shooting can
     height = world.ground_normal is not None and len(episodes) >= ENOUGH_EPISODES
     names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
+    start = [(p, _start(world, p) if begun else p.prior[0]) for p in names]
     mass: FirstContacts | None = None
     effects: FirstContacts | None = None
     if config.mass_distribution:
-        mass = fit_mass_distribution(world, episodes, [(p, p.prior[0]) for p in names], sigma)
+        mass = fit_mass_distribution(world, episodes, start, sigma)
         world = mass.world
     if effect_parameters(world):
         # flight needs no contact and no short steps
-        effects = _fit_effects(
-            world_for("flight", world) if flying else world, episodes, [] if flying else names, sigma
+        effects = fit_effect_windows(
+            world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
     observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
@@ -200,7 +207,8 @@ def fit_physics(
     if flying:
         found = _never_touching(world, names, sigma, _open_loop(world, observations, warm, names), record)
     else:
-        search = _search(world, observations, warm, names, _noise_floor(world, observations, sigma), config)
+        floor = _noise_floor(world, observations, sigma)
+        search = _search(world, observations, warm, start, floor, config, begun)
         if not math.isfinite(search.lowest):
             raise NotConvergedError(
                 "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
@@ -221,6 +229,7 @@ def fit_physics(
         warnings=(*found.warnings, *bound_warnings(known, more)),
         mass=mass,
         effects=effects,
+        constants={} if effects is None else effects.constants,
         starts=starts,
     )
 
@@ -240,21 +249,12 @@ def _never_touching(
     return replace(found, warnings=(NEVER_TOUCHES, *unseen))
 
 
-def _fit_effects(
-    world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
-    contact: Sequence[Parameter],
-    sigma: tuple[float, float],
-) -> FirstContacts:
-    """Fit the world's effects to flight and first contacts; the contact's numbers beside them.
-
-    The open-loop search is for few numbers: with every effect its valley gets narrower; windows show effects well.
-    """
-    start = {f"{a.effect.name}.{name}": float(value) for a in world.effects for name, value in a.values.items()}
-    wanted = [(parameter, start[parameter.name]) for parameter in effect_parameters(world)]
-    touching = any(active.effect.phase == "contact" for active in world.effects)
-    along = [(p, p.prior[0]) for p in contact]
-    return fit_first_contacts(world, episodes, wanted, along, sigma, True, CONTACT_S if touching else AFTER_S)
+def _start(world: World, parameter: Parameter) -> float:
+    """Return a parameter's value in a world, within its bounds; the ground is not moved."""
+    if parameter is GROUND_SHIFT:
+        return 0.0
+    low, high = parameter.bounds
+    return min(max(float(getattr(world.contact, parameter.name)[0]), low), high)
 
 
 def _noise_floor(world: World, observations: Observations, sigma: tuple[float, float]) -> float:
@@ -328,17 +328,19 @@ def _search(
     world: World,
     observations: Observations,
     warm: Tensor,
-    names: list[Parameter],
+    start: Sequence[tuple[Parameter, float]],
     floor: float,
     config: PhysConfig,
+    begun: bool,
 ) -> SearchResult:
-    episodes = len(observations.names)
+    episodes, names = len(observations.names), [p for p, _ in start]
+    generations = max(LEAST_GENERATIONS, config.generations // 2) if begun else config.generations
     prior = Prior(
         np.array([p.encode(p.prior[0]) for p in names]),
         np.array([p.prior[1] for p in names]),
         np.array([p.limits for p in names]),
     )
-    bar = progress(range(config.generations), "phys-geo: search", total=config.generations)
+    bar = progress(range(generations), "phys-geo: search", total=generations)
     steps = iter(bar)
 
     def advance(_: int, cost: float) -> None:
@@ -350,7 +352,8 @@ def _search(
         prior,
         seed=config.seed,
         population=config.population or _population(episodes),
-        generations=config.generations,
+        generations=generations,
+        first=np.array([p.encode(value) for p, value in start]),
         errors=ERRORS_PER_EPISODE * episodes,
         floor=floor,
         on_generation=advance,

@@ -34,7 +34,7 @@ from .estimation.observations import Observations
 from .estimation.trajectory import TrajectoryResiduals, retract, state_prior
 from .estimation.warmup import estimate_states, warmup_frames
 from .filmed import Episode, filmed_episode, track_record, track_warnings, tracks_noise
-from .fit_effects import fit_with_constants
+from .fit_effects import fit_with_effects
 from .imaging.refinement import ImageObjective, Refined, TrackTerm, refine_end_to_end
 from .imaging.silhouettes import body_outlines
 from .imaging.touching import TouchingSpheres, dense_times
@@ -112,7 +112,7 @@ def fit_physics_from_images(
     noise = tracks_noise(capture, episodes)
     known = noise[0] or 0.0, noise[1] or 0.0
     doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
-    start = fit_with_constants(world, [(episode.name, episode.tracks) for episode in episodes], config, noise)
+    start = fit_with_effects(world, [(episode.name, episode.tracks) for episode in episodes], config, noise)
     clock.lap("dynamics")
 
     world = start.effects.world if start.effects is not None else world

@@ -1,18 +1,26 @@
 """Effects in a fit: added by name, fitted with the rest, kept in the model, and used wherever the model is."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
 from cgwm.datasets.models import read_model
+from cgwm.datasets.tracks import write_tracks
 from cgwm.pipeline import first_contacts, phys_geo
-from cgwm.pipeline.fit_effects import fit_with_constants, fitted_effects, with_effects
-from cgwm.pipeline.physics import World, simulate
+from cgwm.pipeline.effect_flights import fit_effect_flights
+from cgwm.pipeline.effect_windows import fit_effect_windows
+from cgwm.pipeline.estimation.search import SearchResult
+from cgwm.pipeline.fit import fit
+from cgwm.pipeline.fit_effects import fit_with_effects, fitted_effects, with_effects
+from cgwm.pipeline.physics import ContactLaw, World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.measured import measure
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, effect_parameters
 from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig, UsageError
 from small_model import write_small_model
 from worlds import F64, ball_body, box_body, state_of, times, world_of
@@ -47,9 +55,9 @@ def active(name: str, **values: float) -> ActiveEffect:
 def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)  # the search and the first contacts tell
     episodes = thrown(replace(boxes(), effects=(active("quadratic_drag", k=0.2),)), 4)
-    plain = fit_with_constants(boxes(), episodes, BRIEF, (5e-4, 1e-3))
+    plain = fit_with_effects(boxes(), episodes, BRIEF, (5e-4, 1e-3))
     world = replace(boxes(), effects=(active("quadratic_drag"),))
-    found = fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
+    found = fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3))
     drag = next(p for p in found.parameters if p.name == "quadratic_drag.k")
     assert drag.interval_95 is not None and drag.interval_95[0] < 0.2 < drag.interval_95[1]
     assert drag.estimate == pytest.approx(0.2, rel=0.25) and drag.unit == "1/m"
@@ -65,10 +73,10 @@ def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pyt
     episodes = thrown(replace(boxes(), effects=(active("ground_magnet", **truth),)), 1)
     brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "iterations": 1})
     world = replace(boxes(), effects=(active("ground_magnet"),))
-    found = fit_with_constants(world, episodes, brief, (5e-4, 1e-3))
-    tried = found.record["constants_tried"]
+    found = fit_with_effects(world, episodes, brief, (5e-4, 1e-3))
+    tried = found.record["effects"]["constants_tried"]
     assert [row[f"ground_magnet.{constant.name}"] for row in tried] == list(constant.grid)
-    best = min(tried, key=lambda row: row["open_loop_m"])
+    best = min(tried, key=lambda row: row["cost"])
     assert found.constants == {f"ground_magnet.{constant.name}": best[f"ground_magnet.{constant.name}"]}
 
 
@@ -76,7 +84,7 @@ def test_an_effect_that_lacks_what_it_needs_is_refused() -> None:
     episodes = thrown(boxes(ground=False), 1)
     world = replace(boxes(ground=False), effects=(active("ground_magnet"),))
     with pytest.raises(InputDataError, match="'ground_magnet' needs a ground in the manifest, and this capture has"):
-        fit_with_constants(world, episodes, BRIEF, (None, None))
+        fit_with_effects(world, episodes, BRIEF, (None, None))
 
 
 def test_effects_join_those_of_the_parent_and_take_their_fitted_values() -> None:
@@ -134,9 +142,9 @@ def test_what_a_fit_cannot_find_is_refused(tmp_path: Path) -> None:
     driven = replace(ball_body(name="tip"), motion="driven")
     world = replace(world_of(box_body(), driven), effects=(active("length_scale"),))
     with pytest.raises(InputDataError, match="'length_scale' with a driven body: its track is its command"):
-        fit_with_constants(world, episodes, BRIEF, (5e-4, 1e-3))
+        fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3))
     with pytest.raises(InputDataError, match=r"phys-geo.step_s is 5 ms(.|\n)*up to 3.1 ms"):
-        fit_with_constants(boxes(), episodes, BRIEF.model_copy(update={"step_s": 0.005}), (5e-4, 1e-3))
+        fit_with_effects(boxes(), episodes, BRIEF.model_copy(update={"step_s": 0.005}), (5e-4, 1e-3))
     model = read_model(write_small_model(tmp_path / "model"))
     for name, values, found in (
         ("linear_drag", {"c": -5.0}, "linear_drag.c is -5 1/s"),
@@ -153,3 +161,99 @@ def test_up_is_against_gravity_on_a_slope_too() -> None:
     start = state_of(((0, 0, 5.0), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
     rollout = simulate(replace(world, ground_normal=slope), start, times(0.1))
     assert rollout.velocity_m_s[0, -1, 0].tolist() == pytest.approx([0, 0, -0.881], abs=1e-9)
+
+
+def test_a_fit_that_was_begun_starts_at_the_worlds_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    law = ContactLaw(*(torch.tensor([value], dtype=F64) for value in (0.12, 0.02, 5.0)))
+    world = replace(boxes(), contact=law)
+    seen: list[tuple[list[float], int]] = []
+    search = phys_geo.importance_search
+
+    def noted(*arguments: Any, **more: Any) -> SearchResult:
+        seen.append((more["first"].tolist(), more["generations"]))
+        return search(*arguments, **more)
+
+    monkeypatch.setattr(phys_geo, "importance_search", noted)
+    episodes = thrown(boxes(), 1)
+    for begun in (True, False):
+        fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3), begun)
+    friction, contact_time, damping = CONTACT_PARAMETERS
+    assert seen[0][0] == [friction.encode(0.12), contact_time.encode(0.02), damping.encode(damping.bounds[1])]
+    assert seen[1][0] == [p.encode(p.prior[0]) for p in CONTACT_PARAMETERS]
+    assert [generations for _, generations in seen] == [2, 4]
+
+
+def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path) -> None:
+    """The parent's fit of the physics is gone, and so is what it warned of; what its photos showed is still true."""
+    root = tmp_path / "capture"
+    (root / "tracks").mkdir(parents=True)
+    text = ['format = "cgwm-capture/1"', "[world]", "ground = { normal = [0.0, 0.0, 1.0], offset_m = 0.0 }"]
+    text += ['[[bodies]]\nname = "box"\nmass_kg = 1.0', "shape = { sphere = { radius_m = 0.05 } }"]
+    text += ['[splits]\ntrain = ["0"]']
+    (root / "capture.toml").write_text("\n".join(text) + "\n")
+    write_tracks(root / "tracks" / "0.csv", thrown(boxes(), 1)[0][1])
+    brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "step_s": 0.003})
+    fit(root, tmp_path / "m0", stage="phys-geo", phys_config=brief)
+    path = tmp_path / "m0" / "model.json"
+    parent = json.loads(path.read_text())
+    record = json.loads((tmp_path / "m0" / "fit.json").read_text())["stages"]["phys-geo"]
+    assert record["warnings"] and set(record["warnings"]) <= set(parent["warnings"])
+    gone, kept = "the parent's contact time ended on its bound", "a photo is blurred"
+    record_path = tmp_path / "m0" / "fit.json"
+    changed = json.loads(record_path.read_text())
+    changed["stages"]["phys-geo"]["warnings"] = [gone]
+    record_path.write_text(json.dumps(changed))
+    path.write_text(json.dumps(parent | {"warnings": [gone, kept]}))
+    child = fit(root, tmp_path / "m1", stage="phys-geo", parent=tmp_path / "m0", phys_config=brief)
+    assert kept in child.warnings and gone not in child.warnings
+    assert len(set(child.warnings)) == len(child.warnings)
+
+
+def test_effects_of_flight_are_found_in_flights_from_nothing() -> None:
+    truth = {"quadratic_drag": {"k": 0.4}, "wind": {"w_x": -1.5, "w_y": 2.0}}
+    hidden = tuple(active(name, **values) for name, values in truth.items())
+    episodes = thrown(replace(boxes(), effects=hidden), 4)
+    world = replace(boxes(), effects=tuple(active(name) for name in truth))
+    found = fit_effect_windows(world, episodes, [], (5e-4, 1e-3))
+    assert found.record["flights"] >= 4 and "windows" not in found.record
+    for parameter in found.parameters:
+        name, _, number = parameter.name.partition(".")
+        assert parameter.interval_95 is not None
+        assert parameter.interval_95[0] < truth[name][number] < parameter.interval_95[1]
+    estimate = {p.name: p.estimate for p in found.parameters}
+    assert estimate["quadratic_drag.k"] > 0.1 and estimate["wind.w_x"] < -0.5 and estimate["wind.w_y"] > 0.5
+
+
+def test_what_flights_show_stands_beside_effects_of_contact(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_contacts, "ITERATIONS", 2)
+    episodes = thrown(replace(boxes(), effects=(active("spin_damping", d=1.0),)), 3)
+    alone, beside = (
+        fit_effect_windows(replace(boxes(), effects=effects), episodes, [], (5e-4, 1e-3))
+        for effects in (
+            (active("spin_damping"),),
+            (active("viscous_friction"), active("spin_damping")),
+        )
+    )
+    assert beside.record["windows"] == 3 and beside.record["in_flight"]["flights"] >= 3
+    assert [p.name for p in beside.parameters] == ["spin_damping.d", "viscous_friction.c_v"]
+    assert beside.parameters[0] == alone.parameters[0]
+
+
+def test_flights_that_do_not_show_an_effect_give_nothing() -> None:
+    """Without orientations nothing tells of a spin."""
+    episodes = [(name, {"box": replace(t["box"], quat_wxyz=None)}) for name, t in thrown(boxes(), 3)]
+    world = replace(boxes(), effects=(active("spin_damping"),))
+    wanted = [(parameter, 0.5) for parameter in effect_parameters(world)]
+    assert fit_effect_flights(world, episodes, wanted, (5e-4, 1e-3)) is None
+
+
+def test_few_episodes_make_intervals_wider_where_they_scatter_and_never_narrower() -> None:
+    information = np.diag([100.0, 4.0])
+    alike, apart = np.zeros((3, 2)), np.array([[30.0, 0.0], [-30.0, 0.0], [0.0, 0.0]])
+    assert np.allclose(first_contacts.few_covariance(information, alike), np.diag([0.01, 0.25]))
+    # 2 * 30^2 / 100^2 of scatter, times 3 / 2 and (4.303 / 1.96)^2
+    wide = first_contacts.few_covariance(information, apart)
+    assert wide[0, 0] == pytest.approx(0.18 * 1.5 * (4.3027 / 1.96) ** 2, rel=1e-3) and wide[1, 1] == 0.25
+    many = np.tile(apart, (3, 1))
+    assert first_contacts.few_covariance(information, many)[0, 0] == pytest.approx(6 * 900 / 1e4)

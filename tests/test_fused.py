@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import fused_host
@@ -19,7 +20,8 @@ from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
-from cgwm.pipeline.physics.fused import simulate_fused, unsupported
+from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
+from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
@@ -85,6 +87,10 @@ def agree(expected: Rollout, found: Rollout, tolerance: float) -> None:
             close(f"contact {name}", getattr(expected.contacts, name), getattr(found.contacts, name))
         for name in ("body_a", "body_b", "sliding"):
             assert torch.equal(getattr(found.contacts, name).cpu(), getattr(expected.contacts, name)), name
+
+
+def same_bits(expected: Rollout, found: Rollout) -> None:
+    assert all(torch.equal(getattr(expected, name), getattr(found, name)) for name in POSES)
 
 
 def tossed(count: int = 3, height: float = 0.08) -> State:
@@ -394,6 +400,75 @@ def test_derivatives_of_effects(fused: Fused) -> None:
     torch.testing.assert_close(its.cpu() / scale, jacobian / scale, rtol=1e-7, atol=1e-7)
 
 
+SURFACE_VALUES: dict[str, dict[str, float]] = {
+    "stribeck_friction": {"d": 0.3, "v_s": 0.2},
+    "anisotropic_friction": {"a": 0.1, "b": -0.08},
+    "friction_patch": {"c_11": 0.1, "c_22": 0.2, "c_32": -0.1, "c_13": 0.15, "p": 0.1},
+    "viscous_friction": {"c_v": 0.8},
+    "rolling_resistance": {"c_r": 3e-3},
+    "torsional_friction": {"c_t": 4e-3},
+    "velocity_restitution": {"r": 0.4},
+    "adhesion": {"F": 3.0, "g": 2e-3},
+}
+
+
+def sliding(world: World) -> State:
+    """Return one body that slides on an edge and spins, and one that falls."""
+    rows = (
+        ((-0.05, 0.04, 0.045), (1, 0.1, 0.05, 0.3), (0.8, -0.3, -0.1), (1, 4, 6)),
+        ((0.02, 0.0, 0.12), (1, 0.3, 0.2, 0.1), (-0.5, 0.6, -0.9), (3, -5, 2)),
+    )
+    return State.joined(*(state_of(row) for row in rows))
+
+
+@pytest.mark.parametrize(("name", "lanes"), [*((name, 1) for name in SURFACE_VALUES), ("all", 1), ("all", 4)])
+def test_effects_of_the_contact_of_one_body(fused: Fused, name: str, lanes: int) -> None:
+    plain = world_of(cube(side=2, half=0.04))
+    names = list(SURFACE_VALUES) if name == "all" else [name]
+    world = replace(plain, effects=tuple(active(one, **SURFACE_VALUES[one]) for one in names))
+    record = name == "all"
+    expected = simulate(world, sliding(world), times(0.25), None, record)
+    agree(expected, fused(world, sliding(world), times(0.25), None, record, lanes=lanes), 1e-9)
+    without = simulate(plain, sliding(world), times(0.25))
+    assert (without.position_m - expected.position_m).abs().max() > 1e-5
+
+
+def test_effects_of_the_contact_of_a_rolling_ball(fused: Fused) -> None:
+    names = ("rolling_resistance", "torsional_friction", "viscous_friction", "velocity_restitution")
+    law = ContactLaw(batch(0.4), batch(0.004), batch(1.2))
+    world = replace(world_of(ball_body()), contact=law)
+    world = replace(world, effects=tuple(active(one, **SURFACE_VALUES[one]) for one in names))
+    radius = float(world.bodies[0].radii.max())
+    state = state_of(((0, 0, radius + 0.01), UPRIGHT, (0.6, 0.2, 0.0), (0.0, 15.0, 8.0)))
+    agree(simulate(world, state, times(0.5)), fused(world, state, times(0.5)), 1e-9)
+
+
+def test_derivatives_of_effects_of_the_contact(fused: Fused) -> None:
+    world = world_of(cube(side=2, half=0.04))
+    pairs = [(name, key) for name, values in SURFACE_VALUES.items() for key in values if key not in ("v_s", "p", "g")]
+    inputs = torch.tensor([[SURFACE_VALUES[name][key] for name, key in pairs]], dtype=F64)
+    first = sliding(world).at([0])
+
+    def function(engine: Any) -> Callable[[Tensor, int], Tensor]:
+        def rolled(values: Tensor, repeats: int) -> Tensor:
+            effects = []
+            for name, numbers in SURFACE_VALUES.items():
+                own = {p.name: 0.0 * values[:, 0] for p in load_effect(name).parameters}
+                own |= {key: values[:, k] for k, (one, key) in enumerate(pairs) if one == name}
+                own |= {key: 0.0 * values[:, 0] + v for key, v in numbers.items() if key in ("v_s", "p", "g")}
+                effects.append(ActiveEffect.of(load_effect(name), own, values))
+            rollout = engine(replace(world, effects=tuple(effects)), first, times(0.05))
+            return torch.cat([getattr(rollout, name)[:, -1].flatten(1) for name in POSES], 1)
+
+        return rolled
+
+    value, jacobian = batched_jacobian(function(simulate), inputs)
+    found, its = batched_jacobian(function(fused), inputs)
+    torch.testing.assert_close(found.cpu(), value, rtol=1e-9, atol=1e-9)
+    scale = jacobian.abs().amax((0, 1)).clamp_min(1e-9)
+    torch.testing.assert_close(its.cpu() / scale, jacobian / scale, rtol=1e-6, atol=1e-6)
+
+
 @NEEDS_COMPILER
 def test_refusals() -> None:
     world, state = world_of(box_body()), tossed(1)
@@ -428,9 +503,15 @@ def test_what_the_kernel_does_not_have() -> None:
     world = world_of(box_body())
     measured = replace(world, effects=(active("clock_scale", s=0.01), active("frame_tilt", tilt_x=0.1)))
     assert reason_against(world) is None and reason_against(measured) is None
-    for name in ("rolling_resistance", "adhesion", "velocity_restitution"):
-        reason = reason_against(replace(world, effects=(active("linear_drag", c=0.1), active(name))))
-        assert reason == f"the kernel does not have its effect '{name}'"
+    two, slope = world_of(box_body(), ball_body()), torch.tensor([0.6, 0.0, 0.8], dtype=F64)
+    for name in SURFACE_VALUES:
+        effects = (active("linear_drag", c=0.1), active(name))
+        assert reason_against(replace(world, effects=effects)) is None
+        reason = reason_against(replace(two, effects=effects))
+        assert reason == f"the kernel has '{name}' for one body on the ground only"
+        assert "takes one" in (reason_against(replace(world, effects=(*effects, active(name)))) or "")
+    tilted = replace(world, ground_normal=slope, effects=(active("anisotropic_friction"),))
+    assert "upright ground" in (reason_against(tilted) or "")
 
     class Other(LinearDrag):
         name = "other"
@@ -450,7 +531,11 @@ def crowded(count: int) -> World:
     return world_of(replace(one, on_plane=chosen), replace(two, on_plane=chosen))
 
 
-def test_the_torch_engine_is_taken_on_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_torch_engine_is_taken_on_a_cpu_without_a_compiler(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host, "compiler", lambda: None)
+    monkeypatch.setattr(dispatch, "compiler", lambda: None)
     world, state = world_of(box_body()), tossed(1)
     with caplog.at_level("INFO", "cgwm"):
         agree(
@@ -459,6 +544,68 @@ def test_the_torch_engine_is_taken_on_the_cpu(caplog: pytest.LogCaptureFixture) 
             0.0,
         )
     assert not caplog.records
+
+
+@NEEDS_COMPILER
+def test_the_kernel_is_taken_on_a_cpu_with_a_compiler(caplog: pytest.LogCaptureFixture) -> None:
+    world, state = world_of(box_body()), tossed(3)
+    dispatch._note.cache_clear()
+    with caplog.at_level("INFO", "cgwm"):
+        found = dispatch.rollout(world, state, times(0.2), None, True)
+        same_bits(found, simulate_on_host(world, state, times(0.2), None, True))
+        agree(simulate(world, state, times(0.2), None, True), found, 1e-9)
+        assert not caplog.records
+        twice = replace(world, effects=(active("adhesion"), active("adhesion")))
+        same_bits(simulate(twice, state, times(0.05)), dispatch.rollout(twice, state, times(0.05)))
+    assert [record.getMessage() for record in caplog.records] == [
+        "rollouts run in the torch engine, not in the fused kernel: the kernel takes one adhesion, and it has several"
+    ]
+
+
+@NEEDS_COMPILER
+def test_threads_change_no_bit_on_the_cpu() -> None:
+    world, state = world_of(box_body()), tossed(100)
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(simulate_on_host(world, state, times(0.1)))
+    finally:
+        torch.set_num_threads(before)
+    same_bits(*found)
+
+
+@NEEDS_COMPILER
+def test_flight_alone_is_for_the_kernel_too() -> None:
+    world = replace(world_of(box_body()), touching=False, effects=(active("linear_drag", c=0.3),))
+    agree(simulate(world, tossed(5), times(0.5)), simulate_on_host(world, tossed(5), times(0.5)), 1e-12)
+    pulled = replace(world, effects=(active("ground_magnet", A=1.0, l=0.1),))
+    assert "its bodies do not touch anything" in (lacking(pulled) or "")
+
+
+def test_a_compiler_that_fails_leaves_the_torch_engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = tmp_path / "g++"
+    broken.write_text("#!/bin/sh\necho 'no room left' >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr(host, "compiler", lambda: str(broken))
+    monkeypatch.setattr(host, "_trial", host._trial.__wrapped__)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert lacking(world_of(box_body())) == f"the C++ compiler {broken} failed: no room left"
+
+
+@NEEDS_COMPILER
+def test_a_kernel_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = 'extern "C" int answer() { return 42; }'
+    assert host._built(source).answer() == 42
+    kept = list((tmp_path / "cgwm" / "kernels").iterdir())
+    assert [path.suffix for path in kept] == [".so"]
+    monkeypatch.setattr(host.subprocess, "run", None)
+    assert host._built(source).answer() == 42
+    (tmp_path / "cgwm" / "kernels").chmod(0o777)
+    with pytest.raises(TypeError):  # what others may have written is not loaded
+        host._built(source)
 
 
 def test_which_derivatives_want_the_torch_engine() -> None:
@@ -499,12 +646,13 @@ def test_the_kernel_is_taken_on_cuda(caplog: pytest.LogCaptureFixture) -> None:
         found = dispatch.rollout(world, state, frames)
         assert torch.equal(found.position_m, simulate_fused(world, state, frames).position_m)
         assert not caplog.records
-        rolling = on_device(replace(world_of(box_body()), effects=(active("rolling_resistance"),)), "cuda", F64)
+        both = (active("rolling_resistance"), active("rolling_resistance"))
+        rolling = on_device(replace(world_of(box_body()), effects=both), "cuda", F64)
         for _ in range(2):
             agree(simulate(world_of(box_body()), tossed(1), times(0.1)), dispatch.rollout(rolling, state, frames), 1e-9)
         assert [record.getMessage() for record in caplog.records] == [
             "rollouts run in the torch engine, not in the fused kernel: "
-            "the kernel does not have its effect 'rolling_resistance'"
+            "the kernel takes one rolling_resistance, and it has several"
         ]
 
 

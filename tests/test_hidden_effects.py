@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from cgwm.datasets import Capture
 from cgwm.datasets.check import check_capture
-from cgwm.datasets.scenes.hidden import mechanics, protocol, record, things
+from cgwm.datasets.images import read_label
+from cgwm.datasets.scenes.hidden import filmed, mechanics, protocol, record, things
 from cgwm.pipeline.physics.effects.registry import effect_names
 from scipy.spatial.transform import Rotation
 
@@ -445,3 +446,31 @@ def test_wrong_cases_are_refused() -> None:
         Case("x", "cube", ("rolling_resistance",)).drawn_effects()
     with pytest.raises(ValueError, match="stage 'test'"):
         hidden_effects.cases("test")
+
+
+def test_a_case_is_filmed(tmp_path: Path) -> None:
+    case = replace(hidden_effects.filmed_cases("development")[0], train=1, test=1, length_s=0.1)
+    truth = hidden_effects.film_capture(tmp_path / "filmed", case)
+    assert json.loads(truth.read_text())["effects"][0]["name"] == "quadratic_drag"
+    capture = Capture.open(tmp_path / "filmed")
+    check_capture(capture)
+    assert not capture.tracks("000") and not (tmp_path / "filmed" / "tracks").exists()
+    hidden_effects.make_capture(tmp_path / "tracked", replace(case, position_std_m=1e-9, rotation_std_rad=1e-9))
+    track = Capture.open(tmp_path / "tracked").tracks("000")["ball"]
+    radius = float(case.drawn_thing().half_extents_m[0])
+    for name, camera in filmed.video_cameras(case).items():
+        assert sorted(capture.videos("000")) == ["left", "right"]
+        for frame in (0, 4):
+            mask = read_label(tmp_path / "filmed" / "video_masks" / name / "000" / f"{frame:06d}.png")
+            rows, columns = np.nonzero(mask)
+            x, y, z = camera.T_world_cam[:3, :3].T @ (track.position_m[frame] - camera.T_world_cam[:3, 3])
+            middle = filmed.FOCAL_PX * np.array([x, y]) / z + np.array(filmed.SIZE_PX) / 2
+            # half a pixel: the middle of pixel 0 lies at 0.5
+            assert np.abs([columns.mean() + 0.5, rows.mean() + 0.5] - middle).max() < 0.15
+            assert len(rows) == pytest.approx(np.pi * (filmed.FOCAL_PX * radius / z) ** 2, rel=0.06)
+
+
+def test_the_filmed_cases_have_seeds_of_their_own() -> None:
+    stages = [hidden_effects.filmed_cases(stage) for stage in ("development", "report")]
+    assert [len(found) for found in stages] == [6, 6] and all(case.filmed for found in stages for case in found)
+    assert not {case.seed for case in stages[0]} & {case.seed for case in stages[1]}

@@ -88,7 +88,7 @@ def test_an_interrupted_fit_does_not_look_for_poses_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(phys_images, "fit_with_constants", interrupted)
+        patch.setattr(phys_images, "fit_with_effects", interrupted)
         fitted(capture, out)
     assert not out.exists()
     checkpoint = tmp_path / "model.checkpoint"

@@ -18,6 +18,8 @@ from cgwm.datasets.scenes.hidden import (
     UNKNOWN,
     Case,
     cases,
+    film_capture,
+    filmed_cases,
     make_capture,
     rough_cases,
 )
@@ -35,6 +37,8 @@ __all__ = [
     "Case",
     "cases",
     "drake_cases",
+    "film_capture",
+    "filmed_cases",
     "make_capture",
     "rough_cases",
 ]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
+from ..physics.fused.packing import reason_against
 from ..physics.parameters import Parameter
 from ..physics.world import World
 from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
@@ -104,7 +105,7 @@ def picture(
     assert jacobian is not None
     columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
     # at neutral a candidate does nothing, so that each part of them has a world, and rollouts, of its own
-    for part in _parts(variants, segments):
+    for part in _parts(variants, segments, world_for(segments.kind, world)):
         beside, numbers = with_variants(world, part, segments.kind)
         at = replace(segments, world=world_for(segments.kind, beside))
         slopes = at.slopes(numbers, base_values(beside, numbers), rows)
@@ -114,18 +115,27 @@ def picture(
     return _picture(linear, segments, parameters, len(base), groups, robust)
 
 
-def _parts(variants: Sequence[Variant], segments: Segments) -> list[list[Variant]]:
-    """Return candidates in parts of one batch each: every rollout pays for all effects of its world."""
+def _parts(variants: Sequence[Variant], segments: Segments, world: World) -> list[list[Variant]]:
+    """Return candidates in parts of one batch each: every rollout pays for all effects of its world.
+
+    Those that the fused kernel takes are kept apart from those that it does not, and it takes one of a kind.
+    """
     most = max(1, PART_ROLLOUTS // len(segments.items))
-    parts: list[list[Variant]] = []
-    count = most
+    parts: list[tuple[bool, list[Variant]]] = []
     for variant in variants:
-        if count + len(variant.parameters) > most:
-            parts.append([])
-            count = 0
-        parts[-1].append(variant)
-        count += len(variant.parameters)
-    return parts
+        fast = reason_against(replace(world, effects=(*world.effects, variant.active))) is None
+        part = next((part for kind, part in parts if kind == fast and _fits(part, variant, most, fast)), None)
+        if part is None:
+            parts.append((fast, [variant]))
+        else:
+            part.append(variant)
+    return [part for _, part in parts]
+
+
+def _fits(part: Sequence[Variant], variant: Variant, most: int, one_of_a_kind: bool) -> bool:
+    """Whether a part takes one candidate more."""
+    alike = any(type(other.active.effect) is type(variant.active.effect) for other in part)
+    return sum(len(v.parameters) for v in (*part, variant)) <= most and not (one_of_a_kind and alike)
 
 
 def _picture(

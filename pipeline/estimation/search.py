@@ -57,6 +57,7 @@ def importance_search(
     generations: int,
     errors: float,
     floor: float,
+    first: Array | None = None,
     on_generation: Callable[[int, float], None] | None = None,
 ) -> SearchResult:
     """Sample the posterior under a tempered likelihood, exp(-errors / 2 * (cost / scale)^2) with scale the lowest cost.
@@ -75,6 +76,7 @@ def importance_search(
         generations: Number of generations.
         errors: Number of independent errors in the mean cost.
         floor: Cost that the measurement's noise alone makes; the scale is never below it.
+        first: The first sample (P,); the prior's mean by default.
         on_generation: Called with the generation and the lowest cost so far.
     """
     rng = np.random.default_rng(seed)
@@ -86,7 +88,7 @@ def importance_search(
     for generation in range(generations):
         drawn = rng.multivariate_normal(*proposals[-1], population).clip(prior.bounds[:, 0], prior.bounds[:, 1])
         if generation == 0:
-            drawn[0] = prior.mean
+            drawn[0] = prior.mean if first is None else first
         new = costs(drawn)
         samples, found = np.concatenate([samples, drawn]), np.concatenate([found.reshape(-1, new.shape[1]), new])
         total = np.where(np.isfinite(found).all(1), found.mean(1), np.inf)

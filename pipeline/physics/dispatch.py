@@ -1,4 +1,4 @@
-"""Rollouts by the fused kernel where it can take them, by the torch engine elsewhere."""
+"""Rollouts by the fused kernel where it can take them, on the GPU or the CPU, by the torch engine elsewhere."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ..compiler import compiler
 from .detection import pairs_of, slot_count
 from .devices import on_device
 from .driven import Drive
 from .fused import simulate_fused, unsupported
+from .fused.host import lacking, simulate_on_host
 from .rollout import Rollout, simulate
 from .world import State, World
 
@@ -33,16 +35,17 @@ def rollout(
     driven: Mapping[str, Track | Drive] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
-    """Do what `simulate` does, on CUDA in one kernel where that can take the world.
+    """Do what `simulate` does, in one kernel where that can take the world: on CUDA, or on a CPU with a C++ compiler.
 
-    Where it cannot, the log says so once for each reason; on the CPU there is no choice, and nothing to say. A world
-    that rolls on another device than its own is taken there if the kernel can take it, and the rollout brought back.
+    Where it cannot, the log says so once for each reason; on a CPU without a compiler there is no choice, and nothing
+    to say. A world that rolls on another device than its own is taken there if the kernel can take it, and the rollout
+    brought back.
 
     Raises:
         InputDataError, UsageError: See :func:`simulate`.
     """
     home = world.gravity.device
-    if world.rolls_on is not None and home.type == "cpu":
+    if world.rolls_on not in (None, home.type) and home.type == "cpu":
         away = on_device(replace(world, rolls_on=None), world.rolls_on)
         reason = unsupported(away) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
         if reason is None:
@@ -50,12 +53,12 @@ def rollout(
             driven = {name: on_device(command, world.rolls_on) for name, command in (driven or {}).items()}
             return on_device(simulate_fused(away, state, times_s, driven, record_contacts), home)
         _note(reason)
-    if home.type != "cuda":
-        return simulate(world, state, times_s, driven, record_contacts)
-    reason = unsupported(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
+    run, against = (simulate_fused, unsupported) if home.type == "cuda" else (simulate_on_host, lacking)
+    reason = against(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
     if reason is None:
-        return simulate_fused(world, state, times_s, driven, record_contacts)
-    _note(reason)
+        return run(world, state, times_s, driven, record_contacts)
+    if home.type == "cuda" or compiler() is not None:
+        _note(reason)
     return simulate(world, state, times_s, driven, record_contacts)
 
 

@@ -6,8 +6,9 @@ from cgwm's where a real one would.
 
 from . import contact, flight, measured, unknown
 from .case import Case
+from .filmed import film_capture
 from .mystery import draw_mystery, make_mystery, open_sealed
-from .plan import KNOWN, PAIRS, UNKNOWN, cases, rough_cases
+from .plan import KNOWN, PAIRS, UNKNOWN, cases, filmed_cases, rough_cases
 from .record import ENGINES, make_capture
 from .registry import EFFECTS
 
@@ -24,6 +25,8 @@ __all__ = [
     "Case",
     "cases",
     "draw_mystery",
+    "film_capture",
+    "filmed_cases",
     "make_capture",
     "make_mystery",
     "open_sealed",

@@ -38,6 +38,7 @@ class Case:
         gaps: Number of gaps of 3 to 8 samples in every episode.
         uneven: Spread of the times, in sampling intervals (0.3: each time off by up to that).
         engine: The truth, one of `record.ENGINES`.
+        filmed: Whether it is measured by two videos with masks, and has no tracks (`filmed.film_capture`).
     """
 
     name: str
@@ -61,6 +62,7 @@ class Case:
     gaps: int = 0
     uneven: float = 0.0
     engine: str = "mujoco"
+    filmed: bool = False
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.effects if name not in EFFECTS]

@@ -41,6 +41,16 @@ ROUGH: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     ("ball", ("gust",)),
 )
 """Effects that are hidden in rough measurements, too; those of the last four have centroids only."""
+FILMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
+    ("ball", ("quadratic_drag",)),
+    ("ball", ("gravity_tilt",)),
+    ("ball", ("wind",)),
+    ("cube", ("linear_drag",)),
+    ("cube", ("com_offset",)),
+    ("ball", ("gust",)),
+)
+"""Effects that are hidden in captures with videos only; the last is in no library."""
+FILM_HZ, FILM_S, FILM_TEST = 40.0, 0.5, 2
 SIZES: tuple[Size, ...] = ("small", "large")
 THINGS: tuple[Kind, ...] = ("cube", "ball")
 NULLS = 200
@@ -87,6 +97,13 @@ def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = 
     ]
     rough = {"outliers": 0.02, "gaps": 1, "uneven": 0.3, "mass_given": False}
     return [replace(case, centroid_only=centroids, **rough) for case, centroids in found]
+
+
+def filmed_cases(stage: Stage) -> list[Case]:
+    """Return cases that are filmed: large effects, six throws of 0.5 s to learn from at 40 Hz; see `cases`."""
+    found = [planned_case(stage, "study", thing, names, "large", 0, "/video") for thing, names in FILMED]
+    film = {"rate_hz": FILM_HZ, "length_s": FILM_S, "protocol": "throws", "test": FILM_TEST}
+    return [replace(case, filmed=True, **film) for case in found]
 
 
 def planned_case(

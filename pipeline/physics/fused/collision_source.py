@@ -20,6 +20,36 @@ INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocit
 }
 
 #if EFFECTS
+#if SURFACE
+// Adds the pull of a sticky ground to a body's velocity and angular momentum.
+INLINE void stick(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec& velocity,
+                  Vec& spin) {
+    const Surface& s = env.law.surface;
+    int p = plane_pair(b), start = contact_start(p);
+    Real sum = Real(0), most = Real(0), each = reciprocal(s.reach);
+    Vec arms = none();
+    for (int k = env.lanes.lane; k < contact_count(p); k += LANES) {
+        long long row = env.geometry + 4LL * problem.spheres[start + k];
+        Vec arm = rotation * (problem.geometry.vector(row) - env.constants[b].com);
+        arm.z = arm.z - problem.geometry.at(row + 3);
+        Real far = each * (env.bodies[b].position.z - env.ground + arm.z);
+        far = at_most(at_least(far, Number(0)), Number(1));
+        Real near = square(Real(Number(1)) - far * far);
+        sum += near;
+        arms = arms + near * arm;
+        if (plain(near) > plain(most)) most = near;
+    }
+    sum = env.lanes.sum(sum);
+    arms = env.lanes.sum(arms);
+    most = -env.lanes.least(-most);
+    // the weights add up to that of the lowest sphere, so that more spheres do not pull more
+    Real pull = -(env.law.step_s * s.adhesion * most * reciprocal(at_least(sum, Number(1e-12))));
+    velocity.z += env.constants[b].inverse_mass * pull * sum;
+    spin.x += pull * arms.y;
+    spin.y -= pull * arms.x;
+}
+#endif
+
 #if MAGNET
 // Height of the lowest sphere of a body that the ground can touch, at least 0.
 __device__ Real height_of(const Problem& problem, const Environment& env, int b, const Mat& rotation) {
@@ -49,6 +79,9 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
 #endif
     velocity = velocity + h * a;
     spin = spin - h * w.spin_damping * body.spin;
+#if SURFACE
+    stick(problem, env, b, rotation, velocity, spin);
+#endif
 }
 #endif
 
@@ -68,7 +101,7 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
     tally.weighted[1] += along * plain(point.y);
     tally.weighted[2] += along * plain(point.z);
     tally.weight += along;
-    if (across > Number(0.99) * plain(friction_of(law)) * along) tally.sliding += along;
+    if (across > Number(0.99) * plain(friction_of(law, c)) * along) tally.sliding += along;
 }
 #endif
 
@@ -280,6 +313,16 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
     for (int i = 0; i < SLOTS; i++) {
         if (list[i].on) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
     }
+#if SURFACE
+    Real total = Real(0);
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) total += weights[i];
+    total = env.lanes.sum(total);
+    EACH_SLOT
+    for (int i = 0; i < SLOTS; i++) {
+        if (list[i].on) surface(list[i], env.law, motion, env.bodies[a].position, weights[i], total);
+    }
+#endif
 #endif
 }
 
@@ -328,6 +371,9 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         free_velocities[b] = motions[b].velocity;
         free_omegas[b] = motions[b].omega;
     }
+#if SURFACE
+    Real touching = Real(env.lanes.sum(Number(count)));
+#endif
     // the impulses of the step before act first
     int sweep = env.lanes.any(env.warm) ? -1 : 0;
     do {
@@ -352,6 +398,10 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             if (sweep >= 0) c.impulse = swept(c, env.law, motions[0].velocity + cross(motions[0].omega, c.arm));
             linear[0] = linear[0] + c.impulse;
             angular[0] = angular[0] + cross(c.arm, c.impulse);
+#if SURFACE
+            if (sweep >= 0) c.turning = turned_by(c, env.law, motions[0], touching);
+            angular[0] = angular[0] + c.turning;
+#endif
         }
 #endif
         EACH_BODY

@@ -8,10 +8,10 @@ from __future__ import annotations
 CONTACTS = r"""
 struct Law {
     Real step_s, inverse_step, stiffness, damping, friction;
+#if SURFACE
+    Surface surface;
+#endif
 };
-
-// Where laws of friction go that depend on the place, the direction or the speed of a contact.
-INLINE Real friction_of(const Law& law) { return law.friction; }
 
 struct Motion {  // free velocities of a body, and what a unit of impulse does to them; 0 where it is not free
     Vec velocity, omega;
@@ -22,6 +22,10 @@ struct Motion {  // free velocities of a body, and what a unit of impulse does t
 struct Contact {  // world frame, impulse on body a
     Vec arm, impulse;
     Real target, stop_n, stop_t;
+#if SURFACE
+    Real friction, steady_x, steady_y;  // impulses that stay as they are
+    Vec turning;                        // angular impulse beyond the moment of the other
+#endif
 #if PAIRED
     Vec normal, arm_b;
     int a, b, slot;
@@ -29,6 +33,14 @@ struct Contact {  // world frame, impulse on body a
     bool on;
 #endif
 };
+
+INLINE Real friction_of(const Law& law, const Contact& c) {
+#if SURFACE
+    return c.friction;
+#else
+    return law.friction;
+#endif
+}
 
 INLINE Real mobility_trace(const Motion& m, Vec arm) {
     return Number(3) * m.inverse_mass + trace(m.inverse_inertia) * dot(arm, arm) - dot(arm, m.inverse_inertia * arm);
@@ -48,7 +60,11 @@ INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inver
         closed = -ahead * reciprocal(at_least(along, Number(1e-12)));
         closed = at_most(at_least(closed, Number(0)), Number(1));
     }
-    Real demand = -law.damping * closed * speed - law.stiffness * at_most(ahead, Number(0)) * law.inverse_step;
+    Real stiffness = law.stiffness, damping = law.damping;
+#if SURFACE
+    response(law.surface, law.step_s, speed, stiffness, damping);
+#endif
+    Real demand = -damping * closed * speed - stiffness * at_most(ahead, Number(0)) * law.inverse_step;
     c.target = speed + demand;
     c.stop_n = reciprocal(inverse_mass);
     c.stop_t = mobility - inverse_mass;
@@ -73,14 +89,20 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
 #else
     Real speed = relative.z, before = c.impulse.z;
     Real x = c.impulse.x - c.stop_t * relative.x, y = c.impulse.y - c.stop_t * relative.y;
+#if SURFACE
+    x -= c.steady_x;
+    y -= c.steady_y;
+#endif
     Real wanted2 = x * x + y * y;
 #endif
     Real along = at_least(before + c.stop_n * (c.target - speed), Number(0));
     // the tiny number keeps the derivative of a contact without impulses finite
-    Real scale = friction_of(law) * along * inverse_root(wanted2 + Real(Number(1e-24)));
+    Real scale = friction_of(law, c) * along * inverse_root(wanted2 + Real(Number(1e-24)));
     scale = at_most(scale, Number(1));
 #if PAIRED
     return along * c.normal + scale * wanted;
+#elif SURFACE
+    return vec(scale * x + c.steady_x, scale * y + c.steady_y, along);
 #else
     return vec(scale * x, scale * y, along);
 #endif
@@ -121,6 +143,32 @@ INLINE bool touch_ground(Contact& c, const Law& law, const Motion& a, Vec arm, R
     Real inverse_mass = a.inverse_mass + J.xx * x * x + Number(2) * J.xy * x * y + J.yy * y * y;
     return prepare(c, law, gap, speed, inverse_mass, mobility_trace(a, c.arm), weight);
 }
+
+#if SURFACE
+// What the ground does to a contact beyond the law: its friction, and the drag of what lies between, of which all
+// contacts together, whose weights add up to `total`, take their shares.
+INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real weight, Real total) {
+    const Surface& s = law.surface;
+    Real u = a.velocity.x + a.omega.y * c.arm.z - a.omega.z * c.arm.y;
+    Real v = a.velocity.y + a.omega.z * c.arm.x - a.omega.x * c.arm.z;
+    c.friction = friction_at(s, law.friction, com.x + c.arm.x, com.y + c.arm.y, u, v);
+    Real drag = law.step_s * s.viscous * weight * reciprocal(at_least(total, Number(0.02)));
+    drag = -(drag * reciprocal(Real(Number(1)) + drag * reciprocal(c.stop_t)));
+    c.steady_x = drag * u;
+    c.steady_y = drag * v;
+    c.turning = none();
+}
+
+// The angular impulse of a contact after a sweep against rolling and spinning; `count` contacts stop the same spin.
+INLINE Vec turned_by(const Contact& c, const Law& law, const Motion& a, Real count) {
+    const Sym& J = a.inverse_inertia;
+    Real across = reciprocal((J.xx + J.yy) * count), about = reciprocal(J.zz * count);
+    Real x = c.turning.x - across * a.omega.x, y = c.turning.y - across * a.omega.y;
+    Real z = c.turning.z - about * a.omega.z;
+    Real roll = shortened(x * x + y * y, law.surface.rolling * c.impulse.z);
+    return vec(roll * x, roll * y, shortened(z * z, law.surface.torsion * c.impulse.z) * z);
+}
+#endif
 
 #if PAIRED
 struct Union {  // the spheres of a body, in its frame

@@ -97,6 +97,24 @@ INLINE void load(const Problem& problem, Environment& env) {
     w.magnet_range = table.at(at + 11);
     at += 12;
 #endif
+#if SURFACE
+    Surface& s = env.law.surface;
+    s.stribeck = table.at(at);
+    s.slow_speed = table.at(at + 1);
+    s.even = table.at(at + 2);
+    s.mixed = table.at(at + 3);
+    for (int i = 0; i < 9; i++) s.spots[i] = table.at(at + 4 + i);
+    s.spot_m = table.at(at + 13);
+    s.viscous = table.at(at + 14);
+    s.rolling = table.at(at + 15);
+    s.torsion = table.at(at + 16);
+    s.restitution = table.at(at + 17);
+    s.time = table.at(at + 18);
+    s.ratio = table.at(at + 19);
+    s.adhesion = table.at(at + 20);
+    s.reach = table.at(at + 21);
+    at += 22;
+#endif
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
         Body& body = env.bodies[b];

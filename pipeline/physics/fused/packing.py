@@ -53,8 +53,6 @@ def reason_against(world: World) -> str | None:
         return "its numbers have several types" if len(kinds) > 1 else "its numbers are neither float32 nor float64"
     if not world.bodies:
         return "it has no bodies"
-    if not world.touching:
-        return "its bodies do not touch anything"
     reason = wrenches.reason_against(world)
     if reason is not None:
         return reason
@@ -102,7 +100,7 @@ def pack(
         single, False, 1, record, bool(effects), wrenches.has_magnet(world), turned,
         tuple(body.free for body in world.bodies),
         tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
-        tuple(body.radii.shape[-1] for body in world.bodies), pairs,
+        tuple(body.radii.shape[-1] for body in world.bodies), pairs, surface=wrenches.has_surface(world),
     )  # fmt: skip
     return Packed(
         structure,

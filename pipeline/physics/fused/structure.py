@@ -12,10 +12,11 @@ from .collision_source import COLLISION
 from .contact_source import CONTACTS
 from .environment_source import ENVIRONMENT
 from .rollout_source import ROLLOUT
+from .surface_source import SURFACE
 
 THREADS = 32
 """Of a block: one warp, so that few environments still spread over all multiprocessors."""
-BODY_COLUMNS, WRENCH_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 4, 5
+BODY_COLUMNS, WRENCH_COLUMNS, SURFACE_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 22, 4, 5
 MOTION_COLUMNS = 13
 """The last ones of a body: position, orientation, velocity and spin."""
 _BUSY_THREADS = 262_144
@@ -52,7 +53,8 @@ class Structure:
     of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnet: one of them by the
     ground's pull; turned: whether the frame of bodies that touch each other is not the world's; free (bodies,); drives
     (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
-    ground, each with its number of contacts; carried: whether each launch goes on where the one before ended.
+    ground, each with its number of contacts; carried: whether each launch goes on where the one before ended; surface:
+    effects of the contact of one body with the ground.
     """
 
     single: bool
@@ -67,6 +69,7 @@ class Structure:
     spheres: tuple[int, ...]
     pairs: tuple[tuple[int, int, int], ...]
     carried: bool = False
+    surface: bool = False
 
     @property
     def contacts(self) -> int:
@@ -81,7 +84,8 @@ class Structure:
     @property
     def table_width(self) -> int:
         """Numbers of an environment."""
-        world = WORLD_COLUMNS + self.turned * TURN_COLUMNS + self.effects * WRENCH_COLUMNS
+        world = WORLD_COLUMNS + self.turned * TURN_COLUMNS
+        world += self.effects * WRENCH_COLUMNS + self.surface * SURFACE_COLUMNS
         return world + len(self.free) * BODY_COLUMNS
 
     @property
@@ -97,7 +101,8 @@ class Structure:
         held = unrolled and not paired and not (self.record and self.slots > _FREE_SLOTS[False, False])
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
-            "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "TURNED": self.turned,
+            "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "SURFACE": self.surface,
+            "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
@@ -113,7 +118,8 @@ class Structure:
             "plane_pair": [_plane_pair(self.pairs, index) for index in range(len(self.free))],
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]
-        return "\n".join((*lines, _LANGUAGE, *functions, ARITHMETIC, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT))
+        parts = (ARITHMETIC, SURFACE, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT)
+        return "\n".join((*lines, _LANGUAGE, *functions, *parts))
 
 
 def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool) -> int:

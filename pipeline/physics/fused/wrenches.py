@@ -1,23 +1,37 @@
-"""The effects of a world that the fused kernel knows, as coefficients of accelerations in flight."""
+"""The effects of a world that the fused kernel knows: coefficients of accelerations in flight, and of the contact."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ..contact import ContactLaw
+from ..effects.adhesion import Adhesion
+from ..effects.anisotropic_friction import AnisotropicFriction
 from ..effects.buoyancy import Buoyancy
 from ..effects.constant_force import ConstantForce
-from ..effects.effect import Effect, vector
+from ..effects.effect import Effect, Values, vector
+from ..effects.friction_patch import FrictionPatch
 from ..effects.ground_magnet import GroundMagnet
 from ..effects.linear_drag import LinearDrag
 from ..effects.magnus_lift import MagnusLift
 from ..effects.quadratic_drag import QuadraticDrag
+from ..effects.rolling_resistance import RollingResistance
 from ..effects.spin_damping import SpinDamping
+from ..effects.stribeck_friction import StribeckFriction
+from ..effects.torsional_friction import TorsionalFriction
+from ..effects.velocity_restitution import VelocityRestitution
+from ..effects.viscous_friction import ViscousFriction
 from ..effects.wind import Wind
 from ..world import World
 
 _KNOWN = (LinearDrag, QuadraticDrag, MagnusLift, SpinDamping, ConstantForce, Buoyancy, Wind, GroundMagnet)
+_DIRECTED = (AnisotropicFriction, FrictionPatch)
+_SURFACE = (
+    *_DIRECTED, Adhesion, RollingResistance, StribeckFriction, TorsionalFriction, VelocityRestitution, ViscousFriction,
+)  # fmt: skip
 
 
 def reason_against(world: World) -> str | None:
@@ -26,10 +40,24 @@ def reason_against(world: World) -> str | None:
         return f"the kernel does not have its contact law '{world.contact.name}'"
     acting = [active.effect for active in world.effects if _acts(active.effect)]
     for effect in acting:
-        if type(effect) not in _KNOWN:  # a user's subclass of a known one is another effect
+        if type(effect) not in (*_KNOWN, *_SURFACE):  # a user's subclass of a known one is another effect
             return f"the kernel does not have its effect '{effect.name}'"
-    if sum(isinstance(effect, GroundMagnet) for effect in acting) > 1:
-        return "the kernel takes one ground_magnet, and it has several"
+    for kind in (GroundMagnet, *_SURFACE):
+        if sum(isinstance(effect, kind) for effect in acting) > 1:
+            return f"the kernel takes one {kind.name}, and it has several"
+        if kind in (GroundMagnet, Adhesion) and not world.touching and any(isinstance(e, kind) for e in acting):
+            return f"the kernel finds the height for {kind.name} by contacts, and its bodies do not touch anything"
+    return _against_surface(world, acting)
+
+
+def _against_surface(world: World, acting: Sequence[Effect]) -> str | None:
+    """Return why the kernel cannot take effects of the contact in a world; None where it can, or there are none."""
+    surface = next((effect for effect in acting if isinstance(effect, _SURFACE)), None)
+    if surface is not None and (len(world.bodies) > 1 or world.ground_normal is None):
+        return f"the kernel has '{surface.name}' for one body on the ground only"
+    directed = next((effect for effect in acting if isinstance(effect, _DIRECTED)), None)
+    if directed is not None and world.ground_normal is not None and world.ground_normal.tolist() != [0.0, 0.0, 1.0]:
+        return f"the kernel has '{directed.name}' for an upright ground only"
     return None
 
 
@@ -43,11 +71,17 @@ def has_magnet(world: World) -> bool:
     return any(isinstance(active.effect, GroundMagnet) for active in world.effects)
 
 
+def has_surface(world: World) -> bool:
+    """Whether an effect changes the contact with the ground; without contact none does."""
+    return world.touching and any(isinstance(active.effect, _SURFACE) for active in world.effects)
+
+
 def coefficients(world: World) -> list[Tensor]:
-    """Return the coefficients (1 or B, k) of the accelerations, world frame; none where no effect acts.
+    """Return the coefficients (1 or B, k) of the effects, world frame; none where no effect acts.
 
     In this order: c, k, s, d; f (3) with the buoyancy; wind (3); A, l of the ground's pull:
-    a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with u = v - wind, and alpha = -d omega.
+    a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with u = v - wind, and alpha = -d omega. Then those of
+    the contact, where there are any, in the order of `Surface` in the source.
     """
     if not any(_acts(active.effect) for active in world.effects):
         return []
@@ -74,4 +108,24 @@ def coefficients(world: World) -> list[Tensor]:
                 wind = wind + effect.along(active.values, world.up)
             case GroundMagnet():
                 magnet, reach = values["A"], values["l"]
-    return [linear, quadratic, magnus, damping, force, wind, magnet, reach]
+    found = [linear, quadratic, magnus, damping, force, wind, magnet, reach]
+    return [*found, *_surface(world, zero)] if has_surface(world) else found
+
+
+def _surface(world: World, zero: Tensor) -> list[Tensor]:
+    """Return the columns (1 or B, 1) of `Surface`; lengths and speeds of what does not act are 1."""
+    law = world.contact
+    assert isinstance(law, ContactLaw)  # see reason_against
+    values: dict[type[Effect], Values] = {type(active.effect): active.values for active in world.effects}
+
+    def number(kind: type[Effect], name: str, otherwise: float = 0.0) -> Tensor:
+        return values[kind][name][:, None] if kind in values else zero + otherwise
+
+    spots = [number(FrictionPatch, parameter.name) for parameter in FrictionPatch.parameters]
+    return [
+        number(StribeckFriction, "d"), number(StribeckFriction, "v_s", 1.0),
+        number(AnisotropicFriction, "a"), number(AnisotropicFriction, "b"),
+        *spots, number(FrictionPatch, "p", 1.0), number(ViscousFriction, "c_v"), number(RollingResistance, "c_r"),
+        number(TorsionalFriction, "c_t"), number(VelocityRestitution, "r"), law.contact_time_s[:, None],
+        law.damping_ratio[:, None], number(Adhesion, "F"), number(Adhesion, "g", 1.0),
+    ]  # fmt: skip

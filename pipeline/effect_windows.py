@@ -1,0 +1,110 @@
+"""Effects in a fit: those of flight found in flights, the others about first contacts, constants on their grids."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import torch
+
+from ..datasets.tracks import Track
+from .effect_flights import fit_effect_flights
+from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, fit_first_contacts
+from .physics.effects import ActiveEffect
+from .physics.parameters import Parameter, effect_parameters
+from .physics.world import World
+
+Start = list[tuple[Parameter, float]]
+
+
+def fit_effect_windows(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    along: Sequence[tuple[Parameter, float]],
+    noise: tuple[float, float],
+) -> FirstContacts:
+    """Fit the world's effects: to flights those that they show, the others to flight and first contacts.
+
+    The open-loop search is for few numbers: with every effect its valley gets narrower; flights and windows show
+    effects well. A constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be searched
+    from there: it is tried at each value of its grid, and the one with the lowest cost is kept.
+
+    Args:
+        world: With effects.
+        episodes: Name and tracks by body of each episode.
+        along: The contact's numbers that are fitted along in contact, and where they start.
+        noise: Of the tracks (position [m], rotation [rad]).
+
+    Raises:
+        NotConvergedError: If the rollouts diverge at the start.
+    """
+    contact = [active.effect.name for active in world.effects if active.effect.phase == "contact"]
+    others = [active.effect.name for active in world.effects if active.effect.name not in contact]
+    after_s = CONTACT_S if contact else AFTER_S
+
+    def about_contacts(at: World, wanted: Start) -> FirstContacts:
+        return fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)
+
+    flown = _best(world, others, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise)) if others else None
+    if flown is not None and not contact:
+        return flown
+    # what flights show stands: in contact it would be bent by what the contact law misses
+    touched = _best(world if flown is None else flown.world, contact if flown else [*others, *contact], about_contacts)
+    assert touched is not None  # windows always give something
+    if flown is None:
+        return touched
+    record = touched.record | {"in_flight": flown.record}
+    parameters, constants = (*flown.parameters, *touched.parameters), flown.constants | touched.constants
+    return FirstContacts(touched.world, parameters, record, constants)
+
+
+def _best(
+    world: World, names: Sequence[str], fit: Callable[[World, Start], FirstContacts | None]
+) -> FirstContacts | None:
+    """Return the fit of some effects at those of their constants that fit best; None where a fit gives nothing."""
+    grids = [
+        (a.effect.name, constant) for a in world.effects if a.effect.name in names for constant in a.effect.constants
+    ]
+    best: FirstContacts | None = None
+    tried = []
+    for values in itertools.product(*(constant.grid for _, constant in grids)):
+        chosen = {f"{effect}.{constant.name}": value for (effect, constant), value in zip(grids, values, strict=True)}
+        at = _at(world, chosen)
+        found = fit(at, _starts(at, names))
+        if found is None:
+            return None
+        tried.append(chosen | {"cost": found.record["costs"][-1]})
+        if best is None or tried[-1]["cost"] < best.record["costs"][-1]:
+            best = replace(found, constants=chosen)
+    assert best is not None  # the product of no grids has one member
+    return replace(best, record=best.record | {"constants_tried": tried}) if grids else best
+
+
+def _starts(world: World, names: Sequence[str]) -> Start:
+    """Return the parameters of some effects and where they start: an effect that is neutral at the size that matters.
+
+    Only numbers that cannot be negative: others have no sign yet. From nothing, what acts through another effect, as
+    wind does through drag, would have no slope.
+    """
+    found = {parameter.name: parameter for parameter in effect_parameters(world)}
+    starts = []
+    for active in world.effects:
+        if active.effect.name not in names:
+            continue
+        neutral = all(float(active.values[p.name]) == 0.0 for p in active.effect.parameters)
+        for number in active.effect.parameters:
+            value = float(active.values[number.name])
+            begun = number.scale if neutral and number.nonnegative else value
+            starts.append((found[f"{active.effect.name}.{number.name}"], begun))
+    return starts
+
+
+def _at(world: World, constants: Mapping[str, float]) -> World:
+    effects = []
+    for active in world.effects:
+        own = {c.name: constants.get(f"{active.effect.name}.{c.name}") for c in active.effect.constants}
+        chosen = {name: value for name, value in own.items() if value is not None}
+        like = next(iter(active.values.values()), torch.zeros(1))
+        effects.append(ActiveEffect.of(active.effect, active.values | chosen, like))
+    return replace(world, effects=tuple(effects))
