@@ -24,6 +24,8 @@ from .segments import Segments
 
 TIME_S = 0.01
 """Contact time of the soft law, critically damped."""
+SWEEPS = 4
+"""So many suffice where impulses change slowly from step to step."""
 STATE_STEPS = (1e-4, 1e-3, 1e-3, 1e-2)
 """Differences by position [m], rotation [rad], velocity [m/s] and angular velocity [rad/s]."""
 PARAMETER_STEP = 0.02
@@ -41,7 +43,8 @@ def soft_world(world: World) -> World:
         damping_ratio=torch.ones_like(law.damping_ratio),
     )
     offset = world.ground_offset + gravity * TIME_S**2
-    return replace(world, contact=soft, ground_offset=offset, step_s=0.5 * TIME_S)
+    sweeps = min(world.sweeps, SWEEPS)
+    return replace(world, contact=soft, ground_offset=offset, step_s=0.5 * TIME_S, sweeps=sweeps)
 
 
 @dataclass(frozen=True)

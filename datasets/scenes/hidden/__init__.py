@@ -7,7 +7,7 @@ from cgwm's where a real one would.
 from . import contact, flight, measured, unknown
 from .case import Case
 from .mystery import draw_mystery, make_mystery, open_sealed
-from .plan import KNOWN, PAIRS, UNKNOWN, cases, rough_cases
+from .plan import KNOWN, PAIRS, STAGES, UNKNOWN, cases, rough_cases
 from .record import ENGINES, make_capture
 from .registry import EFFECTS
 
@@ -19,6 +19,7 @@ __all__ = [
     "ENGINES",
     "KNOWN",
     "PAIRS",
+    "STAGES",
     "TRUTHS",
     "UNKNOWN",
     "Case",
