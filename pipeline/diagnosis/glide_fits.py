@@ -27,10 +27,13 @@ TIME_S = 0.01
 SWEEPS = 4
 """So many suffice where impulses change slowly from step to step."""
 STATE_STEPS = (1e-4, 1e-3, 1e-3, 1e-2)
-"""Differences by position [m], rotation [rad], velocity [m/s] and angular velocity [rad/s]."""
+"""Differences by position [m], rotation [rad], velocity [m/s] and angular velocity [rad/s], both ways."""
 PARAMETER_STEP = 0.02
 """Differences by parameters, in widths of their priors."""
-ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE = 8, 1e4, 0.2, 2e-3
+ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE = 8, 1e5, 0.2, 2e-3
+DAMPINGS = (0.1, 1.0, 10.0, 300.0)
+"""Of each step so many are tried, in units of the damping that was best before: through the end of a slide the linear
+picture holds for small steps only."""
 
 
 def soft_world(world: World) -> World:
@@ -95,44 +98,74 @@ def fit_groups(
 
     start = values.gather(1, place)
     now, cost = start, cost_of(chi2, start)
-    damping = torch.full_like(cost, 1e-3)
-    active = torch.ones(count, dtype=torch.bool)
+    damping, active = torch.full_like(cost, 1e-2), torch.ones(count, dtype=torch.bool)
     information = torch.zeros(count, size, size).to(values)
     for _ in range(iterations):
         places = active[group].nonzero()[:, 0].tolist()
         some, own = segments.select(places), group[places]
         rows, jacobian, basis = _linear(some, parameters, whole(now)[own], free[own])
-        by_value, by_state = jacobian[..., :size], jacobian[..., size:]
-        error = rows[..., None]
-        normal = by_state.mT @ by_state
-        damped = normal + torch.diag_embed(damping[own][:, None] * normal.diagonal(dim1=1, dim2=2) + 1e-9)
-        mixed, slope = by_state.mT @ by_value, by_state.mT @ error
-        solved = torch.linalg.solve(damped, torch.cat((mixed, slope), -1))
-        total = _added(by_value.mT @ by_value - mixed.mT @ solved[..., :size], own, count) + torch.diag_embed(prior)
-        score = _added(-(by_value.mT @ error - mixed.mT @ solved[..., size:])[..., 0], own, count)
-        score = score - prior * (now - start)
-        blocked = ((now <= low) & (score < 0)) | ((now >= high) & (score > 0))
-        moving = (fitted & ~blocked & active[:, None]).to(values)
-        diagonal = damping[:, None] * total.diagonal(dim1=1, dim2=2) * moving + (1 - moving)
-        reduced = total * moving[:, :, None] * moving[:, None] + torch.diag_embed(diagonal)
-        trial = torch.minimum(torch.maximum(now + torch.linalg.solve(reduced, score * moving), low), high)
-        change = -(solved[..., size:] + solved[..., :size] @ (trial - now)[own][..., None])[..., 0]
-        moved = some.moved((basis @ change[..., None])[..., 0])
-        found = chi2.clone()
-        found[places] = _chi2(moved, parameters, whole(trial)[own])
-        after = cost_of(found, trial)
-        better = active & (after < cost)
-        chi2 = torch.where(better[group], found, chi2)
-        segments = _placed(segments, places, moved, better[own])
-        now = torch.where(better[:, None], trial, now)
-        information = torch.where(active[:, None, None], total, information)
-        done = better & (cost - after < FALL + FALL_SHARE * after)
-        cost = torch.where(better, after, cost)
-        damping = torch.where(better, damping / 6, damping * 8)
-        active &= ~done & (damping < MAX_DAMPING)
+
+        def step(damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Return values (G, S), changes of states along the basis (n, K) and information of a damped step."""
+            m, g, by_slope, by_value = _projected(rows, jacobian, size, own, damping)  # noqa: B023 used at once
+            m, g = m + torch.diag_embed(prior), g - prior * (now - start)  # noqa: B023
+            blocked = ((now <= low) & (g < 0)) | ((now >= high) & (g > 0))  # noqa: B023
+            moving = (fitted & ~blocked & active[:, None]).to(values)  # noqa: B023
+            diagonal = damping[:, None] * m.diagonal(dim1=1, dim2=2) * moving + (1 - moving)
+            reduced = m * moving[:, :, None] * moving[:, None] + torch.diag_embed(diagonal)
+            trial = now + torch.linalg.solve(reduced, g * moving)  # noqa: B023
+            trial = torch.minimum(torch.maximum(trial, low), high)
+            return trial, -(by_slope + by_value @ (trial - now)[own][..., None])[..., 0], m  # noqa: B023
+
+        undamped = step(torch.zeros_like(damping))[2]
+        information = torch.where(active[:, None, None], undamped, information)
+        trials, changes, _ = zip(*(step(damping * factor) for factor in DAMPINGS), strict=True)
+        tried = [some.moved((basis @ change[..., None])[..., 0]) for change in changes]
+        # all in one batch: a rollout of many costs little more than one of few
+        every = some.select(list(range(len(places))) * len(tried))
+        every = every.with_state(State.joined(*(one.observations.state for one in tried)))
+        parts = _chi2(every, parameters, torch.cat([whole(trial)[own] for trial in trials]))
+        before, used, old = cost, damping, chi2
+        for factor, trial, moved, part in zip(
+            DAMPINGS, trials, tried, parts.unflatten(0, (len(tried), -1)), strict=True
+        ):
+            found = old.index_copy(0, torch.tensor(places), part)
+            after = cost_of(found, trial)
+            better = active & (after < cost)
+            chi2 = torch.where(better[group], found, chi2)
+            segments = _placed(segments, places, moved, better[own])
+            now, cost = torch.where(better[:, None], trial, now), torch.where(better, after, cost)
+            damping = torch.where(better, used * factor, damping)
+        fell = before - cost
+        damping = torch.where(fell > 0, damping, damping * 10 * DAMPINGS[-1])
+        active &= ~((fell > 0) & (fell < FALL + FALL_SHARE * cost)) & (damping < MAX_DAMPING)
         if not bool(active.any()):
             break
     return GlideFit(segments, chi2, whole(now), information)
+
+
+def _projected(
+    rows: Tensor, jacobian: Tensor, size: int, own: Tensor, damping: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return information (G, S, S) and score (G, S) of groups, and how states (n, K, 1 and S) follow a step.
+
+    Args:
+        rows: Residuals (n, R).
+        jacobian: By numbers and states (n, R, S + K).
+        size: S.
+        own: Group of each glide (n,).
+        damping: Of each group (G,).
+    """
+    count = len(damping)
+    by_value, by_state = jacobian[..., :size], jacobian[..., size:]
+    normal, error = by_state.mT @ by_state, rows[..., None]
+    mixed, slope = by_state.mT @ by_value, by_state.mT @ error
+    loaded = torch.diag_embed(damping[own][:, None] * normal.diagonal(dim1=1, dim2=2) + 1e-9)
+    solved = torch.linalg.solve(normal + loaded, torch.cat((mixed, slope), -1))
+    by_numbers, by_slope = solved[..., :size], solved[..., size:]
+    information = _added(by_value.mT @ by_value - mixed.mT @ by_numbers, own, count)
+    score = _added(-(by_value.mT @ error - mixed.mT @ by_slope)[..., 0], own, count)
+    return information, score, by_slope, by_numbers
 
 
 def _placed(segments: Segments, places: list[int], moved: Segments, taken: Tensor) -> Segments:
@@ -188,11 +221,11 @@ def _linear(
         at = free[:, slot, None].clamp_min(0)
         changes.append(still)
         moves.append(values.scatter_add(1, at, steps[at] * (free[:, slot, None] >= 0)))
-    changes += [basis[..., j] for j in range(k)]
-    moves += [values] * k
+    changes += [sign * basis[..., j] for j in range(k) for sign in (1.0, -1.0)]
+    moves += [values] * (2 * k)
     every = segments.select(list(range(n)) * len(changes)).moved(torch.cat(changes))
     rows = every.residuals(parameters, torch.cat(moves), jacobian=False)[0].flatten(1).unflatten(0, (len(changes), n))
     rows = torch.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
-    jacobian = (rows[1:] - rows[0]).movedim(0, -1).contiguous()
-    jacobian[..., :size] /= steps[free.clamp_min(0)][:, None]
-    return rows[0], jacobian, basis
+    by_value = (rows[1 : 1 + size] - rows[0]).movedim(0, -1) / steps[free.clamp_min(0)][:, None]
+    by_state = 0.5 * (rows[1 + size :: 2] - rows[2 + size :: 2]).movedim(0, -1)
+    return rows[0], torch.cat((by_value, by_state), -1), basis

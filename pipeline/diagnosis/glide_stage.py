@@ -46,13 +46,14 @@ class GlideEvidence:
     """A candidate in glides.
 
     score: by how much chi2 falls, in units of what the best candidate leaves, less the penalty of BIC; evidence, with
-    its numbers; friction: beside it; left: chi2 / dof.
+    its numbers; friction: beside it; left: chi2 / dof; share: of the excess of chi2 over its mean, that it explains.
     """
 
     evidence: Evidence
     score: float
     friction: float
     left: float
+    share: float
 
 
 def glide_evidence(
@@ -195,7 +196,8 @@ def _ranked(
         corrected = min(1.0, p_value * tries[variant.place])
         evidence = Evidence(candidate, variant.constants, test, corrected, numbers=numbers)
         score = gain - number * math.log(max(degrees, 2.0)) - 2 * math.log(tries[variant.place])
-        one = GlideEvidence(evidence, score, float(fit.values[0, 0].exp()), fit.cost / degrees)
+        share = (base - fit.cost) / max(base - degrees, 1.0)
+        one = GlideEvidence(evidence, score, float(fit.values[0, 0].exp()), fit.cost / degrees, share)
         if variant.place not in best or score > best[variant.place].score:
             best[variant.place] = one
     return sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))

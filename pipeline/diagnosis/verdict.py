@@ -41,7 +41,11 @@ size that matters 29 to 713 where they were right."""
 CONTACT_T = 1.0
 """And where the mean gain of held-out episodes is above this many of its standard errors."""
 GLIDE_SCORE = 40.0
-"""An effect in glides is named above this score."""
+"""An effect in glides is named above this score ..."""
+FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 4, 400.0
+"""... one of more numbers than these above that: a map of friction fits what a slide of a box leaves without any."""
+GLIDE_EXPLAINED = 0.5
+"""And where it explains at least this share of what the noise does not: of less, it stands in for a stranger."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
 """Another one within this score of it, or this share of it, leaves the two unseparated."""
 CONFIRMED = 2.0
@@ -258,7 +262,10 @@ def _with_contact(
 def _equal_in_glides(evidence: Sequence[GlideEvidence]) -> list[GlideEvidence]:
     """Return the effect that glides name and its equals; none where they name none."""
     fit = [one for one in evidence if one.evidence.test.admissible]
-    if not fit or fit[0].score < GLIDE_SCORE:
+    if not fit or fit[0].share < GLIDE_EXPLAINED:
+        return []
+    flexible = len(fit[0].evidence.candidate.effect.parameters) > FEW_NUMBERS
+    if fit[0].score < (GLIDE_SCORE_FLEXIBLE if flexible else GLIDE_SCORE):
         return []
     lead = max(GLIDE_LEAD, GLIDE_SHARE * fit[0].score)
     return [one for one in fit if one.score > fit[0].score - lead]
