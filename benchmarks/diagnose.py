@@ -1,14 +1,15 @@
 """Does `cgwm diagnose` name what is hidden, and nothing where nothing is? Captures whose truth is another engine.
 
     python benchmarks/diagnose.py --stage development --workers 2 [--nulls 20] [--only cube/com_offset] [--list rough]
-    python benchmarks/diagnose.py --stage report --table
+    python benchmarks/diagnose.py --stage report2 --table
     python benchmarks/diagnose.py --list video             # six captures with videos only
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
 
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
 --effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
-by the stage report, whose seeds are others. Results are stored case by case and taken up again.
+by report and report2, whose seeds are others (report2: since what report said was seen). Results are stored case by
+case and taken up again.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from cgwm.pipeline.physics.effects.registry import FLIGHT_ALIASES
 from cgwm.schemas import CgwmError, PhysConfig
 from hidden_effects import (
     EFFECTS,
+    STAGES,
     Case,
     cases,
     drake_cases,
@@ -283,7 +285,7 @@ def _covered(row: dict[str, Any]) -> list[bool]:
 def main() -> int:
     """Measure what is missing of the cases, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--stage", choices=("development", "report"), default="development")
+    parser.add_argument("--stage", choices=STAGES, default="development")
     parser.add_argument("--list", choices=("all", "rough", "drake", "video"), default="all", help="which cases")
     parser.add_argument("--nulls", type=int, default=200)
     parser.add_argument("--only", default="", help="cases whose names contain this")

@@ -51,6 +51,7 @@ def tosses(
     rate_hz: float = 100.0,
     noise: tuple[float, float] = NOISE,
     height_m: tuple[float, float] = (0.2, 0.6),
+    lift_m_s: tuple[float, float] = (-0.5, 2.0),
 ) -> list[tuple[str, dict[str, Track]]]:
     """Tosses with random spin and heading, measured with noise."""
     rng = np.random.default_rng(seed)
@@ -61,7 +62,7 @@ def tosses(
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     heading, speed = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 2.0, count)
     velocity = np.zeros((count, 1, 3))
-    velocity[:, 0] = np.stack([speed * np.cos(heading), speed * np.sin(heading), rng.uniform(-0.5, 2.0, count)], -1)
+    velocity[:, 0] = np.stack([speed * np.cos(heading), speed * np.sin(heading), rng.uniform(*lift_m_s, count)], -1)
     omega = rng.standard_normal((count, 1, 3)) * rng.uniform(2, 10, (count, 1, 1))
     times = torch.arange(round(duration_s * rate_hz) + 1, dtype=F64) / rate_hz
     with torch.no_grad():

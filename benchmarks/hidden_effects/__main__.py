@@ -10,7 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from . import Case, cases, drake_cases, film_capture, filmed_cases, make_capture, rough_cases
+from . import STAGES, Case, cases, drake_cases, film_capture, filmed_cases, make_capture, rough_cases
 
 LISTS = {"all": cases, "drake": drake_cases, "rough": rough_cases}
 
@@ -27,7 +27,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("list", "make"))
     parser.add_argument("out", nargs="?", type=Path)
-    parser.add_argument("--stage", choices=("development", "report"), default="development")
+    parser.add_argument("--stage", choices=STAGES, default="development")
     parser.add_argument("--only", default="", help="part of the name")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--list", choices=(*LISTS, "video"), default="all", dest="which")

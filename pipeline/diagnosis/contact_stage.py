@@ -43,13 +43,13 @@ class ContactEvidence:
     """An effect in contact: its evidence, and what the decision rests on.
 
     score: the fall of the robust loss, less the penalty of BIC; gain: of all held-out episodes together; t: their mean
-    in its standard errors.
+    in its standard errors; both None where glides tell (`glide_stage.py`), whose score is that there.
     """
 
     evidence: Evidence
     score: float
-    gain: float
-    t: float
+    gain: float | None
+    t: float | None
 
 
 def fitted_contact(prepared: Prepared, world: World, start: Segments | None = None) -> tuple[Refit, Segments] | None:

@@ -90,10 +90,10 @@ def cut_episodes(
                     lead = max(1, round(LEAD_S / step))
                     a, b = max(first, a - lead), min(last, b + lead)
                     contact += [Segment(episode, *part) for part in _parts(a, b, step, CONTACT_S, share=True)]
-    return flight, _without_rest(whole, contact, noise), clear
+    return flight, without_rest(whole, contact, noise), clear
 
 
-def _without_rest(whole: Observations, items: Sequence[Segment], noise: tuple[float, float]) -> list[Segment]:
+def without_rest(whole: Observations, items: Sequence[Segment], noise: tuple[float, float]) -> list[Segment]:
     """Return the segments less those in which nothing moves, but for the first ones in a row: they tell no more."""
     kept, resting = [], {}
     for item in items:

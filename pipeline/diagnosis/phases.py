@@ -73,7 +73,7 @@ def clear_frames(world: World, observations: Observations, noise: tuple[float, f
     clear = observations.seen.amax(-1) > 0
     if world.ground_normal is not None and world.ground_offset is not None:
         for column, index in enumerate(observations.free):
-            heights = _heights(world, world.bodies[index], observations, column)
+            heights = heights_of(world, world.bodies[index], observations, column)
             margin = FLIGHT_MARGIN_M + NOISE_SIGMAS * float(np.hypot(noise[0], noise[1] * size_of(world.bodies[index])))
             clear &= _apart(heights, margin)
     others = clearance(replace(world, ground_normal=None), observations)
@@ -87,7 +87,7 @@ def clear_frames(world: World, observations: Observations, noise: tuple[float, f
     return clear
 
 
-def _heights(world: World, body: Body, observations: Observations, column: int) -> Tensor:
+def heights_of(world: World, body: Body, observations: Observations, column: int) -> Tensor:
     """Return the heights (B, T, N) [m] of a body's spheres; of a ball around it where no orientation was measured."""
     normal, offset = world.ground_normal, world.ground_offset
     assert normal is not None and offset is not None

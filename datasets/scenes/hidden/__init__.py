@@ -8,7 +8,7 @@ from . import contact, flight, measured, unknown
 from .case import Case
 from .filmed import film_capture
 from .mystery import draw_mystery, make_mystery, open_sealed
-from .plan import KNOWN, PAIRS, UNKNOWN, cases, filmed_cases, rough_cases
+from .plan import KNOWN, PAIRS, STAGES, UNKNOWN, cases, filmed_cases, rough_cases
 from .record import ENGINES, make_capture
 from .registry import EFFECTS
 
@@ -20,6 +20,7 @@ __all__ = [
     "ENGINES",
     "KNOWN",
     "PAIRS",
+    "STAGES",
     "TRUTHS",
     "UNKNOWN",
     "Case",

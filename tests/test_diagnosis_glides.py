@@ -1,0 +1,81 @@
+"""Glides: bodies that slide, roll and spin on the ground tell effects of contact, whatever the law of contact."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cgwm.pipeline.diagnosis.candidates import Candidate
+from cgwm.pipeline.diagnosis.glide_stage import glide_evidence, with_effect
+from cgwm.pipeline.diagnosis.glides import glides_of
+from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
+from cgwm.pipeline.diagnosis.verdict import GLIDE_SCORE, find
+from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics.contact import ContactLaw
+from cgwm.pipeline.physics.effects import load_effect
+from diagnosis_data import Effects, tosses, world_with
+
+LIBRARY = [
+    Candidate(name, load_effect(name))
+    for name in ("linear_drag", "rolling_resistance", "torsional_friction", "viscous_friction")
+]
+
+
+def rolls(effects: Effects | None = None, law: dict[str, float] | None = None, seed: int = 3) -> tuple[Prepared, World]:
+    """Balls that slide, then roll, by a world with effects and with numbers of contact of its own."""
+    truth, world = world_with("ball", effects), world_with("ball")
+    assert isinstance(truth.contact, ContactLaw)
+    changed = {name: torch.full((1,), value, dtype=torch.float64) for name, value in (law or {}).items()}
+    truth = replace(truth, contact=replace(truth.contact, **changed))
+    episodes = tosses(truth, seed, count=2, duration_s=0.5, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
+    return prepare(world, episodes), world
+
+
+def test_a_glide_ends_at_an_impact() -> None:
+    world = world_with("ball")
+    on = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
+    off = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.3, 0.4), lift_m_s=(0.0, 0.0))
+    slid, bounced = (prepare(world, episodes) for episodes in (on, off))
+    glides = glides_of(world, slid.whole, slid.clear, slid.noise)
+    assert {item.episode for item in glides} == {0, 1}
+    covered = sum(item.last - item.first for item in glides)
+    assert covered >= 0.9 * 2 * (len(slid.whole.times_s[0]) - 1)
+    height = bounced.whole.position_m[:, :, 0, 2] - 0.04
+    for item in glides_of(world, bounced.whole, bounced.clear, bounced.noise):
+        assert float(height[item.episode, item.first : item.last + 1].max()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("rolling_resistance", {"c_r": 0.0015}), ("torsional_friction", {"c_t": 0.0012})],
+)
+def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None:
+    # another contact than the model's, and a friction that it does not know
+    prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22})
+    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE)
+    assert found[0].evidence.name == name
+    assert found[0].score > GLIDE_SCORE
+    assert found[0].score > 3 * found[1].score
+    assert found[0].evidence.numbers is not None
+    (key, value) = next(iter(values.items()))
+    estimate, error = found[0].evidence.numbers[key]
+    assert abs(estimate - value) < max(4 * error, 0.1 * value)
+    after = with_effect(world, found[0])
+    assert after.effects[-1].effect.name == name
+    assert float(after.contact.friction[0]) == pytest.approx(0.22, rel=0.1)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_glides_are_silent_under_another_contact_law() -> None:
+    prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
+    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE)
+    assert not found or found[0].score < GLIDE_SCORE
+
+
+def test_what_glides_tell_is_the_verdict() -> None:
+    prepared, world = rolls({"rolling_resistance": {"c_r": 0.0015}})
+    found = find(prepared, world, LIBRARY)
+    assert found.verdict == "missing_effect"
+    assert [one.evidence.name for one in found.chosen] == ["rolling_resistance"]
+    assert found.chosen[0].where == "contact"
+    before, after = found.errors["rolling_resistance"]
+    assert np.isfinite([before, after]).all()
