@@ -7,7 +7,7 @@ at its start fitted too, they are smooth, and exact derivatives find in a few st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,11 +47,16 @@ UNOBSERVABLE_SHARE = 0.8
 
 @dataclass(frozen=True)
 class FirstContacts:
-    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`."""
+    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
+
+    own: by session or episode, values of `effect.parameter` that are its own; spread: of these from unit to unit.
+    """
 
     world: World
     parameters: tuple[FittedParameter, ...]
     record: dict[str, Any]
+    own: dict[str, dict[str, float]] = field(default_factory=dict)
+    spread: dict[str, float] = field(default_factory=dict)
 
 
 def fit_first_contacts(
@@ -77,7 +82,8 @@ def fit_first_contacts(
     Raises:
         NotConvergedError: If the rollouts diverge at the start.
     """
-    observations = _windows(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
+    picked, windows, _ = windows_of(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
+    observations = Observations.of(world, picked, windows)
     start = [*wanted, *along]
     names = [parameter for parameter, _ in start]
     position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
@@ -116,19 +122,27 @@ def _pinv(information: Array) -> Array:
     return np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
 
 
-def _windows(
+def windows_of(
     world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lead_frames: int | None, after_s: float
-) -> Observations:
-    """Return a window about the first contact of each episode, of at most `MAX_WINDOWS` evenly spread ones."""
+) -> tuple[list[tuple[str, dict[str, Track]]], list[tuple[float, float]], list[float]]:
+    """Return episodes, at most `MAX_WINDOWS` evenly spread ones, windows [s] about their first contacts, and these [s].
+
+    Args:
+        world: The world.
+        episodes: Name and tracks by body of each.
+        lead_frames: Frames before the contact; None for all.
+        after_s: How long a window goes on after it [s].
+    """
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_WINDOWS)).round().astype(int)
     picked = [episodes[i] for i in chosen]
     whole = Observations.of(world, picked, [(-np.inf, np.inf)] * len(picked))
     flying = flight_frames(world, whole).sum(1)
-    windows = []
+    windows, contacts = [], []
     for times, count in zip(whole.times_s, flying.tolist(), strict=True):
         first = times[0] if lead_frames is None else times[max(0, count - lead_frames)]
+        contacts.append(float(times[count]) if count < len(times) else np.inf)
         windows.append((float(first) - 1e-9, float(times[min(count, len(times) - 1)]) + after_s))
-    return Observations.of(world, picked, windows)
+    return picked, windows, contacts
 
 
 def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:
@@ -138,12 +152,15 @@ def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> Wo
     return replace(moved, bodies=tuple(bodies))
 
 
-def described(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
-    """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates."""
+def described(parameter: Parameter, coordinate: float, std: float, reach: float = 1.96) -> FittedParameter:
+    """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates.
+
+    reach: half of the interval, in standard errors.
+    """
     low, high = parameter.limits
     estimate, *interval = (
         float(parameter.decode(torch.tensor(z, dtype=torch.float64)))
-        for z in (coordinate, *(min(max(coordinate + k * 1.96 * std, low), high) for k in (-1, 1)))
+        for z in (coordinate, *(min(max(coordinate + k * reach * std, low), high) for k in (-1, 1)))
     )
     state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
     if std > UNOBSERVABLE_SHARE * parameter.prior[1]:
@@ -172,6 +189,6 @@ def bound_warnings(parameters: Sequence[Parameter], fitted: Sequence[FittedParam
         side, unit = ("upper" if upper else "lower"), "" if found.unit == "1" else f" {found.unit}"
         texts.append(
             f"{found.name} ended on its {side} bound ({found.estimate:.3g}{unit}), which is no estimate: "
-            f"{meaning[found.name][upper]}."
+            f"{meaning[found.name.partition('[')[0]][upper]}."
         )
     return texts

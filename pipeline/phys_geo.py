@@ -17,7 +17,7 @@ only effects are fitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -40,6 +40,7 @@ from .estimation.shooting import Shooting
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
 from .mass_distribution import fit_mass_distribution
+from .own_numbers import fit_own_numbers
 from .physics.contact import restitution
 from .physics.measured import measure
 from .physics.parameters import (
@@ -137,6 +138,7 @@ def fit_physics(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     config: PhysConfig,
     noise: tuple[float | None, float | None] = (None, None),
+    groups: Mapping[str, str] | None = None,
 ) -> PhysicsFit:
     """Fit friction, contact time, damping ratio and ground height to measured tracks; where asked for, the mass too.
 
@@ -145,6 +147,7 @@ def fit_physics(
         episodes: Name and tracks by body of each training episode.
         config: The stage's settings.
         noise: Known measurement noise (position [m], rotation [rad]); estimated where None.
+        groups: Group of each episode that belongs to one, for effects with numbers of each group's own.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
@@ -179,7 +182,7 @@ def fit_physics(
     if effect_parameters(world):
         # flight needs no contact and no short steps
         effects = _fit_effects(
-            world_for("flight", world) if flying else world, episodes, [] if flying else names, sigma
+            world_for("flight", world) if flying else world, episodes, [] if flying else names, sigma, groups or {}
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
     observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
@@ -244,6 +247,7 @@ def _fit_effects(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     contact: Sequence[Parameter],
     sigma: tuple[float, float],
+    groups: Mapping[str, str],
 ) -> FirstContacts:
     """Fit the world's effects to flight and first contacts; the contact's numbers beside them.
 
@@ -253,6 +257,9 @@ def _fit_effects(
     wanted = [(parameter, start[parameter.name]) for parameter in effect_parameters(world)]
     touching = any(active.effect.phase == "contact" for active in world.effects)
     along = [(p, p.prior[0]) for p in contact]
+    if any(parameter.shared != "all" for parameter, _ in wanted):
+        after_s = CONTACT_S if touching else AFTER_S
+        return fit_own_numbers(world, episodes, groups, wanted, along, sigma, not contact, after_s)
     return fit_first_contacts(world, episodes, wanted, along, sigma, True, CONTACT_S if touching else AFTER_S)
 
 
@@ -385,7 +392,10 @@ def _open_loop(world: World, observations: Observations, warm: Tensor, names: li
         drives = {name: drive.repeat(repeats) for name, drive in observations.drives.items()}
         with torch.no_grad():
             rollout = measure(
-                apply_parameters(world, names, decoded), base, observations.times_s.repeat(repeats, 1), drives
+                apply_parameters(observations.world(world, repeats), names, decoded),
+                base,
+                observations.times_s.repeat(repeats, 1),
+                drives,
             )
         free = list(observations.free)
         shift = rollout.position_m[:, :, free] - observations.position_m.repeat(repeats, 1, 1, 1)

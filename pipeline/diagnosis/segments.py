@@ -129,7 +129,8 @@ class Segments:
 
     def rollout(self, record_contacts: bool = False) -> Rollout:
         """Return the true motion of the segments from their states."""
-        world, seen = self.world, self.observations
+        seen = self.observations
+        world = seen.world(self.world)
         with torch.no_grad():
             return rolled_out(world, seen.state, true_times(world, seen.times_s), seen.drives, record_contacts)
 
@@ -140,7 +141,8 @@ class Segments:
             parameters: Numbers of the world that are set.
             values: Their values in fitted coordinates, (B, P).
         """
-        world, seen = self.world, self.observations
+        seen = self.observations
+        world = seen.world(self.world)
         if parameters and values is not None:
             decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(parameters)], -1)
             world = apply_parameters(world, parameters, decoded)
@@ -181,7 +183,8 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
     drives = {name: drive.select(rows) for name, drive in whole.drives.items()}
     state = whole.state.at(rows)
     names = tuple(whole.names[item.episode] for item in items)
-    return replace(whole, names=names, times_s=times, drives=drives, state=state, **picked)
+    own = {name: value[rows] for name, value in whole.own.items()}
+    return replace(whole, names=names, times_s=times, drives=drives, state=state, own=own, **picked)
 
 
 def line_state(segments: Segments, frames: int) -> State:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..physics.driven import Drive
+from ..physics.parameters import with_own
 from ..physics.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
 from ..physics.world import State, World
 
@@ -28,7 +29,8 @@ class Observations:
     names (B): episode of each item; times_s (B, T): frame times, padded beyond an item's end; position_m
     (B, T, nf, 3) and quat_wxyz (B, T, nf, 4) of the free bodies' frames; seen, turned (B, T, nf): 1 where the position,
     the orientation was measured, 0 elsewhere; drives: commands by driven body; state (B, nb): first guess of the
-    states at times_s[:, 0]; free (nf): indices of the free bodies.
+    states at times_s[:, 0]; free (nf): indices of the free bodies; own: values (B,) of effects' parameters that each
+    item has for its own, by `effect.parameter`.
     """
 
     names: tuple[str, ...]
@@ -40,6 +42,15 @@ class Observations:
     drives: dict[str, Drive]
     state: State
     free: tuple[int, ...]
+    own: dict[str, Tensor] = field(default_factory=dict)
+
+    def with_own(self, world: World) -> Observations:
+        """Return the items with the own numbers that a world has of their episodes."""
+        return replace(self, own=_own(world, self.names))
+
+    def world(self, world: World, repeats: int = 1) -> World:
+        """Return a world with the items' own numbers, for the batch repeated so many times."""
+        return with_own(world, self.own, repeats)
 
     @property
     def frames(self) -> Tensor:
@@ -75,6 +86,7 @@ class Observations:
             drives,
             _resting(world, len(rows)),
             free,
+            _own(world, [row.name for row in rows]),
         )
         return replace(partial, state=first_state(world, partial))
 
@@ -84,7 +96,19 @@ class Observations:
         picked = {key: getattr(self, key)[index] for key in ("times_s", "position_m", "quat_wxyz", "seen", "turned")}
         drives = {name: drive.select(index) for name, drive in self.drives.items()}
         names = tuple(self.names[i] for i in items)
-        return replace(self, names=names, drives=drives, state=self.state.at(index), **picked)
+        own = {name: value[index] for name, value in self.own.items()}
+        return replace(self, names=names, drives=drives, state=self.state.at(index), own=own, **picked)
+
+
+def _own(world: World, names: Sequence[str]) -> dict[str, Tensor]:
+    """Return the own values (B,) of episodes by parameter; those that have none have the world's."""
+    numbers = sorted({number for values in world.own.values() for number in values})
+    common = {f"{a.effect.name}.{key}": float(value[0]) for a in world.effects for key, value in a.values.items()}
+    return {
+        number: torch.tensor([world.own.get(name, {}).get(number, common[number]) for name in names]).to(world.gravity)
+        for number in numbers
+        if number in common
+    }
 
 
 @dataclass(frozen=True)
