@@ -49,12 +49,14 @@ UNOBSERVABLE_SHARE = 0.8
 class FirstContacts:
     """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
 
-    own: by session or episode, values of `effect.parameter` that are its own; spread: of these from unit to unit.
+    ground: how far the ground was moved in this world, where ends of episodes showed its height; own: by session or
+    episode, values of `effect.parameter` that are its own; spread: of these from unit to unit.
     """
 
     world: World
     parameters: tuple[FittedParameter, ...]
     record: dict[str, Any]
+    ground: FittedParameter | None = None
     own: dict[str, dict[str, float]] = field(default_factory=dict)
     spread: dict[str, float] = field(default_factory=dict)
 

@@ -29,7 +29,7 @@ from .estimation.noise import MAD_TO_STD
 from .estimation.observations import Observations
 from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .first_contacts import ITERATIONS, MODEL_ERROR, ROBUST_SCALE, FirstContacts, described, windows_of
-from .physics.parameters import Parameter, apply_parameters
+from .physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
 
 Array = NDArray[np.float64]
@@ -92,7 +92,7 @@ def fit_own_numbers(
         along: What is fitted along, one value for all.
         noise: Of the tracks (position [m], rotation [rad]).
         flying: Whether nothing ever touches anything.
-        after_s: How long a window goes on after the first contact [s].
+        after_s: How long a window goes on after the first contact [s]; 0 for flight alone, which is smooth.
         ties: The prior of own numbers, for episodes that the fit has not seen; None to estimate it.
 
     Raises:
@@ -138,7 +138,15 @@ def fit_own_numbers(
         None if ties is None else np.array([ties.spread.get(numbers[k].name, width[i]) for i, k in enumerate(owner)])
     )
     found = _tied(solution, _Errors.of(rows, solution, batch, ends), centre, width, tied, known)
-    return _result(world, wanted, names, owner, found, batch.names, groups, solution)
+    result = _result(world, wanted, names, owner, found, batch.names, groups, solution)
+    if flying or GROUND_SHIFT not in numbers or result.world.ground_offset is None:
+        return result
+    at = int(np.flatnonzero(owner == numbers.index(GROUND_SHIFT))[0])
+    z, std = float(found.values[at]), float(np.sqrt(found.covariance[at, at]))
+    ground = described(GROUND_SHIFT, z, std, float(student.ppf(0.975, found.dof)))
+    moved = replace(result.world, ground_offset=result.world.ground_offset + ground.estimate)
+    record = result.record | {"ground_shift_m": ground.estimate}
+    return replace(result, world=moved, ground=ground, record=record)
 
 
 @dataclass(frozen=True)
@@ -181,6 +189,8 @@ def _batch(
     """Return the windows, which of them are ends, and the standard deviations of their rows (B, F, 1)."""
     picked, windows, contact = windows_of(world, episodes, None, after_s)
     ends = [False] * len(picked)
+    if after_s == 0:
+        windows = [(a, b if np.isinf(at) else at - 1e-6) for (a, b), at in zip(windows, contact, strict=True)]
     if not flying:
         last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in picked]
         windows, ends = [*windows, *((t - REST_S, t + 1e-9) for t in last)], [*ends, *(True for _ in last)]
@@ -207,8 +217,9 @@ class _Errors:
     def of(rows: Tensor, solution: Solution, batch: Observations, ends: NDArray[np.bool_]) -> _Errors:
         weight = (1 / (1 + solution.chi2 / ROBUST_SCALE**2)).unflatten(1, (-1, len(batch.free)))
         r = rows.unflatten(1, (-1, len(batch.free)))
-        moves = (batch.position_m.amax(1) > batch.position_m.amin(1)).to(rows)[:, None]
-        known = torch.cat((batch.seen[..., None] * moves, batch.turned[..., None].expand(-1, -1, -1, 3)), -1)
+        known = torch.cat(
+            (batch.seen[..., None] * batch.measured_axes[:, None], batch.turned[..., None].expand(-1, -1, -1, 3)), -1
+        )
         count = (weight[..., None] * known).sum(1)
         count = (count - 2 * (known.sum(1) > 0)).clamp_min(0.0).sum((1, 2))
         chi2 = (weight[..., None] * r.square() * known).sum((1, 2, 3))

@@ -9,7 +9,6 @@ from ..datasets.tracks import Track
 from ..schemas import ModelFile
 from .estimation.observations import Observations
 from .estimation.warmup import flight_frames
-from .first_contacts import AFTER_S
 from .own_numbers import Ties, fit_own_numbers, unit_of
 from .physics.effects.registry import load_effect
 from .physics.parameters import Parameter, effect_parameters
@@ -46,9 +45,7 @@ def with_fitted_numbers(
     whole = Observations.of(known, unknown, [(-float("inf"), float("inf"))] * len(unknown))
     flying = bool(flight_frames(known, whole)[whole.seen.amax(-1) > 0].all())
     ties = Ties({p.name: centre[p.name] for p in own}, spread)
-    found = fit_own_numbers(
-        known, unknown, groups, [(p, centre[p.name]) for p in own], (), noise, flying, AFTER_S, ties
-    )
+    found = fit_own_numbers(known, unknown, groups, [(p, centre[p.name]) for p in own], (), noise, flying, 0.0, ties)
     return replace(known, own=dict(found.world.own))
 
 

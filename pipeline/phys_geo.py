@@ -32,6 +32,7 @@ from ..datasets.tracks import Track
 from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
 from ..schemas import Parameter as FittedParameter
 from .diagnosis.segments import world_for
+from .diagnosis.usable import refuse_slow_times
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
@@ -130,6 +131,7 @@ def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Tr
             "tracks/<episode>.csv with rows for a body whose motion is 'free'.",
             "add tracks, or fit from the videos: --supervise images.",
         )
+    refuse_slow_times([t[b] for _, t in usable for b in free if b in t], str(capture.root))
     return usable
 
 
@@ -185,6 +187,8 @@ def fit_physics(
             world_for("flight", world) if flying else world, episodes, [] if flying else names, sigma, groups or {}
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
+        if effects.ground is not None:  # rest shows it better than where rollouts end
+            names = list(CONTACT_PARAMETERS)
     observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
     warm = warmup_frames(world, observations, config.warmup_s)
     observations, _ = estimate_states(world, observations, warm, sigma)
@@ -216,7 +220,11 @@ def fit_physics(
         record["correlation"] = _correlation(covariance).tolist()
         found = physics_fit(world, names, best, covariance, sigma, record)
     more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
-    known = [*effect_parameters(world), *(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
+    if effects is not None and effects.ground is not None and world.ground_offset is not None:
+        more.append(_absolute(effects.ground, float(world.ground_offset[0]) - effects.ground.estimate))
+        found = replace(found, ground_offset_m=more[-1].estimate)
+    known = [replace(GROUND_SHIFT, name="ground_offset_m"), *effect_parameters(world)]
+    known += [*(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
     return replace(
         found,
         parameters=(*found.parameters, *more),
@@ -258,8 +266,11 @@ def _fit_effects(
     touching = any(active.effect.phase == "contact" for active in world.effects)
     along = [(p, p.prior[0]) for p in contact]
     if any(parameter.shared != "all" for parameter, _ in wanted):
-        after_s = CONTACT_S if touching else AFTER_S
-        return fit_own_numbers(world, episodes, groups, wanted, along, sigma, not contact, after_s)
+        # steps through a first contact are rough, and would hold up those of all the others
+        along = [(p, value) for p, value in along if touching and p != GROUND_SHIFT]
+        if contact and world.ground_normal is not None:
+            along.append((GROUND_SHIFT, 0.0))
+        return fit_own_numbers(world, episodes, groups, wanted, along, sigma, not contact, CONTACT_S if touching else 0)
     return fit_first_contacts(world, episodes, wanted, along, sigma, True, CONTACT_S if touching else AFTER_S)
 
 
@@ -280,7 +291,9 @@ def _shot(
     record: dict[str, Any],
 ) -> tuple[list[Parameter], np.ndarray, np.ndarray, dict[str, tuple[float, State]]]:
     """Return names, estimate, covariance and starts by multiple shooting; the search's where that leads astray."""
-    shot_names = [*names, GROUND_SHIFT] if world.ground_normal is not None and GROUND_SHIFT not in names else names
+    shown = "effects" in record and "ground_shift_m" in record["effects"]
+    lacking = world.ground_normal is not None and GROUND_SHIFT not in names and not shown
+    shot_names = [*names, GROUND_SHIFT] if lacking else names
     middle = np.array([p.encode(p.prior[0]) for p in shot_names])
     prior = ShotPrior(
         torch.as_tensor(middle),
