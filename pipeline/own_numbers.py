@@ -348,4 +348,4 @@ def _result(
         "degrees_of_freedom": found.dof,
         "spread": spread,
     }
-    return FirstContacts(moved, tuple(rows), record, own, spread)
+    return FirstContacts(moved, tuple(rows), record, own=own, spread=spread)

@@ -103,6 +103,16 @@ def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
         InputDataError: What is wrong, and what to record or check.
     """
     whole, sigma = prepared.whole, prepared.noise[0]
+    size = min(size_of(world.bodies[k]) for k in world.free)
+    gravity, seen = float(world.gravity.norm()) or 9.81, _least_force(prepared)
+    if seen > LEAST_SEEN * gravity and sigma > SHARE_OF_SIZE * size:
+        what = f"no force below {100 * seen / gravity:.0f} % of the weight" if math.isfinite(seen) else "no force"
+        raise InputDataError(
+            f"{where}: with a noise of {1e3 * sigma:.3g} mm on a body of {1e3 * size:.3g} mm {what} could be seen in "
+            "these flights, and no contact.",
+            f"noise or episodes that show {100 * LEAST_SEEN:.0f} % of the weight.",
+            "record longer flights, more of them, or with less noise; check the unit of the positions.",
+        )
     spread, alike = _travel(whole), _apart(whole)
     if spread < ALIKE_SIGMAS * sigma and not _turns(whole, prepared.noise[1]):
         raise InputDataError(
@@ -118,17 +128,6 @@ def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
             "record others, and check that none is a copy.",
         )
     _refuse_floating(world, prepared, where)
-    seen = _least_force(prepared)
-    size = min(size_of(world.bodies[k]) for k in world.free)
-    gravity = float(world.gravity.norm()) or 9.81
-    if seen > LEAST_SEEN * gravity and (not prepared.contact_items or sigma > SHARE_OF_SIZE * size):
-        what = f"no force below {100 * seen / gravity:.0f} % of the weight" if math.isfinite(seen) else "no force"
-        raise InputDataError(
-            f"{where}: with a noise of {1e3 * sigma:.3g} mm on a body of {1e3 * size:.3g} mm {what} could be seen in "
-            "these flights, and no contact.",
-            f"noise or episodes that show {100 * LEAST_SEEN:.0f} % of the weight.",
-            "record longer flights, more of them, or with less noise; check the unit of the positions.",
-        )
 
 
 def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
