@@ -21,7 +21,7 @@ NOISE_M = 0.003
 def fall(drag: float, seed: int) -> Track:
     """Return a throw under a drag that grows with the square of the speed, in steps of 0.1 ms."""
     rng = np.random.default_rng(seed)
-    time, step = np.arange(0, 0.9, 0.03), 1e-4
+    time, step = np.arange(0, 0.8, 0.04), 1e-4
     position, velocity = np.array([0.0, 0.0, 5.0]), np.array([4.0, 1.0, 3.0]) + rng.normal(0, 0.3, 3)
     seen, now = [], 0.0
     for moment in time:
@@ -57,10 +57,18 @@ def throws(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_each_session_has_its_own_drag_and_its_unseen_throws_follow_it(throws: Path, tmp_path: Path) -> None:
-    fit(throws, tmp_path / "m0")
+@pytest.fixture(scope="module")
+def base(throws: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    model = tmp_path_factory.mktemp("models") / "m0"
+    fit(throws, model)
+    return model
+
+
+def test_each_session_has_its_own_drag_and_its_unseen_throws_follow_it(
+    throws: Path, base: Path, tmp_path: Path
+) -> None:
     effects = PhysConfig(effects=("quadratic_drag@group",))
-    found = fit(throws, tmp_path / "m1", "phys-geo", tmp_path / "m0", phys_config=effects)
+    found = fit(throws, tmp_path / "m1", "phys-geo", base, phys_config=effects)
     effect = found.effects[0]
     assert effect.name == "quadratic_drag@group"
     for ball, drag in DRAG.items():
@@ -72,18 +80,20 @@ def test_each_session_has_its_own_drag_and_its_unseen_throws_follow_it(throws: P
     assert mean.std_error is not None and mean.std_error > 0.015
     assert 0.02 < effect.spread["k"] < 0.09
     opened = Capture.open(throws, splits=("test",))
-    left = [evaluate_model(read_model(tmp_path / name), opened).result.state_fitted_residual_m for name in ("m0", "m1")]
+    models = [read_model(path) for path in (base, tmp_path / "m1")]
+    left = [evaluate_model(model, opened).result.state_fitted_residual_m for model in models]
     assert left[0] is not None and left[1] is not None
     assert left[1].mean < 0.5 * left[0].mean
     assert left[1].mean < 3 * NOISE_M
     with pytest.raises(InputDataError, match="belongs to none"):
-        fit(throws, tmp_path / "m2", "phys-geo", tmp_path / "m0", "stray", phys_config=effects)
+        fit(throws, tmp_path / "m2", "phys-geo", base, "stray", phys_config=effects)
 
 
-def test_an_episode_that_the_fit_has_not_seen_is_fitted_beside_its_state(throws: Path, tmp_path: Path) -> None:
-    fit(throws, tmp_path / "m0")
+def test_an_episode_that_the_fit_has_not_seen_is_fitted_beside_its_state(
+    throws: Path, base: Path, tmp_path: Path
+) -> None:
     effects = PhysConfig(effects=("quadratic_drag@episode",))
-    fit(throws, tmp_path / "m1", "phys-geo", tmp_path / "m0", phys_config=effects)
+    fit(throws, tmp_path / "m1", "phys-geo", base, phys_config=effects)
     found = evaluate_model(read_model(tmp_path / "m1"), Capture.open(throws, splits=("test",))).result
     assert any("the fit has not seen them" in warning for warning in found.warnings)
     assert found.state_fitted_residual_m is not None
