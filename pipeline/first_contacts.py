@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import t as student
 from torch import Tensor
 
 from ..datasets.tracks import Track
@@ -23,6 +24,7 @@ from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .estimation.warmup import flight_frames
 from .physics.parameters import Parameter, apply_parameters
 from .physics.world import World
+from .window_errors import ROBUST_SCALE, WindowErrors
 
 Array = NDArray[np.float64]
 
@@ -35,7 +37,8 @@ CONTACT_S = 1.5
 MODEL_ERROR = (0.0005, 0.01)
 """What a rigid body and this contact law miss in such a window (position [m], rotation [rad]) beside the tracks' noise.
 Only their ratio matters much; the residuals are weighed robustly, and intervals come from the episodes' scatter."""
-ROBUST_SCALE = 3.0
+REACH = 1.96
+"""Half of a 95 % interval of a normal number, in standard errors."""
 MAX_WINDOWS = 100
 """So many give second moments of mass within 2 %."""
 ITERATIONS = 16
@@ -89,8 +92,9 @@ def fit_first_contacts(
     start = [*wanted, *along]
     names = [parameter for parameter, _ in start]
     position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
+    residuals = TrajectoryResiduals(world, names, observations, position_std, rotation_std)
     solution = minimise(
-        TrajectoryResiduals(world, names, observations, position_std, rotation_std),
+        residuals,
         torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity),
         torch.zeros(len(observations.names), STATE_SIZE * len(observations.free)).to(world.gravity),
         torch.tensor([parameter.limits for parameter in names]).to(world.gravity),
@@ -99,12 +103,19 @@ def fit_first_contacts(
         prior_information=state_prior(len(observations.free)),
     )
     count = len(wanted)
-    std_errors = np.sqrt(np.diag(_covariance(solution)))[:count]
+    covariance, reach = _covariance(solution), REACH
+    if len(observations.names) < ENOUGH_EPISODES:
+        # their scatter is no estimate; what the windows miss is
+        rows, _ = residuals(solution.shared, solution.states, False)
+        errors = WindowErrors.of(rows, solution, observations, np.zeros(len(observations.names), bool))
+        factor, dof = errors.factor(len(names))
+        covariance, reach = factor * covariance, float(student.ppf(0.975, dof))
+    std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
     record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
     return FirstContacts(
         _placed(world, found, coordinates),
-        tuple(described(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
+        tuple(described(p, float(z), float(s), reach) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
         record,
     )
 
@@ -112,7 +123,7 @@ def fit_first_contacts(
 def _covariance(solution: Solution) -> Array:
     """Return the covariance (P, P): from the scatter of the episodes' gradients (Huber 1967), or for few the curvature.
 
-    A scatter of a few episodes is no estimate; the curvature rests on `MODEL_ERROR`.
+    The curvature rests on `MODEL_ERROR`, and on residuals that do not depend on each other.
     """
     inverse = _pinv(solution.information.numpy())
     scores = solution.scores.numpy()
@@ -154,7 +165,7 @@ def _placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> Wo
     return replace(moved, bodies=tuple(bodies))
 
 
-def described(parameter: Parameter, coordinate: float, std: float, reach: float = 1.96) -> FittedParameter:
+def described(parameter: Parameter, coordinate: float, std: float, reach: float = REACH) -> FittedParameter:
     """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates.
 
     reach: half of the interval, in standard errors.

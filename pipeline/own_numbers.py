@@ -28,9 +28,10 @@ from .estimation.least_squares import Solution, minimise
 from .estimation.noise import MAD_TO_STD
 from .estimation.observations import Observations
 from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
-from .first_contacts import ITERATIONS, MODEL_ERROR, ROBUST_SCALE, FirstContacts, described, windows_of
+from .first_contacts import ITERATIONS, MODEL_ERROR, FirstContacts, described, windows_of
 from .physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
+from .window_errors import ROBUST_SCALE, WindowErrors
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,6 @@ LEAST_SHARE = 1e-3
 """Of the widest prior: where units do not differ, tau goes to 0 and is held here."""
 STATE_INFORMATION = 1e-4
 """Of the usual prior on states: a straight line through a few frames of a long fall begins far from where it did."""
-MOST_CORRELATED = 0.98
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def fit_own_numbers(
     known = (
         None if ties is None else np.array([ties.spread.get(numbers[k].name, width[i]) for i, k in enumerate(owner)])
     )
-    found = _tied(solution, _Errors.of(rows, solution, batch, ends), centre, width, tied, known)
+    found = _tied(solution, WindowErrors.of(rows, solution, batch, ends), centre, width, tied, known)
     result = _result(world, wanted, names, owner, found, batch.names, groups, solution)
     if flying or GROUND_SHIFT not in numbers or result.world.ground_offset is None:
         return result
@@ -205,37 +205,6 @@ def _batch(
 
 
 @dataclass(frozen=True)
-class _Errors:
-    """What the residuals are like: chi2 (B,) and count (B,) of numbers, weighted; kind (B,); inflation by kind."""
-
-    chi2: Array
-    count: Array
-    kind: NDArray[np.int64]
-    inflation: Array
-
-    @staticmethod
-    def of(rows: Tensor, solution: Solution, batch: Observations, ends: NDArray[np.bool_]) -> _Errors:
-        weight = (1 / (1 + solution.chi2 / ROBUST_SCALE**2)).unflatten(1, (-1, len(batch.free)))
-        r = rows.unflatten(1, (-1, len(batch.free)))
-        known = torch.cat(
-            (batch.seen[..., None] * batch.measured_axes[:, None], batch.turned[..., None].expand(-1, -1, -1, 3)), -1
-        )
-        count = (weight[..., None] * known).sum(1)
-        count = (count - 2 * (known.sum(1) > 0)).clamp_min(0.0).sum((1, 2))
-        chi2 = (weight[..., None] * r.square() * known).sum((1, 2, 3))
-        pairs = torch.minimum(weight[:, 1:], weight[:, :-1])[..., None] * known[:, 1:] * known[:, :-1]
-        product = (pairs * r[:, 1:] * r[:, :-1]).sum((1, 2, 3))
-        square = 0.5 * (pairs * (r[:, 1:].square() + r[:, :-1].square())).sum((1, 2, 3))
-        kind = ends.astype(np.int64)
-        inflation = np.ones(2)
-        for k in np.unique(kind):
-            rho = float(product[kind == k].sum() / square[kind == k].sum().clamp_min(1e-300))
-            rho = min(max(rho, 0.0), MOST_CORRELATED)
-            inflation[k] = (1 + rho) / (1 - rho)
-        return _Errors(chi2.numpy(), count.numpy(), kind, inflation)
-
-
-@dataclass(frozen=True)
 class _Tied:
     """Numbers (n,) with their covariance, means and tau (n,) of their priors, degrees of freedom, effective errors."""
 
@@ -249,7 +218,7 @@ class _Tied:
 
 def _tied(
     solution: Solution,
-    errors: _Errors,
+    errors: WindowErrors,
     centre: Array,
     width: Array,
     tied: Sequence[NDArray[np.int64]],
@@ -272,11 +241,11 @@ def _tied(
                 square = ((values[places] - mean[places]) ** 2 + np.diag(covariance)[places]).sum() / (len(places) - 1)
                 tau[places] = np.clip(np.sqrt(square), LEAST_SHARE * width[places], width[places])
         values, covariance = _solved(matrix, right, mean, tau)
-    dof = float((errors.count / errors.inflation[errors.kind]).sum()) - len(values)
+    dof = float(errors.independent.sum()) - len(values)
     return _Tied(values, covariance, mean, tau, max(dof, 1.0), factor)
 
 
-def _factors(parts: Array, slopes: Array, at: Array, errors: _Errors, centre: Array, width: Array) -> Array:
+def _factors(parts: Array, slopes: Array, at: Array, errors: WindowErrors, centre: Array, width: Array) -> Array:
     """Return by what factor the errors of each item (B,) exceed independent ones of its standard deviations."""
     factor = np.ones(len(parts))
     for _ in range(10):
@@ -286,7 +255,7 @@ def _factors(parts: Array, slopes: Array, at: Array, errors: _Errors, centre: Ar
         away = values - at
         chi2 = errors.chi2 - 2 * slopes @ away + np.einsum("p,bpq,q->b", away, parts, away)
         lost = np.einsum("pq,bqp->b", covariance, parts) / factor
-        free = errors.count / errors.inflation[errors.kind] - lost
+        free = errors.independent - lost
         for k in np.unique(errors.kind):
             some = errors.kind == k
             pooled = max(chi2[some].sum(), 1e-12) / max(free[some].sum(), 1.0)
