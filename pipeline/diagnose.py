@@ -33,7 +33,8 @@ from .diagnosis.throws import DEFAULT, Throw, read_throws, throws_of
 from .diagnosis.usable import refuse_blind, refuse_strange
 from .diagnosis.verdict import Findings, find
 from .diagnosis.wrench import Omnibus, organisers, wrench_windows
-from .physics.effects.registry import effect_names, load_effect
+from .own_worlds import with_known_numbers
+from .physics.effects.registry import effect_names, load_effect, split_units
 from .physics.world import World
 from .sg_gs import resolve_device
 
@@ -73,6 +74,7 @@ def diagnose(
     world = replace(_world(loaded, opened), rolls_on=resolve_device(device).type)
     library = library_of(candidates)
     found = diagnosed_episodes(loaded, opened, split)
+    world = with_known_numbers(world, loaded.file, [name for name, _ in found.episodes], opened.groups)
     refuse_strange(world, found.episodes, str(opened.root))
     groups = _groups(opened, [name for name, _ in found.episodes])
     prepared = prepare(world, found.episodes, found.noise, groups)
@@ -129,6 +131,13 @@ def library_of(candidates: Sequence[str]) -> list[Candidate]:
     Raises:
         UsageError: If an effect cannot be loaded, or two have one name.
     """
+    shared = next((spec for spec in candidates if split_units(spec)[1] is not None), None)
+    if shared is not None:
+        raise UsageError(
+            f"{shared}: a diagnosis tests one value for all episodes of what it has built in.",
+            f"{split_units(shared)[0]}.",
+            f"add it to the model: 'cgwm fit CAPTURE --from MODEL --effects {shared}'.",
+        )
     specs = [*effect_names(), *(spec for spec in candidates if spec not in effect_names())]
     library = [Candidate(spec, load_effect(spec)) for spec in specs]
     names: dict[str, str] = {}

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets.tracks import Track
+from cgwm.pipeline.compared import ComparedModel
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.diagnosis.prepared import prepare
 from cgwm.pipeline.diagnosis.usable import refuse_blind, refuse_strange
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics import World
+from cgwm.pipeline.short_errors import short_errors
 from cgwm.schemas import InputDataError
 from diagnosis_data import NOISE, tosses, world_with, write_capture
 
@@ -100,3 +102,19 @@ def test_a_noise_that_was_given_is_not_talked_down() -> None:
     assert any("What is given counts" in warning for warning in told.warnings)
     # what is more than was given is measured
     assert prepare(world, episodes, (0.1 * NOISE[0], None)).noise[0] == pytest.approx(NOISE[0], rel=0.2)
+
+
+def test_what_was_not_measured_is_no_degree_of_freedom() -> None:
+    world = world_with("ball", ground=False)
+
+    def heights_only(track: Track) -> Track:
+        return replace(track, position_m=track.position_m * [0.0, 0.0, 1.0], quat_wxyz=None)
+
+    episodes = changed(tosses(world, 3, count=3, duration_s=0.3), heights_only)
+    prepared = prepare(world, episodes)
+    assert prepared.flight is not None
+    assert prepared.flight.dof.tolist() == [len(episodes[0][1]["ball"]) - 2] * 3
+    short = short_errors(world, episodes, prepared, ["ball"]).errors["000"]
+    assert np.isfinite(short.sigmas[:, 0]).any(0).tolist() == [False, False, True, False, False, False]
+    one = ComparedModel("m", "m", None, None, prepared.noise, {"000": short})  # pyright: ignore[reportArgumentType]
+    assert one.episode_chi2("000") == pytest.approx(1.0, abs=0.6)
