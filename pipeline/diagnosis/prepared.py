@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from ..estimation.noise import estimate_noise
@@ -85,7 +86,9 @@ def prepare(
     whole = whole_episodes(world, episodes)
     turned = bool(whole.turned.any())
     flight, contact, clear = cut_episodes(world, whole, noise)
-    carried = carried_frames(world, whole, flight, noise)
+    # with nothing to stand on, what does not fall falls as fast as its drag lets it
+    alone = world.ground_normal is None and len(world.bodies) == 1
+    carried = torch.zeros_like(clear) if alone else carried_frames(world, whole, flight, noise)
     if bool(carried.any()):
         flight, contact, clear = cut_episodes(world, whole, noise, carried)
         warnings.append(
