@@ -3,7 +3,8 @@
     python benchmarks/real_data.py [--only throws|drops|cube] [--pictures FOLDER]
 
 Each model is fitted to the split "train", and the errors are those of the split "test". Bars: on throws, by session,
-and on drops pooled over the balls the median state-fitted residual falls by half.
+and on drops pooled over the balls the median state-fitted residual falls by half; on the tosses short predictions of
+flight and rest fall to the noise, a reduced chi-square of 1.5 at most.
 """
 
 from __future__ import annotations
@@ -21,55 +22,57 @@ from cgwm.datasets.capture import Capture
 from cgwm.datasets.contactnets import import_contactnets
 from cgwm.datasets.jugglebot import import_jugglebot
 from cgwm.datasets.models import read_model
-from cgwm.pipeline.eval import Evaluation, evaluate_model
+from cgwm.pipeline.compare import compare_models
+from cgwm.pipeline.eval import Evaluation
 from cgwm.pipeline.fit import fit
 from cgwm.schemas import PhysConfig
 from store import Store, shared_data
 
 HALF = 0.5
+NOISE_CHI2 = 1.5
 SESSIONS = ("session3_timing", "session7")
-BALLS = (
-    "baseball",
-    "blue-basketball",
-    "green-basketball",
-    "volleyball",
-    "bowling-ball",
-    "tennis-ball",
-    "yellow-whiffle-ball",
-)
+MARKER = Path(__file__).resolve().parents[1] / "docs" / "real-data" / "marker_rotation.py"
 STEPS = {
     "throws": (("quadratic_drag",), ("gravity_tilt",)),
-    "drops": (("quadratic_drag",),),
-    "cube": (("com_offset", "inertia_shape"),),
+    "drops": (("quadratic_drag@group",),),
+    "cube": (("length_scale", "com_offset", "quadratic_drag", f"{MARKER}:MarkerRotation", "frame_tilt@episode"),),
 }
 """Effects that are added, model by model."""
-CUBE_TOSSES = 20
-"""For training, and as many for the test."""
+CUBE_TRAIN, CUBE_TEST = 20, 8
+"""Of 400 tosses: a fit of all takes long, and 20 show the effects."""
 
 
 def walk(kind: str, capture: Path, folder: Path) -> tuple[dict[str, Any], list[Evaluation]]:
-    """Fit the base model and those with effects, and evaluate each on the split "test"."""
+    """Fit the base model and those with effects, and compare them on the split "test"."""
     models = [folder / f"{capture.name}-m0"]
     fit(capture, models[0])
     for added in STEPS[kind]:
         models.append(folder / f"{capture.name}-m{len(models)}")
         fit(capture, models[-1], "phys-geo", models[-2], phys_config=PhysConfig(effects=added))
     opened = Capture.open(capture, splits=("test",))
-    found = [evaluate_model(read_model(model), opened) for model in models]
+    found = compare_models([(path.name, read_model(path)) for path in models], opened)
     rows = []
-    for path, evaluation in zip(models, found, strict=True):
-        one, file = evaluation.result, read_model(path).file
+    for path, one in zip(models, found.result.models, strict=True):
+        file = read_model(path).file
         rows.append(
             {
-                "effects": [effect.name for effect in file.effects],
+                "effects": [effect.name.rpartition("/")[2] for effect in file.effects],
                 "parameters": {p.name: (p.estimate, p.interval_95) for p in file.parameters if "." in p.name},
-                "noise_m": file.measurement_std.get("position_m"),
+                "spread": {effect.name.rpartition("/")[2]: effect.spread for effect in file.effects if effect.spread},
+                "noise": found.result.measurement_std,
                 "translation_error_m": one.translation_error_m.median,
+                "rotation_error_deg": None if one.rotation_error_deg is None else one.rotation_error_deg.median,
                 "state_fitted_m": [e.state_fitted_residual_m for e in one.per_episode],
                 "state_noise_floor_m": one.state_noise_floor_m and one.state_noise_floor_m.median,
+                "reduced_chi2": {
+                    "all": one.reduced_chi2,
+                    **{p: None if f is None else f.reduced_chi2 for p, f in one.by_phase.items()},
+                },
+                "position_rms_m": {p: None if f is None else f.position_rms_m for p, f in one.by_phase.items()},
+                "rotation_rms_deg": {p: None if f is None else f.rotation_rms_deg for p, f in one.by_phase.items()},
             }
         )
-    return {"models": rows}, found
+    return {"models": rows}, [model.evaluation for model in found.models]
 
 
 def picture(path: Path, title: str, names: Sequence[str], found: Sequence[Evaluation]) -> None:
@@ -82,12 +85,17 @@ def picture(path: Path, title: str, names: Sequence[str], found: Sequence[Evalua
         for episode in evaluation.episodes:
             seen = episode.prediction
             panel.plot(seen.time_s, 1e3 * seen.translation_error_m()[:, 0], lw=0.8, color="#2a6f97", alpha=0.7)
-        panel.set_title(name, fontsize=9)
+        panel.set_title(name.replace(", ", ",\n"), fontsize=8)
         panel.set_xlabel("time [s]", fontsize=8)
         panel.tick_params(labelsize=8)
     panels[0].set_ylabel("open-loop error [mm]", fontsize=8)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110)
+
+
+def short(spec: str) -> str:
+    """Return the name of an effect without the path to its file."""
+    return spec.rpartition(":")[2]
 
 
 def pooled(rows: Sequence[dict[str, Any]], model: int) -> float:
@@ -109,10 +117,10 @@ def main() -> int:
     store, met = Store("real_data"), []
     makers: dict[str, dict[str, Callable[[Path], object]]] = {
         "throws": {s: lambda out, s=s: import_jugglebot(data / "jugglebot", out, only=s) for s in SESSIONS},
-        "drops": {b: lambda out, b=b: import_balldrops(data / "balldrops", out, only=b) for b in BALLS},
+        "drops": {"drops": lambda out: import_balldrops(data / "balldrops", out)},
         "cube": {
             "cube": lambda out: import_contactnets(
-                data / "cube_tosses" / "cube_tosses_si.npz", out, n_train=CUBE_TOSSES, n_test=CUBE_TOSSES
+                data / "cube_tosses" / "cube_tosses_si.npz", out, n_train=CUBE_TRAIN, n_test=CUBE_TEST
             )
         },
     }
@@ -127,7 +135,7 @@ def main() -> int:
                     make(Path(folder) / name)
                     figures, found = walk(kind, Path(folder) / name, Path(folder))
                 if given.pictures is not None:
-                    labels = ["base", *("+ " + ", ".join(added) for added in STEPS[kind])]
+                    labels = ["base", *("+ " + ", ".join(map(short, added)) for added in STEPS[kind])]
                     picture(given.pictures / f"{name}.png", name, labels, found)
                 return figures
 
@@ -138,6 +146,11 @@ def main() -> int:
         print(f"{kind}: state-fitted residual {1e3 * before:.1f} mm, then {1e3 * after:.1f} mm")
         if kind == "drops":
             met.append(after <= HALF * before)
+        if kind == "cube":
+            for phase in ("flight", "rest"):
+                chi2 = [model["reduced_chi2"][phase] for model in rows[0]["models"]]
+                print(f"cube, {phase}: reduced chi2 {chi2[0]:.3g}, then {chi2[-1]:.3g}")
+                met.append(chi2[-1] <= NOISE_CHI2)
     print(f"{sum(met)} of {len(met)} bars met")
     return 0 if all(met) else 1
 

@@ -139,6 +139,11 @@ class Capture:
             found &= {name for split in self.only_splits for name in self.episodes(split)}
         return sorted(found)
 
+    @property
+    def groups(self) -> dict[str, str]:
+        """Group of each episode that belongs to one."""
+        return {name: entry.group for name, entry in self.manifest.episodes.items() if entry.group is not None}
+
     def tracks(self, episode: str) -> dict[str, Track]:
         """Return the tracks of an episode by body, between its `start_s` and `end_s`; empty without any."""
         return self.tracks_counted(episode)[0]

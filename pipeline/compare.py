@@ -15,6 +15,7 @@ from ..schemas import CompareResult, InputDataError, PairedDifference, UsageErro
 from .compared import ComparedModel
 from .diagnosis.prepared import prepare
 from .eval import check_bodies, evaluate_model
+from .own_worlds import with_fitted_numbers
 from .paired import paired_difference
 from .physics.world import World
 from .prediction import Episode
@@ -108,7 +109,9 @@ def compare_models(
     compared = []
     with progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
         for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
+            # of an episode's own numbers a short prediction knows as much as of its state
             world = World.from_model(model)
+            world = with_fitted_numbers(world, episodes, model.file, capture.groups, prepared.noise)
             fit = short_errors(world, episodes, prepared, bodies)
             points, organisers = wrench_points(world, fit, prepared)
             compared.append(

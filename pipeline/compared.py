@@ -108,7 +108,7 @@ def _figures(short: Sequence[ShortErrors], phase: Phase | None, noise: tuple[flo
     return PhaseFigures(
         frames=len(rows),
         reduced_chi2=float(square.sum()) / total if total >= LEAST_FREEDOM else None,
-        position_rms_m=float(np.sqrt(mean[:3].sum())) * noise[0],
+        position_rms_m=float(np.sqrt(np.nansum(mean[:3]))) * noise[0],
         rotation_rms_deg=float(np.degrees(np.sqrt(mean[3:].sum()) * noise[1])) if turned else None,
         sigmas={name: float(np.sqrt(mean[k])) for k, name in enumerate(FREEDOMS) if np.isfinite(mean[k])},
     )

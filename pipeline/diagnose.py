@@ -12,7 +12,6 @@ import torch
 
 from ..datasets.capture import Capture
 from ..datasets.models import Model, read_model
-from ..datasets.tracks import Track
 from ..schemas import (
     DiagnoseResult,
     EffectEstimate,
@@ -24,26 +23,20 @@ from ..schemas import (
     UsageError,
 )
 from .diagnosis.candidates import Candidate, admissible
-from .diagnosis.cuts import whole_episodes
 from .diagnosis.episodes import diagnosed_episodes
 from .diagnosis.law_file import require_law_file, save_law
 from .diagnosis.next_throw import next_experiment
-from .diagnosis.phases import size_of
 from .diagnosis.prepared import Prepared, prepare
 from .diagnosis.residual_law import residual_law
 from .diagnosis.slots import Evidence
 from .diagnosis.throws import DEFAULT, Throw, read_throws, throws_of
+from .diagnosis.usable import refuse_blind, refuse_strange
 from .diagnosis.verdict import Findings, find
 from .diagnosis.wrench import Omnibus, organisers, wrench_windows
-from .estimation.warmup import clearance
-from .physics.effects.registry import effect_names, load_effect
+from .own_worlds import with_known_numbers
+from .physics.effects.registry import effect_names, load_effect, split_units
 from .physics.world import World
 from .sg_gs import resolve_device
-
-LONGEST_STEP_S = 0.2
-"""Slower tracks show no flight; those in milliseconds look so."""
-MOST_SUNK = 0.2
-"""A body whose lowest point lies deeper than this share of its size under the ground has another shape or ground."""
 
 
 def diagnose(
@@ -81,10 +74,12 @@ def diagnose(
     world = replace(_world(loaded, opened), rolls_on=resolve_device(device).type)
     library = library_of(candidates)
     found = diagnosed_episodes(loaded, opened, split)
-    _refuse_strange(world, found.episodes, opened)
+    world = with_known_numbers(world, loaded.file, [name for name, _ in found.episodes], opened.groups)
+    refuse_strange(world, found.episodes, str(opened.root))
     groups = _groups(opened, [name for name, _ in found.episodes])
     prepared = prepare(world, found.episodes, found.noise, groups)
     prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
+    refuse_blind(world, prepared, str(opened.root))
     result = report(prepared, world, library, compared)
     if save_law_to is None:
         return result
@@ -112,7 +107,7 @@ def report(
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
     return DiagnoseResult(
         verdict=findings.verdict,
-        sentence=_sentence(findings, law),
+        sentence=_sentence(findings, law) + _unseen(prepared),
         selected=selected,
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
@@ -136,6 +131,13 @@ def library_of(candidates: Sequence[str]) -> list[Candidate]:
     Raises:
         UsageError: If an effect cannot be loaded, or two have one name.
     """
+    shared = next((spec for spec in candidates if split_units(spec)[1] is not None), None)
+    if shared is not None:
+        raise UsageError(
+            f"{shared}: a diagnosis tests one value for all episodes of what it has built in.",
+            f"{split_units(shared)[0]}.",
+            f"add it to the model: 'cgwm fit CAPTURE --from MODEL --effects {shared}'.",
+        )
     specs = [*effect_names(), *(spec for spec in candidates if spec not in effect_names())]
     library = [Candidate(spec, load_effect(spec)) for spec in specs]
     names: dict[str, str] = {}
@@ -171,30 +173,13 @@ def _groups(capture: Capture, names: Sequence[str]) -> list[int]:
     return [sorted(set(sessions)).index(session) for session in sessions]
 
 
-def _refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], capture: Capture) -> None:
-    """Refuse times in another unit, and bodies that sink into the ground."""
-    free = [world.bodies[k].name for k in world.free]
-    step = float(np.median(np.concatenate([np.diff(t[b].time_s) for _, t in episodes for b in free if b in t])))
-    if step > LONGEST_STEP_S:
-        raise InputDataError(
-            f"{capture.root}: the tracks have a frame every {step:.3g} s; if these are milliseconds, they are not "
-            "what the column time_s says.",
-            f"at most {LONGEST_STEP_S:g} s.",
-            "write time_s in seconds.",
-        )
-    whole = whole_episodes(world, episodes)
-    if world.ground_normal is None or not bool(whole.turned.any()):
-        return
-    size = min(size_of(world.bodies[k]) for k in world.free)
-    gap = clearance(world, whole)[whole.seen.amax(-1) > 0]
-    deep = float(torch.quantile(gap, 0.05))
-    if deep < -MOST_SUNK * size:
-        raise InputDataError(
-            f"{capture.root}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
-            f"size is {1e3 * size:.0f} mm.",
-            "a shape, a ground and tracks that belong together.",
-            "check [[bodies]] shape, [world] ground, and which body was tracked.",
-        )
+def _unseen(prepared: Prepared) -> str:
+    """Say of what kind of motion nothing was seen, and nothing is said."""
+    if not prepared.contact_items:
+        return " Only flight was seen: this says nothing about contact."
+    if prepared.flight is None:
+        return " Only contact was seen: this says nothing about flight."
+    return ""
 
 
 def _one_phase(prepared: Prepared) -> list[str]:

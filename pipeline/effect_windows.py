@@ -11,8 +11,9 @@ import torch
 from ..datasets.tracks import Track
 from .effect_flights import fit_effect_flights
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, fit_first_contacts
+from .own_numbers import fit_own_numbers
 from .physics.effects import ActiveEffect
-from .physics.parameters import Parameter, effect_parameters
+from .physics.parameters import GROUND_SHIFT, Parameter, effect_parameters
 from .physics.world import World
 
 Start = list[tuple[Parameter, float]]
@@ -23,6 +24,7 @@ def fit_effect_windows(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     along: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
+    groups: Mapping[str, str],
 ) -> FirstContacts:
     """Fit the world's effects: to flights those that they show, the others to flight and first contacts.
 
@@ -35,13 +37,17 @@ def fit_effect_windows(
         episodes: Name and tracks by body of each episode.
         along: The contact's numbers that are fitted along in contact, and where they start.
         noise: Of the tracks (position [m], rotation [rad]).
+        groups: Group of each episode that belongs to one, for effects with numbers of each group's own.
 
     Raises:
+        InputDataError: If an effect has numbers of each group's own, and an episode belongs to none.
         NotConvergedError: If the rollouts diverge at the start.
     """
     contact = [active.effect.name for active in world.effects if active.effect.phase == "contact"]
     others = [active.effect.name for active in world.effects if active.effect.name not in contact]
     after_s = CONTACT_S if contact else AFTER_S
+    if any(parameter.shared != "all" for parameter in effect_parameters(world)):
+        return _with_own_numbers(world, episodes, along, noise, groups, bool(contact))
 
     def about_contacts(at: World, wanted: Start) -> FirstContacts:
         return fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)
@@ -57,6 +63,30 @@ def fit_effect_windows(
     record = touched.record | {"in_flight": flown.record}
     parameters, constants = (*flown.parameters, *touched.parameters), flown.constants | touched.constants
     return FirstContacts(touched.world, parameters, record, constants)
+
+
+def _with_own_numbers(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    along: Sequence[tuple[Parameter, float]],
+    noise: tuple[float, float],
+    groups: Mapping[str, str],
+    touching: bool,
+) -> FirstContacts:
+    # steps through a first contact are rough, and would hold up those of all the others
+    others = [(p, value) for p, value in along if touching and p != GROUND_SHIFT]
+    if along and world.ground_normal is not None:
+        others.append((GROUND_SHIFT, 0.0))
+
+    def own(at: World, _: Start) -> FirstContacts:
+        # from where the effects stand: there the prior of units has its middle
+        values = {f"{a.effect.name}.{name}": float(value) for a in at.effects for name, value in a.values.items()}
+        wanted = [(parameter, values[parameter.name]) for parameter in effect_parameters(at)]
+        return fit_own_numbers(at, episodes, groups, wanted, others, noise, not along, CONTACT_S if touching else 0.0)
+
+    found = _best(world, [active.effect.name for active in world.effects], own)
+    assert found is not None  # windows always give something
+    return found
 
 
 def _best(

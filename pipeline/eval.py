@@ -25,6 +25,7 @@ from ..schemas import EpisodeErrors, ErrorSummary, EvalResult, InputDataError
 from .estimation.noise import estimate_noise
 from .image_errors import VideoComparison, VideoErrors, renderable, usable_cameras
 from .memory import enough_memory
+from .own_worlds import own_parameters, with_fitted_numbers, with_known_numbers
 from .physics.world import World
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, Episode, EpisodePrediction, predict
 
@@ -114,7 +115,8 @@ def evaluate_model(
     video_times = [_video_times(capture, name, cameras.get(name, [])) for name, _ in episodes]
     noise = _noise(model, capture, episodes)
     fits = 0 if brief else STATE_FIT_EPISODES
-    predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits)
+    world, fitted = _own_worlds(world, model, capture, episodes, noise, warnings, brief)
+    predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits, fitted)
 
     def compare(prediction: EpisodePrediction) -> tuple[VideoComparison, ...]:
         names = cameras.get(prediction.episode, [])
@@ -122,6 +124,28 @@ def evaluate_model(
         return tuple(comparison for comparison in found if comparison is not None)
 
     return _evaluation(predictions, compare, warnings)
+
+
+def _own_worlds(
+    world: World,
+    model: Model,
+    capture: Capture,
+    episodes: Sequence[Episode],
+    noise: tuple[float, float],
+    warnings: list[str],
+    brief: bool,
+) -> tuple[World, World]:
+    """Return the world with the own numbers that the fit knows, and with those of all episodes, fitted to them."""
+    names = [name for name, _ in episodes]
+    known = with_known_numbers(world, model.file, names, capture.groups)
+    unknown = [name for name in names if len(known.own.get(name, {})) < len(own_parameters(world))]
+    if brief or not unknown:
+        return known, known
+    warnings.append(
+        f"{len(unknown)} of the {len(names)} episodes should have numbers of their own, and the fit has not seen them: "
+        "open loop they have the mean; in the state-fitted residual they are fitted, as the state is."
+    )
+    return known, with_fitted_numbers(world, episodes, model.file, capture.groups, noise)
 
 
 def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s: float = 0.1) -> Evaluation:
@@ -210,9 +234,10 @@ def _predict(
     warmup_s: float,
     video_times: Sequence[Array],
     state_fits: int = STATE_FIT_EPISODES,
+    fitted: World | None = None,
 ) -> list[EpisodePrediction]:
     with progress(desc="eval: rollouts", total=len(episodes), unit="episode") as bar:
-        return predict(world, episodes, noise, warmup_s, video_times, bar.update, state_fits)
+        return predict(world, episodes, noise, warmup_s, video_times, bar.update, state_fits, fitted)
 
 
 def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: list[str]) -> dict[str, list[str]]:

@@ -24,6 +24,7 @@ from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .estimation.warmup import flight_frames
 from .physics.parameters import Parameter, apply_parameters
 from .physics.world import World
+from .window_errors import ROBUST_SCALE, WindowErrors
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,8 @@ CONTACT_S = 1.5
 MODEL_ERROR = (0.0005, 0.01)
 """What a rigid body and this contact law miss in such a window (position [m], rotation [rad]) beside the tracks' noise.
 Only their ratio matters much; the residuals are weighed robustly, and intervals come from the episodes' scatter."""
-ROBUST_SCALE = 3.0
+REACH = 1.96
+"""Half of a 95 % interval of a normal number, in standard errors."""
 MAX_WINDOWS = 100
 """So many give second moments of mass within 2 %."""
 ITERATIONS = 16
@@ -51,12 +53,17 @@ class FirstContacts:
     """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
 
     constants: of effects, `effect.constant` by name.
+    ground: how far the ground was moved in this world, where ends of episodes showed its height; own: by session or
+    episode, values of `effect.parameter` that are its own; spread: of these from unit to unit.
     """
 
     world: World
     parameters: tuple[FittedParameter, ...]
     record: dict[str, Any]
     constants: dict[str, float] = field(default_factory=dict)
+    ground: FittedParameter | None = None
+    own: dict[str, dict[str, float]] = field(default_factory=dict)
+    spread: dict[str, float] = field(default_factory=dict)
 
 
 def fit_first_contacts(
@@ -82,12 +89,14 @@ def fit_first_contacts(
     Raises:
         NotConvergedError: If the rollouts diverge at the start.
     """
-    observations = _windows(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
+    picked, windows, _ = windows_of(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
+    observations = Observations.of(world, picked, windows)
     start = [*wanted, *along]
     names = [parameter for parameter, _ in start]
     position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
+    residuals = TrajectoryResiduals(world, names, observations, position_std, rotation_std)
     solution = minimise(
-        TrajectoryResiduals(world, names, observations, position_std, rotation_std),
+        residuals,
         torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity),
         torch.zeros(len(observations.names), STATE_SIZE * len(observations.free)).to(world.gravity),
         torch.tensor([parameter.limits for parameter in names]).to(world.gravity),
@@ -96,7 +105,14 @@ def fit_first_contacts(
         prior_information=state_prior(len(observations.free)),
     )
     count = len(wanted)
-    std_errors = np.sqrt(np.diag(few_covariance(solution.information.numpy(), solution.scores.numpy())))[:count]
+    covariance = few_covariance(solution.information.numpy(), solution.scores.numpy())
+    if len(observations.names) < ENOUGH_EPISODES:
+        rows, _ = residuals(solution.shared, solution.states, False)
+        errors = WindowErrors.of(rows, solution, observations, np.zeros(len(observations.names), bool))
+        factor, dof = errors.factor(len(names))
+        missed = factor * (student.ppf(0.975, dof) / REACH) ** 2 * _pinv(solution.information.numpy())
+        covariance = _wider(covariance, missed)
+    std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
     record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
     return FirstContacts(
@@ -121,9 +137,13 @@ def few_covariance(information: Array, scores: Array) -> Array:
         return scatter
     if count < 2:
         return inverse
-    few = count / (count - 1) * (student.ppf(0.975, count - 1) / 1.96) ** 2
-    width = np.sqrt(np.maximum(1.0, few * np.diag(scatter) / np.diag(inverse).clip(1e-300)))
-    return inverse * np.outer(width, width)
+    return _wider(inverse, count / (count - 1) * (student.ppf(0.975, count - 1) / REACH) ** 2 * scatter)
+
+
+def _wider(covariance: Array, other: Array) -> Array:
+    """Return a covariance (P, P) with the larger one of its variances and another's, and its own correlations."""
+    width = np.sqrt(np.maximum(1.0, np.diag(other) / np.diag(covariance).clip(1e-300)))
+    return covariance * np.outer(width, width)
 
 
 def _pinv(information: Array) -> Array:
@@ -131,19 +151,27 @@ def _pinv(information: Array) -> Array:
     return np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
 
 
-def _windows(
+def windows_of(
     world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lead_frames: int | None, after_s: float
-) -> Observations:
-    """Return a window about the first contact of each episode, of at most `MAX_WINDOWS` evenly spread ones."""
+) -> tuple[list[tuple[str, dict[str, Track]]], list[tuple[float, float]], list[float]]:
+    """Return episodes, at most `MAX_WINDOWS` evenly spread ones, windows [s] about their first contacts, and these [s].
+
+    Args:
+        world: The world.
+        episodes: Name and tracks by body of each.
+        lead_frames: Frames before the contact; None for all.
+        after_s: How long a window goes on after it [s].
+    """
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_WINDOWS)).round().astype(int)
     picked = [episodes[i] for i in chosen]
     whole = Observations.of(world, picked, [(-np.inf, np.inf)] * len(picked))
     flying = flight_frames(world, whole).sum(1)
-    windows = []
+    windows, contacts = [], []
     for times, count in zip(whole.times_s, flying.tolist(), strict=True):
         first = times[0] if lead_frames is None else times[max(0, count - lead_frames)]
+        contacts.append(float(times[count]) if count < len(times) else np.inf)
         windows.append((float(first) - 1e-9, float(times[min(count, len(times) - 1)]) + after_s))
-    return Observations.of(world, picked, windows)
+    return picked, windows, contacts
 
 
 def placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> World:
@@ -154,12 +182,15 @@ def placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> Wor
     return replace(moved, bodies=tuple(bodies))
 
 
-def described(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
-    """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates."""
+def described(parameter: Parameter, coordinate: float, std: float, reach: float = REACH) -> FittedParameter:
+    """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates.
+
+    reach: half of the interval, in standard errors.
+    """
     low, high = parameter.limits
     estimate, *interval = (
         float(parameter.decode(torch.tensor(z, dtype=torch.float64)))
-        for z in (coordinate, *(min(max(coordinate + k * 1.96 * std, low), high) for k in (-1, 1)))
+        for z in (coordinate, *(min(max(coordinate + k * reach * std, low), high) for k in (-1, 1)))
     )
     estimate = min(max(estimate, parameter.bounds[0]), parameter.bounds[1])  # rounding may lead past a bound
     state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
@@ -189,6 +220,6 @@ def bound_warnings(parameters: Sequence[Parameter], fitted: Sequence[FittedParam
         side, unit = ("upper" if upper else "lower"), "" if found.unit == "1" else f" {found.unit}"
         texts.append(
             f"{found.name} ended on its {side} bound ({found.estimate:.3g}{unit}), which is no estimate: "
-            f"{meaning[found.name][upper]}."
+            f"{meaning[found.name.partition('[')[0]][upper]}."
         )
     return texts

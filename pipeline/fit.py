@@ -323,7 +323,8 @@ def _with_physics(
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        found = fit_with_effects(world, track_episodes(capture, split), config, noise, model.file.contact is not None)
+        episodes, begun = track_episodes(capture, split), model.file.contact is not None
+        found = fit_with_effects(world, episodes, config, noise, begun, capture.groups)
     elif config.mass_distribution:
         raise UsageError(
             f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not show where the mass is.",
@@ -395,6 +396,8 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
                 {e.name: load_effect(e.name).name for e in file.effects},
                 found.parameters,
                 found.constants,
+                {} if found.effects is None else found.effects.own,
+                {} if found.effects is None else found.effects.spread,
             ),
             "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
             "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),

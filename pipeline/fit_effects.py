@@ -10,6 +10,7 @@ from ..schemas import EffectModel, InputDataError, PhysConfig, UsageError
 from ..schemas import Parameter as FittedParameter
 from .phys_geo import PhysicsFit, fit_physics
 from .physics.effects import load_effect
+from .physics.effects.registry import split_units
 from .physics.world import World
 
 
@@ -23,6 +24,9 @@ def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple
     unique: dict[str, EffectModel] = {}
     for effect in effects:
         own = load_effect(effect.name).name
+        if own in unique and split_units(unique[own].name)[0] == split_units(effect.name)[0]:
+            # the same effect, shared otherwise: it goes on from where it is
+            unique[own] = unique[own].model_copy(update={"name": effect.name})
         if own in unique and unique[own].name != effect.name:
             raise UsageError(
                 f"two effects are called '{own}': {unique[own].name} and {effect.name}.", todo="rename one of them."
@@ -42,6 +46,8 @@ def fitted_effects(
     names: Mapping[str, str],
     parameters: Iterable[FittedParameter],
     constants: Mapping[str, float],
+    own: Mapping[str, Mapping[str, float]] | None = None,
+    spread: Mapping[str, float] | None = None,
 ) -> tuple[EffectModel, ...]:
     """Return the effects with the values that a fit found.
 
@@ -50,13 +56,26 @@ def fitted_effects(
         names: The name that an effect gives itself, by the name that the model has for it.
         parameters: What was fitted, `effect.parameter` by name.
         constants: The chosen constants, `effect.constant` by name.
+        own: By session or episode, the values of `effect.parameter` that are its own.
+        spread: Of these from unit to unit, `effect.parameter` by name.
     """
-    found = {parameter.name: parameter.estimate for parameter in parameters} | dict(constants)
+    found = {p.name: p.estimate for p in parameters if "[" not in p.name} | dict(constants)
     effects = []
     for effect in present:
         prefix = f"{names[effect.name]}."
         values = {key.removeprefix(prefix): value for key, value in found.items() if key.startswith(prefix)}
-        effects.append(effect.model_copy(update={"parameters": effect.parameters | values}))
+        mine = {
+            unit: {key.removeprefix(prefix): value for key, value in numbers.items() if key.startswith(prefix)}
+            for unit, numbers in (own or {}).items()
+        }
+        update = {
+            "parameters": effect.parameters | values,
+            "own": {unit: numbers for unit, numbers in mine.items() if numbers},
+            "spread": {
+                key.removeprefix(prefix): value for key, value in (spread or {}).items() if key.startswith(prefix)
+            },
+        }
+        effects.append(effect.model_copy(update=update))
     return tuple(effects)
 
 
@@ -66,6 +85,7 @@ def fit_with_effects(
     config: PhysConfig,
     noise: tuple[float | None, float | None],
     begun: bool = False,
+    groups: Mapping[str, str] | None = None,
 ) -> PhysicsFit:
     """Fit the world, see `fit_physics`, where its effects have what they need.
 
@@ -74,7 +94,7 @@ def fit_with_effects(
         NotConvergedError: If every rollout diverges.
     """
     _require_needs(world, episodes)
-    return fit_physics(world, episodes, config, noise, begun)
+    return fit_physics(world, episodes, config, noise, begun, groups)
 
 
 def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> None:
@@ -109,9 +129,3 @@ def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
                 "effects of the measurement for captures without driven bodies.",
                 "leave it out of --effects.",
             )
-        for number in effect.parameters:
-            if number.shared != "all":
-                raise InputDataError(
-                    f"{effect.name}.{number.name} is one value for each {number.shared}; a fit finds one for all.",
-                    'shared = "all".',
-                )

@@ -17,7 +17,7 @@ only effects are fitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,6 +32,7 @@ from ..datasets.tracks import Track
 from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
 from ..schemas import Parameter as FittedParameter
 from .diagnosis.segments import world_for
+from .diagnosis.usable import refuse_slow_times
 from .effect_windows import fit_effect_windows
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
@@ -133,6 +134,7 @@ def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Tr
             "tracks/<episode>.csv with rows for a body whose motion is 'free'.",
             "add tracks, or fit from the videos: --supervise images.",
         )
+    refuse_slow_times([t[b] for _, t in usable for b in free if b in t], str(capture.root))
     return usable
 
 
@@ -142,6 +144,7 @@ def fit_physics(
     config: PhysConfig,
     noise: tuple[float | None, float | None] = (None, None),
     begun: bool = False,
+    groups: Mapping[str, str] | None = None,
 ) -> PhysicsFit:
     """Fit friction, contact time, damping ratio and ground height to measured tracks; where asked for, the mass too.
 
@@ -152,18 +155,13 @@ def fit_physics(
         noise: Known measurement noise (position [m], rotation [rad]); estimated where None.
         begun: Whether the world's contact numbers are those of an earlier fit: then the search starts there, and half
             as many generations do; else it starts at the middles of the priors.
+        groups: Group of each episode that belongs to one, for effects with numbers of each group's own.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
         InputDataError: If the tracks do not show where the mass is, and that is asked for.
     """
-    longest = math.pi * CONTACT_TIME.bounds[0]
-    if config.step_s > longest:
-        raise InputDataError(
-            f"phys-geo.step_s is {1e3 * config.step_s:g} ms: contacts of {1e3 * CONTACT_TIME.bounds[0]:g} ms, the "
-            "shortest that the search looks at, would end within the step in which they begin.",
-            f"up to {1e3 * longest:.2g} ms.",
-        )
+    _require_short_steps(config.step_s)
     free_tracks = [
         tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
     ]
@@ -187,9 +185,12 @@ def fit_physics(
     if effect_parameters(world):
         # flight needs no contact and no short steps
         effects = fit_effect_windows(
-            world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma
+            world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma, groups or {}
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
+        if effects.ground is not None:  # rest shows it better than where rollouts end
+            names = list(CONTACT_PARAMETERS)
+            start = [(p, value) for p, value in start if p in names]
     observations = Observations.of(world, searched, [_span(tracks) for _, tracks in searched])
     warm = warmup_frames(world, observations, config.warmup_s)
     observations, _ = estimate_states(world, observations, warm, sigma)
@@ -221,8 +222,33 @@ def fit_physics(
             )
         record["correlation"] = _correlation(covariance).tolist()
         found = physics_fit(world, names, best, covariance, sigma, record)
+    return _completed(found, world, mass, effects, starts)
+
+
+def _require_short_steps(step_s: float) -> None:
+    longest = math.pi * CONTACT_TIME.bounds[0]
+    if step_s > longest:
+        raise InputDataError(
+            f"phys-geo.step_s is {1e3 * step_s:g} ms: contacts of {1e3 * CONTACT_TIME.bounds[0]:g} ms, the "
+            "shortest that the search looks at, would end within the step in which they begin.",
+            f"up to {1e3 * longest:.2g} ms.",
+        )
+
+
+def _completed(
+    found: PhysicsFit,
+    world: World,
+    mass: FirstContacts | None,
+    effects: FirstContacts | None,
+    starts: dict[str, tuple[float, State]],
+) -> PhysicsFit:
+    """Return the fit of the contact with what was found of effects and of the mass."""
     more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
-    known = [*effect_parameters(world), *(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
+    if effects is not None and effects.ground is not None and world.ground_offset is not None:
+        more.append(_absolute(effects.ground, float(world.ground_offset[0]) - effects.ground.estimate))
+        found = replace(found, ground_offset_m=more[-1].estimate)
+    known = [replace(GROUND_SHIFT, name="ground_offset_m"), *effect_parameters(world)]
+    known += [*(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
     return replace(
         found,
         parameters=(*found.parameters, *more),
@@ -274,7 +300,9 @@ def _shot(
     record: dict[str, Any],
 ) -> tuple[list[Parameter], np.ndarray, np.ndarray, dict[str, tuple[float, State]]]:
     """Return names, estimate, covariance and starts by multiple shooting; the search's where that leads astray."""
-    shot_names = [*names, GROUND_SHIFT] if world.ground_normal is not None and GROUND_SHIFT not in names else names
+    shown = "effects" in record and "ground_shift_m" in record["effects"]
+    lacking = world.ground_normal is not None and GROUND_SHIFT not in names and not shown
+    shot_names = [*names, GROUND_SHIFT] if lacking else names
     middle = np.array([p.encode(p.prior[0]) for p in shot_names])
     prior = ShotPrior(
         torch.as_tensor(middle),
@@ -389,7 +417,10 @@ def _open_loop(world: World, observations: Observations, warm: Tensor, names: li
         drives = {name: drive.repeat(repeats) for name, drive in observations.drives.items()}
         with torch.no_grad():
             rollout = measure(
-                apply_parameters(world, names, decoded), base, observations.times_s.repeat(repeats, 1), drives
+                apply_parameters(observations.world(world, repeats), names, decoded),
+                base,
+                observations.times_s.repeat(repeats, 1),
+                drives,
             )
         free = list(observations.free)
         shift = rollout.position_m[:, :, free] - observations.position_m.repeat(repeats, 1, 1, 1)

@@ -27,7 +27,7 @@ from ..datasets.capture import Capture
 from ..datasets.models import Model
 from ..datasets.ply import Splats
 from ..datasets.tracks import Track
-from ..schemas import PhysConfig
+from ..schemas import PhysConfig, UsageError
 from .checkpoint import Checkpoint
 from .estimation.least_squares import minimise
 from .estimation.observations import Observations
@@ -40,7 +40,7 @@ from .imaging.silhouettes import body_outlines
 from .imaging.touching import TouchingSpheres, dense_times
 from .phys_geo import PhysicsFit, physics_fit
 from .physics.measured import measure
-from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters
+from .physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
 from .physics.world import State, World
 from .sg_gs import resolve_device
 from .video_checks import examine_tracks
@@ -112,6 +112,11 @@ def fit_physics_from_images(
     noise = tracks_noise(capture, episodes)
     known = noise[0] or 0.0, noise[1] or 0.0
     doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
+    if any(number.shared != "all" for number in effect_parameters(world)):
+        raise UsageError(
+            "numbers of each group's or episode's own with --supervise images: images do not tell them apart yet.",
+            "NAME@group and NAME@episode with --supervise tracks.",
+        )
     start = fit_with_effects(world, [(episode.name, episode.tracks) for episode in episodes], config, noise)
     clock.lap("dynamics")
 

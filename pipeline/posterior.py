@@ -70,7 +70,7 @@ def can_vary(file: ModelFile, name: str) -> bool:
 
 def _own_name(effect: EffectModel) -> str:
     """Return the name that an effect gives itself, which its parameters carry."""
-    return load_effect(effect.name).name if ":" in effect.name else effect.name
+    return load_effect(effect.name).name if ":" in effect.name or "@" in effect.name else effect.name
 
 
 def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:

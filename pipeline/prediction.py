@@ -116,6 +116,7 @@ def predict(
     video_times_s: Sequence[Array],
     on_step: Callable[[int], object] = lambda _: None,
     state_fits: int = STATE_FIT_EPISODES,
+    fitted_world: World | None = None,
 ) -> list[EpisodePrediction]:
     """Predict episodes open loop from their warm-ups.
 
@@ -127,6 +128,7 @@ def predict(
         video_times_s: For each episode, further times at which to predict [s].
         on_step: Called with a number of finished episodes.
         state_fits: For how many of them, at most, the state is fitted to the whole episode.
+        fitted_world: The world with all episodes' own numbers, for these fits; None for the same.
 
     Returns:
         The predictions, in the order of the episodes.
@@ -136,6 +138,7 @@ def predict(
     """
     count = len(episodes)
     samples = min(max(SAMPLES_IN_ALL // count, SAMPLES[0]), SAMPLES[1])
+    with_own = world if fitted_world is None else fitted_world
     fitted = set(np.linspace(0, count - 1, min(count, state_fits)).round().astype(int).tolist())
     # those to fit in one batch; then episodes of similar length together, since a batch is as long as its longest
     order = sorted(range(count), key=lambda i: (i not in fitted, max(len(track) for track in episodes[i][1].values())))
@@ -144,7 +147,7 @@ def predict(
         numbers = order[first : first + BATCH]
         batch = _Batch.of(world, [episodes[i] for i in numbers], noise, warmup_s)
         floor = batch.uncertainty().noise_floor(samples, numbers)
-        best = batch.state_fitted([k for k, number in enumerate(numbers) if number in fitted], noise)
+        best = batch.state_fitted([k for k, number in enumerate(numbers) if number in fitted], noise, with_own)
         for k, prediction in enumerate(batch.predictions([video_times_s[i] for i in numbers])):
             figures = {"noise_floor_m": float(floor[k]), "state_fitted_m": best.get(k)}
             found[numbers[k]] = replace(prediction, **figures)
@@ -176,12 +179,12 @@ class _Batch:
     def uncertainty(self) -> StartUncertainty:
         return StartUncertainty(self.world, self.observations, self.covariance, self.weight())
 
-    def state_fitted(self, items: list[int], noise: tuple[float, float]) -> dict[int, float]:
+    def state_fitted(self, items: list[int], noise: tuple[float, float], world: World) -> dict[int, float]:
         """Return the state-fitted residual [m] of some items of the batch."""
         if not items:
             return {}
         chosen = StartUncertainty(
-            self.world, self.observations.select(items), self.covariance[items], self.weight()[items]
+            self.world, self.observations.select(items).with_own(world), self.covariance[items], self.weight()[items]
         )
         return dict(zip(items, chosen.fit(noise, STATE_FIT_ITERATIONS).tolist(), strict=True))
 
@@ -193,7 +196,7 @@ class _Batch:
         longest = max(len(grid) for grid, _ in grids)
         padded = np.stack([_padded(grid, longest) for grid, _ in grids])
         with torch.no_grad():
-            rollout = measure(self.world, seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
+            rollout = measure(seen.world(self.world), seen.state, torch.as_tensor(padded).to(seen.times_s), seen.drives)
         require_finite(
             rollout, self.world, seen.state, [f"episode '{name}'" for name in seen.names], [len(g) for g, _ in grids]
         )

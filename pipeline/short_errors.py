@@ -138,7 +138,9 @@ def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: 
         torch.nan_to_num(rows, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED).unflatten(1, (-1, bodies)).numpy()
     )
     seen = segments.observations
-    mask = torch.cat((seen.seen[..., None].expand(-1, -1, -1, 3), seen.turned[..., None].expand(-1, -1, -1, 3)), -1)
+    mask = torch.cat(
+        (seen.seen[..., None] * seen.measured_axes[:, None], seen.turned[..., None].expand(-1, -1, -1, 3)), -1
+    )
     measured = mask.numpy() > 0
     for item, segment in enumerate(segments.items):
         one = found[names[segment.episode]]

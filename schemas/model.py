@@ -77,8 +77,14 @@ class EffectModel(FileModel):
     """An effect in the model, with the values of its parameters and constants."""
 
     name: str
-    """A built-in effect, `path/to/file.py:ClassName`, or the name of an entry point of the group `cgwm.effects`."""
+    """A built-in effect, `path/to/file.py:ClassName`, or the name of an entry point of the group `cgwm.effects`; with
+    `@group` or `@episode` behind it each session, or episode, has numbers of its own."""
     parameters: dict[str, float] = {}
+    """Where each unit has its own: the mean over units, which serves one that the fit has not seen."""
+    own: dict[str, dict[str, float]] = {}
+    """By session or episode: its own values of parameters."""
+    spread: dict[str, float] = {}
+    """By parameter with own values: their standard deviation from unit to unit, of the prior that ties them."""
 
 
 class Exposure(FileModel):

@@ -119,7 +119,8 @@ def without_effect(world: World, name: str) -> World:
 
 def base_parameters(world: World, kind: Kind) -> list[Parameter]:
     """Return the numbers of a model that are fitted along: those of its effects, and in contact those of contact."""
-    own = effect_parameters(world)
+    # sessions that have their own numbers keep them: they were fitted with a prior, which a refit here does not know
+    own = [p for p in effect_parameters(world) if p.shared == "all" or not world.own]
     if kind == "flight":
         acting = {a.effect.name for a in world.effects if a.effect.phase != "contact"}
         return [p for p in own if p.name.partition(".")[0] in acting]

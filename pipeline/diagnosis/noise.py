@@ -22,6 +22,9 @@ SLOW_DEGREE = 7
 OUTLIER_SIGMAS = 6.0
 """A frame so far from the cubic through the others of its window is no measurement: 2e-9 of normal ones lie there."""
 KEEP_SIGMAS = 4.0
+SURE_SIGMAS = 2.5
+"""So many standard errors beyond chance are neighbouring frames' errors taken for correlated."""
+MOST_CORRELATED = 0.95
 ENOUGH = 60
 """So few residuals give a standard deviation within 10 %."""
 
@@ -31,10 +34,16 @@ def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float 
 
     Each window of consecutive frames is fitted by a cubic; residuals are scaled to the same variance, those beyond
     `KEEP_SIGMAS` of a first, robust estimate are left out. Windows of a body whose orientation was measured are short:
-    turning about a point beside its centre of mass, it does not follow a long cubic.
+    turning about a point beside its centre of mass, it does not follow a long cubic. A cubic follows a part of errors
+    that last for several frames, as those of smoothed tracks do: the standard deviation is that of all of them.
     """
     position, rotation = _residuals(whole, flight)
-    return _spread(position, FLOOR_M), _spread(rotation, FLOOR_RAD)
+    found = [_spread(position, FLOOR_M), _spread(rotation, FLOOR_RAD)]
+    for kind in (0, 1):
+        alone = found[kind]
+        if alone is not None:
+            found[kind] = alone * _hidden(whole, flight, kind, alone)
+    return found[0], found[1]
 
 
 def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
@@ -95,6 +104,45 @@ def without_outliers(
             (seen, turned)[kind][episode, frame, column] = 0.0
             count += 1
     return replace(whole, seen=seen, turned=turned), count, kinked
+
+
+def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: float) -> float:
+    """Return by what factor errors exceed those that do not depend on each other, of the same residuals; 1 for these.
+
+    With r = Q e, Q the projector on what a cubic leaves of a window, and errors e of correlation rho^|i-j|, C: the
+    expectation of r'r is tr(QC), that of r'Lr, neighbours multiplied, is tr(QLQC); their ratio gives rho.
+    """
+    t = np.linspace(-1, 1, WINDOW)
+    basis, _ = np.linalg.qr(np.vander(t, DEGREE + 1))
+    left = np.eye(WINDOW) - basis @ basis.T
+    pair = 0.5 * (np.eye(WINDOW, k=1) + np.eye(WINDOW, k=-1))
+    square, product, count = 0.0, 0.0, 0
+    for segment in flight:
+        for column in range(len(whole.free)):
+            if not bool(whole.turned[segment.episode, :, column].any()):
+                continue  # long windows see all of a centroid's errors, see `slow_noise`
+            for frames in _frames(whole, segment, column, kind):
+                if len(frames) < WINDOW:
+                    continue
+                away = _cubic(whole, segment.episode, column, frames, kind)
+                if np.abs(away).max() > KEEP_SIGMAS * noise:
+                    continue
+                raw = away * np.sqrt(np.diag(left))[:, None]
+                square, product = square + float((raw**2).sum()), product + float((raw * (pair @ raw)).sum())
+                count += raw.shape[1]
+    seen = left @ pair @ left
+    alone, known = np.trace(seen), np.trace(left)
+    if count == 0 or square <= 0:
+        return 1.0
+    # with independent errors the ratio has this scatter
+    scatter = np.sqrt(2 * ((seen @ seen).trace() - alone**2 / known) / count) / known
+    if product / square < alone / known + SURE_SIGMAS * scatter:
+        return 1.0
+    gap = np.abs(np.subtract.outer(np.arange(WINDOW), np.arange(WINDOW)))
+    rhos = np.linspace(0.0, MOST_CORRELATED, 200)
+    ratios = [np.trace(seen @ rho**gap) / np.trace(left @ rho**gap) for rho in rhos]
+    rho = rhos[int(np.abs(np.array(ratios) - product / square).argmin())]
+    return float(np.sqrt(known / np.trace(left @ rho**gap)))
 
 
 def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarray, np.ndarray]:

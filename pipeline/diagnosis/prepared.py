@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from ..estimation.noise import estimate_noise
@@ -30,7 +31,8 @@ NOISE_DISAGREES = 1.3
 class Prepared:
     """Episodes ready for tests.
 
-    names (E); groups (E): session of each episode; whole (E): all frames; clear (E, T): frames surely in flight; noise:
+    names (E); groups (E): session of each episode; whole (E): all frames; clear (E, T): frames surely in flight;
+    carried (E, T): frames above the ground in which nothing falls; noise:
     position [m], rotation [rad]; slow: by what factor the variance of slow errors of a centroid exceeds that of all;
     flight: segments with fitted states, None where there are none; contact_items: the contact segments; outliers:
     frames left out; turned: whether orientations were measured; warnings.
@@ -40,6 +42,7 @@ class Prepared:
     groups: tuple[int, ...]
     whole: Observations
     clear: Tensor
+    carried: Tensor
     noise: tuple[float, float]
     slow: float
     flight: Segments | None
@@ -73,7 +76,7 @@ def prepare(
     Args:
         world: The model's world.
         episodes: Name and tracks by body of each.
-        given: Noise of the tracks, where it is known; what the flights show otherwise wins.
+        given: Noise of the tracks, where it is known; where the flights show more, that wins.
         groups: Session of each episode; all the same by default.
     """
     warnings: list[str] = []
@@ -83,7 +86,9 @@ def prepare(
     whole = whole_episodes(world, episodes)
     turned = bool(whole.turned.any())
     flight, contact, clear = cut_episodes(world, whole, noise)
-    carried = carried_frames(world, whole, flight, noise)
+    # with nothing to stand on, what does not fall falls as fast as its drag lets it
+    alone = world.ground_normal is None and len(world.bodies) == 1
+    carried = torch.zeros_like(clear) if alone else carried_frames(world, whole, flight, noise)
     if bool(carried.any()):
         flight, contact, clear = cut_episodes(world, whole, noise, carried)
         warnings.append(
@@ -108,6 +113,7 @@ def prepare(
         tuple(groups or [0] * len(episodes)),
         whole,
         clear,
+        carried,
         noise,
         slow_noise(whole, flight),
         fitted,
@@ -124,12 +130,19 @@ def _agreed(
     rough: tuple[float, float],
     warnings: list[str],
 ) -> tuple[float, float]:
-    """Return the noise to work with: what was given, unless the flights show another; else what they show."""
+    """Return the noise to work with: what was given, unless the flights show more; else what they show."""
     chosen = []
     for name, unit, said, seen, otherwise in zip(
         ("position", "rotation"), ("m", "rad"), given, found, rough, strict=True
     ):
-        if said is not None and seen is not None and not 1 / NOISE_DISAGREES < said / seen < NOISE_DISAGREES:
+        if said is not None and seen is not None and said / seen >= NOISE_DISAGREES:
+            warnings.append(
+                f"the {name} noise is given as {said:.2g} {unit}; neighbouring frames of a flight agree within "
+                f"{seen:.2g} {unit}. What is given counts, as errors that last are not seen there: effects below it "
+                "stay unseen."
+            )
+            chosen.append(said)
+        elif said is not None and seen is not None and said / seen <= 1 / NOISE_DISAGREES:
             warnings.append(
                 f"the {name} noise is given as {said:.2g} {unit}; in flight it is {seen:.2g} {unit}, which is used."
             )

@@ -61,10 +61,14 @@ class Segments:
 
     @property
     def dof(self) -> Tensor:
-        """Degrees of freedom (B,) of each segment: its numbers measured, less those of its state that they show."""
+        """Degrees of freedom (B,) of each segment: its numbers measured, less those of its state that they show.
+
+        A coordinate that is the same in all frames was not measured.
+        """
         seen = self.observations
         moved, turned = seen.seen.sum(1), seen.turned.sum(1)
-        free = 3 * (moved - 2).clamp_min(0) + 3 * (turned - 2).clamp_min(0)
+        axes = seen.measured_axes.sum(-1)
+        free = axes * (moved - 2).clamp_min(0) + 3 * (turned - 2).clamp_min(0)
         return free.sum(-1)
 
     def select(self, items: Sequence[int]) -> Segments:
@@ -129,7 +133,8 @@ class Segments:
 
     def rollout(self, record_contacts: bool = False) -> Rollout:
         """Return the true motion of the segments from their states."""
-        world, seen = self.world, self.observations
+        seen = self.observations
+        world = seen.world(self.world)
         with torch.no_grad():
             return rolled_out(world, seen.state, true_times(world, seen.times_s), seen.drives, record_contacts)
 
@@ -140,7 +145,8 @@ class Segments:
             parameters: Numbers of the world that are set.
             values: Their values in fitted coordinates, (B, P).
         """
-        world, seen = self.world, self.observations
+        seen = self.observations
+        world = seen.world(self.world)
         if parameters and values is not None:
             decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(parameters)], -1)
             world = apply_parameters(world, parameters, decoded)
@@ -181,7 +187,9 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
     drives = {name: drive.select(rows) for name, drive in whole.drives.items()}
     state = whole.state.at(rows)
     names = tuple(whole.names[item.episode] for item in items)
-    return replace(whole, names=names, times_s=times, drives=drives, state=state, **picked)
+    picked["measured_axes"] = whole.measured_axes[rows]
+    own = {name: value[rows] for name, value in whole.own.items()}
+    return replace(whole, names=names, times_s=times, drives=drives, state=state, own=own, **picked)
 
 
 def line_state(segments: Segments, frames: int) -> State:

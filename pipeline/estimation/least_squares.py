@@ -27,8 +27,9 @@ class Solution:
     """Where the fit ended.
 
     shared (P,); states (B, S): changes from the initial states; cost; costs by accepted iteration; information (P, P):
-    of the shared parameters, states eliminated; scores (B, P): gradient of each item, states eliminated; state_cov
-    (B, S, S): covariance of the states at fixed parameters; chi2 (B, F); converged; free (P,): not on a bound.
+    of the shared parameters, states eliminated, and by_item (B, P, P) its parts; scores (B, P): negative gradient of
+    each item, states eliminated, half of that of the cost; state_cov (B, S, S): covariance of the states at fixed
+    parameters; chi2 (B, F); converged; free (P,): not on a bound.
     """
 
     shared: Tensor
@@ -41,6 +42,7 @@ class Solution:
     chi2: Tensor
     converged: bool
     free: Tensor
+    by_item: Tensor
 
 
 def robust_loss(chi2: Tensor, scale: float | None) -> tuple[Tensor, Tensor]:
@@ -75,6 +77,7 @@ def minimise(
     iterations: int = 25,
     tolerance: float = 1e-4,
     prior_information: Tensor | None = None,
+    shared_prior: tuple[Tensor, Tensor] | None = None,
     on_iteration: Callable[[int, float], None] | None = None,
 ) -> Solution:
     """Minimise the robust sum of squares over shared parameters and item states.
@@ -88,6 +91,7 @@ def minimise(
         iterations: Most accepted or refused steps.
         tolerance: Stop when the cost falls by less than this fraction.
         prior_information: Information (S,), or (B, S), of a zero-mean prior on each state change.
+        shared_prior: Centre (P,) and information (P,) of a prior on the parameters; no part of what is returned.
         on_iteration: Called with the iteration and the cost.
 
     Returns:
@@ -97,21 +101,25 @@ def minimise(
         NotConvergedError: If the start gives no finite residual.
     """
     prior = torch.zeros(states.shape[1]).to(states) if prior_information is None else prior_information
+    centre, held = (torch.zeros_like(shared), torch.zeros_like(shared)) if shared_prior is None else shared_prior
     damping, costs, converged = 1e-3, [], False
     linear = _linearise(residuals, shared, states, robust_scale, prior)
     if not torch.isfinite(linear.cost):
         raise NotConvergedError("the model diverges already at the start of the fit (no finite residual).")
-    costs.append(float(linear.cost))
+    total = linear.cost + (held * (shared - centre).square()).sum()
+    costs.append(float(total))
     for iteration in range(iterations):
-        step_shared, step_states = _step(linear, shared, bounds, damping)
+        step_shared, step_states = _step(linear, shared, bounds, damping, held, held * (centre - shared))
         next_shared = (shared + step_shared).clamp(bounds[:, 0], bounds[:, 1])
         next_states = states + step_states
         cost = _cost(residuals, next_shared, next_states, robust_scale, prior)
-        if torch.isfinite(cost) and cost < linear.cost:
-            fall = float((linear.cost - cost) / linear.cost.clamp_min(1e-300))
+        cost = cost + (held * (next_shared - centre).square()).sum()
+        if torch.isfinite(cost) and cost < total:
+            fall = float((total - cost) / total.clamp_min(1e-300))
             shared, states = next_shared, next_states
             linear = _linearise(residuals, shared, states, robust_scale, prior)
-            costs.append(float(linear.cost))
+            total = linear.cost + (held * (shared - centre).square()).sum()
+            costs.append(float(total))
             damping = max(damping / 5, 1e-8)
             if fall < tolerance:
                 converged = True
@@ -171,9 +179,12 @@ def _eliminate(linear: _Linear, damping: float) -> tuple[Tensor, Tensor, Tensor,
     return reduced, gradient, by_shared, by_gradient
 
 
-def _step(linear: _Linear, shared: Tensor, bounds: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+def _step(
+    linear: _Linear, shared: Tensor, bounds: Tensor, damping: float, held: Tensor, pull: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the damped step; held, pull (P,): information and slope of the prior on the parameters."""
     reduced, gradient, by_shared, by_gradient = _eliminate(linear, damping)
-    total, slope = reduced.sum(0), gradient.sum(0)
+    total, slope = reduced.sum(0) + torch.diag(held), gradient.sum(0) + pull
     free = (~bound_stops(shared, slope, bounds)).to(shared.dtype)
     scale = total.diagonal().clamp_min(1e-9)
     system = total * free[:, None] * free + torch.diag(damping * scale + (1 - free) * scale + 1e-9)
@@ -188,4 +199,6 @@ def _solution(
     free = (shared > bounds[:, 0]) & (shared < bounds[:, 1])
     eye = torch.eye(linear.a.shape[-1]).to(linear.a)
     state_cov = torch.linalg.pinv(linear.a, hermitian=True) if linear.a.shape[-1] else linear.a * eye
-    return Solution(shared, states, costs[-1], costs, reduced.sum(0), gradient, state_cov, linear.chi2, converged, free)
+    return Solution(
+        shared, states, costs[-1], costs, reduced.sum(0), gradient, state_cov, linear.chi2, converged, free, reduced
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from ..physics.driven import Drive
+from ..physics.parameters import with_own
 from ..physics.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
 from ..physics.world import State, World
+from .noise import moves
 
 if TYPE_CHECKING:
     from ...datasets.tracks import Track
@@ -28,7 +30,9 @@ class Observations:
     names (B): episode of each item; times_s (B, T): frame times, padded beyond an item's end; position_m
     (B, T, nf, 3) and quat_wxyz (B, T, nf, 4) of the free bodies' frames; seen, turned (B, T, nf): 1 where the position,
     the orientation was measured, 0 elsewhere; drives: commands by driven body; state (B, nb): first guess of the
-    states at times_s[:, 0]; free (nf): indices of the free bodies.
+    states at times_s[:, 0]; free (nf): indices of the free bodies; measured_axes
+    (B, nf, 3): 1 for coordinates that were measured, which are those that ever change in the track; own: values (B,) of
+    effects' parameters that each item has for its own, by `effect.parameter`.
     """
 
     names: tuple[str, ...]
@@ -40,6 +44,16 @@ class Observations:
     drives: dict[str, Drive]
     state: State
     free: tuple[int, ...]
+    measured_axes: Tensor
+    own: dict[str, Tensor] = field(default_factory=dict)
+
+    def with_own(self, world: World) -> Observations:
+        """Return the items with the own numbers that a world has of their episodes."""
+        return replace(self, own=_own(world, self.names))
+
+    def world(self, world: World, repeats: int = 1) -> World:
+        """Return a world with the items' own numbers, for the batch repeated so many times."""
+        return with_own(world, self.own, repeats)
 
     @property
     def frames(self) -> Tensor:
@@ -75,6 +89,8 @@ class Observations:
             drives,
             _resting(world, len(rows)),
             free,
+            torch.as_tensor(np.stack([row.axes for row in rows])).to(like),
+            _own(world, [row.name for row in rows]),
         )
         return replace(partial, state=first_state(world, partial))
 
@@ -84,7 +100,20 @@ class Observations:
         picked = {key: getattr(self, key)[index] for key in ("times_s", "position_m", "quat_wxyz", "seen", "turned")}
         drives = {name: drive.select(index) for name, drive in self.drives.items()}
         names = tuple(self.names[i] for i in items)
-        return replace(self, names=names, drives=drives, state=self.state.at(index), **picked)
+        picked["measured_axes"] = self.measured_axes[index]
+        own = {name: value[index] for name, value in self.own.items()}
+        return replace(self, names=names, drives=drives, state=self.state.at(index), own=own, **picked)
+
+
+def _own(world: World, names: Sequence[str]) -> dict[str, Tensor]:
+    """Return the own values (B,) of episodes by parameter; those that have none have the world's."""
+    numbers = sorted({number for values in world.own.values() for number in values})
+    common = {f"{a.effect.name}.{key}": float(value[0]) for a in world.effects for key, value in a.values.items()}
+    return {
+        number: torch.tensor([world.own.get(name, {}).get(number, common[number]) for name in names]).to(world.gravity)
+        for number in numbers
+        if number in common
+    }
 
 
 @dataclass(frozen=True)
@@ -95,6 +124,7 @@ class _Row:
     quat: np.ndarray
     seen: np.ndarray
     turned: np.ndarray
+    axes: np.ndarray
 
     @staticmethod
     def of(world: World, name: str, tracks: dict[str, Track], window: tuple[float, float]) -> _Row:
@@ -103,15 +133,16 @@ class _Row:
         times = np.unique(np.concatenate([track.time_s for track in cut.values()]))
         shape = (len(times), len(bodies))
         position, quat = np.zeros((*shape, 3)), np.tile([1.0, 0, 0, 0], (*shape, 1))
-        seen, turned = np.zeros(shape), np.zeros(shape)
+        seen, turned, axes = np.zeros(shape), np.zeros(shape), np.ones((len(bodies), 3))
         for column, body in enumerate(bodies):
             if body in cut:
                 at = np.searchsorted(times, cut[body].time_s)
                 position[at, column], seen[at, column] = cut[body].position_m, 1.0
+                axes[column] = moves(tracks[body].position_m)
                 measured = cut[body].quat_wxyz
                 if measured is not None:
                     quat[at, column], turned[at, column] = measured, 1.0
-        return _Row(name, times, position, quat, seen, turned)
+        return _Row(name, times, position, quat, seen, turned, axes)
 
     def padded(self, length: int) -> _Row:
         extra = length - len(self.times)
@@ -129,6 +160,7 @@ class _Row:
             pad(self.quat),
             np.concatenate((self.seen, zero)),
             np.concatenate((self.turned, zero)),
+            self.axes,
         )
 
 

@@ -96,8 +96,10 @@ class TrajectoryResiduals:
     def _roll(self, inputs: Tensor, repeats: int) -> Rollout:
         count = len(self.parameters)
         values = [p.decode(inputs[:, k]) for k, p in enumerate(self.parameters)]
-        world = apply_parameters(self.world, self.parameters, torch.stack(values, -1)) if count else self.world
         seen = self.observations
+        world = seen.world(self.world, repeats)
+        if count:
+            world = apply_parameters(world, self.parameters, torch.stack(values, -1))
         state = retract(seen.state.repeat(repeats), inputs[:, count:], seen.free)
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
         return measure(world, state, seen.times_s.repeat(repeats, 1), drives)

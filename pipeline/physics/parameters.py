@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from .effects.effect import ActiveEffect
 from .world import World, stretched_inertia
 
 
@@ -189,6 +190,30 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
             known = [torch.ones_like(values[:, 0]) if factor is None else factor for factor in factors]
             world = world.with_body(index, inertia=scaled_inertia(body.inertia, torch.stack(known, -1)))
     return world
+
+
+def with_own(world: World, own: Mapping[str, Tensor], repeats: int = 1) -> World:
+    """Return the world with an own value for each item of a batch.
+
+    Args:
+        world: The world.
+        own: Values (B,) by `effect.parameter`.
+        repeats: How often the batch is repeated.
+    """
+    return replace(world, effects=tuple(_with_own(active, own, repeats) for active in world.effects)) if own else world
+
+
+def _with_own(active: ActiveEffect, own: Mapping[str, Tensor], repeats: int) -> ActiveEffect:
+    mine = {name: own.get(f"{active.effect.name}.{name}") for name in active.values}
+    size = next((len(value) for value in mine.values() if value is not None), 0)
+    if size == 0:
+        return active
+    # what is stacked with an own number has as many values
+    values = {
+        name: (active.values[name].expand(size) if value is None else value).repeat(repeats)
+        for name, value in mine.items()
+    }
+    return replace(active, values=values)
 
 
 def scaled_inertia(inertia: Tensor, factors: Tensor) -> Tensor:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,7 +55,8 @@ class World:
     gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
     sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact; touching: whether
     bodies touch at all (without, every motion is free flight, and costs a tenth); rolls_on: the device that
-    `dispatch.rollout` takes rollouts to and their results back from, None for where the tensors lie.
+    `dispatch.rollout` takes rollouts to and their results back from, None for where the tensors lie; own: by episode,
+    its own values of effects' parameters, `effect.parameter` by name.
     """
 
     bodies: tuple[Body, ...]
@@ -68,6 +69,7 @@ class World:
     effects: tuple[ActiveEffect, ...] = ()
     touching: bool = True
     rolls_on: str | None = None
+    own: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def body_names(self) -> list[str]:

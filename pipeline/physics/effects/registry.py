@@ -7,10 +7,11 @@ import importlib.util
 import inspect
 import math
 import sys
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any, get_args
+from typing import Any, Literal, cast, get_args
 
 from ....schemas import UsageError, did_you_mean
 from .effect import Effect, EffectConstant, EffectParameter, Need, Phase
@@ -61,6 +62,7 @@ CONTACT_ALIASES: tuple[frozenset[str], ...] = (
     frozenset({"gravity_scale", "buoyancy", "clock_scale", "constant_force"}),
 )
 """Of these, those that rigid contact does not tell apart either: weight, and with it friction, scales alike."""
+Units = Literal["group", "episode"]
 _HOOKS = ("world", "flow", "wrench", "contact", "times", "observe")
 
 
@@ -73,11 +75,18 @@ def load_effect(spec: str) -> Effect:
     """Return an effect; only the module that it lies in is imported.
 
     Args:
-        spec: The name of a built-in effect or of an entry point, or `path/to/file.py:ClassName`.
+        spec: The name of a built-in effect or of an entry point, or `path/to/file.py:ClassName`; with `@group` or
+            `@episode` behind it each session, or episode, has numbers of its own.
 
     Raises:
         UsageError: If there is no such effect, its file or class is missing or fails, or it is badly declared.
     """
+    plain, units = split_units(spec)
+    if units is not None:
+        effect = load_effect(plain)
+        numbers = tuple(replace(number, shared=units) for number in effect.parameters)
+        effect.parameters = numbers  # pyright: ignore[reportAttributeAccessIssue]
+        return effect
     if spec in BUILT_IN:
         module = importlib.import_module(f".{spec}", __package__)
         found = getattr(module, "".join(word.capitalize() for word in spec.split("_")))
@@ -86,6 +95,20 @@ def load_effect(spec: str) -> Effect:
     else:
         found = _from_package(spec)
     return _checked(found, spec)
+
+
+def split_units(spec: str) -> tuple[str, Units | None]:
+    """Return what to load, and what has numbers of its own.
+
+    >>> split_units("quadratic_drag@group"), split_units("wind")
+    (('quadratic_drag', 'group'), ('wind', None))
+    """
+    plain, _, units = spec.rpartition("@")
+    if not plain or "/" in units:
+        return spec, None
+    if units in get_args(Units):
+        return plain, cast(Units, units)
+    raise UsageError(f"{spec}: '@{units}'.", f"{plain}@group or {plain}@episode, or {plain} alone.")
 
 
 def aliases(name: str) -> list[str]:
