@@ -24,7 +24,7 @@ def fit_effect_windows(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     along: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
-    groups: Mapping[str, str],
+    groups: Mapping[str, str] | None = None,
 ) -> FirstContacts:
     """Fit the world's effects: to flights those that they show, the others to flight and first contacts.
 
@@ -47,7 +47,7 @@ def fit_effect_windows(
     others = [active.effect.name for active in world.effects if active.effect.name not in contact]
     after_s = CONTACT_S if contact else AFTER_S
     if any(parameter.shared != "all" for parameter in effect_parameters(world)):
-        return _with_own_numbers(world, episodes, along, noise, groups, bool(contact))
+        return _with_own_numbers(world, episodes, along, noise, groups or {}, bool(contact))
 
     def about_contacts(at: World, wanted: Start) -> FirstContacts:
         return fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)

@@ -185,7 +185,7 @@ def fit_physics(
     if effect_parameters(world):
         # flight needs no contact and no short steps
         effects = fit_effect_windows(
-            world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma, groups or {}
+            world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma, groups
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         if effects.ground is not None:  # rest shows it better than where rollouts end
