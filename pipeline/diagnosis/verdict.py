@@ -41,7 +41,7 @@ size that matters 29 to 713 where they were right."""
 CONTACT_T = 1.0
 """And where the mean gain of held-out episodes is above this many of its standard errors."""
 GLIDE_SCORE = 220.0
-"""An effect in glides is named above this score ... On development seeds the largest of 12 captures without one was 170
+"""An effect in glides is named above this score ... On development seeds the largest of 13 captures without one was 170
 (friction against spinning, of a cube); those that were named rightly had 278 to 91813."""
 FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 4, 400.0
 """... one of more numbers than these above that: a map of friction fits what a box leaves without any (score 190)."""
