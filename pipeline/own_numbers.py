@@ -266,7 +266,7 @@ def _factors(parts: Array, slopes: Array, at: Array, errors: WindowErrors, centr
 
 def _solved(matrix: Array, right: Array, mean: Array, tau: Array) -> tuple[Array, Array]:
     covariance = np.linalg.inv(matrix + np.diag(tau**-2.0))
-    return covariance @ (right + mean / tau**2), covariance
+    return (covariance @ (right + mean / tau**2)).astype(np.float64), covariance.astype(np.float64)
 
 
 def _result(
