@@ -194,9 +194,9 @@ def _batch(
     if not flying:
         last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in picked]
         windows, ends = [*windows, *((t - REST_S, t + 1e-9) for t in last)], [*ends, *(True for _ in last)]
-        picked, contact = [*picked, *picked], [*contact, *(-np.inf for _ in last)]
+        picked, contact = [*picked, *picked], [*contact, *(np.inf for _ in last)]
     batch = Observations.of(world, picked, windows)
-    # a flight is followed to the noise; what a rigid body and a contact law miss comes after it
+    # a flight is followed to the noise, and a rest as well as it turns out; what a contact law misses comes between
     free = batch.times_s < torch.tensor(contact)[:, None].to(batch.times_s)
     free = free.repeat_interleave(len(batch.free), 1)[..., None]
     rough = [float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True)]
