@@ -47,7 +47,7 @@ STEPS = {
     ),
 }
 """Effects that are added, model by model."""
-CUBE_TRAIN, CUBE_TEST = 20, 8
+CUBE_TRAIN, CUBE_TEST = 20, 16
 """Of 400 tosses: a fit of all takes long, and 20 show the effects."""
 
 
