@@ -35,10 +35,19 @@ MARKER = Path(__file__).resolve().parents[1] / "docs" / "real-data" / "marker_ro
 STEPS = {
     "throws": (("quadratic_drag",), ("gravity_tilt",)),
     "drops": (("quadratic_drag@group",),),
-    "cube": (("length_scale", "com_offset", "quadratic_drag", f"{MARKER}:MarkerRotation", "frame_tilt@episode"),),
+    "cube": (
+        (
+            "length_scale",
+            "com_offset",
+            "quadratic_drag",
+            f"{MARKER}:MarkerRotation",
+            "gravity_tilt@episode",
+            "frame_tilt@episode",
+        ),
+    ),
 }
 """Effects that are added, model by model."""
-CUBE_TRAIN, CUBE_TEST = 20, 8
+CUBE_TRAIN, CUBE_TEST = 20, 16
 """Of 400 tosses: a fit of all takes long, and 20 show the effects."""
 
 

@@ -194,9 +194,9 @@ def _batch(
     if not flying:
         last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in picked]
         windows, ends = [*windows, *((t - REST_S, t + 1e-9) for t in last)], [*ends, *(True for _ in last)]
-        picked, contact = [*picked, *picked], [*contact, *(-np.inf for _ in last)]
+        picked, contact = [*picked, *picked], [*contact, *(np.inf for _ in last)]
     batch = Observations.of(world, picked, windows)
-    # a flight is followed to the noise; what a rigid body and a contact law miss comes after it
+    # a flight is followed to the noise, and a rest as well as it turns out; what a contact law misses comes between
     free = batch.times_s < torch.tensor(contact)[:, None].to(batch.times_s)
     free = free.repeat_interleave(len(batch.free), 1)[..., None]
     rough = [float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True)]
@@ -266,7 +266,7 @@ def _factors(parts: Array, slopes: Array, at: Array, errors: WindowErrors, centr
 
 def _solved(matrix: Array, right: Array, mean: Array, tau: Array) -> tuple[Array, Array]:
     covariance = np.linalg.inv(matrix + np.diag(tau**-2.0))
-    return covariance @ (right + mean / tau**2), covariance
+    return (covariance @ (right + mean / tau**2)).astype(np.float64), covariance.astype(np.float64)
 
 
 def _result(
