@@ -13,7 +13,8 @@ from cgwm.datasets.dataset import read_manifest
 from cgwm.datasets.loader import RolloutReader
 from cgwm.datasets.models import read_model, write_model
 from cgwm.pipeline import labels as labels_module
-from cgwm.pipeline import synthesize as stage
+from cgwm.pipeline import rollout_batches as batches
+from cgwm.pipeline.label_reach import Box
 from cgwm.pipeline.labels import LabelRenderer
 from cgwm.pipeline.posterior import draw_parameters, with_parameter
 from cgwm.pipeline.sampling import draw_start, extent, look_at_cameras, resolve_plan, rotation_matrix
@@ -101,8 +102,8 @@ def test_a_failure_leaves_nothing(
         rollout = simulate(*arguments, **options)  # pyright: ignore
         return replace(rollout, position_m=rollout.position_m * torch.nan)
 
-    simulate = stage.roll_out
-    monkeypatch.setattr(stage, "roll_out", diverge)
+    simulate = batches.roll_out
+    monkeypatch.setattr(batches, "roll_out", diverge)
     with pytest.raises(NotConvergedError, match=r"rollout 0 \(seed 5\) diverged by step 0(.|\n)*Its start is in"):
         synthesize(model_path, tmp_path / "out", CONFIG.model_copy(update={"shards": shards}))
     assert list(tmp_path.iterdir()) == []
@@ -161,10 +162,11 @@ def test_crops_are_the_whole_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     quat = rng.normal(size=(6, 2, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     crops = list(renderer.blocks(position, quat))
-    monkeypatch.setattr(labels_module, "_reach", lambda spheres, view: (0, 0, view.width, view.height))
+    monkeypatch.setattr(labels_module, "reach", lambda spheres, viewmat, K, width, height: Box(0, 0, width, height))
     for crop, whole in zip(crops, renderer.blocks(position, quat), strict=True):
         np.testing.assert_array_equal(crop.image, whole.image)
         np.testing.assert_array_equal(crop.mask, whole.mask)
+        np.testing.assert_array_equal(crop.amodal, whole.amodal)
         np.testing.assert_allclose(crop.depth, whole.depth, atol=1e-6)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -40,6 +41,8 @@ class RenderOutput:
             0 where more does. It has no derivative. None where it was not asked for.
         pairs: From the kernels of `rasterize`: how many pairs of tiles and spheres there are, to compare with the
             capacity, int32 () on the device; otherwise None.
+        alone: Opacity of each group of spheres if it were alone, shape (C, H, W, G); it has no derivative. None where
+            there are no groups.
     """
 
     features: Tensor
@@ -47,6 +50,7 @@ class RenderOutput:
     weighted_depth: Tensor
     median_depth: Tensor | None = None
     pairs: Tensor | None = None
+    alone: Tensor | None = None
 
     @property
     def depth(self) -> Tensor:
@@ -72,6 +76,7 @@ def render(
     tile_size: int = _TILE,
     median: bool = False,
     capacity: int | None = None,
+    groups: Sequence[slice] = (),
 ) -> RenderOutput:
     """Render spheres into C cameras.
 
@@ -84,7 +89,8 @@ def render(
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
         scales: Standard deviations s > 0 [m], shape (N,).
         opacities: Peak alphas in [0, 1], shape (N,).
-        features: Colours or any other channels, shape (N, F).
+        features: Colours or any other channels, shape (N, F), or (C, N, F) where they differ by camera; these have no
+            derivative on CUDA.
         viewmats: T_cam_world, camera axes OpenCV, shape (C, 4, 4).
         Ks: Camera matrices [px], shape (C, 3, 3); the centre of the top-left pixel is (0.5, 0.5).
         width: Image width [px].
@@ -96,6 +102,7 @@ def render(
         tile_size: Side of the tiles of the torch path [px]; changes the speed only.
         median: Whether to return the median depth.
         capacity: Room for pairs of tiles and spheres in the kernels, see `rasterize.Raster`.
+        groups: Spheres whose opacities alone are asked for, too: G slices of the N.
 
     Returns:
         Features, alpha and depth.
@@ -107,7 +114,15 @@ def render(
         values, alpha, depth, middle, pairs = rasterize(
             means, scales, opacities, features, viewmats, Ks, raster, distortion
         )
-        return replace(_finished(values, alpha, depth, background, middle if median else None), pairs=pairs)
+        made = _finished(values, alpha, depth, background, middle if median else None)
+        alphas = [
+            rasterize(
+                means[..., group, :], scales[group], opacities[group], opacities[group, None], viewmats, Ks, raster,
+                distortion,
+            )[1]
+            for group in groups
+        ]  # fmt: skip
+        return replace(made, pairs=pairs, alone=torch.stack(alphas, -1).detach() if groups else None)
     camera_count = viewmats.shape[0]
     local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     tiles = _Tiles.make(Ks, distortion, width, height, tile_size)
@@ -124,15 +139,28 @@ def render(
         scales.index_select(0, spheres),
         opacities.index_select(0, spheres),
     )
-    channels = torch.cat([features.index_select(0, spheres), centres[:, 2:]], 1)
+    seen = features.index_select(0, spheres) if features.dim() == 2 else features.flatten(0, 1).index_select(0, flat)
+    channels = torch.cat([seen, centres[:, 2:]], 1)
     every_tile = torch.arange(counts.shape[0], device=means.device)
     lists = TileLists(
         tiles.basis, tiles.frame_of(every_tile), counts.cumsum(0) - counts, counts, min_alpha, min_transmittance
     )
     values, alpha, middle = composite(coefficients, channels, lists, median)
+    alone = None
+    if groups:
+        with torch.no_grad():
+            alphas = [_alone(coefficients, tile_ids, (spheres >= g.start) & (spheres < g.stop), lists) for g in groups]
+            alone = tiles.to_image(torch.stack(alphas, 2), camera_count)
     image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
     median_depth = tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None
-    return _finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth)
+    return replace(_finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth), alone=alone)
+
+
+def _alone(coefficients: Tensor, tile_ids: Tensor, chosen: Tensor, lists: TileLists) -> Tensor:
+    """Return the alpha (T, P) of some of the pairs alone."""
+    counts = torch.bincount(tile_ids[chosen], minlength=lists.counts.shape[0])
+    own = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
+    return composite(coefficients[chosen], coefficients[chosen, :1], own)[1]
 
 
 @cache
