@@ -60,12 +60,14 @@ class Bench:
             self._run(config.model_copy(update={"rollouts": 64}))
         stopwatch, cpu = Stopwatch(), time.process_time()
         summary, wall_s = self._run(config, stopwatch)
+        cpu_s = time.process_time() - cpu
         figures = {
             "frames_per_s": summary.frames / wall_s,
+            "frames_per_core_s": summary.frames / cpu_s,
             "frames": summary.frames,
             "kilobytes_a_frame": summary.bytes / summary.frames / 1e3,
             "wall_s": wall_s,
-            "cores_busy": (time.process_time() - cpu) / wall_s,
+            "cores_busy": cpu_s / wall_s,
             "seconds": {name: round(value, 3) for name, value in sorted(stopwatch.seconds.items())},
         }
         if self.device == "cuda":

@@ -10,7 +10,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -114,16 +114,16 @@ def _written(
     diverged: list[Diverged] = []
     with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
         with RolloutWriter(path, config.seed, config_json, f"cgwm {version('cgwm')}", config.compression) as writer:
-            found = _simulated(job, indices, stopwatch)
-            for motion in progress(found, "rollouts", len(indices), "rollout"):
-                if isinstance(motion, Diverged):
-                    diverged.append(motion)
-                    continue
-                with stopwatch.part("labels"):
-                    labels = _labels(job, motion)
-                with stopwatch.part("render and hand over"):
-                    writer.write(labels, _frames(job, labels, stopwatch))
-                contacts += len(labels.contacts.body_a)
+            with closing(_simulated(job, indices, stopwatch)) as found:
+                for motion in progress(found, "rollouts", len(indices), "rollout"):
+                    if isinstance(motion, Diverged):
+                        diverged.append(motion)
+                        continue
+                    with stopwatch.part("labels"):
+                        labels = _labels(job, motion)
+                    with stopwatch.part("render and hand over"):
+                        writer.write(labels, _frames(job, labels, stopwatch))
+                    contacts += len(labels.contacts.body_a)
             if len(diverged) == len(indices):
                 raise diverged[0].error
             ended = time.perf_counter()

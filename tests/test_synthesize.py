@@ -198,6 +198,34 @@ def test_labels_agree_with_a_plain_rendering() -> None:
     np.testing.assert_allclose(block.depth[0][pure], picture.depth[0].numpy()[pure], atol=2e-3)
 
 
+def test_amodal_masks_show_what_is_hidden() -> None:
+    """The tip stands between the camera and the cube: amodal masks are those of each body rendered alone."""
+    model = small_model(driven=True)
+    plan = resolve_plan(model, SamplingPlan(views=1))
+    cameras = look_at_cameras(model, plan, SynthesizeConfig(width=96, height=72))
+    camera = cameras["view0"]
+    eye = camera.T_world_cam[:3, 3]
+    cube = np.array([0.0, 0.0, 0.12])
+    position = np.stack([np.stack([cube, cube + step * (eye - cube)]) for step in (0.25, -0.25)])
+    quat = np.tile([1.0, 0, 0, 0], (2, 2, 1))
+    (block,) = LabelRenderer(model, cameras).blocks(position, quat)
+    for body, name in enumerate(("cube", "tip")):
+        splats = model.body_splats[name]
+        for frame in range(2):
+            means = torch.as_tensor(splats.means + position[frame, body])
+            values = [torch.as_tensor(getattr(splats, key)) for key in ("scales", "opacities", "colors")]
+            pose, K = torch.as_tensor(camera.T_cam_world)[None], torch.as_tensor(camera.K)[None]
+            alpha = render(means, *values, pose, K, 96, 72).alpha[0].numpy()
+            seen = (block.amodal[frame] >> body & 1).astype(bool)
+            sure = np.abs(alpha - 0.5) > 1e-3
+            shown = (block.mask[frame] == body + 1) & (alpha < 0.5)  # edges that shine through count as seen
+            np.testing.assert_array_equal(seen[sure & ~shown], (alpha > 0.5)[sure & ~shown])
+            assert block.amodal_px[frame, body] == seen.sum() > 1
+            assert block.visible_px[frame, body] == (block.mask[frame] == body + 1).sum()
+    assert block.visible_px[0, 0] < block.amodal_px[0, 0] and block.visible_px[0, 1] == block.amodal_px[0, 1]
+    assert block.visible_px[1, 1] == 0 < block.amodal_px[1, 1]
+
+
 def test_labels_obey_newton_and_the_states_are_the_bodies(dataset: Path) -> None:
     reader = RolloutReader(dataset)
     touched = 0
