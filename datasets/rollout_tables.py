@@ -20,20 +20,22 @@ from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
 TORQUE = "Mean torque on free bodies about the centre of mass since the frame before, from the angular momentum"
 
 
-def write_tables(demo: Node, labels: RolloutLabels) -> None:
-    """Write all of a rollout but what belongs to its images into its group."""
+def write_tables(demo: Node, labels: RolloutLabels) -> Node:
+    """Write all of a rollout but what belongs to its images into its group, and return the group of observations."""
     _write_attributes(demo, labels, len(labels.time_s))
     _write_timeline(demo, labels)
     _write_bodies(demo, labels)
     _write_contacts(demo, labels)
     _write_parameters(demo, labels.parameters)
-    _write_object_observation(demo.create_group("obs"), labels)
+    observations = demo.create_group("obs")
+    _write_object_observation(observations, labels)
     if labels.cameras:
         _write_cameras(demo, labels.cameras)
+    return observations
 
 
-def put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str) -> Node:
-    """Write an array, with a checksum, and say what it is."""
+def put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str) -> Any:
+    """Write an array, with a checksum, say what it is, and return its DatasetID."""
     values = np.ascontiguousarray(data)
     kind = h5py.h5t.py_create(values.dtype, logical=True)
     scalar = np.ndim(data) == 0
@@ -41,8 +43,8 @@ def put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, sh
     made = h5py.h5d.create(group.id, name.encode(), kind, space, _checked(() if scalar else values.shape))
     if values.size:
         made.write(h5py.h5s.ALL, h5py.h5s.ALL, values.reshape(np.shape(data)))
-    _describe(made, unit, frame, order, shape, text)
-    return h5py.Dataset(made)
+    describe(made, unit, frame, order, shape, text)
+    return made
 
 
 @cache
@@ -55,12 +57,8 @@ def _checked(shape: tuple[int, ...]) -> Any:
     return properties
 
 
-def describe(made: h5py.Dataset, unit: str, frame: str, order: str, shape: str, text: str) -> None:
-    """Say what an array is."""
-    _describe(made.id, unit, frame, order, shape, text)
-
-
-def _describe(made: Any, *texts: str) -> None:
+def describe(made: Any, *texts: str) -> None:
+    """Say what an array (h5py's DatasetID) is: unit, frame, order, shape and description."""
     names = (b"unit", b"frame", b"order", b"shape_meaning", b"description")
     for name, text in zip(names, texts, strict=True):
         _write_text(made, name, text)
@@ -153,9 +151,9 @@ def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> N
     group = demo.create_group("parameters")
     for p in parameters:
         made = put(group, p.name, np.float64(p.value), p.unit, "-", "-", "scalar", "Value used in this rollout.")
-        made.attrs["estimate"] = p.estimate
-        if p.std_error is not None:
-            made.attrs["std_error"] = p.std_error
+        for key, value in (("estimate", p.estimate), ("std_error", p.std_error)):
+            if value is not None:
+                h5py.Dataset(made).attrs[key] = value
 
 
 def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
@@ -179,21 +177,23 @@ def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
         _write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
 
 
-def link_next_observations(demo: Node) -> None:
+def link_next_observations(demo: Node, observations: Node) -> None:
     """Add `next_obs` as virtual datasets on `obs`, shifted by one frame: what robomimic reads, at no size."""
     group = demo.create_group("next_obs")
-    for name, source in demo["obs"].items():
-        count = source.shape[0]
+    place = observations.name
+    for name in observations:
+        source = h5py.h5d.open(observations.id, name.encode())
+        shape, path = source.shape, f"{place}/{name}".encode()
         # By h5py's low level: its high level stamps virtual datasets with the time of their creation.
         properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         properties.set_obj_track_times(False)
         properties.set_layout(h5py.h5d.VIRTUAL)
-        for target, start, length in ((0, 1, count - 1), (count - 1, count - 1, 1)):
+        for target, start, length in ((0, 1, shape[0] - 1), (shape[0] - 1, shape[0] - 1, 1)):
             if length > 0:
-                spaces = [_frames_space(source.shape, first, length) for first in (target, start)]
-                properties.set_virtual(spaces[0], b".", source.name.encode(), spaces[1])
-        space = h5py.h5s.create_simple(source.shape)
-        made = h5py.h5d.create(group.id, name.encode(), source.id.get_type(), space, properties)
+                spaces = [_frames_space(shape, first, length) for first in (target, start)]
+                properties.set_virtual(spaces[0], b".", path, spaces[1])
+        space = h5py.h5s.create_simple(shape)
+        made = h5py.h5d.create(group.id, name.encode(), source.get_type(), space, properties)
         _write_text(made, b"description", f"obs/{name} one frame later; the last frame is repeated.")
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..schemas import ROLLOUTS_FORMAT, NotEnoughSpaceError
 from .cameras import Camera
-from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, encoded, filter_options, jpeg_of
+from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked, encoded, jpeg_of, require_zstd
 from .guarded_file import GuardedFile
 from .processors import processors
 from .rollout_tables import describe, link_next_observations, put, write_tables
@@ -95,7 +95,8 @@ class RolloutWriter:
         compression: Compression = "zstd",
         threads: int | None = None,
     ):
-        filter_options(compression)  # says what is missing, before there is a file
+        if compression in ("zstd", "jpeg"):
+            require_zstd(f"writing with compression {compression}")  # before there is a file
         self._compression: Compression = compression
         self._path = path
         self._guarded = GuardedFile(path)
@@ -223,7 +224,7 @@ class _Demo:
     def __init__(self, data: Node, labels: RolloutLabels, compression: Compression) -> None:
         self.labels = labels
         self._group = data.create_group(f"demo_{labels.episode_index}")
-        write_tables(self._group, labels)
+        self._obs: Node = write_tables(self._group, labels)
         self._compression: Compression = compression
         count, bodies = len(labels.time_s), len(labels.bodies)
         cameras = labels.cameras or {}
@@ -231,7 +232,7 @@ class _Demo:
         self._jpegs: dict[str, dict[int, np.ndarray]] = {name: {} for name in cameras}
         self._images = {name: self._datasets(name, camera, count, bodies) for name, camera in cameras.items()}
 
-    def _datasets(self, name: str, camera: Camera, count: int, bodies: int) -> dict[str, h5py.Dataset]:
+    def _datasets(self, name: str, camera: Camera, count: int, bodies: int) -> dict[str, Any]:
         size = (camera.height, camera.width)
         kinds = {
             "image": (np.dtype(np.uint8), (*size, 3)),
@@ -241,16 +242,13 @@ class _Demo:
         }
         if self._compression == "jpeg":
             del kinds["image"]
-        made: dict[str, h5py.Dataset] = {}
+        made: dict[str, Any] = {}
         for key, (dtype, shape) in kinds.items():
-            options = filter_options(self._compression, dtype)
-            chunk = (_chunk_frames(count), *shape)
-            sets = self._group["obs"].create_dataset(
-                f"{name}_{key}", shape=(count, *shape), dtype=dtype, chunks=chunk, **options
-            )
+            properties = chunked(self._compression, dtype, (_chunk_frames(count), *shape))
+            kind, space = h5py.h5t.py_create(dtype), h5py.h5s.create_simple((count, *shape))
+            made[key] = h5py.h5d.create(self._obs.id, f"{name}_{key}".encode(), kind, space, properties)
             unit, order, axes, text = _IMAGES[key]
-            describe(sets, unit, f"image of camera {name}", order, axes, text)
-            made[key] = sets
+            describe(made[key], unit, f"image of camera {name}", order, axes, text)
         return made
 
     def write(self, chunk: _Chunk) -> None:
@@ -261,7 +259,7 @@ class _Demo:
                 self._jpegs[chunk.camera].update(zip(range(chunk.start, stop), data, strict=True))
                 continue
             made = self._images[chunk.camera][key]
-            made.id.write_direct_chunk((chunk.start, *(0 for _ in made.shape[1:])), data)
+            made.write_direct_chunk((chunk.start, *(0 for _ in made.shape[1:])), data)
         self._counts[chunk.camera][:, chunk.start : stop] = chunk.visible_px, chunk.amodal_px
 
     def finish(self) -> None:
@@ -279,9 +277,10 @@ class _Demo:
         if self._compression == "jpeg":
             for name, camera in (self.labels.cameras or {}).items():
                 self._write_jpegs(name, camera)
-        link_next_observations(self._group)
+        link_next_observations(self._group, self._obs)
 
     def _write_visibility(self) -> None:
+        bodies = self._group["bodies"]
         counts = np.stack([self._counts[name] for name in sorted(self._counts)], axis=2)
         visible, whole = counts
         fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
@@ -297,7 +296,7 @@ class _Demo:
             ),
         }
         for name, (values, unit, text) in texts.items():
-            put(self._group["bodies"], name, values, unit, "image", "-", axes, text)
+            put(bodies, name, values, unit, "image", "-", axes, text)
 
     def _write_jpegs(self, name: str, camera: Camera) -> None:
         files = [data for _, data in sorted(self._jpegs[name].items())]
@@ -305,9 +304,9 @@ class _Demo:
         for row, data in zip(rows, files, strict=True):
             row[: len(data)] = data
         # contiguous: a frame is read without its neighbours
-        made = self._group["obs"].create_dataset(f"{name}_image", data=rows)
+        made = self._obs.create_dataset(f"{name}_image", data=rows)
         unit, order, axes, text = _JPEG
-        describe(made, unit, f"image of camera {name}", order, axes, text)
+        describe(made.id, unit, f"image of camera {name}", order, axes, text)
         made.attrs.update(encoding="jpeg", quality=JPEG_QUALITY, height=camera.height, width=camera.width)
 
 

@@ -7,11 +7,12 @@ import threading
 from pathlib import Path
 
 import h5py
+import hdf5plugin
 import numpy as np
 import pytest
 from cgwm.datasets import rollout_writer
 from cgwm.datasets.atomic import sha256
-from cgwm.datasets.chunks import encoded, filter_options, image_of, jpeg_of
+from cgwm.datasets.chunks import chunked, encoded, image_of, jpeg_of
 from cgwm.datasets.loader import RolloutReader
 from cgwm.datasets.rollout_writer import RolloutWriter
 from cgwm.datasets.rollouts import amodal_dtype
@@ -24,12 +25,15 @@ from test_rollouts import FRAMES, SIZE, blocks, labels
 def test_chunks_are_those_of_the_filters(tmp_path: Path, compression: str, dtype: type) -> None:
     frames = np.random.default_rng(0).integers(0, 9, (11, 12, 16)).astype(dtype)
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        options = filter_options(compression, dtype)
-        theirs = file.create_dataset("theirs", data=frames, chunks=(8, 12, 16), **options)
-        ours = file.create_dataset("ours", frames.shape, dtype, chunks=(8, 12, 16), **options)
+        options = {"zstd": hdf5plugin.Zstd(clevel=1), "gzip": {"compression": "gzip"}, "none": {}}[compression]
+        shuffle = compression != "none" and np.dtype(dtype).itemsize > 1
+        theirs = file.create_dataset("theirs", data=frames, chunks=(8, 12, 16), shuffle=shuffle, **options)
+        properties = chunked(compression, np.dtype(dtype), (8, 12, 16))
+        space = h5py.h5s.create_simple(frames.shape)
+        ours = h5py.h5d.create(file.id, b"ours", h5py.h5t.py_create(np.dtype(dtype)), space, properties)
         for start in (0, 8):
             chunk = encoded(frames[start : start + 8], compression, 8)
-            ours.id.write_direct_chunk((start, 0, 0), chunk)
+            ours.write_direct_chunk((start, 0, 0), chunk)
             assert bytes(chunk) == theirs.id.read_direct_chunk((start, 0, 0))[1]
     with h5py.File(tmp_path / "a.h5") as file:
         np.testing.assert_array_equal(file["ours"][()], frames)
