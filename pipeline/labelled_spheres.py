@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..datasets.cameras import Camera
 from ..datasets.models import Model
-from ..schemas import BodyModel
+from ..schemas import BodyModel, Light
 from .physics.rotation import quat_to_matrix
 from .splats.relighting import Relighting
 from .splats.spheres import Spheres
@@ -70,6 +70,7 @@ class Labelled:
 class _Moving:
     body: int
     spheres: Labelled
+    normals: Tensor | None
     relighting: Relighting | None
 
     def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> Labelled:
@@ -108,9 +109,21 @@ class LabelledModel:
             if body.motion == "fixed":
                 self.fixed.append((index, self._standing(spheres, body)))
             else:
-                light = model.file.light
-                lit = None if light is None or normals is None else Relighting.of(light, body, normals)
-                self.moving.append(_Moving(index, spheres, lit))
+                self.moving.append(_Moving(index, spheres, normals, None))
+        self._bodies = model.file.bodies
+        self.set_light(model.file.light)
+
+    def set_light(self, light: Light | None) -> None:
+        """Shade what moves in this light; None: in that of the photos, whatever its pose."""
+        self.moving = [
+            replace(
+                part,
+                relighting=None
+                if light is None or part.normals is None
+                else Relighting.of(light, self._bodies[part.body], part.normals),
+            )
+            for part in self.moving
+        ]
 
     def tensor(self, values: object) -> Tensor:
         """Return numbers as float32 on the device."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import groupby, pairwise
 
 import numpy as np
@@ -26,6 +26,7 @@ from ..datasets.chunks import CHUNK_FRAMES
 from ..datasets.models import Model
 from ..datasets.processors import processors
 from ..datasets.rollouts import FrameBlock, amodal_dtype
+from ..schemas import Exposure, Light
 from .label_reach import TILE, Box, inside, reach, spans
 from .labelled_spheres import Labelled, LabelledModel
 from .splats.render import RenderOutput, render
@@ -87,25 +88,38 @@ class LabelRenderer:
         """Look through these cameras from now on."""
         self._views = {name: self._view(camera) for name, camera in cameras.items()}
 
+    def set_light(self, light: Light | None) -> None:
+        """Shade what moves in this light from now on; None: in that of the photos."""
+        self._scene.set_light(light)
+
     @torch.no_grad()
-    def blocks(self, position_m: np.ndarray, quat_wxyz: np.ndarray, wait: bool = True) -> Iterator[FrameBlock]:
+    def blocks(
+        self,
+        position_m: np.ndarray,
+        quat_wxyz: np.ndarray,
+        wait: bool = True,
+        exposures: Mapping[str, Exposure] | None = None,
+    ) -> Iterator[FrameBlock]:
         """Render a rollout, a chunk of frames of one camera after the other.
 
         Args:
             position_m: Body frame origins [m], world, shape (T, B, 3).
             quat_wxyz: T_world_body, shape (T, B, 4).
             wait: Whether to wait for the device; without, whoever reads a block calls its `ready` first.
+            exposures: Of some of the cameras; the others show the model's colours.
         """
         at_once = self._frames_at_once() if self._together else CHUNK_FRAMES
         for first in range(0, len(position_m), at_once):
             placed = self._scene.placed(position_m[first : first + at_once], quat_wxyz[first : first + at_once])
             count = len(position_m[first : first + at_once])
+            pictures = self._all_at_once(placed, count) if self._together else self._one_by_one(placed, count)
+            for name, exposure in (exposures or {}).items():
+                pictures[name] = replace(pictures[name], image=_exposed(pictures[name].image, exposure))
+            ready = None
             if self._together:
-                pictures, ready = _to_host(self._all_at_once(placed, count))
+                pictures, ready = _to_host(pictures)
                 if wait:
                     ready()
-            else:
-                pictures, ready = self._one_by_one(placed, count), None
             for start in range(0, count, CHUNK_FRAMES):
                 for name, picture in pictures.items():
                     yield self._block(name, first + start, picture, slice(start, start + CHUNK_FRAMES), ready)
@@ -240,6 +254,14 @@ class LabelRenderer:
         visible = [(mask == body + 1).flatten(1).sum(1) for body in bodies]
         whole = [((amodal >> body) & 1).flatten(1).sum(1) for body in bodies]
         return tuple(torch.stack(counts, 1).to(torch.int32) for counts in (visible, whole))  # type: ignore[return-value]
+
+
+def _exposed(image: Tensor, exposure: Exposure) -> Tensor:
+    """Return images as a camera of that exposure shows them, cut off at black and white."""
+    if exposure == Exposure():
+        return image
+    gain, offset = (torch.tensor(three, device=image.device) for three in (exposure.gain_rgb, exposure.offset_rgb))
+    return (image * gain + 255 * offset).clamp(0, 255).round().to(torch.uint8)
 
 
 def _size(camera: Camera) -> tuple[int, int]:

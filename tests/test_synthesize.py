@@ -22,7 +22,9 @@ from cgwm.pipeline.splats.render import render
 from cgwm.pipeline.synthesize import shard_indices, synthesize
 from cgwm.schemas import (
     EffectModel,
+    Exposure,
     InputDataError,
+    Light,
     NotConvergedError,
     Parameter,
     SamplingPlan,
@@ -224,6 +226,35 @@ def test_amodal_masks_show_what_is_hidden() -> None:
             assert block.visible_px[frame, body] == (block.mask[frame] == body + 1).sum()
     assert block.visible_px[0, 0] < block.amodal_px[0, 0] and block.visible_px[0, 1] == block.amodal_px[0, 1]
     assert block.visible_px[1, 1] == 0 < block.amodal_px[1, 1]
+
+
+def test_cameras_light_and_exposure_may_change_between_rollouts() -> None:
+    """What a renderer is told later is what one that is made so shows."""
+    normals = np.tile([0.0, 0, 1], (400, 1))
+    model = small_model()
+    model = replace(model, body_splats={"cube": replace(model.body_splats["cube"], normals=normals)})
+    dark, light = (Light(lamp=lamp, sky=0.1) for lamp in ((0.0, 0.0, 0.1), (0.3, 0.2, 0.5)))
+    lit = [replace(model, file=model.file.model_copy(update={"light": one})) for one in (dark, light)]
+    settings = SynthesizeConfig(width=64, height=48)
+    views = [
+        look_at_cameras(model, resolve_plan(model, SamplingPlan(views=2, view_elevation_deg=angle)), settings)
+        for angle in (20, 50)
+    ]
+    poses = np.tile([0.0, 0, 0.15], (3, 1, 1)), np.tile([0.6, 0.8, 0, 0], (3, 1, 1))
+    told = LabelRenderer(lit[0], views[0])
+    before = list(told.blocks(*poses))
+    told.set_cameras(views[1])
+    told.set_light(light)
+    for block, expected in zip(told.blocks(*poses), LabelRenderer(lit[1], views[1]).blocks(*poses), strict=True):
+        np.testing.assert_array_equal(block.image, expected.image)
+        np.testing.assert_array_equal(block.mask, expected.mask)
+        assert (block.image != before[0].image).any()
+    exposure = Exposure(gain_rgb=(0.5, 1.0, 2.0), offset_rgb=(0.1, 0.0, 0.0))
+    plain = list(told.blocks(*poses))
+    exposed = list(told.blocks(*poses, exposures={"view1": exposure}))
+    np.testing.assert_array_equal(exposed[0].image, plain[0].image)
+    wanted = (plain[1].image * np.array([0.5, 1, 2]) + [25.5, 0, 0]).clip(0, 255)
+    np.testing.assert_allclose(exposed[1].image, wanted, atol=0.51)
 
 
 def test_labels_obey_newton_and_the_states_are_the_bodies(dataset: Path) -> None:
