@@ -125,16 +125,24 @@ class Simulator:
     def _result(
         self, draw: Draw, rollout: Rollout, row: int, began: tuple[World, State], name: str
     ) -> Motion | Diverged:
-        poses = (rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s)
-        own = [values[row].numpy() for values in poses]
-        if not all(np.isfinite(values).all() for values in own):
-            one = Rollout(rollout.times_s.cpu(), *(values[row : row + 1] for values in poses))
+        rows = slice(row, row + 1)
+        one = Rollout(
+            rollout.times_s,
+            rollout.position_m[rows],
+            rollout.quat_wxyz[rows],
+            rollout.velocity_m_s[rows],
+            rollout.omega_body_rad_s[rows],
+        )
+        position, quat, velocity, omega = (
+            values[0].numpy() for values in (one.position_m, one.quat_wxyz, one.velocity_m_s, one.omega_body_rad_s)
+        )
+        if not all(np.isfinite(values).all() for values in (position, quat, velocity, omega)):
             try:
-                require_finite(one, began[0], began[1].at(slice(row, row + 1)), [name])
+                require_finite(one, began[0], began[1].at(rows), [name])
             except NotConvergedError as error:
                 return Diverged(draw, error)
         assert rollout.contacts is not None
-        return Motion(draw, *own, _contact_table(rollout.contacts, row))
+        return Motion(draw, position, quat, velocity, omega, _contact_table(rollout.contacts, row))
 
 
 def joined_worlds(worlds: Sequence[World]) -> World:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -172,7 +172,7 @@ def draw_rollout(job: _Job, index: int) -> Draw:
     return Draw(index, model, parameters, draw_start(model, job.plan, float(job.times_s[-1]), rng))
 
 
-def _simulated(job: _Job, indices: range, stopwatch: Stopwatch) -> Iterator[Motion | Diverged]:
+def _simulated(job: _Job, indices: range, stopwatch: Stopwatch) -> Generator[Motion | Diverged, None, None]:
     """Yield the rollouts in the order of their numbers; the next batch is simulated meanwhile."""
     size = job.config.batch or ROLLOUTS_AT_ONCE[job.device]
     batches = [indices[first : first + size] for first in range(0, len(indices), size)]
