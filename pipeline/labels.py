@@ -276,7 +276,7 @@ def _rendered(
         return RenderOutput(nothing[..., None].expand(-1, -1, -1, features.shape[-1]), nothing, nothing)
     return render(
         spheres.means, spheres.scales, spheres.opacities, features, viewmats, Ks, box.width, box.height,
-        tile_size=TILE, groups=groups,
+        tile_size=TILE, groups=groups, group_transmittance=0.99 * (1 - SOLID_ALPHA),
     )  # fmt: skip
 
 

@@ -333,6 +333,8 @@ def test_groups_are_seen_alone():
         alone = render(means[group], scales[group], opacities[group], features[group], viewmats, Ks, 24, 17)
         torch.testing.assert_close(seen.alone[..., number], alone.alpha)
         assert float(alone.alpha.max()) > 0.5
+        short = render(means, scales, opacities, features, viewmats, Ks, 24, 17, groups=groups, group_transmittance=0.4)
+        assert ((short.alone > 0.6) == (seen.alone > 0.6)).all() and (short.alone <= seen.alone + 1e-12).all()
 
 
 def test_features_may_differ_by_camera():

@@ -77,6 +77,7 @@ def render(
     median: bool = False,
     capacity: int | None = None,
     groups: Sequence[slice] = (),
+    group_transmittance: float = MIN_TRANSMITTANCE,
 ) -> RenderOutput:
     """Render spheres into C cameras.
 
@@ -103,6 +104,8 @@ def render(
         median: Whether to return the median depth.
         capacity: Room for pairs of tiles and spheres in the kernels, see `rasterize.Raster`.
         groups: Spheres whose opacities alone are asked for, too: G slices of the N.
+        group_transmittance: `min_transmittance` of the groups: where a group lets less through, its opacity may be
+            told too low, but not below 1 minus this.
 
     Returns:
         Features, alpha and depth.
@@ -115,9 +118,10 @@ def render(
             means, scales, opacities, features, viewmats, Ks, raster, distortion
         )
         made = _finished(values, alpha, depth, background, middle if median else None)
+        single = replace(raster, min_transmittance=group_transmittance, capacity=None)
         alphas = [
             rasterize(
-                means[..., group, :], scales[group], opacities[group], opacities[group, None], viewmats, Ks, raster,
+                means[..., group, :], scales[group], opacities[group], opacities[group, None], viewmats, Ks, single,
                 distortion,
             )[1]
             for group in groups
@@ -149,7 +153,8 @@ def render(
     alone = None
     if groups:
         with torch.no_grad():
-            alphas = [_alone(coefficients, tile_ids, (spheres >= g.start) & (spheres < g.stop), lists) for g in groups]
+            single = replace(lists, min_transmittance=group_transmittance)
+            alphas = [_alone(coefficients, tile_ids, (spheres >= g.start) & (spheres < g.stop), single) for g in groups]
             alone = tiles.to_image(torch.stack(alphas, 2), camera_count)
     image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
     median_depth = tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None
@@ -326,11 +331,26 @@ def _meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[
     block_axes = torch.nn.functional.normalize((flat_axes[members] * valid[..., None]).sum(1), dim=1)
     apart = _angle((flat_axes[members] * block_axes[:, None]).sum(-1)) + flat_half[members]
     block_half = torch.where(valid, apart, 0.0).amax(1)
-    block, sphere = (_angle(block_axes @ direction.T) <= block_half[:, None] + cone).nonzero(as_tuple=True)
-    angles = _angle((flat_axes[members[block]] @ direction[sphere, :, None])[..., 0])
-    meets = (angles <= flat_half[members[block]] + cone[sphere, None]) & valid[block]
-    pair, member = meets.nonzero(as_tuple=True)
-    return members[block[pair], member], sphere[pair]
+    near = _angle(block_axes @ direction.T) <= block_half[:, None] + cone
+    found: list[tuple[Tensor, Tensor]] = []
+    for block, spheres in enumerate(near):
+        chosen, tiles = spheres.nonzero()[:, 0], members[block, valid[block]]
+        tile, place = _cones_meet(flat_axes[tiles], flat_half[tiles], direction[chosen], cone[chosen])
+        found.append((tiles[tile], chosen[place]))
+    tile_ids, spheres = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return tile_ids, spheres
+
+
+def _cones_meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the meetings of cones, by axes (t, 3) and (n, 3) and half angles (t,) and (n,); all angles to pi.
+
+    Cosines are compared, not angles: cos a >= cos(b + c) where b + c stays within pi.
+    """
+    limit = half.cos()[:, None] * cone.cos() - half.sin()[:, None] * cone.sin()
+    limit = limit - 8 * torch.finfo(limit.dtype).eps  # culling must not lose what is visible
+    meets = (axes @ direction.T >= limit) | (half[:, None] + cone >= math.pi)
+    tile, place = meets.nonzero(as_tuple=True)
+    return tile, place
 
 
 def _angle(cosine: Tensor) -> Tensor:
