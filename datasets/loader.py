@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from ..schemas import InputDataError, UsageError, did_you_mean
+from .chunks import image_of
 from .kinds import refuse_other_kind
 from .rollouts import Node, demo_names, open_shard
 
@@ -100,10 +101,12 @@ class RolloutReader:
             names = self.keys(number)
             raise UsageError(f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names))
         data = group[key]
+        if data.attrs.get("encoding") == "jpeg":
+            return np.stack([image_of(row) for row in data[start:stop]])
         return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
-        """Return the contacts of one frame: body_a, body_b, pos_world, normal_world, distance, impulse_world, mode."""
+        """Return the contacts of one frame: the arrays of the group `contacts` but `offsets`, cut to it."""
         group = self.group(number)["contacts"]
         first, last = group["offsets"][frame : frame + 2]
         return {name: item[first:last] for name, item in group.items() if name != "offsets"}

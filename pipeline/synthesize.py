@@ -1,15 +1,16 @@
 """The stage synthesize: labelled rollouts of a fitted model into HDF5.
 
-Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e and simulated by
-itself, so its content depends neither on the sharding nor on the other rollouts.
+Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e; its content depends
+neither on the sharding nor on the rollouts that are simulated with it.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +24,8 @@ from ..datasets.dataset import new_dataset, shard_entry, shard_name
 from ..datasets.mjcf import mujoco_states, write_mjcf
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
-from ..datasets.rollouts import ContactTable, FrameBlock, RolloutLabels, RolloutParameter, RolloutWriter
+from ..datasets.rollout_writer import RolloutWriter
+from ..datasets.rollouts import FrameBlock, RolloutLabels
 from ..schemas import (
     DatasetManifest,
     DatasetSummary,
@@ -36,18 +38,22 @@ from ..schemas import (
 )
 from .labels import LabelRenderer
 from .memory import enough_memory
-from .physics.checks import require_apart, require_finite
-from .physics.dispatch import rollout as roll_out
-from .physics.records import ContactRecord
-from .physics.world import State, World
+from .net_forces import contact_force_n, contact_torque_n_m
+from .physics.world import World
 from .posterior import draw_parameters, not_varied
+from .rollout_batches import ENVIRONMENTS, Diverged, Draw, Motion, Simulator
 from .sampling import Start, draw_start, look_at_cameras, resolve_plan
+from .stopwatch import Stopwatch
 
 STATE_ONLY = (
     "state only: the model has no visual spheres, so there is nothing to render; "
     "obs/ holds the bodies' state and no images"
 )
-RECORDED_PACKAGES = ("cgwm", "h5py", "mujoco", "numpy", "torch")
+RECORDED_PACKAGES = ("cgwm", "h5py", "hdf5plugin", "mujoco", "numpy", "torch")
+ROLLOUTS_AT_ONCE = {"cuda": ENVIRONMENTS, "cpu": 1}
+"""Drawn and simulated together where the settings do not say, one batch ahead of the pictures."""
+NOT_CONTENT = {"shard", "batch"}
+"""Settings that change no rollout."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +66,13 @@ class _Job:
     times_s: np.ndarray
     cameras: Mapping[str, Camera]
     renderer: LabelRenderer | None
+    simulator: Simulator
     device: str
 
 
-def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False) -> DatasetSummary:
+def synthesize(
+    model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False, stopwatch: Stopwatch | None = None
+) -> DatasetSummary:
     """Write one shard of a dataset of labelled rollouts.
 
     With one shard, `out` appears complete. With more, every call adds its shard to `out` (the first that is ready
@@ -74,14 +83,16 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         out: DATASET.
         config: The settings; times, sizes and the sampling plan are in it.
         overwrite: Replace what is there: the dataset where it has one shard, else the shard.
+        stopwatch: To measure where the time goes.
 
     Returns:
-        What was written, with its hash and the speed.
+        What was written, with its hash and the speed. Rollouts that diverge are left out and named in its notes.
 
     Raises:
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
-        NotConvergedError: If a simulation diverges.
+        NotConvergedError: If all simulations diverge.
+        NotEnoughSpaceError: If the disk is full.
         NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """
     began = time.perf_counter()
@@ -89,24 +100,38 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         job = _prepare(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
-        return _written(job, model, out, config, overwrite, began)
+        return _written(job, model, out, config, overwrite, began, stopwatch or Stopwatch())
 
 
 def _written(
-    job: _Job, model: Path, out: Path, config: SynthesizeConfig, overwrite: bool, began: float
+    job: _Job, model: Path, out: Path, config: SynthesizeConfig, overwrite: bool, began: float, stopwatch: Stopwatch
 ) -> DatasetSummary:
     indices = shard_indices(config)
     notes = _notes(job)
     manifest = _manifest(model, job, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
     contacts = 0
+    diverged: list[Diverged] = []
     with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
         with RolloutWriter(path, config.seed, config_json, f"cgwm {version('cgwm')}", config.compression) as writer:
-            for index in progress(indices, "rollouts", len(indices), "rollout"):
-                labels = simulate_rollout(job, index)
-                writer.write(labels, _frames(job, labels))
-                contacts += len(labels.contacts.body_a)
-        entries.append(_entry(path, config, len(indices), writer.total * max(1, len(job.cameras))))
+            with closing(_simulated(job, indices, stopwatch)) as found:
+                for motion in progress(found, "rollouts", len(indices), "rollout"):
+                    if isinstance(motion, Diverged):
+                        diverged.append(motion)
+                        continue
+                    with stopwatch.part("labels"):
+                        labels = _labels(job, motion)
+                    with stopwatch.part("render and hand over"):
+                        writer.write(labels, _frames(job, labels, stopwatch))
+                    contacts += len(labels.contacts.body_a)
+            if len(diverged) == len(indices):
+                raise diverged[0].error
+            ended = time.perf_counter()
+        stopwatch.seconds["wait for the writer"] = time.perf_counter() - ended
+        written = len(indices) - len(diverged)
+        with stopwatch.part("hash"):
+            entries.append(_entry(path, config, written, writer.total * max(1, len(job.cameras))))
+    notes += tuple(f"left out: {one.error.found}" for one in diverged)
     seconds = time.perf_counter() - began
     entry = entries[0]
     return DatasetSummary(
@@ -139,26 +164,33 @@ def shard_indices(config: SynthesizeConfig) -> range:
     return range(first, last)
 
 
-def simulate_rollout(job: _Job, index: int) -> RolloutLabels:
-    """Draw and simulate the rollout with the global number `index`; everything but its images."""
+def draw_rollout(job: _Job, index: int) -> Draw:
+    """Draw the parameters and the start of the rollout with the global number `index`."""
     rng = np.random.default_rng(np.random.SeedSequence(job.config.seed, spawn_key=(index,)))
     file, parameters = draw_parameters(job.model.file, job.plan.parameter_spread, rng)
     model = replace(job.model, file=file)
-    start = draw_start(model, job.plan, float(job.times_s[-1]), rng)
-    world = World.from_model(model, torch.float64, job.device)
-    state = State(*(_batched(values, job.device) for values in _state(start)))
-    times = torch.as_tensor(job.times_s, dtype=torch.float64, device=job.device)
-    require_apart(world, state)
-    with torch.no_grad():
-        rollout = roll_out(world, state, times, start.driven, record_contacts=True)
-    require_finite(rollout, world, state, [f"rollout {index} (seed {job.config.seed})"])
-    poses = tuple(
-        values[0].cpu().numpy()
-        for values in (rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s)
-    )
-    assert rollout.contacts is not None  # asked for above
-    contacts = _contact_table(rollout.contacts)
-    return _labels(job, index, model, parameters, start, poses, contacts)
+    return Draw(index, model, parameters, draw_start(model, job.plan, float(job.times_s[-1]), rng))
+
+
+def _simulated(job: _Job, indices: range, stopwatch: Stopwatch) -> Generator[Motion | Diverged, None, None]:
+    """Yield the rollouts in the order of their numbers; the next batch is simulated meanwhile."""
+    size = job.config.batch or ROLLOUTS_AT_ONCE[job.device]
+    batches = [indices[first : first + size] for first in range(0, len(indices), size)]
+    with ThreadPoolExecutor(1, "cgwm-simulate") as ahead:
+        following = ahead.submit(_simulate, job, batches[0], stopwatch)
+        for number in range(len(batches)):
+            with stopwatch.part("wait for simulation"):
+                found = following.result()
+            if number + 1 < len(batches):
+                following = ahead.submit(_simulate, job, batches[number + 1], stopwatch)
+            yield from found
+
+
+def _simulate(job: _Job, indices: range, stopwatch: Stopwatch) -> list[Motion | Diverged]:
+    with stopwatch.part("draw"):
+        draws = [draw_rollout(job, index) for index in indices]
+    with stopwatch.part("simulate", job.device == "cuda"):
+        return job.simulator.run(draws, job.config.seed)
 
 
 def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
@@ -181,7 +213,8 @@ def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
     visible = bool(model.body_splats)
     cameras = look_at_cameras(model, plan, config) if visible else {}
     renderer = LabelRenderer(model, cameras, device) if visible else None
-    return _Job(model, config, plan, np.arange(count) / config.frame_rate_hz, cameras, renderer, device)
+    times = np.arange(count) / config.frame_rate_hz
+    return _Job(model, config, plan, times, cameras, renderer, Simulator(model, times, device), device)
 
 
 @contextmanager
@@ -211,7 +244,7 @@ def _manifest(path: Path, job: _Job, notes: tuple[str, ...]) -> DatasetManifest:
     settings = job.config.model_copy(update={"plan": job.plan, "shard": 0})
     return DatasetManifest(
         model_sha256=sha256(path),
-        config=settings.model_dump(mode="json", exclude={"shard"}),
+        config=settings.model_dump(mode="json", exclude=NOT_CONTENT),
         rollouts=job.config.rollouts,
         shard_count=job.config.shards,
         bodies=tuple(body.name for body in job.model.file.bodies),
@@ -239,32 +272,28 @@ def _entry(path: Path, config: SynthesizeConfig, rollouts: int, frames: int) -> 
     return shard_entry(path, config.shard, rollouts, frames, shard_name(config.shard, config.shards))
 
 
-def _frames(job: _Job, labels: RolloutLabels) -> Iterator[FrameBlock]:
-    if job.renderer is not None:
-        yield from job.renderer.blocks(labels.position_m, labels.quat_wxyz)
+def _frames(job: _Job, labels: RolloutLabels, stopwatch: Stopwatch) -> Iterator[FrameBlock]:
+    if job.renderer is None:
+        return
+    blocks = job.renderer.blocks(labels.position_m, labels.quat_wxyz, wait=False)
+    while True:
+        with stopwatch.part("render", job.device == "cuda"):
+            block = next(blocks, None)
+        if block is None:
+            return
+        yield block
 
 
-def _state(start: Start) -> tuple[np.ndarray, ...]:
-    return start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s
-
-
-def _batched(values: np.ndarray, device: str) -> torch.Tensor:
-    return torch.as_tensor(values, dtype=torch.float64, device=device)[None]
-
-
-def _labels(
-    job: _Job,
-    index: int,
-    model: Model,
-    parameters: tuple[RolloutParameter, ...],
-    start: Start,
-    poses: tuple[np.ndarray, ...],
-    contacts: ContactTable,
-) -> RolloutLabels:
+def _labels(job: _Job, motion: Motion) -> RolloutLabels:
+    draw, contacts, model = motion.draw, motion.contacts, motion.draw.model
     bodies = model.file.bodies
-    actions, meaning = _actions(model.file, start, job.plan, len(job.times_s))
+    actions, meaning = _actions(model.file, draw.start, job.plan, len(job.times_s))
+    poses = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
+    mass = np.array([body.mass_kg for body in bodies])
+    inertia = np.array([body.inertia_kg_m2 for body in bodies])
+    free = np.array([body.motion == "free" for body in bodies])
     return RolloutLabels(
-        episode_index=index,
+        episode_index=draw.index,
         seed=job.config.seed,
         model_mjcf=write_mjcf(model, job.cameras),
         time_s=job.times_s,
@@ -273,16 +302,18 @@ def _labels(
         action_meaning=meaning,
         bodies=tuple(body.name for body in bodies),
         motions=tuple(body.motion for body in bodies),
-        mass_kg=np.array([body.mass_kg for body in bodies]),
+        mass_kg=mass,
         com_m=np.array([body.com_m for body in bodies]),
-        inertia_kg_m2=np.array([body.inertia_kg_m2 for body in bodies]),
-        position_m=poses[0],
-        quat_wxyz=poses[1],
-        velocity_m_s=poses[2],
-        omega_body_rad_s=poses[3],
+        inertia_kg_m2=inertia,
+        position_m=motion.position_m,
+        quat_wxyz=motion.quat_wxyz,
+        velocity_m_s=motion.velocity_m_s,
+        omega_body_rad_s=motion.omega_body_rad_s,
         gravity_m_s2=np.array(model.file.gravity_m_s2),
         contacts=contacts,
-        parameters=parameters,
+        contact_force_n=contact_force_n(contacts, job.times_s, len(bodies)),
+        contact_torque_n_m=contact_torque_n_m(motion.quat_wxyz, motion.omega_body_rad_s, inertia, job.times_s, free),
+        parameters=draw.parameters,
         effects={effect.name: effect.parameters for effect in model.file.effects},
         cameras=job.cameras,
     )
@@ -298,25 +329,3 @@ def _actions(file: ModelFile, start: Start, plan: SamplingPlan, count: int) -> t
     command = np.concatenate([start.velocity_m_s[index] for index in driven]) / scale
     text = f"Velocity command of {names}, world axes, in units of {scale:g} m/s."
     return np.repeat(command[None], count, axis=0), text
-
-
-def _contact_table(record: ContactRecord) -> ContactTable:
-    """Keep the contacts that touch at the frame, or that passed on an impulse since the frame before."""
-    impulse = record.impulse_n_s[0].cpu().numpy()
-    distance = record.distance_m[0].cpu().numpy()
-    active = (np.abs(impulse).max(-1) > 0) | (distance <= 0)
-    frame, slot = np.nonzero(active)
-
-    def rows(values: torch.Tensor) -> np.ndarray:
-        return values[0].cpu().numpy()[frame, slot]
-
-    return ContactTable(
-        offsets=np.concatenate([[0], np.cumsum(active.sum(1))]).astype(np.int64),
-        body_a=record.body_a.cpu().numpy()[slot].astype(np.int32),
-        body_b=record.body_b.cpu().numpy()[slot].astype(np.int32),
-        position_m=rows(record.position_m),
-        normal=rows(record.normal),
-        distance_m=distance[frame, slot],
-        impulse_n_s=impulse[frame, slot],
-        sliding=rows(record.sliding).astype(np.uint8),
-    )

@@ -72,6 +72,7 @@ from .errors import (
     InputDataError,
     NotConvergedError,
     NotEnoughMemoryError,
+    NotEnoughSpaceError,
     UsageError,
     did_you_mean,
 )
@@ -158,6 +159,7 @@ __all__ = [
     "NextExperiment",
     "NotConvergedError",
     "NotEnoughMemoryError",
+    "NotEnoughSpaceError",
     "Organiser",
     "Outcome",
     "PackageState",

@@ -50,6 +50,10 @@ class NotEnoughMemoryError(CgwmError):
     """What was asked for needs more memory than there is (exit code 1)."""
 
 
+class NotEnoughSpaceError(CgwmError):
+    """What was asked for needs more room on the disk than there is (exit code 1)."""
+
+
 class CheckFailedError(CgwmError):
     """A check found faults (exit code 1)."""
 
