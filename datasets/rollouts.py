@@ -16,7 +16,7 @@ from typing import Any, Literal, Self
 import h5py
 import numpy as np
 
-from ..schemas import ROLLOUTS_FORMAT, InputDataError
+from ..schemas import ROLLOUTS_FORMAT, Exposure, InputDataError, Light
 from .cameras import Camera
 
 Compression = Literal["zstd", "gzip", "none"]
@@ -108,6 +108,14 @@ class RolloutLabels:
     parameters: tuple[RolloutParameter, ...] = ()
     effects: Mapping[str, Mapping[str, float]] | None = None
     cameras: Mapping[str, Camera] | None = None
+    attempt: int = 0
+    """How often the rollout was drawn before and rejected; from 1 on the spawn key is (episode_index, attempt)."""
+    exposures: Mapping[str, Exposure] | None = None
+    """Of each camera; none: the pictures are as the model has them."""
+    light_gain_rgb: np.ndarray | None = None
+    """Brightness of the light relative to the photos [1], shape (3,)."""
+    light: Light | None = None
+    """The lamp and the sky of this rollout, where the model has them."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +248,8 @@ class RolloutWriter:
         observations = demo.create_group("obs")
         _write_object_observation(observations, labels)
         if labels.cameras:
-            _write_cameras(demo, labels.cameras)
+            _write_cameras(demo, labels.cameras, labels.exposures or {})
+            _write_light(demo, labels)
             images = {name: self._image_sets(observations, name, c, count) for name, c in labels.cameras.items()}
             visible = _write_frames(images, frames, count, len(labels.bodies))
             axes, text = "(T, camera, body)", "Pixels of the body in the mask; cameras in the order of their names."
@@ -305,6 +314,7 @@ def _write_attributes(demo: Node, labels: RolloutLabels, count: int) -> None:
         model_file=labels.model_mjcf,
         episode_index=labels.episode_index,
         seed=labels.seed,
+        attempt=labels.attempt,
         params_json=json.dumps(parameters),
         effects_json=json.dumps({name: dict(values) for name, values in (labels.effects or {}).items()}),
     )
@@ -372,7 +382,7 @@ def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
     _put(group, "object", values, "SI", "world", order, "(T, 13 B)", "State of all bodies, robomimic's low-dim key.")
 
 
-def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
+def _write_cameras(demo: Node, cameras: Mapping[str, Camera], exposures: Mapping[str, Exposure]) -> None:
     group = demo.create_group("cameras")
     for name, camera in cameras.items():
         entry = group.create_group(name)
@@ -383,7 +393,22 @@ def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
         _put(entry, "T_world_cam", camera.T_world_cam, "m", "world", "row", "(4, 4)", text)
         _put(entry, "width", camera.width, "px", "-", "-", "scalar", "Image width.")
         _put(entry, "height", camera.height, "px", "-", "-", "scalar", "Image height.")
+        exposure = exposures.get(name, Exposure())
+        seen = "What the model shows, 0 to 1, times this, plus offset_rgb, cut off at 0 and 1, is the image."
+        _put(entry, "gain_rgb", exposure.gain_rgb, "1", "-", "RGB", "(3,)", f"Exposure and light. {seen}")
+        _put(entry, "offset_rgb", exposure.offset_rgb, "1", "-", "RGB", "(3,)", "Exposure: see gain_rgb.")
         entry.attrs["camera_model"] = "OPENCV" if distortion.any() else "PINHOLE"
+
+
+def _write_light(demo: Node, labels: RolloutLabels) -> None:
+    """The rollout's light; its gain is part of every camera's `gain_rgb`."""
+    group = demo.create_group("light")
+    gain = np.ones(3) if labels.light_gain_rgb is None else labels.light_gain_rgb
+    _put(group, "gain_rgb", gain, "1", "-", "RGB", "(3,)", "Brightness relative to the photos; in the cameras' gain.")
+    if labels.light is not None:
+        text = "Direction to the lamp times its brightness relative to the room's mean; shades the moving bodies."
+        _put(group, "lamp", labels.light.lamp, "1", "world", "x y z", "(3,)", text)
+        _put(group, "sky", labels.light.sky, "1", "world", "-", "scalar", "Brightness from above against the side.")
 
 
 def _write_frames(

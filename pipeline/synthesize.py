@@ -1,14 +1,16 @@
 """The stage synthesize: labelled rollouts of a fitted model into HDF5.
 
-Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e and simulated by
-itself, so its content depends neither on the sharding nor on the other rollouts.
+Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e, and after a draw that
+the plan's rules reject from `spawn_key=(e, attempt)`; it is simulated by itself. So its content depends neither on the
+sharding nor on the other rollouts.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -23,7 +25,7 @@ from ..datasets.dataset import new_dataset, shard_entry, shard_name
 from ..datasets.mjcf import mujoco_states, write_mjcf
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
-from ..datasets.rollouts import ContactTable, FrameBlock, RolloutLabels, RolloutParameter, RolloutWriter
+from ..datasets.rollouts import ContactTable, FrameBlock, RolloutLabels, RolloutWriter
 from ..schemas import (
     DatasetManifest,
     DatasetSummary,
@@ -34,14 +36,17 @@ from ..schemas import (
     SynthesizeConfig,
     UsageError,
 )
+from .draws import Draw, draw_rollout
 from .labels import LabelRenderer
+from .lights import exposed
 from .memory import enough_memory
 from .physics.checks import require_apart, require_finite
 from .physics.dispatch import rollout as roll_out
 from .physics.records import ContactRecord
 from .physics.world import State, World
-from .posterior import draw_parameters, not_varied
-from .sampling import Start, draw_start, look_at_cameras, resolve_plan
+from .posterior import not_varied, require_admissible, with_correlations
+from .rejection import Rejection, accepted_rollouts
+from .sampling import Start, look_at_cameras, resolve_plan
 
 STATE_ONLY = (
     "state only: the model has no visual spheres, so there is nothing to render; "
@@ -60,6 +65,7 @@ class _Job:
     times_s: np.ndarray
     cameras: Mapping[str, Camera]
     renderer: LabelRenderer | None
+    rejection: Rejection
     device: str
 
 
@@ -99,14 +105,15 @@ def _written(
     notes = _notes(job)
     manifest = _manifest(model, job, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
-    contacts = 0
+    contacts, rejected = 0, Counter[str]()
     with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
         with RolloutWriter(path, config.seed, config_json, f"cgwm {version('cgwm')}", config.compression) as writer:
             for index in progress(indices, "rollouts", len(indices), "rollout"):
-                labels = simulate_rollout(job, index)
-                writer.write(labels, _frames(job, labels))
-                contacts += len(labels.contacts.body_a)
-        entries.append(_entry(path, config, len(indices), writer.total * max(1, len(job.cameras))))
+                for draw, labels in _accepted(job, [index], rejected):
+                    writer.write(labels, _frames(job, draw, labels))
+                    contacts += len(labels.contacts.body_a)
+        entry = _entry(path, config, len(indices), writer.total * max(1, len(job.cameras)))
+        entries.append(entry.model_copy(update={"rejected": dict(sorted(rejected.items()))}))
     seconds = time.perf_counter() - began
     entry = entries[0]
     return DatasetSummary(
@@ -120,6 +127,8 @@ def _written(
         cameras=tuple(job.cameras),
         seconds=seconds,
         frames_per_s=entry.frames / seconds,
+        rejected=entry.rejected,
+        plan=job.plan,
         notes=notes,
     )
 
@@ -139,29 +148,51 @@ def shard_indices(config: SynthesizeConfig) -> range:
     return range(first, last)
 
 
-def simulate_rollout(job: _Job, index: int) -> RolloutLabels:
-    """Draw and simulate the rollout with the global number `index`; everything but its images."""
-    rng = np.random.default_rng(np.random.SeedSequence(job.config.seed, spawn_key=(index,)))
-    file, parameters = draw_parameters(job.model.file, job.plan.parameter_spread, rng)
-    model = replace(job.model, file=file)
-    start = draw_start(model, job.plan, float(job.times_s[-1]), rng)
-    world = World.from_model(model, torch.float64, job.device)
+def _accepted(job: _Job, indices: Sequence[int], rejected: Counter[str]) -> Iterator[tuple[Draw, RolloutLabels]]:
+    def draw(index: int, attempt: int) -> Draw:
+        duration_s = float(job.times_s[-1])
+        return draw_rollout(job.model, job.plan, job.config, job.cameras, duration_s, index, attempt)
+
+    def simulate(draws: Sequence[Draw]) -> list[RolloutLabels]:
+        return [simulate_rollout(job, one) for one in draws]
+
+    attempts = job.plan.reject.attempts
+    yield from accepted_rollouts(indices, draw, simulate, job.rejection.reason, attempts, rejected)
+
+
+def simulate_rollout(job: _Job, draw: Draw) -> RolloutLabels:
+    """Simulate a draw; everything but its images."""
+    start = draw.start
+    world = World.from_model(draw.model, torch.float64, job.device)
     state = State(*(_batched(values, job.device) for values in _state(start)))
     times = torch.as_tensor(job.times_s, dtype=torch.float64, device=job.device)
     require_apart(world, state)
     with torch.no_grad():
         rollout = roll_out(world, state, times, start.driven, record_contacts=True)
-    require_finite(rollout, world, state, [f"rollout {index} (seed {job.config.seed})"])
+    require_finite(rollout, world, state, [f"rollout {draw.index} (seed {job.config.seed})"])
     poses = tuple(
         values[0].cpu().numpy()
         for values in (rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s)
     )
     assert rollout.contacts is not None  # asked for above
     contacts = _contact_table(rollout.contacts)
-    return _labels(job, index, model, parameters, start, poses, contacts)
+    return _labels(job, draw, poses, contacts)
 
 
-def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
+def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
+    """Return a plan with what it leaves out filled in for a model.
+
+    Args:
+        model: MODEL.
+        plan: The plan.
+
+    Raises:
+        InputDataError: If `model` is no model or has no fitted physics, or the plan does not fit it.
+    """
+    return _with_plan(model, plan)[1]
+
+
+def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
     model = read_model(path)
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking:
@@ -171,7 +202,13 @@ def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
         )
     if model.file.contact is None:
         World.from_model(model)  # says what is missing, and how to get it
-    plan = resolve_plan(model, config.plan)
+    model = replace(model, file=with_correlations(model))
+    require_admissible(model.file, plan.parameters)
+    return model, resolve_plan(model, plan)
+
+
+def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
+    model, plan = _with_plan(path, config.plan)
     count = round(config.duration_s * config.frame_rate_hz) + 1
     if count < 2:
         raise UsageError(
@@ -181,7 +218,8 @@ def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
     visible = bool(model.body_splats)
     cameras = look_at_cameras(model, plan, config) if visible else {}
     renderer = LabelRenderer(model, cameras, device) if visible else None
-    return _Job(model, config, plan, np.arange(count) / config.frame_rate_hz, cameras, renderer, device)
+    rejection = Rejection.of(model, plan.reject)
+    return _Job(model, config, plan, np.arange(count) / config.frame_rate_hz, cameras, renderer, rejection, device)
 
 
 @contextmanager
@@ -239,9 +277,16 @@ def _entry(path: Path, config: SynthesizeConfig, rollouts: int, frames: int) -> 
     return shard_entry(path, config.shard, rollouts, frames, shard_name(config.shard, config.shards))
 
 
-def _frames(job: _Job, labels: RolloutLabels) -> Iterator[FrameBlock]:
-    if job.renderer is not None:
-        yield from job.renderer.blocks(labels.position_m, labels.quat_wxyz)
+def _frames(job: _Job, draw: Draw, labels: RolloutLabels) -> Iterator[FrameBlock]:
+    if job.renderer is None:
+        return
+    renderer = job.renderer
+    lit = job.plan.light_turn_deg.support != (0.0, 0.0) and draw.lighting.light is not None
+    if job.plan.moving_views or lit:
+        file = job.model.file.model_copy(update={"light": draw.lighting.light})
+        renderer = LabelRenderer(replace(job.model, file=file), draw.cameras, job.device)
+    for block in renderer.blocks(labels.position_m, labels.quat_wxyz):
+        yield exposed(block, draw.lighting.exposures[block.camera])
 
 
 def _state(start: Start) -> tuple[np.ndarray, ...]:
@@ -254,19 +299,18 @@ def _batched(values: np.ndarray, device: str) -> torch.Tensor:
 
 def _labels(
     job: _Job,
-    index: int,
-    model: Model,
-    parameters: tuple[RolloutParameter, ...],
-    start: Start,
+    draw: Draw,
     poses: tuple[np.ndarray, ...],
     contacts: ContactTable,
 ) -> RolloutLabels:
+    model = draw.model
     bodies = model.file.bodies
-    actions, meaning = _actions(model.file, start, job.plan, len(job.times_s))
+    actions, meaning = _actions(model.file, draw.start, job.plan, job.times_s)
     return RolloutLabels(
-        episode_index=index,
+        episode_index=draw.index,
         seed=job.config.seed,
-        model_mjcf=write_mjcf(model, job.cameras),
+        attempt=draw.attempt,
+        model_mjcf=write_mjcf(model, draw.cameras),
         time_s=job.times_s,
         states=mujoco_states(model.file, job.times_s, poses),
         actions=actions,
@@ -282,22 +326,29 @@ def _labels(
         omega_body_rad_s=poses[3],
         gravity_m_s2=np.array(model.file.gravity_m_s2),
         contacts=contacts,
-        parameters=parameters,
+        parameters=draw.parameters,
         effects={effect.name: effect.parameters for effect in model.file.effects},
-        cameras=job.cameras,
+        cameras=draw.cameras,
+        exposures=draw.lighting.exposures,
+        light_gain_rgb=draw.lighting.gain_rgb,
+        light=draw.lighting.light,
     )
 
 
-def _actions(file: ModelFile, start: Start, plan: SamplingPlan, count: int) -> tuple[np.ndarray, str]:
+def _actions(file: ModelFile, start: Start, plan: SamplingPlan, times_s: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the commands (T, A): velocities of the driven bodies over the plan's largest push speed."""
     driven = [index for index, body in enumerate(file.bodies) if body.motion == "driven"]
     if not driven:
-        return np.zeros((count, 1)), "No body is driven: zero."
-    scale = max(plan.push_speed_m_s[1], 1e-9)
+        return np.zeros((len(times_s), 1)), "No body is driven: zero."
+    scale = max(plan.push_speed_m_s.support[1], 1e-9)
     names = ", ".join(file.bodies[index].name for index in driven)
-    command = np.concatenate([start.velocity_m_s[index] for index in driven]) / scale
+    commands = []
+    for index in driven:
+        track = start.driven[file.bodies[index].name]
+        assert track.velocity_m_s is not None  # a push has it
+        commands.append(track.velocity_m_s[np.searchsorted(track.time_s, times_s, side="right") - 1])
     text = f"Velocity command of {names}, world axes, in units of {scale:g} m/s."
-    return np.repeat(command[None], count, axis=0), text
+    return np.concatenate(commands, axis=1) / scale, text
 
 
 def _contact_table(record: ContactRecord) -> ContactTable:

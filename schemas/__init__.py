@@ -40,7 +40,6 @@ from .dataset import (
     ROLLOUTS_FORMAT,
     DatasetManifest,
     DatasetSummary,
-    SamplingPlan,
     ShardEntry,
 )
 from .demo import (
@@ -80,6 +79,7 @@ from .model import (
     MODEL_FORMAT,
     BodyModel,
     ContactParameters,
+    Correlation,
     EffectModel,
     Exposure,
     FitFile,
@@ -90,6 +90,7 @@ from .model import (
     Solver,
 )
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
+from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
 from .results import EpisodeErrors, ErrorSummary, EvalResult
 from .validation import ValidationReport
 
@@ -119,12 +120,14 @@ __all__ = [
     "CompareResult",
     "ComparedParameter",
     "ContactParameters",
+    "Correlation",
     "DatasetManifest",
     "DatasetSummary",
     "DemoResult",
     "DemoTarget",
     "Device",
     "DiagnoseResult",
+    "Distribution",
     "DoctorReport",
     "EffectEstimate",
     "EffectModel",
@@ -173,6 +176,7 @@ __all__ = [
     "PosedVideo",
     "Provenance",
     "RankedEffect",
+    "RejectionRules",
     "ResidualLaw",
     "SamplingPlan",
     "Scale",
@@ -194,6 +198,8 @@ __all__ = [
     "WorstMoment",
     "did_you_mean",
     "parse",
+    "plan_toml",
     "read_json",
+    "read_plan",
     "read_toml",
 ]
