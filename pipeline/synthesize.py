@@ -42,6 +42,7 @@ from .lights import exposed
 from .memory import enough_memory
 from .physics.checks import require_apart, require_finite
 from .physics.dispatch import rollout as roll_out
+from .physics.effects.effect import changed_by_effects
 from .physics.records import ContactRecord
 from .physics.world import State, World
 from .posterior import not_varied, require_admissible, with_correlations
@@ -176,7 +177,22 @@ def simulate_rollout(job: _Job, draw: Draw) -> RolloutLabels:
     )
     assert rollout.contacts is not None  # asked for above
     contacts = _contact_table(rollout.contacts)
-    return _labels(job, draw, poses, contacts)
+    model = replace(draw.model, file=_as_simulated(draw.model.file, world))
+    return _labels(job, replace(draw, model=model), poses, contacts)
+
+
+def _as_simulated(file: ModelFile, world: World) -> ModelFile:
+    """Return the model with the gravity, masses and inertias that its effects give it."""
+    if not any(active.effect.has("world") for active in world.effects):
+        return file
+    world = changed_by_effects(world)
+    bodies = []
+    for body, real in zip(file.bodies, world.bodies, strict=True):
+        inertia = real.inertia[0].tolist()
+        six = tuple(inertia[i][j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+        update = {"mass_kg": float(real.mass[0]), "com_m": tuple(real.com[0].tolist()), "inertia_kg_m2": six}
+        bodies.append(body.model_copy(update=update))
+    return file.model_copy(update={"bodies": tuple(bodies), "gravity_m_s2": tuple(world.gravity[0].tolist())})
 
 
 def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:

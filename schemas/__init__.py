@@ -92,7 +92,7 @@ from .model import (
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
 from .results import EpisodeErrors, ErrorSummary, EvalResult
-from .validation import ValidationReport
+from .validation import Failure, ValidationReport
 
 __all__ = [
     "CAMERAS_FORMAT",
@@ -138,6 +138,7 @@ __all__ = [
     "ErrorSummary",
     "EvalResult",
     "Exposure",
+    "Failure",
     "FileModel",
     "FileShape",
     "FitFile",
