@@ -111,10 +111,13 @@ class RolloutReader:
     def read(self, number: int, key: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return an array of a rollout, its first axis cut to `start:stop` (frames, for what has a time axis)."""
         group = self.group(number)
-        if key not in group:
+        try:
+            data = group[key]
+        except KeyError:
             names = self.keys(number)
-            raise UsageError(f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names))
-        data = group[key]
+            raise UsageError(
+                f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names)
+            ) from None
         return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
