@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from ..datasets.rollouts import FrameBlock
@@ -71,5 +72,5 @@ def exposed(block: FrameBlock, exposure: Exposure) -> FrameBlock:
     levels = np.arange(256)[:, None]
     shown = levels * np.array(exposure.gain_rgb) + 255 * np.array(exposure.offset_rgb)
     table = shown.clip(0, 255).round().astype(np.uint8)
-    image = np.stack([table[block.image[..., channel], channel] for channel in range(3)], axis=-1)
-    return replace(block, image=image)
+    image = cv2.LUT(block.image.reshape(-1, block.image.shape[2], 3), table[None])
+    return replace(block, image=image.reshape(block.image.shape))

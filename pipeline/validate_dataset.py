@@ -169,6 +169,7 @@ def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterato
         yield Fault("time", f"time: not increasing at frame {frame}.", frame, value=float(time[frame]))
         return
     yield from _check_states(demo, findings)
+    yield from _check_parameters(demo, model)
     yield from _check_contacts(demo, count, model, findings)
     if model is not None and "cameras" in demo:
         yield from check_pictures(demo, model, count, findings.pictures)
@@ -220,6 +221,17 @@ def _finite(item: h5py.Dataset) -> bool:
     if item.chunks is None:
         return bool(np.isfinite(item[()]).all())
     return all(bool(np.isfinite(item[rows]).all()) for rows in item.iter_chunks())
+
+
+def _check_parameters(demo: Node, model: Model | None) -> Iterator[Fault]:
+    """Physical parameters lie within the bounds that the model gives them."""
+    for listed in model.file.parameters if model is not None else ():
+        if listed.bounds is None or listed.name not in demo["parameters"]:
+            continue
+        value, (low, high) = float(demo["parameters"][listed.name][()]), listed.bounds
+        if not low <= value <= high:
+            text = f"parameters/{listed.name}: {value:g} {listed.unit}; {low:g} to {high:g} is admissible."
+            yield Fault("parameters", text, value=value, limit=low if value < low else high)
 
 
 def _check_contacts(demo: Node, count: int, model: Model | None, findings: _Findings) -> Iterator[Fault]:

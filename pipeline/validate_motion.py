@@ -76,6 +76,7 @@ def check_motion(
     time = demo["time"][()]
     frame = np.repeat(np.arange(len(time)), np.diff(contacts["offsets"]))
     turned = any(load_effect(name).has("contact") for name in effects)
+    yield from _check_forces(contacts, read, time, frame)
     for index, motion in enumerate(read["motions"]):
         if motion == b"free":
             body = _body(read, index, model, effects)
@@ -144,6 +145,28 @@ def _levers(
     places = np.concatenate([contacts["pos_world"][mine] for _, mine in sides])
     impulses = np.concatenate([sign * contacts["impulse_world"][mine] for sign, mine in sides])
     return frames, places, impulses
+
+
+def _check_forces(
+    contacts: dict[str, np.ndarray], read: dict[str, np.ndarray], time: np.ndarray, frame: np.ndarray
+) -> Iterator[Fault]:
+    """Labelled forces, where there are any, are the impulses over the time between the frames."""
+    length = np.concatenate([[np.inf], np.diff(time)])
+    scale = float(np.abs(contacts["impulse_world"]).max(initial=1e-12)) / float(np.diff(time).min())
+    pairs = []
+    if "force_world" in contacts:
+        expected = contacts["impulse_world"] / length[frame][:, None]
+        pairs.append(("contacts/force_world", contacts["force_world"], expected, frame))
+    if "contact_force" in read:
+        total = [_impulses(contacts, frame, index, len(time)) for index in range(len(read["motions"]))]
+        expected = np.stack(total, axis=1) / length[:, None, None]
+        pairs.append(("bodies/contact_force", read["contact_force"], expected, np.arange(len(time))))
+    for name, found, expected, frames in pairs:
+        errors = np.abs(found - expected).reshape(len(frames), -1).max(1, initial=0.0)
+        if len(errors) and not errors.max() <= IMPULSE_TOLERANCE * scale:
+            worst = int(frames[errors.argmax()])
+            text = f"{name}: frame {worst}: off the impulses over the time between frames by {errors.max():.3g} N."
+            yield Fault("forces", text, worst, value=float(errors.max()), limit=IMPULSE_TOLERANCE * scale)
 
 
 def _check_momentum(

@@ -32,7 +32,7 @@ def raw(dataset: Path, demo: int, key: str) -> np.ndarray:
     for path in dataset.glob("rollouts-*.h5"):
         with h5py.File(path) as file:
             if f"data/demo_{demo}" in file:
-                return file[f"data/demo_{demo}/{key}"][()]
+                return np.asarray(file[f"data/demo_{demo}/{key}"])
     raise KeyError(demo)
 
 

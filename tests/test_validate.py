@@ -196,6 +196,21 @@ def other_object(demo: h5py.Group) -> None:
     demo["obs/object"][1, 0] += 1e-3
 
 
+def wild_parameter(demo: h5py.Group) -> None:
+    demo["parameters/friction"][()] = 2.5
+
+
+def wrong_force(demo: h5py.Group) -> None:
+    contacts = demo["contacts"]
+    frame = np.repeat(np.arange(13), np.diff(contacts["offsets"][()]))
+    force = contacts["impulse_world"][()] * 30
+    contacts.create_dataset("force_world", data=force).attrs.update(dict(contacts["impulse_world"].attrs))
+    total = np.zeros((13, 1, 3))
+    np.add.at(total[:, 0], frame, force)
+    total[7, 0, 2] += 0.1
+    demo["bodies"].create_dataset("contact_force", data=total).attrs.update(dict(demo["bodies/vel"].attrs))
+
+
 def no_unit(demo: h5py.Group) -> None:
     del demo["bodies/vel"].attrs["unit"]
 
@@ -246,6 +261,8 @@ def lost_parameter(demo: h5py.Group) -> None:
         (other_inertia, "bodies/omega_body: body 'cube', frame "),
         (miscounted_pixels, "bodies/visible_px: frame 2, camera view1, body 'cube'"),
         (other_object, "obs/object: differs from the bodies"),
+        (wild_parameter, "parameters/friction: 2.5 1; 0.01 to 2 is admissible"),
+        (wrong_force, "bodies/contact_force: frame 7: off the impulses over the time between frames by 0.1 N"),
         (no_unit, "bodies/vel: has no attribute unit"),
         (no_velocity, "an array or attribute is missing"),
         (short_action, "actions: 12 frames; num_samples says 13"),
