@@ -45,7 +45,7 @@ from .physics.dispatch import rollout as roll_out
 from .physics.effects.effect import changed_by_effects
 from .physics.records import ContactRecord
 from .physics.world import State, World
-from .posterior import not_varied, require_admissible, with_correlations
+from .posterior import DERIVED, not_varied, require_admissible, with_correlations
 from .rejection import Rejection, accepted_rollouts
 from .sampling import Start, look_at_cameras, resolve_plan
 
@@ -232,6 +232,11 @@ def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
         )
     device = _device(config)
     visible = bool(model.body_splats)
+    if plan.reject.unseen_share is not None and not visible:
+        raise InputDataError(
+            f"{path}: the model has no visual spheres, so that no camera sees it, and the plan has unseen_share.",
+            todo="leave unseen_share out of [reject].",
+        )
     cameras = look_at_cameras(model, plan, config) if visible else {}
     renderer = LabelRenderer(model, cameras, device) if visible else None
     rejection = Rejection.of(model, plan.reject)
@@ -283,6 +288,12 @@ def _notes(job: _Job) -> tuple[str, ...]:
     spread = [p.name for p in job.model.file.parameters if p.std_error and p.name not in kept]
     if job.plan.parameter_spread > 0 and not spread:
         notes.append("no physical parameter has a standard error, so all rollouts have the same physics")
+    together = {name for block in job.model.file.correlations for name in block.parameters}
+    alone = [name for name in spread if name not in together and name not in DERIVED]
+    if job.plan.parameter_spread > 0 and len(alone) > 1:
+        notes.append(f"drawn each by itself, because the model has no correlations of them: {', '.join(alone)}")
+    if job.plan.light_turn_deg.support != (0.0, 0.0) and job.model.file.light is None:
+        notes.append("light_turn_deg turns nothing: the model has no light")
     unseen = [b.name for b in job.model.file.bodies if b.name not in job.model.body_splats]
     if job.renderer is not None and unseen:
         notes.append(f"not in the images, because they have no visual spheres: {', '.join(unseen)}")

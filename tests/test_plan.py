@@ -452,3 +452,31 @@ def test_the_resolved_plan_makes_the_same_dataset(tmp_path: Path) -> None:
         written = json.loads(file.attrs["config_json"])["plan"]
     assert SamplingPlan.model_validate(written) == plan
     assert extent(small_model(), small_model().file.bodies[0]).radius_m * 3 == pytest.approx(plan.height_m.support[1])
+
+
+def test_what_a_plan_asks_of_a_model_that_lacks_it_is_told(tmp_path: Path) -> None:
+    path = write_small_model(tmp_path / "model", visible=False)
+    unseen = SamplingPlan.model_validate({"reject": {"unseen_share": 0.0}})
+    with pytest.raises(InputDataError, match="no visual spheres, so that no camera sees it, and the plan has unseen"):
+        synthesize(path, tmp_path / "out", CONFIG.model_copy(update={"plan": unseen}))
+    turned = SamplingPlan.model_validate({"light_turn_deg": [0, 90]})
+    notes = synthesize(path, tmp_path / "out", CONFIG.model_copy(update={"plan": turned, "rollouts": 1})).notes
+    assert "light_turn_deg turns nothing: the model has no light" in notes
+    assert "drawn each by itself, because the model has no correlations of them: friction, damping_ratio" in notes
+
+
+def test_shards_of_one_plan_belong_together(tmp_path: Path) -> None:
+    path = write_small_model(tmp_path / "model", visible=False)
+    kinds = {"height_m": {"normal": [0.2, 0.01]}, "heading_deg": {"choice": [0, 90]}, "spin_rad_s": 0}
+    kinds |= {"parameters": {"friction": [0.2, 0.3]}}
+    plan = SamplingPlan.model_validate(kinds)
+    config = CONFIG.model_copy(update={"plan": plan, "shards": 2, "rollouts": 2})
+    for shard in (0, 1):
+        synthesize(path, tmp_path / "out", config.model_copy(update={"shard": shard}))
+    assert len(read_manifest(tmp_path / "out").shards) == 2
+    reader = RolloutReader(tmp_path / "out")
+    for number in (0, 1):
+        assert 0.2 <= reader.parameters(number)["friction"] <= 0.3
+        velocity = reader.read(number, "bodies/vel")[0, 0]
+        assert min(abs(velocity[:2])) < 1e-12  # along x or y, with no spin about another point than the middle
+    reader.close()
