@@ -29,7 +29,9 @@ from cgwm.datasets.processors import processors
 from cgwm.datasets.rollout_writer import RolloutWriter, _encoded_images
 from cgwm.datasets.rollouts import FrameBlock
 from cgwm.pipeline import synthesize as stage
+from cgwm.pipeline.draws import draw_rollout
 from cgwm.pipeline.rollout_batches import Motion
+from cgwm.pipeline.rollout_labels import labels_of
 from cgwm.pipeline.stopwatch import Stopwatch
 from cgwm.schemas import SynthesizeConfig
 from store import Store
@@ -88,7 +90,11 @@ class Bench:
 
     def motions(self, job: Any, count: int) -> list[Motion]:
         """Return the first rollouts."""
-        found = job.simulator.run([stage.draw_rollout(job, index) for index in range(count)], self.config.seed)
+        duration_s = float(job.times_s[-1])
+        draws = [
+            draw_rollout(job.model, job.plan, job.config, job.cameras, duration_s, index) for index in range(count)
+        ]
+        found = job.simulator.run(draws, self.config.seed)
         assert all(isinstance(motion, Motion) for motion in found)
         return found
 
@@ -108,7 +114,7 @@ class Bench:
         (motion,) = self.motions(job, 1)
         began, count = time.perf_counter(), 50
         for _ in range(count):
-            stage._labels(job, motion)
+            labels_of(motion, job.plan, self.config.seed, job.times_s)
         wall_s = time.perf_counter() - began
         return {"frames_per_s": CAMERAS * count * len(motion.position_m) / wall_s, "milliseconds": 1e3 * wall_s / count}
 
@@ -132,7 +138,9 @@ class Bench:
         """Return the labels of one rollout and its images, in memory."""
         (motion,) = self.motions(job, 1)
         found = job.renderer.blocks(motion.position_m, motion.quat_wxyz)
-        return stage._labels(job, motion), [replace(block, ready=None) for block in found]
+        return labels_of(motion, job.plan, self.config.seed, job.times_s), [
+            replace(block, ready=None) for block in found
+        ]
 
     def compress(self) -> dict[str, Any]:
         """Return the speed of zstd, one thread and as many as there are processors."""

@@ -17,8 +17,17 @@ if TYPE_CHECKING:
 def synthesize(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DATASET", help="The directory to write.", show_default=False)
-    ],
+        Path | None, typer.Option("--out", "-o", metavar="DATASET", help="The directory to write.", show_default=False)
+    ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan", metavar="FILE", help="What to draw from (TOML); printed as resolved.", show_default=False
+        ),
+    ] = None,
+    print_plan: Annotated[
+        bool, typer.Option("--print-plan", help="Print the plan for this model as TOML, to edit; make nothing.")
+    ] = False,
     rollouts: Annotated[
         int | None, typer.Option("--rollouts", show_default="8", help="Number of rollouts, of all shards together.")
     ] = None,
@@ -38,14 +47,26 @@ def synthesize(
     """A model to labelled rollouts in HDF5: images, depth, masks, poses, contacts, parameters."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.synthesize import synthesize as work
-        from ..schemas import SynthesizeConfig
+        from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
         from .settings import StageSettings
 
         index, count = _shard(shard) if shard is not None else (None, None)
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
         )
-        emit(work(model, out, settings, overwrite), _summary)
+        if plan is not None:
+            if "plan" in settings.model_fields_set:
+                raise UsageError("--plan, and synthesize.plan in the settings.", "one of the two.")
+            settings = settings.model_copy(update={"plan": read_plan(plan)})
+        if print_plan:
+            from ..pipeline.synthesize import resolved_plan
+
+            emit(resolved_plan(model, settings.plan), plan_toml)
+        elif out is None:
+            raise UsageError("--out is missing.", todo="name the directory to write: --out DATASET.")
+        else:
+            shown = plan is not None
+            emit(work(model, out, settings, overwrite), lambda done: (_plan(done) if shown else "") + _summary(done))
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -55,6 +76,12 @@ def _shard(text: str) -> tuple[int, int]:
     if not (slash and index.isdecimal() and count.isdecimal()) or int(index) >= int(count):
         raise UsageError(f"--shard {text}: no shard.", "I/N with 0 <= I < N, for example 3/64.")
     return int(index), int(count)
+
+
+def _plan(summary: DatasetSummary) -> str:
+    from ..schemas import plan_toml
+
+    return f"The plan, resolved:\n\n{plan_toml(summary.plan, comments=False)}\n"
 
 
 def _summary(summary: DatasetSummary) -> str:
@@ -68,6 +95,10 @@ def _summary(summary: DatasetSummary) -> str:
         ["speed", f"{summary.frames_per_s:.1f} frames/s"],
         ["time", f"{summary.seconds:.1f} s"],
     ]
+    if summary.rejected:
+        total = sum(summary.rejected.values())
+        rules = ", ".join(f"{rule} {count}" for rule, count in summary.rejected.items())
+        rows.append(["rejected", f"{total} of {total + summary.rollouts} draws: {rules}"])
     cameras = ", ".join(summary.cameras) or "none"
     head = f"Wrote {summary.dataset}/{summary.shard}; cameras: {cameras}."
     return "\n".join([head, table(rows), *warnings(summary.notes)])

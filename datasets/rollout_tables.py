@@ -14,6 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from ..schemas import Exposure
 from .cameras import Camera
 from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
 
@@ -30,7 +31,8 @@ def write_tables(demo: Node, labels: RolloutLabels) -> Node:
     observations = demo.create_group("obs")
     _write_object_observation(observations, labels)
     if labels.cameras:
-        _write_cameras(demo, labels.cameras)
+        _write_cameras(demo, labels.cameras, labels.exposures or {})
+        _write_light(demo, labels)
     return observations
 
 
@@ -76,7 +78,7 @@ def _text_kind() -> tuple[Any, Any]:
 
 def _write_attributes(demo: Node, labels: RolloutLabels, count: int) -> None:
     parameters = {p.name: {"value": p.value, "unit": p.unit} for p in labels.parameters}
-    demo.attrs.update(num_samples=count, episode_index=labels.episode_index, seed=labels.seed)
+    demo.attrs.update(num_samples=count, episode_index=labels.episode_index, seed=labels.seed, attempt=labels.attempt)
     texts = {
         b"model_file": labels.model_mjcf,
         b"params_json": json.dumps(parameters),
@@ -163,7 +165,7 @@ def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
     put(group, "object", values, "SI", "world", order, "(T, 13 B)", "State of all bodies, robomimic's low-dim key.")
 
 
-def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
+def _write_cameras(demo: Node, cameras: Mapping[str, Camera], exposures: Mapping[str, Exposure]) -> None:
     group = demo.create_group("cameras")
     for name, camera in cameras.items():
         entry = group.create_group(name)
@@ -174,7 +176,22 @@ def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
         put(entry, "T_world_cam", camera.T_world_cam, "m", "world", "row", "(4, 4)", text)
         put(entry, "width", camera.width, "px", "-", "-", "scalar", "Image width.")
         put(entry, "height", camera.height, "px", "-", "-", "scalar", "Image height.")
+        exposure = exposures.get(name, Exposure())
+        seen = "What the model shows, 0 to 1, times this, plus offset_rgb, cut off at 0 and 1, is the image."
+        put(entry, "gain_rgb", exposure.gain_rgb, "1", "-", "RGB", "(3,)", f"Exposure and light. {seen}")
+        put(entry, "offset_rgb", exposure.offset_rgb, "1", "-", "RGB", "(3,)", "Exposure: see gain_rgb.")
         _write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
+
+
+def _write_light(demo: Node, labels: RolloutLabels) -> None:
+    """The rollout's light; its gain is part of every camera's `gain_rgb`."""
+    group = demo.create_group("light")
+    gain = np.ones(3) if labels.light_gain_rgb is None else labels.light_gain_rgb
+    put(group, "gain_rgb", gain, "1", "-", "RGB", "(3,)", "Brightness relative to the photos; in the cameras' gain.")
+    if labels.light is not None:
+        text = "Direction to the lamp times its brightness relative to the room's mean; shades the moving bodies."
+        put(group, "lamp", labels.light.lamp, "1", "world", "x y z", "(3,)", text)
+        put(group, "sky", labels.light.sky, "1", "world", "-", "scalar", "Brightness from above against the side.")
 
 
 def link_next_observations(demo: Node, observations: Node) -> None:

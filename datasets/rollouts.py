@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..schemas import ROLLOUTS_FORMAT, InputDataError
+from ..schemas import ROLLOUTS_FORMAT, Exposure, InputDataError, Light
 from .cameras import Camera
 from .chunks import require_zstd
 
@@ -103,6 +103,14 @@ class RolloutLabels:
     parameters: tuple[RolloutParameter, ...] = ()
     effects: Mapping[str, Mapping[str, float]] | None = None
     cameras: Mapping[str, Camera] | None = None
+    attempt: int = 0
+    """How often the rollout was drawn before and rejected; from 1 on the spawn key is (episode_index, attempt)."""
+    exposures: Mapping[str, Exposure] | None = None
+    """Of each camera; none: the pictures are as the model has them."""
+    light_gain_rgb: np.ndarray | None = None
+    """Brightness of the light relative to the photos [1], shape (3,)."""
+    light: Light | None = None
+    """The lamp and the sky of this rollout, where the model has them."""
 
 
 @dataclass(frozen=True)

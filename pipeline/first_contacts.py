@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datasets.tracks import Track
+from ..schemas import Correlation
 from ..schemas import Parameter as FittedParameter
 from .estimation.least_squares import Solution, minimise
 from .estimation.observations import Observations
@@ -47,10 +48,14 @@ UNOBSERVABLE_SHARE = 0.8
 
 @dataclass(frozen=True)
 class FirstContacts:
-    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`."""
+    """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
+
+    correlation: of the parameters, in their order.
+    """
 
     world: World
     parameters: tuple[FittedParameter, ...]
+    correlation: Correlation
     record: dict[str, Any]
 
 
@@ -91,14 +96,22 @@ def fit_first_contacts(
         prior_information=state_prior(len(observations.free)),
     )
     count = len(wanted)
-    std_errors = np.sqrt(np.diag(_covariance(solution)))[:count]
+    covariance = _covariance(solution)[:count, :count]
+    std_errors = np.sqrt(np.diag(covariance))
     found, coordinates = names[:count], solution.shared[:count]
     record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
     return FirstContacts(
         _placed(world, found, coordinates),
         tuple(described(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
+        correlation_of([p.name for p in found], covariance),
         record,
     )
+
+
+def correlation_of(names: Sequence[str], covariance: Array) -> Correlation:
+    """Return the correlations of fitted coordinates with a covariance (P, P), as `model.json` has them."""
+    std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
+    return Correlation(parameters=tuple(names), matrix=tuple(map(tuple, (covariance / np.outer(std, std)).tolist())))
 
 
 def _covariance(solution: Solution) -> Array:

@@ -29,7 +29,7 @@ from ..datasets.capture import Capture
 from ..datasets.ply import Splats
 from ..datasets.progress import progress
 from ..datasets.tracks import Track
-from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
+from ..schemas import ContactParameters, Correlation, InputDataError, NotConvergedError, PhysConfig
 from ..schemas import Parameter as FittedParameter
 from .diagnosis.segments import world_for
 from .estimation.noise import estimate_noise
@@ -39,7 +39,15 @@ from .estimation.shooting import Prior as ShotPrior
 from .estimation.shooting import Shooting
 from .estimation.tempering import tempered
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
-from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, bound_warnings, described, fit_first_contacts
+from .first_contacts import (
+    AFTER_S,
+    CONTACT_S,
+    FirstContacts,
+    bound_warnings,
+    correlation_of,
+    described,
+    fit_first_contacts,
+)
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
@@ -98,7 +106,7 @@ class PhysicsFit:
     is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; mass, effects: where these were
     fitted; constants: of effects, `effect.constant` by name; starts: time [s] and state of the first frame of each
     episode, where shooting found it; collision: colliding spheres by body, where they were moved; tracks: what was
-    found in videos, by episode and body.
+    found in videos, by episode and body; correlations: of the numbers of the contact, then of effects and of the mass.
     """
 
     contact: ContactParameters
@@ -113,6 +121,7 @@ class PhysicsFit:
     starts: dict[str, tuple[float, State]] = field(default_factory=dict)
     collision: dict[str, Splats] = field(default_factory=dict)
     tracks: dict[str, dict[str, Track]] = field(default_factory=dict)
+    correlations: tuple[Correlation, ...] = ()
 
 
 def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
@@ -211,13 +220,13 @@ def fit_physics(
             names, best, covariance, starts = _shot(
                 world, searched, (observations, warm), names, search, sigma, config, record
             )
-        record["correlation"] = _correlation(covariance).tolist()
         found = physics_fit(world, names, best, covariance, sigma, record)
     more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
     known = [*effect_parameters(world), *(p for i in world.free for p in mass_distribution(world.bodies[i].name, 1.0))]
     return replace(
         found,
         parameters=(*found.parameters, *more),
+        correlations=(*found.correlations, *(part.correlation for part in (effects, mass) if part is not None)),
         warnings=(*found.warnings, *bound_warnings(known, more)),
         mass=mass,
         effects=effects,
@@ -405,11 +414,6 @@ def _surface_radius(world: World, index: int) -> Tensor:
     return ((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).mean()
 
 
-def _correlation(covariance: np.ndarray) -> np.ndarray:
-    std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
-    return covariance / np.outer(std, std)
-
-
 def physics_fit(
     world: World,
     names: list[Parameter],
@@ -451,6 +455,7 @@ def physics_fit(
         sigma,
         record,
         tuple(warnings),
+        correlations=(correlation_of([p.name for p in fitted], covariance),),
     )
 
 

@@ -17,12 +17,14 @@ import torch
 from torch import Tensor
 
 from ..datasets.models import Model
-from ..datasets.rollouts import ContactTable, RolloutParameter
-from ..schemas import NotConvergedError
+from ..datasets.rollouts import ContactTable
+from ..schemas import ModelFile, NotConvergedError
+from .draws import Draw
 from .physics.checks import require_apart, require_finite
 from .physics.devices import on_device
 from .physics.dispatch import rollout as roll_out
 from .physics.driven import Drive
+from .physics.effects.effect import changed_by_effects
 from .physics.fused import unsupported
 from .physics.records import ContactRecord
 from .physics.rollout import Rollout
@@ -36,24 +38,15 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Draw:
-    """A rollout before it is simulated: its global number, the model with its parameters, and where it begins."""
-
-    index: int
-    model: Model
-    parameters: tuple[RolloutParameter, ...]
-    start: Start
-
-
-@dataclass(frozen=True)
 class Motion:
     """What came of a draw: float64, T frames, B bodies, in the world frame but for omega.
 
-    position_m (T, B, 3), quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) of the body frames' origins, omega_body_rad_s
-    (T, B, 3).
+    file: the drawn model with the gravity, masses and inertias that its effects give it; position_m (T, B, 3),
+    quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) of the body frames' origins, omega_body_rad_s (T, B, 3).
     """
 
     draw: Draw
+    file: ModelFile
     position_m: np.ndarray
     quat_wxyz: np.ndarray
     velocity_m_s: np.ndarray
@@ -114,7 +107,10 @@ class Simulator:
         rollout = roll_out(there_world, there_state, self._times, driven, record_contacts=True)
         rollout = on_device(rollout, "cpu")
         assert rollout.contacts is not None  # asked for
-        return [self._result(draw, rollout, row, (world, state), names[row]) for row, draw in enumerate(draws)]
+        return [
+            self._result(draw, _as_simulated(draw.model.file, worlds[row]), rollout, row, (world, state), names[row])
+            for row, draw in enumerate(draws)
+        ]
 
     def _driven(self, draws: Sequence[Draw]) -> dict[str, Drive]:
         """Return the commands of the driven bodies, of all rollouts together."""
@@ -123,7 +119,7 @@ class Simulator:
         return {name: Drive.of([draw.start.driven[name] for draw in draws], like) for name in names}
 
     def _result(
-        self, draw: Draw, rollout: Rollout, row: int, began: tuple[World, State], name: str
+        self, draw: Draw, file: ModelFile, rollout: Rollout, row: int, began: tuple[World, State], name: str
     ) -> Motion | Diverged:
         rows = slice(row, row + 1)
         one = Rollout(
@@ -142,7 +138,7 @@ class Simulator:
             except NotConvergedError as error:
                 return Diverged(draw, error)
         assert rollout.contacts is not None
-        return Motion(draw, position, quat, velocity, omega, _contact_table(rollout.contacts, row))
+        return Motion(draw, file, position, quat, velocity, omega, _contact_table(rollout.contacts, row))
 
 
 def joined_worlds(worlds: Sequence[World]) -> World:
@@ -179,6 +175,20 @@ def _joined(things: list[T]) -> T:
 def _state(starts: Sequence[Start]) -> State:
     names = [field.name for field in fields(State)]
     return State(*(torch.as_tensor(np.stack([getattr(start, name) for start in starts])) for name in names))
+
+
+def _as_simulated(file: ModelFile, world: World) -> ModelFile:
+    """Return the model with the gravity, masses and inertias that its effects give it."""
+    if not any(active.effect.has("world") for active in world.effects):
+        return file
+    world = changed_by_effects(world)
+    bodies = []
+    for body, real in zip(file.bodies, world.bodies, strict=True):
+        inertia = real.inertia[0].tolist()
+        six = tuple(inertia[i][j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+        update = {"mass_kg": float(real.mass[0]), "com_m": tuple(real.com[0].tolist()), "inertia_kg_m2": six}
+        bodies.append(body.model_copy(update=update))
+    return file.model_copy(update={"bodies": tuple(bodies), "gravity_m_s2": tuple(world.gravity[0].tolist())})
 
 
 def _contact_table(record: ContactRecord, row: int) -> ContactTable:

@@ -1,14 +1,16 @@
 """The stage synthesize: labelled rollouts of a fitted model into HDF5.
 
-Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e; its content depends
-neither on the sharding nor on the rollouts that are simulated with it.
+Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e, and after a draw that
+the plan's rules reject from `spawn_key=(e, attempt)`; its content depends neither on the sharding nor on the rollouts
+that are simulated with it.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Generator, Iterator, Mapping
+from collections import Counter
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -21,7 +23,6 @@ import torch
 from ..datasets.atomic import sha256
 from ..datasets.cameras import Camera
 from ..datasets.dataset import new_dataset, shard_entry, shard_name
-from ..datasets.mjcf import mujoco_states, write_mjcf
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
 from ..datasets.rollout_writer import RolloutWriter
@@ -30,19 +31,20 @@ from ..schemas import (
     DatasetManifest,
     DatasetSummary,
     InputDataError,
-    ModelFile,
     SamplingPlan,
     ShardEntry,
     SynthesizeConfig,
     UsageError,
 )
+from .draws import Draw, draw_rollout
 from .labels import LabelRenderer
 from .memory import enough_memory
-from .net_forces import contact_force_n, contact_torque_n_m
 from .physics.world import World
-from .posterior import draw_parameters, not_varied
-from .rollout_batches import ENVIRONMENTS, Diverged, Draw, Motion, Simulator
-from .sampling import Start, draw_start, look_at_cameras, resolve_plan
+from .posterior import DERIVED, not_varied, require_admissible, with_correlations
+from .rejection import Rejection, accepted_rollouts
+from .rollout_batches import ENVIRONMENTS, Diverged, Simulator
+from .rollout_labels import labels_of
+from .sampling import look_at_cameras, resolve_plan
 from .stopwatch import Stopwatch
 
 STATE_ONLY = (
@@ -67,7 +69,16 @@ class _Job:
     cameras: Mapping[str, Camera]
     renderer: LabelRenderer | None
     simulator: Simulator
+    rejection: Rejection
     device: str
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What became of draws that are not in the dataset: rejected, by rule; and what is said of those that diverged."""
+
+    rejected: Counter[str]
+    diverged: list[str]
 
 
 def synthesize(
@@ -86,12 +97,12 @@ def synthesize(
         stopwatch: To measure where the time goes.
 
     Returns:
-        What was written, with its hash and the speed. Rollouts that diverge are left out and named in its notes.
+        What was written, with its hash and the speed, and how many draws were rejected by which rule.
 
     Raises:
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
-        NotConvergedError: If all simulations diverge.
+        NotConvergedError: If the rules reject all draws for a rollout, or too many of them diverge.
         NotEnoughSpaceError: If the disk is full.
         NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """
@@ -110,28 +121,20 @@ def _written(
     notes = _notes(job)
     manifest = _manifest(model, job, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
-    contacts = 0
-    diverged: list[Diverged] = []
+    contacts, outcome = 0, _Outcome(Counter(), [])
     with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
         with RolloutWriter(path, config.seed, config_json, f"cgwm {version('cgwm')}", config.compression) as writer:
-            with closing(_simulated(job, indices, stopwatch)) as found:
-                for motion in progress(found, "rollouts", len(indices), "rollout"):
-                    if isinstance(motion, Diverged):
-                        diverged.append(motion)
-                        continue
-                    with stopwatch.part("labels"):
-                        labels = _labels(job, motion)
+            with closing(_rollouts(job, indices, outcome, stopwatch)) as found:
+                for draw, labels in progress(found, "rollouts", len(indices), "rollout"):
                     with stopwatch.part("render and hand over"):
-                        writer.write(labels, _frames(job, labels, stopwatch))
+                        writer.write(labels, _frames(job, draw, labels, stopwatch))
                     contacts += len(labels.contacts.body_a)
-            if len(diverged) == len(indices):
-                raise diverged[0].error
             ended = time.perf_counter()
         stopwatch.seconds["wait for the writer"] = time.perf_counter() - ended
-        written = len(indices) - len(diverged)
         with stopwatch.part("hash"):
-            entries.append(_entry(path, config, written, writer.total * max(1, len(job.cameras))))
-    notes += tuple(f"left out: {one.error.found}" for one in diverged)
+            entry = _entry(path, config, len(indices), writer.total * max(1, len(job.cameras)))
+        entries.append(entry.model_copy(update={"rejected": dict(sorted(outcome.rejected.items()))}))
+    notes += tuple(f"drawn again: {found}" for found in outcome.diverged)
     seconds = time.perf_counter() - began
     entry = entries[0]
     return DatasetSummary(
@@ -145,6 +148,8 @@ def _written(
         cameras=tuple(job.cameras),
         seconds=seconds,
         frames_per_s=entry.frames / seconds,
+        rejected=entry.rejected,
+        plan=job.plan,
         notes=notes,
     )
 
@@ -164,36 +169,57 @@ def shard_indices(config: SynthesizeConfig) -> range:
     return range(first, last)
 
 
-def draw_rollout(job: _Job, index: int) -> Draw:
-    """Draw the parameters and the start of the rollout with the global number `index`."""
-    rng = np.random.default_rng(np.random.SeedSequence(job.config.seed, spawn_key=(index,)))
-    file, parameters = draw_parameters(job.model.file, job.plan.parameter_spread, rng)
-    model = replace(job.model, file=file)
-    return Draw(index, model, parameters, draw_start(model, job.plan, float(job.times_s[-1]), rng))
-
-
-def _simulated(job: _Job, indices: range, stopwatch: Stopwatch) -> Generator[Motion | Diverged, None, None]:
-    """Yield the rollouts in the order of their numbers; the next batch is simulated meanwhile."""
+def _rollouts(
+    job: _Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch
+) -> Generator[tuple[Draw, RolloutLabels], None, None]:
+    """Yield the accepted rollouts in the order of their numbers; the next batch is simulated meanwhile."""
     size = job.config.batch or ROLLOUTS_AT_ONCE[job.device]
     batches = [indices[first : first + size] for first in range(0, len(indices), size)]
     with ThreadPoolExecutor(1, "cgwm-simulate") as ahead:
-        following = ahead.submit(_simulate, job, batches[0], stopwatch)
+        following = ahead.submit(_batch, job, batches[0], outcome, stopwatch)
         for number in range(len(batches)):
             with stopwatch.part("wait for simulation"):
                 found = following.result()
             if number + 1 < len(batches):
-                following = ahead.submit(_simulate, job, batches[number + 1], stopwatch)
+                following = ahead.submit(_batch, job, batches[number + 1], outcome, stopwatch)
             yield from found
 
 
-def _simulate(job: _Job, indices: range, stopwatch: Stopwatch) -> list[Motion | Diverged]:
-    with stopwatch.part("draw"):
-        draws = [draw_rollout(job, index) for index in indices]
-    with stopwatch.part("simulate", job.device == "cuda"):
-        return job.simulator.run(draws, job.config.seed)
+def _batch(job: _Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch) -> list[tuple[Draw, RolloutLabels]]:
+    duration_s = float(job.times_s[-1])
+
+    def draw(index: int, attempt: int) -> Draw:
+        with stopwatch.part("draw"):
+            return draw_rollout(job.model, job.plan, job.config, job.cameras, duration_s, index, attempt)
+
+    def simulate(draws: Sequence[Draw]) -> list[RolloutLabels | Diverged]:
+        with stopwatch.part("simulate", job.device == "cuda"):
+            found = job.simulator.run(draws, job.config.seed)
+        outcome.diverged.extend(one.error.found for one in found if isinstance(one, Diverged))
+        with stopwatch.part("labels"):
+            return [
+                one if isinstance(one, Diverged) else labels_of(one, job.plan, job.config.seed, job.times_s)
+                for one in found
+            ]
+
+    attempts = job.plan.reject.attempts
+    return list(accepted_rollouts(indices, draw, simulate, job.rejection.reason, attempts, outcome.rejected))
 
 
-def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
+def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
+    """Return a plan with what it leaves out filled in for a model.
+
+    Args:
+        model: MODEL.
+        plan: The plan.
+
+    Raises:
+        InputDataError: If `model` is no model or has no fitted physics, or the plan does not fit it.
+    """
+    return _with_plan(model, plan)[1]
+
+
+def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
     model = read_model(path)
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking:
@@ -203,7 +229,13 @@ def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
         )
     if model.file.contact is None:
         World.from_model(model)  # says what is missing, and how to get it
-    plan = resolve_plan(model, config.plan)
+    model = replace(model, file=with_correlations(model))
+    require_admissible(model.file, plan.parameters)
+    return model, resolve_plan(model, plan)
+
+
+def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
+    model, plan = _with_plan(path, config.plan)
     count = round(config.duration_s * config.frame_rate_hz) + 1
     if count < 2:
         raise UsageError(
@@ -211,10 +243,16 @@ def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
         )
     device = _device(config)
     visible = bool(model.body_splats)
+    if plan.reject.unseen_share is not None and not visible:
+        raise InputDataError(
+            f"{path}: the model has no visual spheres, so that no camera sees it, and the plan has unseen_share.",
+            todo="leave unseen_share out of [reject].",
+        )
     cameras = look_at_cameras(model, plan, config) if visible else {}
     renderer = LabelRenderer(model, cameras, device) if visible else None
     times = np.arange(count) / config.frame_rate_hz
-    return _Job(model, config, plan, times, cameras, renderer, Simulator(model, times, device), device)
+    simulator, rejection = Simulator(model, times, device), Rejection.of(model, plan.reject)
+    return _Job(model, config, plan, times, cameras, renderer, simulator, rejection, device)
 
 
 @contextmanager
@@ -262,6 +300,12 @@ def _notes(job: _Job) -> tuple[str, ...]:
     spread = [p.name for p in job.model.file.parameters if p.std_error and p.name not in kept]
     if job.plan.parameter_spread > 0 and not spread:
         notes.append("no physical parameter has a standard error, so all rollouts have the same physics")
+    together = {name for block in job.model.file.correlations for name in block.parameters}
+    alone = [name for name in spread if name not in together and name not in DERIVED]
+    if job.plan.parameter_spread > 0 and len(alone) > 1:
+        notes.append(f"drawn each by itself, because the model has no correlations of them: {', '.join(alone)}")
+    if job.plan.light_turn_deg.support != (0.0, 0.0) and job.model.file.light is None:
+        notes.append("light_turn_deg turns nothing: the model has no light")
     unseen = [b.name for b in job.model.file.bodies if b.name not in job.model.body_splats]
     if job.renderer is not None and unseen:
         notes.append(f"not in the images, because they have no visual spheres: {', '.join(unseen)}")
@@ -272,60 +316,19 @@ def _entry(path: Path, config: SynthesizeConfig, rollouts: int, frames: int) -> 
     return shard_entry(path, config.shard, rollouts, frames, shard_name(config.shard, config.shards))
 
 
-def _frames(job: _Job, labels: RolloutLabels, stopwatch: Stopwatch) -> Iterator[FrameBlock]:
+def _frames(job: _Job, draw: Draw, labels: RolloutLabels, stopwatch: Stopwatch) -> Iterator[FrameBlock]:
     if job.renderer is None:
         return
-    blocks = job.renderer.blocks(labels.position_m, labels.quat_wxyz, wait=False)
+    with stopwatch.part("render", job.device == "cuda"):
+        if job.plan.moving_views:
+            job.renderer.set_cameras(draw.cameras)
+        if job.plan.light_turn_deg.support != (0.0, 0.0) and draw.lighting.light is not None:
+            job.renderer.set_light(draw.lighting.light)
+        exposures = None if draw.lighting.plain else draw.lighting.exposures
+        blocks = job.renderer.blocks(labels.position_m, labels.quat_wxyz, wait=False, exposures=exposures)
     while True:
         with stopwatch.part("render", job.device == "cuda"):
             block = next(blocks, None)
         if block is None:
             return
         yield block
-
-
-def _labels(job: _Job, motion: Motion) -> RolloutLabels:
-    draw, contacts, model = motion.draw, motion.contacts, motion.draw.model
-    bodies = model.file.bodies
-    actions, meaning = _actions(model.file, draw.start, job.plan, len(job.times_s))
-    poses = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
-    mass = np.array([body.mass_kg for body in bodies])
-    inertia = np.array([body.inertia_kg_m2 for body in bodies])
-    free = np.array([body.motion == "free" for body in bodies])
-    return RolloutLabels(
-        episode_index=draw.index,
-        seed=job.config.seed,
-        model_mjcf=write_mjcf(model, job.cameras),
-        time_s=job.times_s,
-        states=mujoco_states(model.file, job.times_s, poses),
-        actions=actions,
-        action_meaning=meaning,
-        bodies=tuple(body.name for body in bodies),
-        motions=tuple(body.motion for body in bodies),
-        mass_kg=mass,
-        com_m=np.array([body.com_m for body in bodies]),
-        inertia_kg_m2=inertia,
-        position_m=motion.position_m,
-        quat_wxyz=motion.quat_wxyz,
-        velocity_m_s=motion.velocity_m_s,
-        omega_body_rad_s=motion.omega_body_rad_s,
-        gravity_m_s2=np.array(model.file.gravity_m_s2),
-        contacts=contacts,
-        contact_force_n=contact_force_n(contacts, job.times_s, len(bodies)),
-        contact_torque_n_m=contact_torque_n_m(motion.quat_wxyz, motion.omega_body_rad_s, inertia, job.times_s, free),
-        parameters=draw.parameters,
-        effects={effect.name: effect.parameters for effect in model.file.effects},
-        cameras=job.cameras,
-    )
-
-
-def _actions(file: ModelFile, start: Start, plan: SamplingPlan, count: int) -> tuple[np.ndarray, str]:
-    """Return the commands (T, A): velocities of the driven bodies over the plan's largest push speed."""
-    driven = [index for index, body in enumerate(file.bodies) if body.motion == "driven"]
-    if not driven:
-        return np.zeros((count, 1)), "No body is driven: zero."
-    scale = max(plan.push_speed_m_s[1], 1e-9)
-    names = ", ".join(file.bodies[index].name for index in driven)
-    command = np.concatenate([start.velocity_m_s[index] for index in driven]) / scale
-    text = f"Velocity command of {names}, world axes, in units of {scale:g} m/s."
-    return np.repeat(command[None], count, axis=0), text

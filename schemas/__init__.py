@@ -40,7 +40,6 @@ from .dataset import (
     ROLLOUTS_FORMAT,
     DatasetManifest,
     DatasetSummary,
-    SamplingPlan,
     ShardEntry,
 )
 from .demo import (
@@ -81,6 +80,7 @@ from .model import (
     MODEL_FORMAT,
     BodyModel,
     ContactParameters,
+    Correlation,
     EffectModel,
     Exposure,
     FitFile,
@@ -91,8 +91,9 @@ from .model import (
     Solver,
 )
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
+from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
 from .results import EpisodeErrors, ErrorSummary, EvalResult
-from .validation import ValidationReport
+from .validation import Failure, ValidationReport
 
 __all__ = [
     "CAMERAS_FORMAT",
@@ -120,12 +121,14 @@ __all__ = [
     "CompareResult",
     "ComparedParameter",
     "ContactParameters",
+    "Correlation",
     "DatasetManifest",
     "DatasetSummary",
     "DemoResult",
     "DemoTarget",
     "Device",
     "DiagnoseResult",
+    "Distribution",
     "DoctorReport",
     "EffectEstimate",
     "EffectModel",
@@ -136,6 +139,7 @@ __all__ = [
     "ErrorSummary",
     "EvalResult",
     "Exposure",
+    "Failure",
     "FileModel",
     "FileShape",
     "FitFile",
@@ -175,6 +179,7 @@ __all__ = [
     "PosedVideo",
     "Provenance",
     "RankedEffect",
+    "RejectionRules",
     "ResidualLaw",
     "SamplingPlan",
     "Scale",
@@ -196,6 +201,8 @@ __all__ = [
     "WorstMoment",
     "did_you_mean",
     "parse",
+    "plan_toml",
     "read_json",
+    "read_plan",
     "read_toml",
 ]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from .base import FileModel
-from .dataset import SamplingPlan
+from .plan import SamplingPlan
 
 Device = Literal["auto", "cpu", "cuda"]
 

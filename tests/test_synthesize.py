@@ -291,7 +291,7 @@ def test_starts_are_above_the_ground_and_within_the_plan() -> None:
         assert 0.02 - 1e-12 <= gap <= 0.2 + 1e-12
         assert np.linalg.norm(start.position_m[0, :2]) <= 0.1 + 1e-12
         assert np.linalg.norm(start.quat_wxyz[0]) == pytest.approx(1)
-        assert plan.spin_rad_s and np.linalg.norm(start.omega_body_rad_s[0]) <= plan.spin_rad_s[1]
+        assert plan.spin_rad_s and np.linalg.norm(start.omega_body_rad_s[0]) <= plan.spin_rad_s.support[1]
 
 
 def test_two_bodies_start_apart() -> None:
