@@ -17,6 +17,7 @@ import torch
 from ..datasets.models import Model
 from ..datasets.rollouts import Node
 from ..schemas import EffectModel
+from .net_forces import contact_torque_n_m
 from .physics.effects import load_effect
 from .physics.rollout import Engine
 from .physics.world import State, World
@@ -150,23 +151,28 @@ def _levers(
 def _check_forces(
     contacts: dict[str, np.ndarray], read: dict[str, np.ndarray], time: np.ndarray, frame: np.ndarray
 ) -> Iterator[Fault]:
-    """Labelled forces, where there are any, are the impulses over the time between the frames."""
+    """Labelled forces are the impulses, and torques the changes of angular momentum, by time between the frames."""
     length = np.concatenate([[np.inf], np.diff(time)])
-    scale = float(np.abs(contacts["impulse_world"]).max(initial=1e-12)) / float(np.diff(time).min())
-    pairs = []
-    if "force_world" in contacts:
-        expected = contacts["impulse_world"] / length[frame][:, None]
-        pairs.append(("contacts/force_world", contacts["force_world"], expected, frame))
-    if "contact_force" in read:
-        total = [_impulses(contacts, frame, index, len(time)) for index in range(len(read["motions"]))]
-        expected = np.stack(total, axis=1) / length[:, None, None]
-        pairs.append(("bodies/contact_force", read["contact_force"], expected, np.arange(len(time))))
-    for name, found, expected, frames in pairs:
-        errors = np.abs(found - expected).reshape(len(frames), -1).max(1, initial=0.0)
-        if len(errors) and not errors.max() <= IMPULSE_TOLERANCE * scale:
+    total = [_impulses(contacts, frame, index, len(time)) for index in range(len(read["motions"]))]
+    force = np.stack(total, axis=1) / length[:, None, None]
+    row_force = contacts["impulse_world"] / length[frame][:, None]
+    keys = ("quat_wxyz", "omega_body", "inertia")
+    torque = contact_torque_n_m(*(read[key] for key in keys), time, read["motions"] == b"free")
+    numbers = np.arange(len(time))
+    impulses, turns = "the impulses over the time between frames", "the change of angular momentum over that time"
+    for name, found, expected, frames, what, unit in (
+        ("contacts/force_world", contacts["force_world"], row_force, frame, impulses, "N"),
+        ("bodies/contact_force", read["contact_force"], force, numbers, impulses, "N"),
+        ("bodies/contact_torque", read["contact_torque"], torque, numbers, turns, "N m"),
+    ):
+        if not len(frames):
+            continue
+        errors = np.abs(found - expected).reshape(len(frames), -1).max(1)
+        limit = IMPULSE_TOLERANCE * max(float(np.abs(expected).max()), 1e-12)
+        if not errors.max() <= limit:
             worst = int(frames[errors.argmax()])
-            text = f"{name}: frame {worst}: off the impulses over the time between frames by {errors.max():.3g} N."
-            yield Fault("forces", text, worst, value=float(errors.max()), limit=IMPULSE_TOLERANCE * scale)
+            text = f"{name}: frame {worst}: off {what} by {errors.max():.3g} {unit}."
+            yield Fault("forces", text, worst, value=float(errors.max()), limit=limit)
 
 
 def _check_momentum(

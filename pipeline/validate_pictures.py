@@ -69,12 +69,12 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
         if any(item.shape[1:] != size for item in sets):
             yield Fault("shape", f"obs/{camera_name}_mask: shape {sets[0].shape[1:]}; the camera has {size}.")
             continue
-        amodal_set = demo.get(f"obs/{camera_name}_amodal")
-        visible = demo["bodies/visible_px"][:, number] if "visible_px" in demo["bodies"] else None
+        amodal_set = demo[f"obs/{camera_name}_amodal"]
+        counts = {key: demo[f"bodies/{key}"][:, number] for key in ("visible_px", "amodal_px", "visible_fraction")}
         for first in range(0, count, sets[0].chunks[0] if sets[0].chunks else count):
             frames = range(first, min(count, first + (sets[0].chunks[0] if sets[0].chunks else count)))
             masks, depths = (item[frames.start : frames.stop] for item in sets)
-            amodals = None if amodal_set is None else amodal_set[frames.start : frames.stop]
+            amodals = amodal_set[frames.start : frames.stop]
             for frame in frames:
                 mask, depth = masks[frame - first], depths[frame - first]
                 place = f"obs/{camera_name}_mask, frame {frame}"
@@ -82,8 +82,9 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
                     text = f"{place}: label {mask.max()}; there are {len(names)} bodies."
                     yield Fault("labels", text, frame, camera_name, value=float(mask.max()), limit=len(names))
                     continue
-                if visible is not None:
-                    yield from _check_counts(mask, visible[frame], names, frame, camera_name)
+                bits = [amodals[frame - first] >> np.uint8(body) & 1 > 0 for body in range(len(names))]
+                listed = {key: values[frame] for key, values in counts.items()}
+                yield from _check_counts(mask, bits, listed, names, frame, camera_name)
                 painted = {
                     body: _paint(model, name, position[frame, body], quat[frame, body], camera)
                     for body, name in enumerate(names)
@@ -92,8 +93,8 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
                 for body, spheres in painted.items():
                     others = [other for index, other in painted.items() if index != body]
                     shown = mask == body + 1
-                    bits = None if amodals is None else (amodals[frame - first] >> np.uint8(body)) & 1 > 0
-                    fault = _compare(spheres, others, shown, depth, bits, findings)
+                    whole = _compare_amodal(spheres, bits[body], findings)
+                    fault = _compare(spheres, others, shown, depth, findings) or whole
                     if fault is not None:
                         check, text, value, limit = fault
                         place = f"obs/{camera_name}, frame {frame}, body '{names[body]}'"
@@ -105,13 +106,20 @@ def _camera(group: Node) -> Camera:
     return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
 
 
-def _check_counts(mask: np.ndarray, visible: np.ndarray, names: list[str], frame: int, camera: str) -> Iterator[Fault]:
-    """`bodies/visible_px` counts the pixels of the mask."""
-    counted = np.bincount(mask.ravel(), minlength=len(names) + 1)[1 : len(names) + 1]
-    for name, found, listed in zip(names, counted, visible, strict=True):
-        if found != listed:
-            text = f"bodies/visible_px: frame {frame}, camera {camera}, body '{name}': {listed}; the mask has {found}."
-            yield Fault("labels", text, frame, camera, name, float(listed), float(found))
+def _check_counts(
+    mask: np.ndarray, amodal: list[np.ndarray], listed: dict[str, np.ndarray], names: list[str], frame: int, camera: str
+) -> Iterator[Fault]:
+    """`bodies/visible_px` counts the pixels of the mask, `amodal_px` the bits; `visible_fraction` is their quotient."""
+    visible = np.bincount(mask.ravel(), minlength=len(names) + 1)[1 : len(names) + 1]
+    whole = np.array([part.sum() for part in amodal])
+    fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
+    found = {"visible_px": visible, "amodal_px": whole, "visible_fraction": fraction}
+    for key, values in listed.items():
+        for name, value, expected in zip(names, values, found[key], strict=True):
+            if not abs(value - expected) <= 1e-6:
+                text = f"bodies/{key}: frame {frame}, camera {camera}, body '{name}': {value:g}; "
+                text += f"the masks have {expected:g}."
+                yield Fault("labels", text, frame, camera, name, float(value), float(expected))
 
 
 def _paint(model: Model, name: str, position: np.ndarray, quat: np.ndarray, camera: Camera) -> _Painted:
@@ -143,7 +151,6 @@ def _compare(
     others: list[_Painted],
     mask: np.ndarray,
     depth: np.ndarray,
-    amodal: np.ndarray | None,
     findings: PictureFindings,
 ) -> tuple[str, str, float, float] | None:
     """Compare a body's mask and depth with its projected spheres.
@@ -153,11 +160,6 @@ def _compare(
     """
     area, covered = int(mask.sum()), body.covered
     reach = DEPTH_RADII * body.radius_m
-    if amodal is not None and max(int(covered.sum()), int(amodal.sum())) >= MIN_IOU_PX:
-        iou = float((amodal & covered).sum() / (amodal | covered).sum())
-        findings.amodal_iou.append(iou)
-        if iou < MIN_IOU:
-            return "amodal mask", f"amodal mask and pose overlap by {iou:.2f}; {MIN_IOU} is allowed.", iou, MIN_IOU
     hidden = covered & ~mask & (depth > 0) & (depth < body.depth - reach)
     for other in others:
         hidden |= covered & ~mask & other.covered & (other.depth < body.depth)
@@ -189,6 +191,20 @@ def _compare(
             text = f"its depth is off that of its pose by {error:.3g} m (median); {reach:.2g} m is allowed."
             return "depth", text, error, reach
     return None
+
+
+def _compare_amodal(
+    body: _Painted, amodal: np.ndarray, findings: PictureFindings
+) -> tuple[str, str, float, float] | None:
+    """Compare a body's amodal mask with its projected spheres, hidden or not; returns what `_compare` does."""
+    covered = body.covered
+    if max(int(covered.sum()), int(amodal.sum())) < MIN_IOU_PX:
+        return None
+    iou = float((amodal & covered).sum() / (amodal | covered).sum())
+    findings.amodal_iou.append(iou)
+    if iou >= MIN_IOU:
+        return None
+    return "amodal mask", f"amodal mask and pose overlap by {iou:.2f}; {MIN_IOU} is allowed.", iou, MIN_IOU
 
 
 def picture_facts(findings: PictureFindings) -> dict[str, Any]:
