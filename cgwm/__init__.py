@@ -18,6 +18,8 @@ _PUBLIC = {
     "Capture": ".datasets.capture",
     "CgwmError": ".schemas",
     "CheckFailedError": ".schemas",
+    "DamagedShardError": ".schemas",
+    "DiskFullError": ".schemas",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
     "NotConvergedError": ".schemas",
@@ -40,6 +42,7 @@ _PUBLIC = {
     "import_pinwm": ".datasets.pinwm",
     "import_rosbag": ".datasets.rosbag",
     "import_tum": ".datasets.tum",
+    "merge": ".pipeline.merge",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.mystery",
@@ -65,6 +68,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
     from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
+    from .pipeline.merge import merge  # pyright: ignore[reportMissingImports]
     from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
     from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
     from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
@@ -72,6 +76,8 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
         CalibrateConfig,
         CgwmError,
         CheckFailedError,
+        DamagedShardError,
+        DiskFullError,
         InputDataError,
         NotConvergedError,
         NotEnoughMemoryError,
@@ -86,6 +92,8 @@ __all__ = [
     "Capture",
     "CgwmError",
     "CheckFailedError",
+    "DamagedShardError",
+    "DiskFullError",
     "InputDataError",
     "Model",
     "NotConvergedError",
@@ -109,6 +117,7 @@ __all__ = [
     "import_pinwm",
     "import_rosbag",
     "import_tum",
+    "merge",
     "read_model",
     "run_demo",
     "run_mystery",

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
-from .run import running
+from .run import running, typed
 
 if TYPE_CHECKING:
-    from ..schemas import DatasetSummary
+    from ..schemas import DatasetSummary, ShardsSummary
 
 
 def synthesize(
@@ -26,6 +28,22 @@ def synthesize(
         str | None,
         typer.Option("--shard", metavar="I/N", show_default="0/1", help="Make shard I of N; I runs from 0 to N-1."),
     ] = None,
+    shards: Annotated[
+        int | None,
+        typer.Option("--shards", min=1, metavar="N", help="Make N shards, all of them.", show_default=False),
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            "--ray",
+            metavar="[ADDRESS]",
+            help="Make the shards on a Ray cluster: its address; local; or the one that is there.",
+            show_default=False,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the shards that are complete; with --overwrite remake damaged ones.")
+    ] = False,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -37,15 +55,26 @@ def synthesize(
 ) -> None:
     """A model to labelled rollouts in HDF5: images, depth, masks, poses, contacts, parameters."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.synthesize import synthesize as work
-        from ..schemas import SynthesizeConfig
+        from ..schemas import SynthesizeConfig, UsageError
         from .settings import StageSettings
 
-        index, count = _shard(shard) if shard is not None else (None, None)
+        if shard is not None and (shards is not None or ray is not None):
+            other = "--shards" if shards is not None else "--ray"
+            raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
+        index, count = _shard(shard) if shard is not None else (None, shards)
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
         )
-        emit(work(model, out, settings, overwrite), _summary)
+        if shards is None and ray is None:
+            from ..pipeline.synthesize import synthesize as work
+
+            emit(work(model, out, settings, overwrite, resume), lambda summary: _summary(summary, settings.shards))
+        else:
+            from ..pipeline.cluster import default_shards, synthesize_shards
+
+            if "shards" not in settings.model_fields_set:
+                settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
+            emit(synthesize_shards(model, out, settings, overwrite, resume, ray), _shards_summary)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -57,7 +86,7 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-def _summary(summary: DatasetSummary) -> str:
+def _summary(summary: DatasetSummary, count: int) -> str:
     from .output import table, warnings
 
     rows = [
@@ -65,9 +94,53 @@ def _summary(summary: DatasetSummary) -> str:
         ["frames", str(summary.frames)],
         ["contacts", str(summary.contacts)],
         ["size", f"{summary.bytes / 1e6:.1f} MB"],
-        ["speed", f"{summary.frames_per_s:.1f} frames/s"],
-        ["time", f"{summary.seconds:.1f} s"],
     ]
+    if not summary.up_to_date:
+        rows += [["speed", f"{summary.frames_per_s:.1f} frames/s"], ["time", f"{summary.seconds:.1f} s"]]
     cameras = ", ".join(summary.cameras) or "none"
-    head = f"Wrote {summary.dataset}/{summary.shard}; cameras: {cameras}."
-    return "\n".join([head, table(rows), *warnings(summary.notes)])
+    place = f"{summary.dataset}/{summary.shard}"
+    head = f"{place} is up to date" if summary.up_to_date else f"Wrote {place}"
+    lines = [f"{head}; cameras: {cameras}.", table(rows)]
+    if count > 1 and "SLURM_JOB_ID" not in os.environ:
+        lines += [f"all {count} on SLURM: {_slurm_line(typed(), count)}", f"then: cgwm merge {summary.dataset}"]
+    return "\n".join([*lines, *warnings(summary.notes)])
+
+
+def _slurm_line(arguments: list[str], count: int) -> str:
+    """Return the command that submits all shards, from the one that made one of them.
+
+    >>> _slurm_line(["synthesize", "m", "--shard", "3/9", "-o", "data"], 9)
+    "sbatch --array=0-8 --wrap 'cgwm synthesize m --shard $SLURM_ARRAY_TASK_ID/9 -o data --resume'"
+    """
+    words = ["cgwm"]
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if before == "--shard" or word.startswith("--shard="):
+            words.append(f"{'--shard=' if word.startswith('--shard=') else ''}$SLURM_ARRAY_TASK_ID/{count}")
+        else:
+            words.append(shlex.quote(word))
+    line = " ".join(words + ["--resume"] * ("--resume" not in arguments))
+    return f"sbatch --array=0-{count - 1} --wrap {shlex.quote(line)}"
+
+
+def _shards_summary(summary: ShardsSummary) -> str:
+    from .output import table, warnings
+
+    kept = summary.shards - summary.made
+    rows = [
+        ["shards", str(summary.shards)],
+        ["rollouts", str(summary.rollouts)],
+        ["frames", str(summary.frames)],
+        ["size", f"{summary.bytes / 1e6:.1f} MB"],
+    ]
+    if summary.made:
+        rows += [["speed", f"{summary.frames_per_s:.1f} frames/s"], ["time", f"{summary.seconds:.1f} s"]]
+    upkeep = f", {kept} were up to date" if kept and summary.made else ""
+    head = (
+        f"Wrote {summary.made} shards of {summary.dataset}{upkeep}"
+        if summary.made
+        else f"{summary.dataset} is up to date"
+    )
+    lines = [f"{head}.", table(rows)]
+    if summary.shards > 1:
+        lines.append(f"to read it as one file: cgwm merge {summary.dataset}")
+    return "\n".join([*lines, *warnings(summary.notes)])

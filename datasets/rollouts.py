@@ -18,6 +18,7 @@ import numpy as np
 
 from ..schemas import ROLLOUTS_FORMAT, InputDataError
 from .cameras import Camera
+from .sink import Sink
 
 Compression = Literal["zstd", "gzip", "none"]
 
@@ -29,6 +30,9 @@ CHUNK_FRAMES = 8
 
 ZSTD_FILTER = 32015
 """HDF5's registered number of the zstd filter, which hdf5plugin brings."""
+
+SHARDS = "shards"
+"""Group of an index: the files that it looks into (`file`, relative to it), with their `bytes` and `sha256`."""
 
 VALID_EVERY = 5
 """Every n-th rollout (by global index, the last of each group) belongs to `mask/valid`, the others to `mask/train`."""
@@ -154,7 +158,7 @@ def _require_zstd(what: str) -> None:
 
 
 def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
-    """Open a shard for reading.
+    """Open a shard, or the index of several, for reading.
 
     Args:
         path: An HDF5 file of rollouts.
@@ -175,10 +179,25 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
             raise InputDataError(f"{path}: its format attribute is '{found}'.", f"'{ROLLOUTS_FORMAT}'.")
         if "zstd" in str(file.attrs.get("filters", "")):
             _require_zstd(f"reading {path}")
+        if SHARDS in file:
+            _refuse_lost(path, file[SHARDS])
     except BaseException:
         file.close()
         raise
     return file
+
+
+def _refuse_lost(path: Path, shards: Node) -> None:
+    """Refuse an index whose shards are not all there: HDF5 would read fill values, and say nothing."""
+    for name, size in zip(shards["file"][()], shards["bytes"][()], strict=True):
+        shard = path.resolve().parent / name.decode()
+        if not shard.is_file() or shard.stat().st_size != size:
+            found = f"{shard.stat().st_size} bytes" if shard.is_file() else "no such file"
+            raise InputDataError(
+                f"{path}: an index that looks into {name.decode()}: {found}.",
+                f"a shard of {size} bytes there.",
+                "put the shard back, or make the index again with 'cgwm merge --overwrite'.",
+            )
 
 
 def demo_names(file: h5py.File) -> list[str]:
@@ -202,7 +221,8 @@ class RolloutWriter:
 
     def __init__(self, path: Path, seed: int, config_json: str, creator: str, compression: Compression = "zstd"):
         self._options = filter_options(compression)
-        self._file = h5py.File(path, "w")
+        self._sink = Sink(path)
+        self._file = h5py.File(self._sink, "w")
         self._file.attrs.update(
             format=ROLLOUTS_FORMAT,
             format_version=1,
@@ -224,9 +244,16 @@ class RolloutWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self._finish()
-        self._file.close()
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            try:
+                self._file.close()
+            finally:
+                self._sink.close()
+                if kind is None or issubclass(kind, Exception):
+                    self._sink.check()  # what went wrong first; the others follow from it
 
     def write(self, labels: RolloutLabels, frames: Iterable[FrameBlock] = ()) -> None:
         """Write one rollout; `frames` may be a generator, and is consumed block by block."""
@@ -248,6 +275,7 @@ class RolloutWriter:
             pixels = np.stack([visible[name] for name in cameras], axis=1)
             _put(demo["bodies"], "visible_px", pixels, "px", "image", "-", axes, text)
         _link_next_observations(demo)
+        self._sink.check()
         self._indices.append(labels.episode_index)
         self.total += count
 

@@ -19,11 +19,12 @@ import torch
 
 from ..datasets.atomic import sha256
 from ..datasets.cameras import Camera
-from ..datasets.dataset import new_dataset, shard_entry, shard_name
+from ..datasets.dataset import finished_shard, new_dataset, shard_entry
 from ..datasets.mjcf import mujoco_states, write_mjcf
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
 from ..datasets.rollouts import ContactTable, FrameBlock, RolloutLabels, RolloutParameter, RolloutWriter
+from ..datasets.shards import contact_count, shard_name, shard_range
 from ..schemas import (
     DatasetManifest,
     DatasetSummary,
@@ -63,7 +64,9 @@ class _Job:
     device: str
 
 
-def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False) -> DatasetSummary:
+def synthesize(
+    model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False, resume: bool = False
+) -> DatasetSummary:
     """Write one shard of a dataset of labelled rollouts.
 
     With one shard, `out` appears complete. With more, every call adds its shard to `out` (the first that is ready
@@ -74,6 +77,7 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         out: DATASET.
         config: The settings; times, sizes and the sampling plan are in it.
         overwrite: Replace what is there: the dataset where it has one shard, else the shard.
+        resume: Keep the shard if it is there and its hash is right. With `overwrite`, a damaged one is made again.
 
     Returns:
         What was written, with its hash and the speed.
@@ -81,6 +85,8 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
     Raises:
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
+        DamagedShardError: If a shard that is to be kept is not what was written.
+        DiskFullError: If there is no room for the shard.
         NotConvergedError: If a simulation diverges.
         NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """
@@ -89,15 +95,17 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         job = _prepare(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
-        return _written(job, model, out, config, overwrite, began)
+        return _written(job, model, out, config, overwrite, resume, began)
 
 
 def _written(
-    job: _Job, model: Path, out: Path, config: SynthesizeConfig, overwrite: bool, began: float
+    job: _Job, model: Path, out: Path, config: SynthesizeConfig, overwrite: bool, resume: bool, began: float
 ) -> DatasetSummary:
     indices = shard_indices(config)
     notes = _notes(job)
     manifest = _manifest(model, job, notes)
+    if resume and (kept := finished_shard(out, manifest, config.shard, overwrite)) is not None:
+        return _summary(out, job, kept, contact_count(out / kept.file), time.perf_counter() - began, True, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
     contacts = 0
     with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
@@ -106,9 +114,13 @@ def _written(
                 labels = simulate_rollout(job, index)
                 writer.write(labels, _frames(job, labels))
                 contacts += len(labels.contacts.body_a)
-        entries.append(_entry(path, config, len(indices), writer.total * max(1, len(job.cameras))))
-    seconds = time.perf_counter() - began
-    entry = entries[0]
+        entries.append(_entry(path, job, len(indices), writer.total * max(1, len(job.cameras))))
+    return _summary(out, job, entries[0], contacts, time.perf_counter() - began, False, notes)
+
+
+def _summary(
+    out: Path, job: _Job, entry: ShardEntry, contacts: int, seconds: float, up_to_date: bool, notes: tuple[str, ...]
+) -> DatasetSummary:
     return DatasetSummary(
         dataset=str(out),
         shard=entry.file,
@@ -119,7 +131,8 @@ def _written(
         contacts=contacts,
         cameras=tuple(job.cameras),
         seconds=seconds,
-        frames_per_s=entry.frames / seconds,
+        frames_per_s=0.0 if up_to_date else entry.frames / seconds,
+        up_to_date=up_to_date,
         notes=notes,
     )
 
@@ -135,8 +148,7 @@ def shard_indices(config: SynthesizeConfig) -> range:
             f"{config.shards} shards for {config.rollouts} rollouts: some would be empty.",
             f"1 to {config.rollouts} shards.",
         )
-    first, last = (config.rollouts * k // config.shards for k in (config.shard, config.shard + 1))
-    return range(first, last)
+    return shard_range(config.rollouts, config.shards, config.shard)
 
 
 def simulate_rollout(job: _Job, index: int) -> RolloutLabels:
@@ -235,8 +247,9 @@ def _notes(job: _Job) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _entry(path: Path, config: SynthesizeConfig, rollouts: int, frames: int) -> ShardEntry:
-    return shard_entry(path, config.shard, rollouts, frames, shard_name(config.shard, config.shards))
+def _entry(path: Path, job: _Job, rollouts: int, frames: int) -> ShardEntry:
+    index, name = job.config.shard, shard_name(job.config.shard, job.config.shards)
+    return shard_entry(path, index, rollouts, frames, name, torch.device(job.device).type)
 
 
 def _frames(job: _Job, labels: RolloutLabels) -> Iterator[FrameBlock]:

@@ -50,6 +50,14 @@ class NotEnoughMemoryError(CgwmError):
     """What was asked for needs more memory than there is (exit code 1)."""
 
 
+class DiskFullError(CgwmError):
+    """What is being written needs more room than the disk, a quota or a limit leaves (exit code 1)."""
+
+
+class DamagedShardError(InputDataError):
+    """A finished shard is not what it was when it was written (exit code 2)."""
+
+
 class CheckFailedError(CgwmError):
     """A check found faults (exit code 1)."""
 
