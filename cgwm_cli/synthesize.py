@@ -134,12 +134,10 @@ def _shards_summary(summary: ShardsSummary) -> str:
     ]
     if summary.made:
         rows += [["speed", f"{summary.frames_per_s:.1f} frames/s"], ["time", f"{summary.seconds:.1f} s"]]
-    upkeep = f", {kept} were up to date" if kept and summary.made else ""
-    head = (
-        f"Wrote {summary.made} shards of {summary.dataset}{upkeep}"
-        if summary.made
-        else f"{summary.dataset} is up to date"
-    )
+    others = "; the others were up to date" if kept else ""
+    head = f"Wrote {summary.made} of {summary.shards} shards of {summary.dataset}{others}"
+    if not summary.made:
+        head = f"{summary.dataset} is up to date"
     lines = [f"{head}.", table(rows)]
     if summary.shards > 1:
         lines.append(f"to read it as one file: cgwm merge {summary.dataset}")

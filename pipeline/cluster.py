@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import chdir, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -172,18 +173,38 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _connect(ray: Any, address: str, options: dict[str, Any]) -> None:
-    if address != "local":
-        try:
-            ray.init(address=address, **options)
-            return
-        except (ConnectionError, ValueError) as error:
-            if address != "auto":
-                raise UsageError(
-                    f"--ray {address}: no Ray cluster answers there ({str(error).splitlines()[0]}).",
-                    "host:port, ray://host:port, auto, local.",
-                    "start one ('ray start --head'), or pass --ray local.",
-                ) from None
-    ray.init(address="local", include_dashboard=False, **options)
+    address = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
+    # Ray puts the working directory on its workers' path, where a clone's folder cgwm/ would hide the package.
+    with chdir(os.path.sep):
+        if address not in ("auto", "local"):
+            _require_answer(address)
+        if address != "local":
+            try:
+                ray.init(address=address, **options)
+                return
+            except (ConnectionError, ValueError) as error:
+                if address != "auto":
+                    raise _no_cluster(address, str(error)) from None
+        ray.init(address="local", include_dashboard=False, **options)
+
+
+def _require_answer(address: str) -> None:
+    """Ray itself tries for many minutes to reach a machine that is not there."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        raise _no_cluster(address, "no host:port")
+    try:
+        socket.create_connection((host, int(port)), timeout=10.0).close()
+    except OSError as error:
+        raise _no_cluster(address, str(error)) from None
+
+
+def _no_cluster(address: str, reason: str) -> UsageError:
+    return UsageError(
+        f"--ray {address}: no Ray cluster answers there ({reason.splitlines()[0]}).",
+        "host:port, ray://host:port, auto, local.",
+        "start one ('ray start --head'), or pass --ray local.",
+    )
 
 
 def _gpus(ray: Any, device: str) -> int:

@@ -4,10 +4,12 @@ import json
 import multiprocessing
 import os
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,9 +21,18 @@ from cgwm.datasets.dataset import check_hashes, new_dataset, read_manifest, shar
 from cgwm.datasets.index import INDEX
 from cgwm.datasets.loader import RolloutDataset, RolloutReader
 from cgwm.datasets.shards import shard_name
+from cgwm.pipeline.cluster import synthesize_shards
 from cgwm.pipeline.merge import merge
 from cgwm.pipeline.synthesize import synthesize
-from cgwm.schemas import DamagedShardError, DatasetManifest, DiskFullError, InputDataError, SynthesizeConfig, UsageError
+from cgwm.schemas import (
+    DamagedShardError,
+    DatasetManifest,
+    DiskFullError,
+    InputDataError,
+    NotConvergedError,
+    SynthesizeConfig,
+    UsageError,
+)
 from small_model import write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=5, duration_s=0.3, width=32, height=24, device="cpu", seed=3, shards=3)
@@ -408,6 +419,97 @@ def test_a_disk_that_is_full_at_the_end_is_no_complete_shard(
     with pytest.raises(DiskFullError, match=r"no room for rollouts-0000-of-0001.h5: No space left on device"):
         synthesize(model, tmp_path / "out", shard(0, shards=1, rollouts=1))
     assert list(tmp_path.iterdir()) == []
+
+
+def interrupted(model: Path, out: Path, number: signal.Signals) -> subprocess.CompletedProcess[str]:
+    """Make all shards in a process of its own, and send it a signal while it writes the second."""
+    words = ["synthesize", model, "--out", out, "--shards=3", *options_of(CONFIG)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _SYNTHESIZE, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        end = time.monotonic() + 120
+        while not list(out.parent.glob(f".{out.name}.{shard_name(1, 3)}.partial-*")):
+            assert process.poll() is None and time.monotonic() < end, process.communicate()
+            time.sleep(0.002)
+        process.send_signal(number)
+        printed, said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return subprocess.CompletedProcess(words, process.returncode, printed, said)
+
+
+def test_an_interrupt_leaves_the_complete_shards(model: Path, made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = interrupted(model, out, signal.SIGINT)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == (
+        f"Interrupted; 1 of 3 shards of {out} are complete; the same command with --resume goes on.\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert sorted(path.name for path in out.glob("roll*")) == ["rollouts-0000-of-0003.h5", "rollouts-0000-of-0003.json"]
+    summary = synthesize_shards(model, out, CONFIG, resume=True)
+    assert (summary.made, summary.shards, summary.rollouts) == (2, 3, 5)
+    assert sha256(out) == sha256(made)
+
+
+def test_a_kill_leaves_what_can_be_resumed(model: Path, made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert interrupted(model, out, signal.SIGKILL).returncode == -signal.SIGKILL
+    (left,) = tmp_path.glob(".*")
+    elsewhere = tmp_path / ".out.rollouts-0002-of-0003.h5.partial-1-00000000-00000000.h5"
+    elsewhere.touch()  # of a process on another machine, which may be alive
+    assert [entry.index for entry in read_manifest(out).shards] == [0]
+    with pytest.raises(
+        UsageError, match=r"rollouts-0000-of-0003.h5 exists.\nNext: .*--resume, which keeps what is whole"
+    ):
+        synthesize_shards(model, out, CONFIG)
+    assert synthesize_shards(model, out, CONFIG, resume=True).made == 2
+    assert not left.exists() and elsewhere.exists()
+    assert sha256(out) == sha256(made)
+    assert merge([out]).notes == (f"left unfinished by a process that may be running: {elsewhere}",)
+
+
+def test_a_shard_that_fails_does_not_hold_up_the_others(
+    model: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverging(path: Path, out: Path, config: SynthesizeConfig, *rest: bool) -> object:
+        if config.shard == 1:
+            raise NotConvergedError("rollout 1 diverged.", todo="look at it.")
+        return synthesize(path, out, config, *rest)
+
+    monkeypatch.setattr("cgwm.pipeline.cluster.synthesize", diverging)
+    with pytest.raises(NotConvergedError) as caught:
+        synthesize_shards(model, tmp_path / "out", CONFIG)
+    assert str(caught.value) == (
+        "shard 1: rollout 1 diverged. (1 of 3 shards failed, 2 are complete.)\nNext: look at it."
+    )
+    monkeypatch.undo()
+    assert synthesize_shards(model, tmp_path / "out", CONFIG, resume=True).made == 1
+    assert sha256(tmp_path / "out") == sha256(made)
+
+
+def test_the_command_line_speaks_of_shards(model: Path, parts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    words = ["synthesize", str(model), "--out", str(parts), *options_of(CONFIG)]
+    done = command(*words, "--shard", "1/3", "--resume")
+    assert done.returncode == 0
+    first, *_, line, last = done.stdout.splitlines()
+    assert first == f"{parts}/rollouts-0001-of-0003.h5 is up to date; cameras: view0, view1."
+    wrap = "cgwm " + shlex.join(words) + " --shard $SLURM_ARRAY_TASK_ID/3 --resume"
+    assert line == f"all 3 on SLURM: sbatch --array=0-2 --wrap {shlex.quote(wrap)}"
+    assert last == f"then: cgwm merge {parts}"
+    refused = command(*words, "--shard=1/3", "--shards=3")
+    assert (refused.returncode, refused.stderr) == (
+        2,
+        "--shard 1/3 is one shard, --shards makes all.\nAllowed: one of the two.\n",
+    )
+
+
+def test_ray_that_is_not_installed_is_named(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UsageError, match=r"--ray needs the package ray[\s\S]*pip install 'cgwm\[ray\]'"):
+        synthesize_shards(model, tmp_path / "out", CONFIG, ray="local")
 
 
 def test_manifests_of_before_are_read(made: Path) -> None:
