@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,8 @@ from ..schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError
 from .atomic import move_into_place, new_directory, new_file, scratch_file, sha256
 from .index import index_fault
 from .kinds import refuse_other_kind
+from .room import enough_room
 from .shards import gathered, shard_fault, shard_name, tidied, write_entry
-from .sink import enough_room
 
 MANIFEST = "dataset.json"
 MODEL_FOLDER = "model"
@@ -106,7 +106,7 @@ def new_dataset(
     Raises:
         UsageError: Before anything is written, if the output exists and `overwrite` is not set, or if the shard
             belongs to another dataset than the one that is there.
-        DiskFullError: If there is no room; what was complete before is still there.
+        NotEnoughSpaceError: If there is no room; what was complete before is still there.
     """
     entries: list[ShardEntry] = []
     name = shard_name(index, manifest.shard_count)
@@ -215,12 +215,18 @@ def missing_shards(manifest: DatasetManifest) -> list[int]:
     return [index for index in range(manifest.shard_count) if index not in present]
 
 
-def check_hashes(path: Path, manifest: DatasetManifest) -> list[str]:
-    """Compare the shards, their index and the model's copy with the manifest; return one sentence a fault."""
+def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] | None = None) -> list[str]:
+    """Compare the shards, their index and the model's copy with the manifest; return one sentence a fault.
+
+    Args:
+        path: DATASET.
+        manifest: Its manifest.
+        files: Names of the shards to read for their hash, of the others the size is compared; all where left out.
+    """
     faults = [
         f"{shard_name(index, manifest.shard_count)}: this shard is missing." for index in missing_shards(manifest)
     ]
-    found = (shard_fault(path / shard.file, shard) for shard in manifest.shards)
+    found = (shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards)
     faults += [fault for fault in found if fault is not None]
     listed = {shard.file for shard in manifest.shards}
     if manifest.index is not None:

@@ -15,9 +15,9 @@ import numpy as np
 
 from ..schemas import DatasetManifest, ShardEntry
 from .atomic import sha256
+from .guarded_file import GuardedFile
 from .progress import progress
 from .rollouts import SHARDS, Node, demo_names, open_shard
-from .sink import Sink
 
 INDEX = "index.h5"
 
@@ -33,9 +33,9 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
         InputDataError: If a shard cannot be read.
         OSError: If the index cannot be written.
     """
-    sink = Sink(path)
+    guarded = GuardedFile(path)
     try:
-        with h5py.File(sink, "w") as index:
+        with h5py.File(guarded, "w") as index:
             data = index.create_group("data")
             splits: dict[str, list[str]] = {}
             total = 0
@@ -49,13 +49,13 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
                         splits.setdefault(split, []).extend(member.decode() for member in members[()])
                     for demo in demo_names(shard):
                         _mirror(shard["data"][demo], data.create_group(demo), name.encode())
-                sink.check()
+                _check(guarded)
             data.attrs["total"] = total
             _write_splits(index.create_group("mask"), splits)
             _write_shards(index.create_group(SHARDS), [(name, entry) for _, name, entry in shards])
     finally:
-        sink.close()
-        sink.check()
+        guarded.close()
+        _check(guarded)
 
 
 def index_fault(file: Path, manifest: DatasetManifest) -> str | None:
@@ -70,6 +70,11 @@ def index_fault(file: Path, manifest: DatasetManifest) -> str | None:
     if found != [shard.sha256 for shard in manifest.shards]:
         return f"{file.name}: of other shards than those that are there; make it again with 'cgwm merge --overwrite'."
     return None
+
+
+def _check(file: GuardedFile) -> None:
+    if file.error is not None:
+        raise file.error
 
 
 def _mirror(source: Node, target: Node, file: bytes) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..schemas import ROLLOUTS_FORMAT, InputDataError
 from .cameras import Camera
-from .sink import Sink
+from .guarded_file import GuardedFile
 
 Compression = Literal["zstd", "gzip", "none"]
 
@@ -221,8 +221,8 @@ class RolloutWriter:
 
     def __init__(self, path: Path, seed: int, config_json: str, creator: str, compression: Compression = "zstd"):
         self._options = filter_options(compression)
-        self._sink = Sink(path)
-        self._file = h5py.File(self._sink, "w")
+        self._guarded = GuardedFile(path)
+        self._file = h5py.File(self._guarded, "w")
         self._file.attrs.update(
             format=ROLLOUTS_FORMAT,
             format_version=1,
@@ -251,9 +251,9 @@ class RolloutWriter:
             try:
                 self._file.close()
             finally:
-                self._sink.close()
+                self._guarded.close()
                 if kind is None or issubclass(kind, Exception):
-                    self._sink.check()  # what went wrong first; the others follow from it
+                    self._check()  # what went wrong first; the others follow from it
 
     def write(self, labels: RolloutLabels, frames: Iterable[FrameBlock] = ()) -> None:
         """Write one rollout; `frames` may be a generator, and is consumed block by block."""
@@ -275,9 +275,13 @@ class RolloutWriter:
             pixels = np.stack([visible[name] for name in cameras], axis=1)
             _put(demo["bodies"], "visible_px", pixels, "px", "image", "-", axes, text)
         _link_next_observations(demo)
-        self._sink.check()
+        self._check()
         self._indices.append(labels.episode_index)
         self.total += count
+
+    def _check(self) -> None:
+        if self._guarded.error is not None:
+            raise self._guarded.error
 
     def _image_sets(self, group: Node, name: str, camera: Camera, count: int) -> dict[str, h5py.Dataset]:
         size = (camera.height, camera.width)

@@ -8,7 +8,7 @@ a rename, which network file systems do at once too. `cgwm merge` gathers the en
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -133,24 +133,27 @@ def foreign(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_jso
         manifest: The dataset's.
         config_json: The dataset's settings, as the shards carry them.
     """
+    return next(_strange(file, entry, manifest, config_json), None)
+
+
+def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_json: str) -> Iterator[str]:
     if entry.model_sha256 not in (None, manifest.model_sha256):
-        return f"{file.name}: made from another model ({entry.model_sha256}; the dataset's is {manifest.model_sha256})."
-    others = [name for name, found in entry.versions.items() if manifest.versions.get(name) != found]
-    if others:
-        name = others[0]
-        wanted = manifest.versions.get(name, "none")
-        return f"{file.name}: made with {name} {entry.versions[name]}; the dataset's is {wanted}."
+        yield f"{file.name}: made from another model ({entry.model_sha256}; the dataset's is {manifest.model_sha256})."
+    for name, version in entry.versions.items():
+        if manifest.versions.get(name) != version:
+            yield f"{file.name}: made with {name} {version}; the dataset's is {manifest.versions.get(name, 'none')}."
     with open_shard(file) as handle:
         attributes: Node = handle.attrs
         if int(attributes["seed"]) != manifest.config.get("seed"):
-            return f"{file.name}: made with seed {attributes['seed']}; the dataset's is {manifest.config.get('seed')}."
+            yield f"{file.name}: made with seed {attributes['seed']}; the dataset's is {manifest.config.get('seed')}."
         if attributes["config_json"] != config_json:
-            return f"{file.name}: made with other settings (its attribute config_json)."
+            yield f"{file.name}: made with other settings (its attribute config_json)."
         found = [int(name.removeprefix("demo_")) for name in demo_names(handle)]
     wanted = shard_range(manifest.rollouts, manifest.shard_count, entry.index)
-    if found != list(wanted):
-        return f"{file.name}: holds the rollouts {ranges(found) or 'none'}; its number stands for {ranges(wanted)}."
-    return None
+    if not set(found) <= set(wanted):  # fewer are right: rollouts that diverge are left out
+        yield f"{file.name}: holds the rollouts {ranges(found)}; its number stands for {ranges(wanted)}."
+    if len(found) != entry.rollouts:
+        yield f"{file.name}: holds {len(found)} rollouts; its entry says {entry.rollouts}."
 
 
 def tidied(path: Path) -> list[str]:

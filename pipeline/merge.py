@@ -21,8 +21,8 @@ from ..datasets.dataset import (
 )
 from ..datasets.index import INDEX, index_fault, write_index
 from ..datasets.progress import progress
+from ..datasets.room import enough_room
 from ..datasets.shards import entry_file, foreign, ranges, shard_fault, shard_name, tidied
-from ..datasets.sink import enough_room
 from ..schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
 from .doctor import cpu_cores
 
@@ -57,7 +57,7 @@ def merge(
         UsageError: If the output exists, or there are several sources and no output.
         InputDataError: If a source is no dataset; or with all faults: shards that are missing, damaged, twice there
             or of another model, seed, plan or version.
-        DiskFullError: If there is no room for the index.
+        NotEnoughSpaceError: If there is no room for the index.
     """
     if not sources:
         raise UsageError("no dataset to merge.", "one directory or more.")

@@ -86,7 +86,7 @@ def synthesize(
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
         DamagedShardError: If a shard that is to be kept is not what was written.
-        DiskFullError: If there is no room for the shard.
+        NotEnoughSpaceError: If there is no room for the shard.
         NotConvergedError: If a simulation diverges.
         NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """

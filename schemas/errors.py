@@ -50,8 +50,8 @@ class NotEnoughMemoryError(CgwmError):
     """What was asked for needs more memory than there is (exit code 1)."""
 
 
-class DiskFullError(CgwmError):
-    """What is being written needs more room than the disk, a quota or a limit leaves (exit code 1)."""
+class NotEnoughSpaceError(CgwmError):
+    """What was asked for needs more room on the disk than there is (exit code 1)."""
 
 
 class DamagedShardError(InputDataError):

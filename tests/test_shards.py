@@ -1,5 +1,6 @@
 """Shards: any split gives the same demos; whole ones are kept, damaged ones named; joined they read as one file."""
 
+import errno
 import json
 import multiprocessing
 import os
@@ -27,9 +28,9 @@ from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import (
     DamagedShardError,
     DatasetManifest,
-    DiskFullError,
     InputDataError,
     NotConvergedError,
+    NotEnoughSpaceError,
     SynthesizeConfig,
     UsageError,
 )
@@ -404,19 +405,15 @@ def test_a_disk_that_is_full_at_the_end_is_no_complete_shard(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last blocks leave HDF5's cache when the file is closed: that they were lost must not go unseen."""
-    from cgwm.datasets import sink
+    real = os.write
 
-    class Small(sink.io.FileIO):
-        def write(self, data: memoryview) -> int:
-            if self.tell() > 100_000:
-                raise OSError(sink.errno.ENOSPC, "No space left on device")
-            return super().write(data)
+    def full(descriptor: int, data: memoryview) -> int:
+        if os.lseek(descriptor, 0, os.SEEK_CUR) > 100_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(descriptor, data)
 
-    class SmallSink(sink.Sink, Small):
-        pass
-
-    monkeypatch.setattr("cgwm.datasets.rollouts.Sink", SmallSink)
-    with pytest.raises(DiskFullError, match=r"no room for rollouts-0000-of-0001.h5: No space left on device"):
+    monkeypatch.setattr("cgwm.datasets.guarded_file.os.write", full)
+    with pytest.raises(NotEnoughSpaceError, match=r"no room for rollouts-0000-of-0001.h5: No space left on device"):
         synthesize(model, tmp_path / "out", shard(0, shards=1, rollouts=1))
     assert list(tmp_path.iterdir()) == []
 
