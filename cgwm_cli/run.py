@@ -82,7 +82,7 @@ def with_values(arguments: list[str]) -> list[str]:
     ['synthesize', '--ray', 'auto', 'model', '--out', 'data']
     """
     completed: list[str] = []
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=False):
         completed.append(word)
         if word == "--ray" and not _RAY_ADDRESS.fullmatch(following):
             completed.append("auto")

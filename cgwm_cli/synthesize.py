@@ -86,7 +86,7 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-def _summary(summary: DatasetSummary, count: int) -> str:
+def _summary(summary: DatasetSummary, count: int = 1) -> str:
     from .output import table, warnings
 
     rows = [
