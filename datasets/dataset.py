@@ -7,7 +7,9 @@ sees the directory) the first shard that is ready makes the directory, and each 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -136,7 +138,7 @@ def _publish(
                 shutil.copytree(model, folder / MODEL_FOLDER)
                 write_manifest(folder, manifest)
         except (UsageError, OSError):
-            if not (path / MANIFEST).is_file():  # not the case that another shard was faster
+            if not _appears(path / MANIFEST):  # not the case that another shard was faster
                 raise
     refuse_other_dataset(path, manifest)
     if (path / entry.file).exists() and not overwrite:  # by a second task of the same number, meanwhile
@@ -146,6 +148,17 @@ def _publish(
         return
     write_entry(path, entry)
     move_into_place(temporary, path / entry.file)
+
+
+def _appears(file: Path, seconds: float = 10.0) -> bool:
+    """Tell whether a file is there, where its directory is; a network file system may show it some seconds late."""
+    end = time.monotonic() + seconds
+    while not file.is_file():
+        if not os.path.lexists(file.parent) or time.monotonic() > end:
+            return False
+        time.sleep(0.2)
+        os.listdir(file.parent)  # asks the server again
+    return True
 
 
 def _stamped(entries: list[ShardEntry], manifest: DatasetManifest) -> tuple[ShardEntry, ...]:

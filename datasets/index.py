@@ -40,7 +40,8 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
             splits: dict[str, list[str]] = {}
             total = 0
             for file, name, _ in progress(shards, "shards", len(shards), "shard"):
-                with open_shard(file) as shard:
+                with open_shard(file) as opened:
+                    shard: Node = opened
                     if not len(data):
                         _copy_attributes(shard, index)
                         _copy_attributes(shard["data"], data)
@@ -66,7 +67,8 @@ def index_fault(file: Path, manifest: DatasetManifest) -> str | None:
     if sha256(file) != manifest.index.sha256:
         return f"{file.name}: its sha256 differs from dataset.json; make it again with 'cgwm merge --overwrite'."
     with open_shard(file) as index:
-        found = [value.decode() for value in index[SHARDS]["sha256"][()]]
+        listed: Node = index[SHARDS]
+        found = [value.decode() for value in listed["sha256"][()]]
     if found != [shard.sha256 for shard in manifest.shards]:
         return f"{file.name}: of other shards than those that are there; make it again with 'cgwm merge --overwrite'."
     return None

@@ -7,7 +7,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import chdir, closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -105,14 +105,14 @@ def synthesize_shards(
 
 def _here(
     model: Path, out: Path, parts: Sequence[SynthesizeConfig], overwrite: bool, resume: bool
-) -> Iterator[_Outcome]:
+) -> Generator[_Outcome, None, None]:
     for part in parts:
         yield part.shard, _task(str(model), str(out), part, overwrite, resume)
 
 
 def _on_ray(
     model: Path, out: Path, parts: Sequence[SynthesizeConfig], overwrite: bool, resume: bool, address: str
-) -> Iterator[_Outcome]:
+) -> Generator[_Outcome, None, None]:
     with _connected(address) as ray:
         gpus = _gpus(ray, parts[0].device)
         task = ray.remote(_task).options(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)
@@ -156,7 +156,7 @@ def _outcome(ray: Any, reference: Any, shard: int) -> DatasetSummary | CgwmError
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise UsageError(
             "--ray needs the package ray, which is not installed.", todo="pip install 'cgwm[ray]'"
