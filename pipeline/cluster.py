@@ -33,6 +33,9 @@ RETRIES = 3
 _OF_ONE_SHARD = (NotConvergedError, DamagedShardError)
 """Errors that say nothing about the other shards: these are still made."""
 
+_NONE_RUNS = "Could not find any running Ray instance"
+"""What Ray says where no cluster runs on this machine, which is no fault."""
+
 _Outcome = tuple[int, DatasetSummary | CgwmError]
 
 
@@ -183,7 +186,7 @@ def _connect(ray: Any, address: str, options: dict[str, Any]) -> None:
                 ray.init(address=address, **options)
                 return
             except (ConnectionError, ValueError) as error:
-                if address != "auto":
+                if address != "auto" or _NONE_RUNS not in str(error):
                     raise _no_cluster(address, str(error)) from None
         ray.init(address="local", include_dashboard=False, **options)
 
