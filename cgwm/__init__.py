@@ -18,10 +18,12 @@ _PUBLIC = {
     "Capture": ".datasets.capture",
     "CgwmError": ".schemas",
     "CheckFailedError": ".schemas",
+    "DamagedShardError": ".schemas",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
     "NotConvergedError": ".schemas",
     "NotEnoughMemoryError": ".schemas",
+    "NotEnoughSpaceError": ".schemas",
     "PhysConfig": ".schemas",
     "SplatConfig": ".schemas",
     "SynthesizeConfig": ".schemas",
@@ -40,6 +42,7 @@ _PUBLIC = {
     "import_pinwm": ".datasets.pinwm",
     "import_rosbag": ".datasets.rosbag",
     "import_tum": ".datasets.tum",
+    "merge": ".pipeline.merge",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.mystery",
@@ -65,6 +68,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
     from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
+    from .pipeline.merge import merge  # pyright: ignore[reportMissingImports]
     from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
     from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
     from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
@@ -72,9 +76,11 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
         CalibrateConfig,
         CgwmError,
         CheckFailedError,
+        DamagedShardError,
         InputDataError,
         NotConvergedError,
         NotEnoughMemoryError,
+        NotEnoughSpaceError,
         PhysConfig,
         SplatConfig,
         SynthesizeConfig,
@@ -86,10 +92,12 @@ __all__ = [
     "Capture",
     "CgwmError",
     "CheckFailedError",
+    "DamagedShardError",
     "InputDataError",
     "Model",
     "NotConvergedError",
     "NotEnoughMemoryError",
+    "NotEnoughSpaceError",
     "PhysConfig",
     "SplatConfig",
     "SynthesizeConfig",
@@ -109,6 +117,7 @@ __all__ = [
     "import_pinwm",
     "import_rosbag",
     "import_tum",
+    "merge",
     "read_model",
     "run_demo",
     "run_mystery",

@@ -15,6 +15,7 @@ from .effects import list_effects, new_effect, show_effect
 from .eval import evaluate
 from .fit import fit
 from .import_ import import_capture
+from .merge import merge
 from .synthesize import synthesize
 from .validate import validate
 
@@ -23,6 +24,7 @@ VERBS = (
     ("calibrate", calibrate, "Photos to cameras, with a metric scale."),
     ("fit", fit, "A capture to a world model."),
     ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
+    ("merge", merge, "The shards of a dataset as one HDF5 file."),
     ("eval", evaluate, "A model against measurements."),
     ("compare", compare, "Where and when each model fails, side by side."),
     ("diagnose", diagnose, "Which effect a model lacks."),

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
-from .run import running
+from .run import running, typed
 
 if TYPE_CHECKING:
-    from ..schemas import DatasetSummary
+    from ..schemas import DatasetSummary, ShardsSummary
 
 
 def synthesize(
@@ -35,6 +37,22 @@ def synthesize(
         str | None,
         typer.Option("--shard", metavar="I/N", show_default="0/1", help="Make shard I of N; I runs from 0 to N-1."),
     ] = None,
+    shards: Annotated[
+        int | None,
+        typer.Option("--shards", min=1, metavar="N", help="Make N shards, all of them.", show_default=False),
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            "--ray",
+            metavar="[ADDRESS]",
+            help="Make the shards on a Ray cluster: its address; local; or the one that is there.",
+            show_default=False,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the shards that are complete; with --overwrite remake damaged ones.")
+    ] = False,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -46,11 +64,13 @@ def synthesize(
 ) -> None:
     """A model to labelled rollouts in HDF5: images, depth, masks, poses, contacts, parameters."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.synthesize import synthesize as work
         from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
         from .settings import StageSettings
 
-        index, count = _shard(shard) if shard is not None else (None, None)
+        if shard is not None and (shards is not None or ray is not None):
+            other = "--shards" if shards is not None else "--ray"
+            raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
+        index, count = _shard(shard) if shard is not None else (None, shards)
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
         )
@@ -64,9 +84,18 @@ def synthesize(
             emit(resolved_plan(model, settings.plan), plan_toml)
         elif out is None:
             raise UsageError("--out is missing.", todo="name the directory to write: --out DATASET.")
+        elif shards is None and ray is None:
+            from ..pipeline.synthesize import synthesize as work
+
+            done = work(model, out, settings, overwrite, resume)
+            emit(done, lambda found: (_plan(found) if plan is not None else "") + _summary(found, settings.shards))
         else:
-            shown = plan is not None
-            emit(work(model, out, settings, overwrite), lambda done: (_plan(done) if shown else "") + _summary(done))
+            from ..pipeline.cluster import default_shards, synthesize_shards
+
+            if "shards" not in settings.model_fields_set:
+                settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
+            made = synthesize_shards(model, out, settings, overwrite, resume, ray)
+            emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -78,13 +107,13 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-def _plan(summary: DatasetSummary) -> str:
+def _plan(summary: DatasetSummary | ShardsSummary) -> str:
     from ..schemas import plan_toml
 
     return f"The plan, resolved:\n\n{plan_toml(summary.plan, comments=False)}\n"
 
 
-def _summary(summary: DatasetSummary) -> str:
+def _summary(summary: DatasetSummary, count: int = 1) -> str:
     from .output import table, warnings
 
     rows = [
@@ -92,13 +121,61 @@ def _summary(summary: DatasetSummary) -> str:
         ["frames", str(summary.frames)],
         ["contacts", str(summary.contacts)],
         ["size", f"{summary.bytes / 1e6:.1f} MB"],
-        ["speed", f"{summary.frames_per_s:.1f} frames/s"],
-        ["time", f"{summary.seconds:.1f} s"],
     ]
-    if summary.rejected:
-        total = sum(summary.rejected.values())
-        rules = ", ".join(f"{rule} {count}" for rule, count in summary.rejected.items())
-        rows.append(["rejected", f"{total} of {total + summary.rollouts} draws: {rules}"])
+    rows += _rejected(summary)
+    if not summary.up_to_date:
+        rows += [["speed", f"{summary.frames_per_s:.1f} frames/s"], ["time", f"{summary.seconds:.1f} s"]]
     cameras = ", ".join(summary.cameras) or "none"
-    head = f"Wrote {summary.dataset}/{summary.shard}; cameras: {cameras}."
-    return "\n".join([head, table(rows), *warnings(summary.notes)])
+    place = f"{summary.dataset}/{summary.shard}"
+    head = f"{place} is up to date" if summary.up_to_date else f"Wrote {place}"
+    lines = [f"{head}; cameras: {cameras}.", table(rows)]
+    if count > 1 and "SLURM_JOB_ID" not in os.environ:
+        lines += [f"all {count} on SLURM: {_slurm_line(typed(), count)}", f"then: cgwm merge {summary.dataset}"]
+    return "\n".join([*lines, *warnings(summary.notes)])
+
+
+def _rejected(summary: DatasetSummary | ShardsSummary) -> list[list[str]]:
+    if not summary.rejected:
+        return []
+    total = sum(summary.rejected.values())
+    rules = ", ".join(f"{rule} {count}" for rule, count in summary.rejected.items())
+    return [["rejected", f"{total} of {total + summary.rollouts} draws: {rules}"]]
+
+
+def _slurm_line(arguments: list[str], count: int) -> str:
+    """Return the command that submits all shards, from the one that made one of them.
+
+    >>> _slurm_line(["synthesize", "m", "--shard", "3/9", "-o", "data"], 9)
+    "sbatch --array=0-8 --wrap 'cgwm synthesize m --shard $SLURM_ARRAY_TASK_ID/9 -o data --resume'"
+    """
+    words = ["cgwm"]
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if before == "--shard" or word.startswith("--shard="):
+            words.append(f"{'--shard=' if word.startswith('--shard=') else ''}$SLURM_ARRAY_TASK_ID/{count}")
+        else:
+            words.append(shlex.quote(word))
+    line = " ".join(words + ["--resume"] * ("--resume" not in arguments))
+    return f"sbatch --array=0-{count - 1} --wrap {shlex.quote(line)}"
+
+
+def _shards_summary(summary: ShardsSummary) -> str:
+    from .output import table, warnings
+
+    kept = summary.shards - summary.made
+    rows = [
+        ["shards", str(summary.shards)],
+        ["rollouts", str(summary.rollouts)],
+        ["frames", str(summary.frames)],
+        ["size", f"{summary.bytes / 1e6:.1f} MB"],
+        *_rejected(summary),
+    ]
+    if summary.made:
+        rows += [["speed", f"{summary.frames_per_s:.1f} frames/s"], ["time", f"{summary.seconds:.1f} s"]]
+    others = "; the others were up to date" if kept else ""
+    head = f"Wrote {summary.made} of {summary.shards} shards of {summary.dataset}{others}"
+    if not summary.made:
+        head = f"{summary.dataset} is up to date"
+    lines = [f"{head}.", table(rows)]
+    if summary.shards > 1:
+        lines.append(f"to read it as one file: cgwm merge {summary.dataset}")
+    return "\n".join([*lines, *warnings(summary.notes)])

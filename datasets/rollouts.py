@@ -21,6 +21,9 @@ from .chunks import require_zstd
 Node = Any
 """A group of an HDF5 file; h5py's own types do not tell what a path in it leads to."""
 
+SHARDS = "shards"
+"""Group of an index: the files that it looks into (`file`, relative to it), with their `bytes` and `sha256`."""
+
 VALID_EVERY = 5
 """Every n-th rollout (by global index, the last of each group) belongs to `mask/valid`, the others to `mask/train`."""
 
@@ -158,7 +161,7 @@ def amodal_dtype(bodies: int) -> np.dtype[Any]:
 
 
 def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
-    """Open a shard for reading.
+    """Open a shard, or the index of several, for reading.
 
     Args:
         path: An HDF5 file of rollouts.
@@ -179,10 +182,25 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
             raise InputDataError(f"{path}: its format attribute is '{found}'.", f"'{ROLLOUTS_FORMAT}'.")
         if "zstd" in str(file.attrs.get("filters", "")):
             require_zstd(f"reading {path}")
+        if SHARDS in file:
+            _refuse_lost(path, file[SHARDS])
     except BaseException:
         file.close()
         raise
     return file
+
+
+def _refuse_lost(path: Path, shards: Node) -> None:
+    """Refuse an index whose shards are not all there: HDF5 would read fill values, and say nothing."""
+    for name, size in zip(shards["file"][()], shards["bytes"][()], strict=True):
+        shard = path.resolve().parent / name.decode()
+        if not shard.is_file() or shard.stat().st_size != size:
+            found = f"{shard.stat().st_size} bytes" if shard.is_file() else "no such file"
+            raise InputDataError(
+                f"{path}: an index that looks into {name.decode()}: {found}.",
+                f"a shard of {size} bytes there.",
+                "put the shard back, or make the index again with 'cgwm merge --overwrite'.",
+            )
 
 
 def demo_names(file: h5py.File) -> list[str]:

@@ -22,11 +22,12 @@ import torch
 
 from ..datasets.atomic import sha256
 from ..datasets.cameras import Camera
-from ..datasets.dataset import new_dataset, shard_entry, shard_name
+from ..datasets.dataset import finished_shard, new_dataset, shard_entry
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
 from ..datasets.rollout_writer import RolloutWriter
 from ..datasets.rollouts import FrameBlock, RolloutLabels
+from ..datasets.shards import contact_count, shard_name, shard_range
 from ..schemas import (
     DatasetManifest,
     DatasetSummary,
@@ -82,7 +83,12 @@ class _Outcome:
 
 
 def synthesize(
-    model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False, stopwatch: Stopwatch | None = None
+    model: Path,
+    out: Path,
+    config: SynthesizeConfig,
+    overwrite: bool = False,
+    resume: bool = False,
+    stopwatch: Stopwatch | None = None,
 ) -> DatasetSummary:
     """Write one shard of a dataset of labelled rollouts.
 
@@ -94,6 +100,7 @@ def synthesize(
         out: DATASET.
         config: The settings; times, sizes and the sampling plan are in it.
         overwrite: Replace what is there: the dataset where it has one shard, else the shard.
+        resume: Keep the shard if it is there and its hash is right. With `overwrite`, a damaged one is made again.
         stopwatch: To measure where the time goes.
 
     Returns:
@@ -102,8 +109,9 @@ def synthesize(
     Raises:
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
+        DamagedShardError: If a shard that is to be kept is not what was written.
         NotConvergedError: If the rules reject all draws for a rollout, or too many of them diverge.
-        NotEnoughSpaceError: If the disk is full.
+        NotEnoughSpaceError: If there is no room for the shard.
         NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """
     began = time.perf_counter()
@@ -111,15 +119,24 @@ def synthesize(
         job = _prepare(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
-        return _written(job, model, out, config, overwrite, began, stopwatch or Stopwatch())
+        return _written(job, model, out, config, overwrite, resume, began, stopwatch or Stopwatch())
 
 
 def _written(
-    job: _Job, model: Path, out: Path, config: SynthesizeConfig, overwrite: bool, began: float, stopwatch: Stopwatch
+    job: _Job,
+    model: Path,
+    out: Path,
+    config: SynthesizeConfig,
+    overwrite: bool,
+    resume: bool,
+    began: float,
+    stopwatch: Stopwatch,
 ) -> DatasetSummary:
     indices = shard_indices(config)
     notes = _notes(job)
     manifest = _manifest(model, job, notes)
+    if resume and (kept := finished_shard(out, manifest, config.shard, overwrite)) is not None:
+        return _summary(out, job, kept, contact_count(out / kept.file), time.perf_counter() - began, True, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
     contacts, outcome = 0, _Outcome(Counter(), [])
     with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
@@ -132,11 +149,15 @@ def _written(
             ended = time.perf_counter()
         stopwatch.seconds["wait for the writer"] = time.perf_counter() - ended
         with stopwatch.part("hash"):
-            entry = _entry(path, config, len(indices), writer.total * max(1, len(job.cameras)))
+            entry = _entry(path, job, len(indices), writer.total * max(1, len(job.cameras)))
         entries.append(entry.model_copy(update={"rejected": dict(sorted(outcome.rejected.items()))}))
     notes += tuple(f"drawn again: {found}" for found in outcome.diverged)
-    seconds = time.perf_counter() - began
-    entry = entries[0]
+    return _summary(out, job, entries[0], contacts, time.perf_counter() - began, False, notes)
+
+
+def _summary(
+    out: Path, job: _Job, entry: ShardEntry, contacts: int, seconds: float, up_to_date: bool, notes: tuple[str, ...]
+) -> DatasetSummary:
     return DatasetSummary(
         dataset=str(out),
         shard=entry.file,
@@ -147,9 +168,10 @@ def _written(
         contacts=contacts,
         cameras=tuple(job.cameras),
         seconds=seconds,
-        frames_per_s=entry.frames / seconds,
+        frames_per_s=0.0 if up_to_date else entry.frames / seconds,
         rejected=entry.rejected,
         plan=job.plan,
+        up_to_date=up_to_date,
         notes=notes,
     )
 
@@ -165,8 +187,7 @@ def shard_indices(config: SynthesizeConfig) -> range:
             f"{config.shards} shards for {config.rollouts} rollouts: some would be empty.",
             f"1 to {config.rollouts} shards.",
         )
-    first, last = (config.rollouts * k // config.shards for k in (config.shard, config.shard + 1))
-    return range(first, last)
+    return shard_range(config.rollouts, config.shards, config.shard)
 
 
 def _rollouts(
@@ -312,8 +333,9 @@ def _notes(job: _Job) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _entry(path: Path, config: SynthesizeConfig, rollouts: int, frames: int) -> ShardEntry:
-    return shard_entry(path, config.shard, rollouts, frames, shard_name(config.shard, config.shards))
+def _entry(path: Path, job: _Job, rollouts: int, frames: int) -> ShardEntry:
+    index, name = job.config.shard, shard_name(job.config.shard, job.config.shards)
+    return shard_entry(path, index, rollouts, frames, name, torch.device(job.device).type)
 
 
 def _frames(job: _Job, draw: Draw, labels: RolloutLabels, stopwatch: Stopwatch) -> Iterator[FrameBlock]:

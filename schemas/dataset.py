@@ -25,6 +25,20 @@ class ShardEntry(FileModel):
     """Labelled camera images: rollouts x frames x cameras; time steps where there are no cameras."""
     rejected: dict[str, int] = {}
     """Draws that the plan's rules rejected, by rule; each was drawn again."""
+    model_sha256: str | None = None
+    """Hash of the model that it was made of."""
+    versions: dict[str, str] = {}
+    """What it was made with, as in the manifest."""
+    device: str | None = None
+    """cpu or cuda: the two agree to a tolerance, not to the byte."""
+
+
+class IndexEntry(FileModel):
+    """The file that `cgwm merge` writes: all shards as one, by HDF5 virtual datasets."""
+
+    file: str
+    sha256: str
+    bytes: int
 
 
 class DatasetManifest(FileModel):
@@ -40,7 +54,8 @@ class DatasetManifest(FileModel):
     """Rollouts of all shards together, whether they are there yet or not."""
     shard_count: Annotated[int, Field(ge=1)]
     shards: tuple[ShardEntry, ...] = ()
-    """The shards that are complete, by index."""
+    """The shards that are complete, by index; of several shards each has an entry file, until `cgwm merge`."""
+    index: IndexEntry | None = None
     bodies: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     versions: dict[str, str] = {}
@@ -66,4 +81,43 @@ class DatasetSummary(FileModel):
     """Draws of this shard that the plan's rules rejected, by rule."""
     plan: SamplingPlan = SamplingPlan()
     """The resolved sampling plan."""
+    up_to_date: bool = False
+    """The shard was there already, whole, and was kept."""
+    notes: tuple[str, ...] = ()
+
+
+class ShardsSummary(FileModel):
+    """What `cgwm synthesize` reports of several shards at once."""
+
+    dataset: str
+    shards: int
+    made: int
+    """Shards that this run made; the others were there already, whole."""
+    rollouts: int
+    frames: int
+    """Labelled camera images of all shards; time steps where there are no cameras."""
+    bytes: int
+    seconds: float
+    frames_per_s: float
+    """Of the frames that this run made."""
+    rejected: dict[str, int] = {}
+    """Draws of all shards that the plan's rules rejected, by rule."""
+    plan: SamplingPlan = SamplingPlan()
+    """The resolved sampling plan."""
+    notes: tuple[str, ...] = ()
+
+
+class MergeSummary(FileModel):
+    """What `cgwm merge` reports."""
+
+    index: str
+    sha256: str
+    bytes: int
+    """Of the index itself; the shards stay where they are."""
+    shards: int
+    rollouts: int
+    frames: int
+    shard_bytes: int
+    up_to_date: bool = False
+    """The index was there already, of the same shards, and was kept."""
     notes: tuple[str, ...] = ()

@@ -86,7 +86,9 @@ def test_a_foreign_shard_is_refused(model_path: Path, tmp_path: Path) -> None:
     two = CONFIG.model_copy(update={"shards": 2, "duration_s": 0.1})
     synthesize(model_path, tmp_path / "out", two)
     before = sha256(tmp_path / "out")
-    with pytest.raises(UsageError, match=r"another dataset: its config is[\s\S]*repeat the options of the first shard"):
+    with pytest.raises(
+        UsageError, match=r"another dataset: its config.seed is 5, here 99[\s\S]*repeat the options of the first shard"
+    ):
         synthesize(model_path, tmp_path / "out", two.model_copy(update={"shard": 1, "seed": 99}))
     with pytest.raises(UsageError, match=r"rollouts-0000-of-0002.h5 exists.\nNext: choose another name or pass --over"):
         synthesize(model_path, tmp_path / "out", two)
