@@ -131,6 +131,8 @@ def _written(
         written = len(indices) - len(diverged)
         with stopwatch.part("hash"):
             entries.append(_entry(path, config, written, writer.total * max(1, len(job.cameras))))
+        ended = time.perf_counter()
+    stopwatch.seconds["publish"] = time.perf_counter() - ended
     notes += tuple(f"left out: {one.error.found}" for one in diverged)
     seconds = time.perf_counter() - began
     entry = entries[0]
