@@ -27,11 +27,16 @@ def write_tables(demo: Node, labels: RolloutLabels) -> Node:
     _write_bodies(demo, labels)
     _write_contacts(demo, labels)
     _write_parameters(demo, labels.parameters)
-    observations = demo.create_group("obs")
+    observations = new_group(demo, "obs")
     _write_object_observation(observations, labels)
     if labels.cameras:
         _write_cameras(demo, labels.cameras)
     return observations
+
+
+def new_group(parent: Node, name: str) -> Node:
+    """Make a group."""
+    return h5py.Group(h5py.h5g.create(parent.id, name.encode()))
 
 
 def put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str) -> Any:
@@ -69,6 +74,11 @@ def _write_text(made: Any, name: bytes, text: str) -> None:
     h5py.h5a.create(made, name, kind, space).write(np.array(text, dtype=h5py.string_dtype()))
 
 
+def _write_number(made: Any, name: str, number: np.generic) -> None:
+    kind, (_, space) = h5py.h5t.py_create(number.dtype), _text_kind()
+    h5py.h5a.create(made, name.encode(), kind, space).write(np.asarray(number))
+
+
 @cache
 def _text_kind() -> tuple[Any, Any]:
     return h5py.h5t.py_create(h5py.string_dtype(), logical=True), h5py.h5s.create(h5py.h5s.SCALAR)
@@ -76,7 +86,8 @@ def _text_kind() -> tuple[Any, Any]:
 
 def _write_attributes(demo: Node, labels: RolloutLabels, count: int) -> None:
     parameters = {p.name: {"value": p.value, "unit": p.unit} for p in labels.parameters}
-    demo.attrs.update(num_samples=count, episode_index=labels.episode_index, seed=labels.seed)
+    for name, number in {"num_samples": count, "episode_index": labels.episode_index, "seed": labels.seed}.items():
+        _write_number(demo.id, name, np.int64(number))
     texts = {
         b"model_file": labels.model_mjcf,
         b"params_json": json.dumps(parameters),
@@ -99,7 +110,7 @@ def _write_timeline(demo: Node, labels: RolloutLabels) -> None:
 
 
 def _write_bodies(demo: Node, labels: RolloutLabels) -> None:
-    group = demo.create_group("bodies")
+    group = new_group(demo, "bodies")
     names = np.array([name.encode() for name in labels.bodies])
     motions = np.array([motion.encode() for motion in labels.motions])
     inertia_text = "About the centre of mass, body axes."
@@ -125,7 +136,7 @@ def _turning(labels: RolloutLabels) -> str:
 
 
 def _write_contacts(demo: Node, labels: RolloutLabels) -> None:
-    table, group = labels.contacts, demo.create_group("contacts")
+    table, group = labels.contacts, new_group(demo, "contacts")
     impulse = "Impulse on body a since the frame before (frame 0: zero); body b gets its opposite."
     force = "Mean force on body a since the frame before (frame 0: zero): the impulse over the time between the frames."
     offsets = "Rows offsets[t]:offsets[t + 1] of the other arrays belong to frame t."
@@ -148,12 +159,12 @@ def _forces(table: ContactTable, time_s: np.ndarray) -> np.ndarray:
 
 
 def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> None:
-    group = demo.create_group("parameters")
+    group = new_group(demo, "parameters")
     for p in parameters:
         made = put(group, p.name, np.float64(p.value), p.unit, "-", "-", "scalar", "Value used in this rollout.")
         for key, value in (("estimate", p.estimate), ("std_error", p.std_error)):
             if value is not None:
-                h5py.Dataset(made).attrs[key] = value
+                _write_number(made, key, np.float64(value))
 
 
 def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
@@ -164,9 +175,9 @@ def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
 
 
 def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
-    group = demo.create_group("cameras")
+    group = new_group(demo, "cameras")
     for name, camera in cameras.items():
-        entry = group.create_group(name)
+        entry = new_group(group, name)
         distortion = np.asarray(camera.distortion, float)
         text = "Camera to world; OpenCV axes (x right, y down, z forward)."
         put(entry, "K", camera.K, "px", "image", "row", "(3, 3)", "Intrinsics; top-left pixel centre (0.5, 0.5).")
@@ -179,7 +190,7 @@ def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
 
 def link_next_observations(demo: Node, observations: Node) -> None:
     """Add `next_obs` as virtual datasets on `obs`, shifted by one frame: what robomimic reads, at no size."""
-    group = demo.create_group("next_obs")
+    group = new_group(demo, "next_obs")
     place = observations.name
     for name in observations:
         source = h5py.h5d.open(observations.id, name.encode())

@@ -26,7 +26,7 @@ from .cameras import Camera
 from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked, encoded, jpeg_of, require_zstd
 from .guarded_file import GuardedFile
 from .processors import processors
-from .rollout_tables import describe, link_next_observations, put, write_tables
+from .rollout_tables import describe, link_next_observations, new_group, put, write_tables
 from .rollouts import CONVENTION, VALID_EVERY, FrameBlock, Node, RolloutLabels, amodal_dtype
 
 MOST_WAITING_BYTES = 512 << 20
@@ -223,7 +223,7 @@ class _Demo:
 
     def __init__(self, data: Node, labels: RolloutLabels, compression: Compression) -> None:
         self.labels = labels
-        self._group = data.create_group(f"demo_{labels.episode_index}")
+        self._group = new_group(data, f"demo_{labels.episode_index}")
         self._obs: Node = write_tables(self._group, labels)
         self._compression: Compression = compression
         count, bodies = len(labels.time_s), len(labels.bodies)
