@@ -1,20 +1,15 @@
-"""The arrays of one rollout in HDF5, all but its images; each with its unit, frame, order, shape and description.
-
-Written by h5py's low level: a rollout has about 60 arrays with five attributes each, and its high level takes 25 ms for
-them, in which a GPU renders as many frames as it has.
-"""
+"""The arrays of one rollout in HDF5, all but its images; each with its unit, frame, order, shape and description."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from functools import cache
-from typing import Any
 
 import h5py
 import numpy as np
 
 from .cameras import Camera
+from .described import new_group, put, write_number, write_text
 from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
 
 TORQUE = "Mean torque on free bodies about the centre of mass since the frame before, from the angular momentum"
@@ -34,67 +29,17 @@ def write_tables(demo: Node, labels: RolloutLabels) -> Node:
     return observations
 
 
-def new_group(parent: Node, name: str) -> Node:
-    """Make a group."""
-    return h5py.Group(h5py.h5g.create(parent.id, name.encode()))
-
-
-def put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str) -> Any:
-    """Write an array, with a checksum, say what it is, and return its DatasetID."""
-    values = np.ascontiguousarray(data)
-    kind = h5py.h5t.py_create(values.dtype, logical=True)
-    scalar = np.ndim(data) == 0
-    space = h5py.h5s.create(h5py.h5s.SCALAR) if scalar else h5py.h5s.create_simple(values.shape)
-    made = h5py.h5d.create(group.id, name.encode(), kind, space, _checked(() if scalar else values.shape))
-    if values.size:
-        made.write(h5py.h5s.ALL, h5py.h5s.ALL, values.reshape(np.shape(data)))
-    describe(made, unit, frame, order, shape, text)
-    return made
-
-
-@cache
-def _checked(shape: tuple[int, ...]) -> Any:
-    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    properties.set_obj_track_times(False)
-    if shape and all(shape):
-        properties.set_chunk(shape)
-        properties.set_fletcher32()
-    return properties
-
-
-def describe(made: Any, *texts: str) -> None:
-    """Say what an array (h5py's DatasetID) is: unit, frame, order, shape and description."""
-    names = (b"unit", b"frame", b"order", b"shape_meaning", b"description")
-    for name, text in zip(names, texts, strict=True):
-        _write_text(made, name, text)
-
-
-def _write_text(made: Any, name: bytes, text: str) -> None:
-    kind, space = _text_kind()
-    h5py.h5a.create(made, name, kind, space).write(np.array(text, dtype=h5py.string_dtype()))
-
-
-def _write_number(made: Any, name: str, number: np.generic) -> None:
-    kind, (_, space) = h5py.h5t.py_create(number.dtype), _text_kind()
-    h5py.h5a.create(made, name.encode(), kind, space).write(np.asarray(number))
-
-
-@cache
-def _text_kind() -> tuple[Any, Any]:
-    return h5py.h5t.py_create(h5py.string_dtype(), logical=True), h5py.h5s.create(h5py.h5s.SCALAR)
-
-
 def _write_attributes(demo: Node, labels: RolloutLabels, count: int) -> None:
     parameters = {p.name: {"value": p.value, "unit": p.unit} for p in labels.parameters}
     for name, number in {"num_samples": count, "episode_index": labels.episode_index, "seed": labels.seed}.items():
-        _write_number(demo.id, name, np.int64(number))
+        write_number(demo.id, name, np.int64(number))
     texts = {
         b"model_file": labels.model_mjcf,
         b"params_json": json.dumps(parameters),
         b"effects_json": json.dumps({name: dict(values) for name, values in (labels.effects or {}).items()}),
     }
     for name, text in texts.items():
-        _write_text(demo.id, name, text)
+        write_text(demo.id, name, text)
 
 
 def _write_timeline(demo: Node, labels: RolloutLabels) -> None:
@@ -164,7 +109,7 @@ def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> N
         made = put(group, p.name, np.float64(p.value), p.unit, "-", "-", "scalar", "Value used in this rollout.")
         for key, value in (("estimate", p.estimate), ("std_error", p.std_error)):
             if value is not None:
-                _write_number(made, key, np.float64(value))
+                write_number(made, key, np.float64(value))
 
 
 def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
@@ -185,7 +130,7 @@ def _write_cameras(demo: Node, cameras: Mapping[str, Camera]) -> None:
         put(entry, "T_world_cam", camera.T_world_cam, "m", "world", "row", "(4, 4)", text)
         put(entry, "width", camera.width, "px", "-", "-", "scalar", "Image width.")
         put(entry, "height", camera.height, "px", "-", "-", "scalar", "Image height.")
-        _write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
+        write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
 
 
 def link_next_observations(demo: Node, observations: Node) -> None:
@@ -205,7 +150,7 @@ def link_next_observations(demo: Node, observations: Node) -> None:
                 properties.set_virtual(spaces[0], b".", path, spaces[1])
         space = h5py.h5s.create_simple(shape)
         made = h5py.h5d.create(group.id, name.encode(), source.get_type(), space, properties)
-        _write_text(made, b"description", f"obs/{name} one frame later; the last frame is repeated.")
+        write_text(made, b"description", f"obs/{name} one frame later; the last frame is repeated.")
 
 
 def _frames_space(shape: tuple[int, ...], first: int, length: int) -> h5py.h5s.SpaceID:

@@ -24,9 +24,10 @@ import numpy as np
 from ..schemas import ROLLOUTS_FORMAT, NotEnoughSpaceError
 from .cameras import Camera
 from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked, encoded, jpeg_of, require_zstd
+from .described import new_dataset, new_group, put, write_number, write_text
 from .guarded_file import GuardedFile
 from .processors import processors
-from .rollout_tables import describe, link_next_observations, new_group, put, write_tables
+from .rollout_tables import link_next_observations, write_tables
 from .rollouts import CONVENTION, VALID_EVERY, FrameBlock, Node, RolloutLabels, amodal_dtype
 
 MOST_WAITING_BYTES = 512 << 20
@@ -245,10 +246,9 @@ class _Demo:
         made: dict[str, Any] = {}
         for key, (dtype, shape) in kinds.items():
             properties = chunked(self._compression, dtype, (_chunk_frames(count), *shape))
-            kind, space = h5py.h5t.py_create(dtype), h5py.h5s.create_simple((count, *shape))
-            made[key] = h5py.h5d.create(self._obs.id, f"{name}_{key}".encode(), kind, space, properties)
             unit, order, axes, text = _IMAGES[key]
-            describe(made[key], unit, f"image of camera {name}", order, axes, text)
+            texts = (unit, f"image of camera {name}", order, axes, text)
+            made[key] = new_dataset(self._obs, f"{name}_{key}", dtype, (count, *shape), properties, *texts)
         return made
 
     def write(self, chunk: _Chunk) -> None:
@@ -303,11 +303,14 @@ class _Demo:
         rows = np.zeros((len(files), max(map(len, files))), np.uint8)
         for row, data in zip(rows, files, strict=True):
             row[: len(data)] = data
-        # contiguous: a frame is read without its neighbours
-        made = self._obs.create_dataset(f"{name}_image", data=rows)
         unit, order, axes, text = _JPEG
-        describe(made.id, unit, f"image of camera {name}", order, axes, text)
-        made.attrs.update(encoding="jpeg", quality=JPEG_QUALITY, height=camera.height, width=camera.width)
+        # not in chunks: a frame is read without its neighbours
+        made = put(
+            self._obs, f"{name}_image", rows, unit, f"image of camera {name}", order, axes, text, in_chunks=False
+        )
+        write_text(made, b"encoding", "jpeg")
+        for key, value in {"quality": JPEG_QUALITY, "height": camera.height, "width": camera.width}.items():
+            write_number(made, key, np.int64(value))
 
 
 def _chunk_frames(frames: int) -> int:
