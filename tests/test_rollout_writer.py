@@ -10,7 +10,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 import pytest
-from cgwm.datasets import rollout_writer
+from cgwm.datasets import rollout_demo, rollout_writer
 from cgwm.datasets.atomic import sha256
 from cgwm.datasets.chunks import chunked, encoded, image_of, jpeg_of
 from cgwm.datasets.loader import RolloutReader
@@ -103,7 +103,7 @@ def test_what_fails_in_the_thread_is_raised_in_the_caller(
     def fail(*arguments: object) -> None:
         raise OSError(number, "broken")
 
-    monkeypatch.setattr(rollout_writer, "write_tables", fail)
+    monkeypatch.setattr(rollout_demo, "write_tables", fail)
     with pytest.raises(NotEnoughSpaceError if number == errno.ENOSPC else OSError):
         with RolloutWriter(tmp_path / "a.h5", 3, "{}", "test") as writer:
             for index in range(2000):  # more than may wait
