@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 
 from ..schemas import ROLLOUTS_FORMAT, NotEnoughSpaceError
-from .chunks import Compression, encoded, jpeg_of, require_zstd
+from .chunks import Compression, encoded, jpeg_of, require_zstd, zstd_module
 from .guarded_file import GuardedFile
 from .processors import processors
 from .rollout_demo import Chunk, Demo, chunk_frames_of
@@ -64,6 +64,7 @@ class RolloutWriter:
     ):
         if compression in ("zstd", "jpeg"):
             require_zstd(f"writing with compression {compression}")  # before there is a file
+            zstd_module()
         self._compression: Compression = compression
         self._path = path
         self._guarded = GuardedFile(path)
