@@ -147,9 +147,7 @@ def test_a_missing_package_is_named_before_there_is_a_file(tmp_path: Path, monke
     for name in ("compression.zstd", "backports.zstd"):
         monkeypatch.setitem(sys.modules, name, None)
     zstd_module.cache_clear()
-    with pytest.raises(
-        InputDataError, match=r"backports.zstd.*\n.*compression=gzip or none.*\n.*pip install backports"
-    ):
+    with pytest.raises(InputDataError, match=r"backports.zstd.*\n.*=gzip or none.*\n.*pip install backports"):
         RolloutWriter(tmp_path / "a.h5", 3, "{}", "test")
     assert not (tmp_path / "a.h5").exists()
     with RolloutWriter(tmp_path / "b.h5", 3, "{}", "test", "gzip") as writer:
