@@ -5,6 +5,7 @@ Each function here may run in many threads at once: zstd, zlib and OpenCV let go
 
 from __future__ import annotations
 
+import importlib
 import zlib
 from functools import cache
 from typing import Any, Literal
@@ -86,16 +87,26 @@ def encoded(frames: np.ndarray, compression: Compression, chunk_frames: int) -> 
         raw = np.ascontiguousarray(raw.reshape(-1, frames.itemsize).T).reshape(-1)
     if compression == "gzip":
         return zlib.compress(raw.data, GZIP_LEVEL)
-    return _zstd().compress(raw.data, ZSTD_LEVEL)
+    return zstd_module().compress(raw.data, ZSTD_LEVEL)
 
 
-def _zstd() -> Any:
-    """Return the standard library's module `compression.zstd`, before Python 3.14 by its backport."""
-    try:
-        from compression import zstd  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        from backports import zstd
-    return zstd
+@cache
+def zstd_module() -> Any:
+    """Return the standard library's module `compression.zstd`, before Python 3.14 by its backport.
+
+    Raises:
+        InputDataError: If it is not there.
+    """
+    for name in ("compression.zstd", "backports.zstd"):
+        try:
+            return importlib.import_module(name)
+        except ImportError:
+            continue
+    raise InputDataError(
+        "writing with zstd needs the package backports.zstd, which is not installed here.",
+        "--set synthesize.compression=gzip or none need no package.",
+        "pip install backports.zstd",
+    )
 
 
 def jpeg_of(image: np.ndarray) -> np.ndarray:

@@ -1,21 +1,16 @@
-"""The arrays of one rollout in HDF5, all but its images; each with its unit, frame, order, shape and description.
-
-Written by h5py's low level: a rollout has about 60 arrays with five attributes each, and its high level takes 25 ms for
-them, in which a GPU renders as many frames as it has.
-"""
+"""The arrays of one rollout in HDF5, all but its images; each with its unit, frame, order, shape and description."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from functools import cache
-from typing import Any
 
 import h5py
 import numpy as np
 
 from ..schemas import Exposure
 from .cameras import Camera
+from .described import new_group, put, write_number, write_text
 from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
 
 TORQUE = "Mean torque on free bodies about the centre of mass since the frame before, from the angular momentum"
@@ -28,7 +23,7 @@ def write_tables(demo: Node, labels: RolloutLabels) -> Node:
     _write_bodies(demo, labels)
     _write_contacts(demo, labels)
     _write_parameters(demo, labels.parameters)
-    observations = demo.create_group("obs")
+    observations = new_group(demo, "obs")
     _write_object_observation(observations, labels)
     if labels.cameras:
         _write_cameras(demo, labels.cameras, labels.exposures or {})
@@ -36,56 +31,18 @@ def write_tables(demo: Node, labels: RolloutLabels) -> Node:
     return observations
 
 
-def put(group: Node, name: str, data: Any, unit: str, frame: str, order: str, shape: str, text: str) -> Any:
-    """Write an array, with a checksum, say what it is, and return its DatasetID."""
-    values = np.ascontiguousarray(data)
-    kind = h5py.h5t.py_create(values.dtype, logical=True)
-    scalar = np.ndim(data) == 0
-    space = h5py.h5s.create(h5py.h5s.SCALAR) if scalar else h5py.h5s.create_simple(values.shape)
-    made = h5py.h5d.create(group.id, name.encode(), kind, space, _checked(() if scalar else values.shape))
-    if values.size:
-        made.write(h5py.h5s.ALL, h5py.h5s.ALL, values.reshape(np.shape(data)))
-    describe(made, unit, frame, order, shape, text)
-    return made
-
-
-@cache
-def _checked(shape: tuple[int, ...]) -> Any:
-    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    properties.set_obj_track_times(False)
-    if shape and all(shape):
-        properties.set_chunk(shape)
-        properties.set_fletcher32()
-    return properties
-
-
-def describe(made: Any, *texts: str) -> None:
-    """Say what an array (h5py's DatasetID) is: unit, frame, order, shape and description."""
-    names = (b"unit", b"frame", b"order", b"shape_meaning", b"description")
-    for name, text in zip(names, texts, strict=True):
-        _write_text(made, name, text)
-
-
-def _write_text(made: Any, name: bytes, text: str) -> None:
-    kind, space = _text_kind()
-    h5py.h5a.create(made, name, kind, space).write(np.array(text, dtype=h5py.string_dtype()))
-
-
-@cache
-def _text_kind() -> tuple[Any, Any]:
-    return h5py.h5t.py_create(h5py.string_dtype(), logical=True), h5py.h5s.create(h5py.h5s.SCALAR)
-
-
 def _write_attributes(demo: Node, labels: RolloutLabels, count: int) -> None:
     parameters = {p.name: {"value": p.value, "unit": p.unit} for p in labels.parameters}
-    demo.attrs.update(num_samples=count, episode_index=labels.episode_index, seed=labels.seed, attempt=labels.attempt)
+    numbers = {"num_samples": count, "episode_index": labels.episode_index, "seed": labels.seed}
+    for name, number in {**numbers, "attempt": labels.attempt}.items():
+        write_number(demo.id, name, np.int64(number))
     texts = {
         b"model_file": labels.model_mjcf,
         b"params_json": json.dumps(parameters),
         b"effects_json": json.dumps({name: dict(values) for name, values in (labels.effects or {}).items()}),
     }
     for name, text in texts.items():
-        _write_text(demo.id, name, text)
+        write_text(demo.id, name, text)
 
 
 def _write_timeline(demo: Node, labels: RolloutLabels) -> None:
@@ -101,7 +58,7 @@ def _write_timeline(demo: Node, labels: RolloutLabels) -> None:
 
 
 def _write_bodies(demo: Node, labels: RolloutLabels) -> None:
-    group = demo.create_group("bodies")
+    group = new_group(demo, "bodies")
     names = np.array([name.encode() for name in labels.bodies])
     motions = np.array([motion.encode() for motion in labels.motions])
     inertia_text = "About the centre of mass, body axes."
@@ -127,7 +84,7 @@ def _turning(labels: RolloutLabels) -> str:
 
 
 def _write_contacts(demo: Node, labels: RolloutLabels) -> None:
-    table, group = labels.contacts, demo.create_group("contacts")
+    table, group = labels.contacts, new_group(demo, "contacts")
     impulse = "Impulse on body a since the frame before (frame 0: zero); body b gets its opposite."
     force = "Mean force on body a since the frame before (frame 0: zero): the impulse over the time between the frames."
     offsets = "Rows offsets[t]:offsets[t + 1] of the other arrays belong to frame t."
@@ -150,12 +107,12 @@ def _forces(table: ContactTable, time_s: np.ndarray) -> np.ndarray:
 
 
 def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> None:
-    group = demo.create_group("parameters")
+    group = new_group(demo, "parameters")
     for p in parameters:
         made = put(group, p.name, np.float64(p.value), p.unit, "-", "-", "scalar", "Value used in this rollout.")
         for key, value in (("estimate", p.estimate), ("std_error", p.std_error)):
             if value is not None:
-                h5py.Dataset(made).attrs[key] = value
+                write_number(made, key, np.float64(value))
 
 
 def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
@@ -166,9 +123,9 @@ def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
 
 
 def _write_cameras(demo: Node, cameras: Mapping[str, Camera], exposures: Mapping[str, Exposure]) -> None:
-    group = demo.create_group("cameras")
+    group = new_group(demo, "cameras")
     for name, camera in cameras.items():
-        entry = group.create_group(name)
+        entry = new_group(group, name)
         distortion = np.asarray(camera.distortion, float)
         text = "Camera to world; OpenCV axes (x right, y down, z forward)."
         put(entry, "K", camera.K, "px", "image", "row", "(3, 3)", "Intrinsics; top-left pixel centre (0.5, 0.5).")
@@ -180,12 +137,12 @@ def _write_cameras(demo: Node, cameras: Mapping[str, Camera], exposures: Mapping
         seen = "What the model shows, 0 to 1, times this, plus offset_rgb, cut off at 0 and 1, is the image."
         put(entry, "gain_rgb", exposure.gain_rgb, "1", "-", "RGB", "(3,)", f"Exposure and light. {seen}")
         put(entry, "offset_rgb", exposure.offset_rgb, "1", "-", "RGB", "(3,)", "Exposure: see gain_rgb.")
-        _write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
+        write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
 
 
 def _write_light(demo: Node, labels: RolloutLabels) -> None:
     """The rollout's light; its gain is part of every camera's `gain_rgb`."""
-    group = demo.create_group("light")
+    group = new_group(demo, "light")
     gain = np.ones(3) if labels.light_gain_rgb is None else labels.light_gain_rgb
     put(group, "gain_rgb", gain, "1", "-", "RGB", "(3,)", "Brightness relative to the photos; in the cameras' gain.")
     if labels.light is not None:
@@ -196,7 +153,7 @@ def _write_light(demo: Node, labels: RolloutLabels) -> None:
 
 def link_next_observations(demo: Node, observations: Node) -> None:
     """Add `next_obs` as virtual datasets on `obs`, shifted by one frame: what robomimic reads, at no size."""
-    group = demo.create_group("next_obs")
+    group = new_group(demo, "next_obs")
     place = observations.name
     for name in observations:
         source = h5py.h5d.open(observations.id, name.encode())
@@ -211,7 +168,7 @@ def link_next_observations(demo: Node, observations: Node) -> None:
                 properties.set_virtual(spaces[0], b".", path, spaces[1])
         space = h5py.h5s.create_simple(shape)
         made = h5py.h5d.create(group.id, name.encode(), source.get_type(), space, properties)
-        _write_text(made, b"description", f"obs/{name} one frame later; the last frame is repeated.")
+        write_text(made, b"description", f"obs/{name} one frame later; the last frame is repeated.")
 
 
 def _frames_space(shape: tuple[int, ...], first: int, length: int) -> h5py.h5s.SpaceID:

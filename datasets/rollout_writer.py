@@ -12,7 +12,7 @@ import os
 import queue
 import threading
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -22,49 +22,16 @@ import h5py
 import numpy as np
 
 from ..schemas import ROLLOUTS_FORMAT, NotEnoughSpaceError
-from .cameras import Camera
-from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked, encoded, jpeg_of, require_zstd
+from .chunks import Compression, encoded, jpeg_of, require_zstd, zstd_module
 from .guarded_file import GuardedFile
 from .processors import processors
-from .rollout_tables import describe, link_next_observations, put, write_tables
-from .rollouts import CONVENTION, VALID_EVERY, FrameBlock, Node, RolloutLabels, amodal_dtype
+from .rollout_demo import Chunk, Demo, chunk_frames_of
+from .rollouts import CONVENTION, VALID_EVERY, FrameBlock, Node, RolloutLabels
 
 MOST_WAITING_BYTES = 512 << 20
 """Images that may wait, before they are compressed, for the threads and for the file: more make the caller wait."""
 MOST_WAITING = 256
 """Rollouts and chunks that may wait."""
-
-_IMAGES = {
-    "image": ("1", "row, column, RGB", "(T, H, W, 3)", "Rendered colour, 0 to 255."),
-    "depth": ("m", "row, column", "(T, H, W)", "Depth along the optical axis of what the mask names; 0 = no surface."),
-    "mask": ("1", "row, column", "(T, H, W)", "Visible instance: 0 = background, k = the k-th body."),
-    "amodal": (
-        "1",
-        "row, column; bit k - 1 of a pixel belongs to the k-th body",
-        "(T, H, W)",
-        "Amodal masks as bits: (pixel >> (k - 1)) & 1 is 1 where the k-th body would be seen if it were alone, hidden "
-        "or not.",
-    ),
-}
-_JPEG = (
-    "1",
-    "bytes of a JPEG file, filled up with zeros",
-    "(T, longest)",
-    "Rendered colour, lossy: decode each row with any JPEG reader (cv2.imdecode), to height x width, RGB.",
-)
-
-
-@dataclass(frozen=True)
-class _Chunk:
-    """A block on its way: what it is, and its images as they will stand in the file, by name."""
-
-    camera: str
-    start: int
-    count: int
-    size: int
-    visible_px: np.ndarray
-    amodal_px: np.ndarray
-    images: Future[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -97,6 +64,7 @@ class RolloutWriter:
     ):
         if compression in ("zstd", "jpeg"):
             require_zstd(f"writing with compression {compression}")  # before there is a file
+            zstd_module()
         self._compression: Compression = compression
         self._path = path
         self._guarded = GuardedFile(path)
@@ -117,7 +85,7 @@ class RolloutWriter:
         self.total = 0
         self._error: BaseException | None = None
         self._room = _Room(MOST_WAITING_BYTES)
-        self._queue: queue.Queue[RolloutLabels | _Chunk | _End | None] = queue.Queue(MOST_WAITING)
+        self._queue: queue.Queue[RolloutLabels | Chunk | _End | None] = queue.Queue(MOST_WAITING)
         self._pool = ThreadPoolExecutor(threads or processors(), "cgwm-compress")
         self._thread = threading.Thread(target=self._work, name="cgwm-write", daemon=True)
         self._thread.start()
@@ -158,14 +126,14 @@ class RolloutWriter:
         """
         self._check()
         self._queue.put(labels)
-        chunk_frames = _chunk_frames(len(labels.time_s))
+        chunk_frames = chunk_frames_of(len(labels.time_s))
         for block in frames:
             size = sum(image.nbytes for image in block.images.values())
             self._room.take(size)
             self._check()
             images = self._pool.submit(_encoded_images, block, self._compression, chunk_frames)
             counts = (block.visible_px, block.amodal_px)
-            self._queue.put(_Chunk(block.camera, block.start, len(block.image), size, *counts, images))
+            self._queue.put(Chunk(block.camera, block.start, len(block.image), size, *counts, images))
         self._queue.put(_End())
 
     def _check(self) -> None:
@@ -183,16 +151,16 @@ class RolloutWriter:
 
     def _work(self) -> None:
         """Take things from the queue until the end, and write them as long as nothing goes wrong."""
-        demo: _Demo | None = None
+        demo: Demo | None = None
         while (item := self._queue.get()) is not None:
             try:
                 if self._error is not None:
                     continue
                 if isinstance(item, RolloutLabels):
-                    demo = _Demo(self._data, item, self._compression)
+                    demo = Demo(self._data, item, self._compression)
                     continue
                 assert demo is not None  # labels come first
-                if isinstance(item, _Chunk):
+                if isinstance(item, Chunk):
                     demo.write(item)
                 else:
                     demo.finish()
@@ -204,7 +172,7 @@ class RolloutWriter:
                 self._error = self._error or error
                 self._room.open()
             finally:
-                if isinstance(item, _Chunk):
+                if isinstance(item, Chunk):
                     self._room.give(item.size)
 
     def _finish(self) -> None:
@@ -216,102 +184,6 @@ class RolloutWriter:
         for split, names in splits.items():
             width = max((len(name) for name in names), default=1)
             group.create_dataset(split, data=np.array(names, dtype=f"S{width}"))
-
-
-class _Demo:
-    """One rollout while it is written."""
-
-    def __init__(self, data: Node, labels: RolloutLabels, compression: Compression) -> None:
-        self.labels = labels
-        self._group = data.create_group(f"demo_{labels.episode_index}")
-        self._obs: Node = write_tables(self._group, labels)
-        self._compression: Compression = compression
-        count, bodies = len(labels.time_s), len(labels.bodies)
-        cameras = labels.cameras or {}
-        self._counts = {name: np.full((2, count, bodies), -1, np.int32) for name in cameras}
-        self._jpegs: dict[str, dict[int, np.ndarray]] = {name: {} for name in cameras}
-        self._images = {name: self._datasets(name, camera, count, bodies) for name, camera in cameras.items()}
-
-    def _datasets(self, name: str, camera: Camera, count: int, bodies: int) -> dict[str, Any]:
-        size = (camera.height, camera.width)
-        kinds = {
-            "image": (np.dtype(np.uint8), (*size, 3)),
-            "depth": (np.dtype(np.float32), size),
-            "mask": (np.dtype(np.uint8), size),
-            "amodal": (amodal_dtype(bodies), size),
-        }
-        if self._compression == "jpeg":
-            del kinds["image"]
-        made: dict[str, Any] = {}
-        for key, (dtype, shape) in kinds.items():
-            properties = chunked(self._compression, dtype, (_chunk_frames(count), *shape))
-            kind, space = h5py.h5t.py_create(dtype), h5py.h5s.create_simple((count, *shape))
-            made[key] = h5py.h5d.create(self._obs.id, f"{name}_{key}".encode(), kind, space, properties)
-            unit, order, axes, text = _IMAGES[key]
-            describe(made[key], unit, f"image of camera {name}", order, axes, text)
-        return made
-
-    def write(self, chunk: _Chunk) -> None:
-        """Put a chunk's images in their place."""
-        stop = chunk.start + chunk.count
-        for key, data in chunk.images.result().items():
-            if key == "jpeg":
-                self._jpegs[chunk.camera].update(zip(range(chunk.start, stop), data, strict=True))
-                continue
-            made = self._images[chunk.camera][key]
-            made.write_direct_chunk((chunk.start, *(0 for _ in made.shape[1:])), data)
-        self._counts[chunk.camera][:, chunk.start : stop] = chunk.visible_px, chunk.amodal_px
-
-    def finish(self) -> None:
-        """Write what needs all frames.
-
-        Raises:
-            ValueError: If some frames were not written.
-        """
-        for name, counts in self._counts.items():
-            lacking = int((counts[0, :, 0] < 0).sum())
-            if lacking:
-                raise ValueError(f"camera {name}: {lacking} of {counts.shape[1]} frames were not written")
-        if self._counts:
-            self._write_visibility()
-        if self._compression == "jpeg":
-            for name, camera in (self.labels.cameras or {}).items():
-                self._write_jpegs(name, camera)
-        link_next_observations(self._group, self._obs)
-
-    def _write_visibility(self) -> None:
-        bodies = self._group["bodies"]
-        counts = np.stack([self._counts[name] for name in sorted(self._counts)], axis=2)
-        visible, whole = counts
-        fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
-        axes, cameras = "(T, camera, body)", "cameras in the order of their names"
-        texts = {
-            "visible_px": (visible, "px", f"Pixels of the body in the mask; {cameras}."),
-            "amodal_px": (whole, "px", f"Pixels of the body in the image, hidden ones too; {cameras}."),
-            "visible_fraction": (
-                fraction,
-                "1",
-                f"visible_px over amodal_px: how much of what is in the image is not hidden, 0 where nothing is; "
-                f"{cameras}.",
-            ),
-        }
-        for name, (values, unit, text) in texts.items():
-            put(bodies, name, values, unit, "image", "-", axes, text)
-
-    def _write_jpegs(self, name: str, camera: Camera) -> None:
-        files = [data for _, data in sorted(self._jpegs[name].items())]
-        rows = np.zeros((len(files), max(map(len, files))), np.uint8)
-        for row, data in zip(rows, files, strict=True):
-            row[: len(data)] = data
-        # contiguous: a frame is read without its neighbours
-        made = self._obs.create_dataset(f"{name}_image", data=rows)
-        unit, order, axes, text = _JPEG
-        describe(made.id, unit, f"image of camera {name}", order, axes, text)
-        made.attrs.update(encoding="jpeg", quality=JPEG_QUALITY, height=camera.height, width=camera.width)
-
-
-def _chunk_frames(frames: int) -> int:
-    return min(CHUNK_FRAMES, frames)
 
 
 def _encoded_images(block: FrameBlock, compression: Compression, chunk_frames: int) -> dict[str, Any]:

@@ -151,6 +151,8 @@ def _written(
         with stopwatch.part("hash"):
             entry = _entry(path, job, len(indices), writer.total * max(1, len(job.cameras)))
         entries.append(entry.model_copy(update={"rejected": dict(sorted(outcome.rejected.items()))}))
+        ended = time.perf_counter()
+    stopwatch.seconds["publish"] = time.perf_counter() - ended
     notes += tuple(f"drawn again: {found}" for found in outcome.diverged)
     return _summary(out, job, entries[0], contacts, time.perf_counter() - began, False, notes)
 

@@ -10,9 +10,9 @@ import h5py
 import hdf5plugin
 import numpy as np
 import pytest
-from cgwm.datasets import rollout_writer
+from cgwm.datasets import rollout_demo, rollout_writer
 from cgwm.datasets.atomic import sha256
-from cgwm.datasets.chunks import chunked, encoded, image_of, jpeg_of
+from cgwm.datasets.chunks import chunked, encoded, image_of, jpeg_of, zstd_module
 from cgwm.datasets.loader import RolloutReader
 from cgwm.datasets.rollout_writer import RolloutWriter
 from cgwm.datasets.rollouts import amodal_dtype
@@ -103,7 +103,7 @@ def test_what_fails_in_the_thread_is_raised_in_the_caller(
     def fail(*arguments: object) -> None:
         raise OSError(number, "broken")
 
-    monkeypatch.setattr(rollout_writer, "write_tables", fail)
+    monkeypatch.setattr(rollout_demo, "write_tables", fail)
     with pytest.raises(NotEnoughSpaceError if number == errno.ENOSPC else OSError):
         with RolloutWriter(tmp_path / "a.h5", 3, "{}", "test") as writer:
             for index in range(2000):  # more than may wait
@@ -141,3 +141,14 @@ def test_amodal_masks_have_a_bit_for_each_body() -> None:
     assert [amodal_dtype(count) for count in (1, 8, 9, 33, 64)] == [np.uint8, np.uint8, np.uint16, np.uint64, np.uint64]
     with pytest.raises(InputDataError, match="65 bodies"):
         amodal_dtype(65)
+
+
+def test_a_missing_package_is_named_before_there_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("compression.zstd", "backports.zstd"):
+        monkeypatch.setitem(sys.modules, name, None)
+    zstd_module.cache_clear()
+    with pytest.raises(InputDataError, match=r"backports.zstd.*\n.*=gzip or none.*\n.*pip install backports"):
+        RolloutWriter(tmp_path / "a.h5", 3, "{}", "test")
+    assert not (tmp_path / "a.h5").exists()
+    with RolloutWriter(tmp_path / "b.h5", 3, "{}", "test", "gzip") as writer:
+        writer.write(labels(0), blocks(0))

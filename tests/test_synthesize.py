@@ -202,6 +202,42 @@ def test_labels_agree_with_a_plain_rendering() -> None:
     np.testing.assert_allclose(block.depth[0][pure], picture.depth[0].numpy()[pure], atol=2e-3)
 
 
+def test_all_at_once_is_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a GPU does in one call, here by the torch renderer: the same labels, in the same order of blocks."""
+    model = small_model(driven=True)
+    fixed = model.file.bodies[1].model_copy(update={"name": "post", "motion": "fixed"})
+    file = model.file.model_copy(update={"bodies": (*model.file.bodies, fixed)})
+    splats = {**model.body_splats, "post": replace(model.body_splats["tip"], scales=np.array([0.02]))}
+    model = replace(model, file=file, body_splats=splats, collision={**model.collision, "post": splats["post"]})
+    plan = resolve_plan(model, SamplingPlan(views=2))
+    cameras = look_at_cameras(model, plan, SynthesizeConfig(width=72, height=48))
+    cameras["small"] = look_at_cameras(model, plan, SynthesizeConfig(width=40, height=32))["view1"]
+    rng = np.random.default_rng(0)
+    position = rng.uniform(-0.1, 0.1, (11, 3, 3)) + np.array([0, 0, 0.15])
+    quat = rng.normal(size=(11, 3, 4))
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    renderer = LabelRenderer(model, cameras)
+    expected = list(renderer.blocks(position, quat))
+    monkeypatch.setattr(labels_module, "_to_host", lambda pictures: (pictures, lambda: None))
+    monkeypatch.setattr(renderer, "_together", True)
+    renderer.set_cameras(cameras)
+    for numbers in (labels_module.NUMBERS_AT_ONCE, 1):  # one call, and one for each chunk of frames
+        monkeypatch.setattr(labels_module, "NUMBERS_AT_ONCE", numbers)
+        found = list(renderer.blocks(position, quat))
+        assert [(b.camera, b.start, len(b.image)) for b in found] == [
+            (b.camera, b.start, len(b.image)) for b in expected
+        ]
+        for one, other in zip(found, expected, strict=True):
+            assert np.abs(one.image.astype(int) - other.image).max() <= 1
+            for key in ("mask", "amodal"):
+                assert (getattr(one, key) != getattr(other, key)).mean() < 1e-3
+            same = one.mask == other.mask
+            np.testing.assert_allclose(one.depth[same], other.depth[same], atol=1e-5)
+            assert np.abs(one.visible_px - other.visible_px).max() <= 2
+            assert np.abs(one.amodal_px - other.amodal_px).max() <= 2
+    assert set(np.unique(np.concatenate([b.mask.ravel() for b in expected]))) == {0, 1, 2, 3}
+
+
 def test_amodal_masks_show_what_is_hidden() -> None:
     """The tip stands between the camera and the cube: amodal masks are those of each body rendered alone."""
     model = small_model(driven=True)
