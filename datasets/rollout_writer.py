@@ -67,20 +67,16 @@ class RolloutWriter:
             zstd_module()
         self._compression: Compression = compression
         self._path = path
+        self._attributes = {
+            "format": ROLLOUTS_FORMAT,
+            "format_version": 1,
+            "creator": creator,
+            "seed": seed,
+            "config_json": config_json,
+            "convention": CONVENTION,
+            "filters": "zstd, jpeg" if compression == "jpeg" else compression,
+        }
         self._guarded = GuardedFile(path)
-        self._file = h5py.File(self._guarded, "w")
-        self._file.attrs.update(
-            format=ROLLOUTS_FORMAT,
-            format_version=1,
-            creator=creator,
-            seed=seed,
-            config_json=config_json,
-            convention=CONVENTION,
-            filters="zstd, jpeg" if compression == "jpeg" else compression,
-        )
-        self._data: Node = self._file.create_group("data")
-        env = {"env_name": "cgwm", "env_type": 2, "type": 2, "env_kwargs": {}}
-        self._data.attrs["env_args"] = json.dumps(env)
         self._indices: list[int] = []
         self.total = 0
         self._error: BaseException | None = None
@@ -96,23 +92,26 @@ class RolloutWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            self._error = self._error or error  # what still waits is dropped
-            self._room.open()
-        self._queue.put(None)
-        self._thread.join()
-        self._pool.shutdown(cancel_futures=True)
+        if error is not None:
+            self._drop(error)
         try:
-            if self._error is None:
-                self._finish()
-        except BaseException as fault:
-            self._error = fault
+            self._queue.put(None)
+            self._thread.join()
+        except BaseException as interrupt:
+            self._drop(interrupt)
+            self._queue.put(None)
+            self._thread.join()
+            raise
         finally:
-            self._file.close()
+            self._pool.shutdown(cancel_futures=True)
             self._guarded.close()
-        self._error = self._error or self._guarded.error
         if kind is None:
             self._check()
+
+    def _drop(self, error: BaseException) -> None:
+        """Write no more: what still waits is dropped."""
+        self._error = self._error or error
+        self._room.open()
 
     def write(self, labels: RolloutLabels, frames: Iterable[FrameBlock] = ()) -> None:
         """Write one rollout; `frames` may be a generator, and is consumed block by block.
@@ -150,14 +149,37 @@ class RolloutWriter:
         raise error
 
     def _work(self) -> None:
+        """Do all that HDF5 does, from opening the file to closing it.
+
+        In this thread, for Python interrupts only the main one: HDF5 cannot close a file after a call that an interrupt
+        left, and the process would crash at its end.
+        """
+        item = self._queue.get()
+        try:
+            with h5py.File(self._guarded, "w") as file:
+                file.attrs.update(self._attributes)
+                data: Node = file.create_group("data")
+                env = {"env_name": "cgwm", "env_type": 2, "type": 2, "env_kwargs": {}}
+                data.attrs["env_args"] = json.dumps(env)
+                self._write_all(data, item)
+                item = None
+                if self._error is None:
+                    self._finish(file, data)
+        except BaseException as error:  # another thread raises it
+            self._drop(error)
+            while item is not None:
+                item = self._queue.get()
+        self._error = self._error or self._guarded.error
+
+    def _write_all(self, data: Node, item: RolloutLabels | Chunk | _End | None) -> None:
         """Take things from the queue until the end, and write them as long as nothing goes wrong."""
         demo: Demo | None = None
-        while (item := self._queue.get()) is not None:
+        while item is not None:
             try:
                 if self._error is not None:
                     continue
                 if isinstance(item, RolloutLabels):
-                    demo = Demo(self._data, item, self._compression)
+                    demo = Demo(data, item, self._compression)
                     continue
                 assert demo is not None  # labels come first
                 if isinstance(item, Chunk):
@@ -169,18 +191,18 @@ class RolloutWriter:
                 if self._guarded.error is not None:
                     raise self._guarded.error
             except BaseException as error:  # another thread raises it
-                self._error = self._error or error
-                self._room.open()
+                self._drop(error)
             finally:
                 if isinstance(item, Chunk):
                     self._room.give(item.size)
+                item = self._queue.get()
 
-    def _finish(self) -> None:
-        self._data.attrs["total"] = self.total
+    def _finish(self, file: Node, data: Node) -> None:
+        data.attrs["total"] = self.total
         splits = {"train": [], "valid": []}
         for index in sorted(self._indices):
             splits["valid" if index % VALID_EVERY == VALID_EVERY - 1 else "train"].append(f"demo_{index}")
-        group = self._file.create_group("mask")
+        group = file.create_group("mask")
         for split, names in splits.items():
             width = max((len(name) for name in names), default=1)
             group.create_dataset(split, data=np.array(names, dtype=f"S{width}"))
