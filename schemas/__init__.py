@@ -75,6 +75,7 @@ from .errors import (
     UsageError,
     did_you_mean,
 )
+from .exports import ExportFormat, ExportResult
 from .imports import ImportResult
 from .model import (
     MODEL_FORMAT,
@@ -134,6 +135,8 @@ __all__ = [
     "ErrorCurve",
     "ErrorSummary",
     "EvalResult",
+    "ExportFormat",
+    "ExportResult",
     "Exposure",
     "FileModel",
     "FileShape",
