@@ -187,6 +187,6 @@ def _description(chosen: Selection, models: Mapping[str, ObjectModel], whole: bo
 
 
 def _write_json(path: Path, content: dict[Any, Any]) -> None:
-    """Write an entry a line, as bop_toolkit does."""
-    rows = [f'  "{key}": {json.dumps(value)}' for key, value in content.items()]
+    """Write an entry a line, by number, as bop_toolkit does."""
+    rows = [f'  "{key}": {json.dumps(content[key])}' for key in sorted(content)]
     path.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")

@@ -19,6 +19,7 @@ PIXEL_FORMAT = "yuv420p"
 QUALITY_CRF = 18
 KEY_FRAME_EVERY = 2
 MAX_FILE_BYTES = 200 << 20
+"""An episode begins a new file where the last one has more."""
 
 
 class EpisodeVideos:
@@ -29,11 +30,10 @@ class EpisodeVideos:
         key: The feature's name, `observation.images.<camera>`.
         rate: Frames per second.
         size: Width and height [px], both even.
-        max_bytes: An episode begins a new file where the last one has more.
     """
 
-    def __init__(self, root: Path, key: str, rate: Fraction, size: tuple[int, int], max_bytes: int = MAX_FILE_BYTES):
-        self._root, self._key, self._rate, self._size, self._max_bytes = root, key, rate, size, max_bytes
+    def __init__(self, root: Path, key: str, rate: Fraction, size: tuple[int, int]):
+        self._root, self._key, self._rate, self._size = root, key, rate, size
         self._places = FilePlaces()
         self._container: Any = None
         self._stream: Any = None
@@ -43,7 +43,7 @@ class EpisodeVideos:
 
     def begin(self) -> None:
         """Begin an episode."""
-        if self._container is not None and self._path.stat().st_size > self._max_bytes:
+        if self._container is not None and self._path.stat().st_size > MAX_FILE_BYTES:
             self.close()
             self._places.advance()
         if self._container is None:
