@@ -96,6 +96,11 @@ def reader(dataset: Path) -> Iterator[RolloutReader]:
     reader.close()
 
 
+def png(path: Path) -> np.ndarray:
+    """Return a PNG as it is, 8 or 16 bits."""
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+
+
 # models
 
 
@@ -283,10 +288,10 @@ def test_nerfstudio_has_cameras_pictures_depth_and_time(dataset: Path, reader: R
         theirs = camera_of(cameras, f"{view}/{file}")
         np.testing.assert_allclose(theirs.project(points)[0], ours.project(points)[0], atol=1e-9)
         np.testing.assert_array_equal(read_rgb(out / frame["file_path"]), reader.read(3, f"obs/{view}_image")[number])
-        depth = cv2.imread(str(out / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        depth = png(out / frame["depth_file_path"])
         assert depth.dtype == np.uint16
         np.testing.assert_allclose(depth / 1e3, reader.read(3, f"obs/{view}_depth")[number], atol=0.00051)
-        mask = cv2.imread(str(out / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+        mask = png(out / frame["mask_path"])
         np.testing.assert_array_equal(mask == 0, reader.read(3, f"obs/{view}_mask")[number] > 0)
         assert set(np.unique(mask)) <= {0, 255}
         assert frame["time"] == pytest.approx(time_s[number] / time_s[-1])
@@ -331,10 +336,10 @@ def test_bop_poses_depth_and_masks_agree(
         body = 1e3 * reader.read(4, "bodies/pos")[frame, 0]
         np.testing.assert_allclose(R_wc @ body + t_wc, pose["cam_t_m2c"], atol=1e-6)
         pixels = np.round((local @ K.T)[:, :2] / local[:, 2:]).astype(int)
-        mask = cv2.imread(str(scene / "mask_visib" / f"{int(key):06d}_000000.png"), cv2.IMREAD_UNCHANGED)
+        mask = png(scene / "mask_visib" / f"{int(key):06d}_000000.png")
         inside = ((pixels >= 0) & (pixels < [WIDTH, HEIGHT])).all(1)
         assert (mask[pixels[inside, 1], pixels[inside, 0]] > 0).mean() > 0.9
-        depth = cv2.imread(str(scene / "depth" / f"{int(key):06d}.png"), cv2.IMREAD_UNCHANGED)
+        depth = png(scene / "depth" / f"{int(key):06d}.png")
         master = reader.read(4, f"obs/view{view}_depth")[frame]
         np.testing.assert_allclose(depth * cameras[key]["depth_scale"] / 1e3, master, atol=6e-5)
         np.testing.assert_array_equal(
@@ -362,7 +367,7 @@ def test_bop_has_whole_silhouettes_where_the_dataset_has(
     for key, (fact,) in facts.items():
         visible = reader.read(4, "obs/view1_mask")[int(key)] == 1
         silhouette = visible | whole(None, 0, "", 0, 1)[0, 0]
-        mask = cv2.imread(str(scene / "mask" / f"{int(key):06d}_000000.png"), cv2.IMREAD_UNCHANGED)
+        mask = png(scene / "mask" / f"{int(key):06d}_000000.png")
         np.testing.assert_array_equal(mask > 0, silhouette)
         assert (fact["px_count_all"], fact["px_count_visib"]) == (silhouette.sum(), visible.sum())
         assert fact["visib_fract"] == pytest.approx(visible.sum() / silhouette.sum())

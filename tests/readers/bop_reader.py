@@ -4,6 +4,8 @@ Argument: the dataset's directory. The model's corners are projected by K (R p +
 compared with the visible mask and the depth image.
 """
 
+# pyright: reportMissingImports=false
+
 import json
 import sys
 from importlib.metadata import version

@@ -1,5 +1,7 @@
 """Read a .glb with pygltflib and with trimesh and print what they hold, as JSON. Run in an environment with both."""
 
+# pyright: reportMissingImports=false
+
 import json
 import sys
 from importlib.metadata import version

@@ -4,6 +4,8 @@ Arguments: the dataset's directory; an .npz to write the decoded frames, states 
 last frame to.
 """
 
+# pyright: reportMissingImports=false
+
 import json
 import sys
 from importlib.metadata import version

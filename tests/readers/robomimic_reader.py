@@ -3,6 +3,8 @@
 Arguments: the shard; an .npz to write a few items to. robomimic does not know zstd: `import hdf5plugin` teaches HDF5.
 """
 
+# pyright: reportMissingImports=false
+
 import contextlib
 import json
 import sys
