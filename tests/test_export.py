@@ -18,6 +18,7 @@ from cgwm.cli.export import _option
 from cgwm.datasets.atomic import sha256
 from cgwm.datasets.cameras import Camera, camera_of, to_intrinsics
 from cgwm.datasets.colmap_model import read_colmap_model, rotation_from_quat_wxyz
+from cgwm.datasets.exports.bop_coco import run_lengths
 from cgwm.datasets.exports.glb import EXTENSION
 from cgwm.datasets.exports.lerobot_stats import PictureStats, together, vector_stats
 from cgwm.datasets.exports.selection import Selection
@@ -374,7 +375,29 @@ def test_bop_has_whole_silhouettes_where_the_dataset_has(
         rows, columns = np.nonzero(visible)
         left, top, width, height = fact["bbox_visib"]
         assert (left, top, left + width, top + height) == (columns.min(), rows.min(), columns.max(), rows.max())
+    coco = json.loads((scene / "scene_gt_coco.json").read_text())
+    assert [image["id"] for image in coco["images"]] == list(map(int, facts)) and len(coco["annotations"]) > 0
+    for entry in coco["annotations"]:
+        visible = reader.read(4, "obs/view1_mask")[entry["image_id"]] == 1
+        np.testing.assert_array_equal(from_run_lengths(entry["segmentation"]), visible)
+        rows, columns = np.nonzero(visible | whole(None, 0, "", 0, 1)[0, 0])
+        assert entry["bbox"] == [0, 0, columns.max() + 1, rows.max() + 1] and entry["area"] == visible.sum()
+        assert entry["ignore"] == (visible.sum() < 0.1 * len(rows))
     reader.close()
+
+
+def from_run_lengths(runs: dict[str, list[int]]) -> np.ndarray:
+    """Decode COCO's run lengths: background and mask by turns, column after column."""
+    values = np.repeat(np.arange(len(runs["counts"])) % 2, runs["counts"])
+    return values.reshape(runs["size"], order="F").astype(bool)
+
+
+@pytest.mark.parametrize("corner", [False, True])
+def test_run_lengths_begin_with_the_background(corner: bool) -> None:
+    mask = np.random.default_rng(0).random((7, 5)) < 0.4
+    mask[0, 0] = corner
+    assert (run_lengths(mask)["counts"][0] == 0) == corner
+    np.testing.assert_array_equal(from_run_lengths(run_lengths(mask)), mask)
 
 
 def test_amodal_bits_are_read(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:

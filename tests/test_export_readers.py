@@ -37,7 +37,7 @@ LEROBOT_WHOLE = (
 )
 LEROBOT_WHOLE += ("packaging>=24.2,<26", "numpy<2.4")
 ROBOMIMIC_WHOLE = ("h5py", "hdf5plugin", "numpy", "psutil", "tqdm", "termcolor", "setuptools")
-BOP_WHOLE = ("numpy<2", "imageio", "pypng", "pytz", "pillow", "scipy")
+BOP_WHOLE = ("numpy<2", "imageio", "pypng", "pytz", "pillow", "scipy", "scikit-image")
 
 pytestmark = pytest.mark.evidence
 

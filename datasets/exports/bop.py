@@ -21,6 +21,7 @@ from ..colmap_model import rotation_from_quat_wxyz
 from ..images import write_depth, write_image
 from ..loader import RolloutReader
 from ..progress import progress
+from .bop_coco import CocoScene
 from .bop_models import ObjectModel, write_models
 from .selection import Picture, Selection
 
@@ -28,8 +29,8 @@ DEPTH_STEPS_MM = (0.1, 1.0, 10.0)
 """Units of depth images; an image takes the finest that reaches its farthest pixel."""
 SPLIT_FOLDERS = {"train": "train", "valid": "val"}
 NO_AMODAL = (
-    "the dataset has no amodal masks, so that there is no folder mask/ and no scene_gt_info.json (visible fractions "
-    "and whole silhouettes are not known); mask_visib/ is there"
+    "the dataset has no amodal masks, so that mask/, scene_gt_info.json and scene_gt_coco.json are missing (visible "
+    "fractions and whole silhouettes are not known); mask_visib/ is there"
 )
 _NOWHERE = [-1, -1, -1, -1]
 
@@ -76,6 +77,7 @@ class _Scene:
         self.cameras: dict[int, dict[str, Any]] = {}
         self.poses: dict[int, list[dict[str, Any]]] = {}
         self.facts: dict[int, list[dict[str, Any]]] = {}
+        self.coco = CocoScene(chosen.bodies(number))
 
     def write(self) -> tuple[int, int, bool]:
         """Write the scene; return the numbers of images and instances, and whether whole silhouettes were known."""
@@ -91,6 +93,8 @@ class _Scene:
         _write_json(self.folder / "scene_gt.json", self.poses)
         if whole:
             _write_json(self.folder / "scene_gt_info.json", self.facts)
+            text = json.dumps(self.coco.content())
+            (self.folder / "scene_gt_coco.json").write_text(text + "\n", encoding="utf-8")
         return len(self.cameras), sum(map(len, self.poses.values())), whole
 
     def _image(self, image_id: int, camera: Camera, picture: Picture) -> None:
@@ -108,6 +112,7 @@ class _Scene:
         depth = np.round(picture.depth_m * (1e3 / step_mm))
         write_depth(self.folder / "depth" / f"{name}.png", np.where(depth > 65535, 0, depth).astype(np.uint16))
         self.poses[image_id], self.facts[image_id] = [], []
+        self.coco.add_image(image_id, camera.width, camera.height)
         for body in range(self.position.shape[1]):
             R_world = rotation_from_quat_wxyz(self.quat[picture.frame, body])
             t_cam = T_cam_world[:3, :3] @ self.position[picture.frame, body] + T_cam_world[:3, 3]
@@ -120,6 +125,7 @@ class _Scene:
                 (self.folder / "mask").mkdir(exist_ok=True)
                 _write_mask(self.folder / "mask" / f"{name}_{body:06d}.png", silhouette)
                 self.facts[image_id].append(_facts(visible, silhouette, picture.depth_m))
+                self.coco.add(image_id, body, visible, silhouette)
 
 
 def _facts(visible: NDArray[np.bool_], silhouette: NDArray[np.bool_], depth_m: NDArray[np.float32]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from bop_toolkit_lib import inout, misc
+from bop_toolkit_lib import inout, misc, pycoco_utils
 from bop_toolkit_lib.dataset import bop_scenewise
 
 root = Path(sys.argv[1])
@@ -22,6 +22,8 @@ scenes = sorted(path for split in ("train", "val") for path in (root / split).it
 for scene in scenes:
     infos = bop_scenewise.read_scene_infos(scene, read_image_ids=True, read_n_objects=True)
     whole = infos["has_mask"]
+    coco = inout.load_json(scene / "scene_gt_coco.json") if whole else {"annotations": []}
+    annotations = {(entry["image_id"], entry["category_id"]): entry for entry in coco["annotations"]}
     data = bop_scenewise.load_scene_data(scene, load_scene_gt_info=whole)
     for number in sorted(infos["image_ids"])[:: max(1, len(infos["image_ids"]) // 6)]:
         image = bop_scenewise.load_image_data(scene, number, load_gt=True, load_mask=whole, load_gt_info=whole)
@@ -38,6 +40,9 @@ for scene in scenes:
         if whole:
             fact = image["gt_info"][0]
             assert fact["px_count_visib"] == mask.sum() <= fact["px_count_all"] == (image["mask"][0] > 0).sum()
+            runs = annotations[number, pose["obj_id"]]["segmentation"]
+            assert (pycoco_utils.rle_to_binary_mask(runs) == mask).all()
+            assert pycoco_utils.binary_mask_to_rle(mask) == runs
             assert data["scene_gt_info"][number][0]["visib_fract"] <= 1
 info = inout.load_json(root / "models" / "models_info.json", keys_to_int=True)[1]
 about = {
