@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cgwm.datasets.dataset import read_manifest
+from cgwm.datasets.exports.selection import Selection
 from cgwm.datasets.loader import RolloutReader
 from cgwm.datasets.models import read_model
 from cgwm.pipeline.synthesize import synthesize
@@ -37,6 +38,8 @@ LEROBOT_WHOLE = (
 )
 LEROBOT_WHOLE += ("packaging>=24.2,<26", "numpy<2.4")
 ROBOMIMIC_WHOLE = ("h5py", "hdf5plugin", "numpy", "psutil", "tqdm", "termcolor", "setuptools")
+NERFSTUDIO_WHOLE = ("numpy", "tyro", "rich", "jaxtyping", "opencv-python-headless", "pillow", "imageio", "viser")
+NERFSTUDIO_WHOLE += ("tensorboard", "setuptools<81")
 BOP_WHOLE = ("numpy<2", "imageio", "pypng", "pytz", "pillow", "scipy", "scikit-image")
 
 pytestmark = pytest.mark.evidence
@@ -166,6 +169,31 @@ def test_robomimic_reads_the_shard_as_it_is(environment: Environment, work: Path
             np.testing.assert_array_equal(arrays[f"{item}/next_obs/{name}"], master[frames + 1])
         np.testing.assert_array_equal(arrays[f"{item}/actions"], reader.read(0, "actions")[frames])
     reader.close()
+
+
+def test_nerfstudio_reads_the_export(environment: Environment, work: Path) -> None:
+    """A ray through the pixel where our camera sees a body meets that body; pixels, depth and masks agree."""
+    python = environment("nerfstudio", NERFSTUDIO_WHOLE, ("nerfstudio==1.1.5",), (f"torch=={pinned('torch')}",))
+    words = ("--rollout", "2", "--mask", "scene", "--every", "3", "--overwrite")
+    cgwm(work, "export", "dataset", "--to", "nerfstudio", "--out", "nerfstudio", *words)
+    chosen = Selection(work / "dataset", every=3)
+    bodies = chosen.reader.read(2, "bodies/pos")[:, 0]
+    places = {f"{view}/{k:06d}.png": (view, k) for view in chosen.cameras for k in chosen.frames(2)}
+    asked = {name: chosen.camera(2, view, k).project(bodies[k : k + 1])[0][0] for name, (view, k) in places.items()}
+    np.savez(work / "asked.npz", **asked)
+    found = read_by(python, "nerfstudio", work, "nerfstudio", work / "nerfstudio.npz", work / "asked.npz")
+    assert sorted(found["images"]) == sorted(places) and found["scale"] == 1
+    np.testing.assert_array_equal(found["transform"], np.eye(4)[:3])
+    arrays = np.load(work / "nerfstudio.npz")
+    for name, (view, k) in places.items():
+        away = bodies[k] - arrays[f"{name}/origin"]
+        across = np.linalg.norm(np.cross(away, arrays[f"{name}/direction"]))
+        assert across < 1e-5, f"{name}: the ray passes the body {across * 1e3:.3f} mm away"
+        master = {key: chosen.reader.read(2, f"obs/{view}_{key}")[k] for key in ("image", "depth", "mask")}
+        np.testing.assert_allclose(arrays[f"{name}/image"] * 255, master["image"], atol=0.01)
+        np.testing.assert_allclose(arrays[f"{name}/depth"], master["depth"], atol=0.00051)
+        np.testing.assert_array_equal(arrays[f"{name}/mask"], master["mask"] == 0)
+    chosen.reader.close()
 
 
 def test_bop_toolkit_reads_the_export(environment: Environment, work: Path) -> None:
