@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..datasets.mjcf import Keyframe
 from ..datasets.models import Model
@@ -112,12 +113,21 @@ def _mujoco_poses(
             for body, track in driven.items():
                 mocap = int(loaded.body(body).mocapid[0])
                 # the command at the end of the step: where the body is when the step's contacts are solved
-                now = data.time + loaded.opt.timestep
-                data.mocap_pos[mocap] = [np.interp(now, track.time_s, axis) for axis in track.position_m.T]
+                pose = _commanded(track, data.time + loaded.opt.timestep)
+                data.mocap_pos[mocap], data.mocap_quat[mocap] = pose
             mujoco.mj_step(loaded, data)
         frames.append(_poses(data, names))
     position, quat = zip(*frames, strict=True)
     return np.array(position), np.array(quat)
+
+
+def _commanded(track: Track, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return position (3,) and quaternion w x y z (4,) of a command at a time; held still outside of it."""
+    now = np.clip(time_s, track.time_s[0], track.time_s[-1])
+    position = np.array([np.interp(now, track.time_s, axis) for axis in track.position_m.T])
+    assert track.quat_wxyz is not None  # sampled commands have orientations
+    turns = Slerp(track.time_s, Rotation.from_quat(track.quat_wxyz, scalar_first=True))
+    return position, turns(now).as_quat(scalar_first=True)
 
 
 def _poses(data: Any, names: list[str]) -> tuple[np.ndarray, np.ndarray]:

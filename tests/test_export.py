@@ -28,9 +28,10 @@ from cgwm.datasets.meshes import Mesh, mass_properties
 from cgwm.datasets.mjcf import write_mjcf
 from cgwm.datasets.models import Model, read_model, write_model
 from cgwm.datasets.ply import SH_C0, Splats, read_splats
+from cgwm.datasets.tracks import Track
 from cgwm.datasets.transforms import read_transforms
 from cgwm.pipeline.export import DATASET_FORMATS, MODEL_FORMATS, OPTIONS, ExportOptions, export, object_model
-from cgwm.pipeline.resimulate import keyframe_of, resimulate, start_of
+from cgwm.pipeline.resimulate import _commanded, keyframe_of, resimulate, start_of
 from cgwm.pipeline.splats.surface_nets import union_mesh
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import (
@@ -129,6 +130,15 @@ def test_the_deviation_finds_another_gravity_and_another_mass() -> None:
     assert wrong.flight[0] == pytest.approx(1e3 * 0.5 * 0.11 * (0.01 * steps) ** 2, rel=1e-2)
     shifted = resimulate(model, text.replace('pos="0.01 0 0" mass', 'pos="0.02 0 0" mass'), start, 0.2)
     assert shifted.flight is not None and shifted.flight[0] > 0.1
+
+
+def test_a_command_turns_and_moves_the_mocap_body() -> None:
+    quats = np.array([[1.0, 0, 0, 0], [np.cos(0.3), 0, 0, np.sin(0.3)]])
+    track = Track(np.array([0.0, 0.2]), np.array([[0.0, 0, 0], [0.1, 0, 0]]), quats)
+    position, quat = _commanded(track, 0.1)
+    np.testing.assert_allclose(position, [0.05, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(quat, [np.cos(0.15), 0, 0, np.sin(0.15)], atol=1e-12)
+    np.testing.assert_allclose(_commanded(track, 9.0)[1], quats[1], atol=1e-12)
 
 
 def test_mjcf_says_what_it_lacks(tmp_path: Path) -> None:
