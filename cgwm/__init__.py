@@ -33,6 +33,7 @@ _PUBLIC = {
     "diagnose": ".pipeline.diagnose",
     "doctor": ".pipeline.doctor",
     "evaluate": ".pipeline.eval",
+    "export": ".pipeline.export",
     "fit": ".pipeline.fit",
     "import_balldrops": ".datasets.balldrops",
     "import_contactnets": ".datasets.contactnets",
@@ -67,6 +68,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.diagnose import diagnose  # pyright: ignore[reportMissingImports]
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
+    from .pipeline.export import export  # pyright: ignore[reportMissingImports]
     from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
     from .pipeline.merge import merge  # pyright: ignore[reportMissingImports]
     from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
@@ -108,6 +110,7 @@ __all__ = [
     "diagnose",
     "doctor",
     "evaluate",
+    "export",
     "fit",
     "import_balldrops",
     "import_contactnets",

@@ -13,6 +13,7 @@ from .diagnose import diagnose
 from .doctor import doctor
 from .effects import list_effects, new_effect, show_effect
 from .eval import evaluate
+from .export import export
 from .fit import fit
 from .import_ import import_capture
 from .merge import merge
@@ -29,6 +30,7 @@ VERBS = (
     ("compare", compare, "Where and when each model fails, side by side."),
     ("diagnose", diagnose, "Which effect a model lacks."),
     ("import", import_capture, "Recordings in another format to a capture."),
+    ("export", export, "A dataset or a model in the format of another tool."),
     ("validate", validate, "Check a capture, a model or a dataset."),
     ("doctor", doctor, "What this machine has, and what would be used."),
 )

@@ -79,6 +79,7 @@ from .errors import (
     UsageError,
     did_you_mean,
 )
+from .exports import ExportFormat, ExportResult
 from .imports import ImportResult
 from .model import (
     MODEL_FORMAT,
@@ -143,6 +144,8 @@ __all__ = [
     "ErrorCurve",
     "ErrorSummary",
     "EvalResult",
+    "ExportFormat",
+    "ExportResult",
     "Exposure",
     "Failure",
     "FileModel",
