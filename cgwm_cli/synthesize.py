@@ -26,6 +26,9 @@ def synthesize(
         str | None,
         typer.Option("--shard", metavar="I/N", show_default="0/1", help="Make shard I of N; I runs from 0 to N-1."),
     ] = None,
+    preview: Annotated[
+        bool, typer.Option("--preview/--no-preview", help="Write preview.png and preview.webm beside the first shard.")
+    ] = True,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -45,7 +48,7 @@ def synthesize(
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
         )
-        emit(work(model, out, settings, overwrite), _summary)
+        emit(work(model, out, settings, overwrite, preview=preview), _summary)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -70,4 +73,5 @@ def _summary(summary: DatasetSummary) -> str:
     ]
     cameras = ", ".join(summary.cameras) or "none"
     head = f"Wrote {summary.dataset}/{summary.shard}; cameras: {cameras}."
-    return "\n".join([head, table(rows), *warnings(summary.notes)])
+    look = [f"To look at: {', '.join(f'{summary.dataset}/{name}' for name in summary.preview)}"]
+    return "\n".join([head, table(rows), *(look if summary.preview else []), *warnings(summary.notes)])

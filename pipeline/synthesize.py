@@ -41,6 +41,7 @@ from .physics.dispatch import rollout as roll_out
 from .physics.records import ContactRecord
 from .physics.world import State, World
 from .posterior import draw_parameters, not_varied
+from .preview import with_preview
 from .sampling import Start, draw_start, look_at_cameras, resolve_plan
 
 STATE_ONLY = (
@@ -63,7 +64,9 @@ class _Job:
     device: str
 
 
-def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False) -> DatasetSummary:
+def synthesize(
+    model: Path, out: Path, config: SynthesizeConfig, overwrite: bool = False, preview: bool = True
+) -> DatasetSummary:
     """Write one shard of a dataset of labelled rollouts.
 
     With one shard, `out` appears complete. With more, every call adds its shard to `out` (the first that is ready
@@ -74,6 +77,7 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         out: DATASET.
         config: The settings; times, sizes and the sampling plan are in it.
         overwrite: Replace what is there: the dataset where it has one shard, else the shard.
+        preview: Write a contact sheet and a film of the first rollouts beside the first shard.
 
     Returns:
         What was written, with its hash and the speed.
@@ -89,7 +93,8 @@ def synthesize(model: Path, out: Path, config: SynthesizeConfig, overwrite: bool
         job = _prepare(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
-        return _written(job, model, out, config, overwrite, began)
+        summary = _written(job, model, out, config, overwrite, began)
+    return with_preview(summary) if preview and config.shard == 0 else summary
 
 
 def _written(

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..datasets.cameras import Camera
 from ..datasets.dataset import check_hashes, read_manifest
+from ..datasets.loader import camera_of
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
 from ..datasets.rollouts import Node, demo_names, open_shard
@@ -255,7 +256,7 @@ def _check_images(demo: Node, model: Model, count: int, findings: _Findings) -> 
     position, quat = demo["bodies/pos"][()], demo["bodies/quat_wxyz"][()]
     frames = np.unique(np.linspace(0, count - 1, FRAMES_PER_ROLLOUT).round().astype(int))
     for camera_name in demo["cameras"]:
-        camera = _camera(demo[f"cameras/{camera_name}"])
+        camera = camera_of(demo[f"cameras/{camera_name}"])
         findings.frames += count
         mask_set, depth_set = (demo[f"obs/{camera_name}_{key}"] for key in ("mask", "depth"))
         size = (camera.height, camera.width)
@@ -274,11 +275,6 @@ def _check_images(demo: Node, model: Model, count: int, findings: _Findings) -> 
                 fault = _compare(seen, mask == body + 1, depth, findings)
                 if fault:
                     yield f"obs/{camera_name}, frame {frame}, body '{name}': {fault}"
-
-
-def _camera(group: Node) -> Camera:
-    read = {name: np.asarray(item[()]) for name, item in group.items()}
-    return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
 
 
 def _project(model: Model, name: str, position: np.ndarray, quat: np.ndarray, camera: Camera) -> _Seen:

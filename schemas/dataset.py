@@ -103,4 +103,6 @@ class DatasetSummary(FileModel):
     cameras: tuple[str, ...]
     seconds: float
     frames_per_s: float
+    preview: tuple[str, ...] = ()
+    """Pictures of the first rollouts, files beside the first shard."""
     notes: tuple[str, ...] = ()

@@ -67,8 +67,8 @@ def tiles(strip: FrameStrip, width: int = TILE_WIDTH, outlined: bool = True) -> 
     x, y, w, h = _window(strip)
     size = (width, round(width / _ASPECT))
     cut = (slice(None), slice(y, y + h), slice(x, x + w))
-    real = np.stack([_resized(frame, size) for frame in strip.real[cut]])
-    predicted = np.stack([_resized(frame, size) for frame in strip.predicted[cut]])
+    real = np.stack([resized(frame, size) for frame in strip.real[cut]])
+    predicted = np.stack([resized(frame, size) for frame in strip.predicted[cut]])
     if outlined and strip.masks is not None:
         for frame, mask in zip(predicted, strip.masks[cut], strict=True):
             _outline(frame, mask)
@@ -186,7 +186,13 @@ def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
         if len(data) <= most_bytes:
             return data
     height, width = image.shape[:2]
-    return small_png(_resized(image, (round(0.8 * width), round(0.8 * height))), most_bytes)
+    return small_png(resized(image, (round(0.8 * width), round(0.8 * height))), most_bytes)
+
+
+def resized(image: Image, size: tuple[int, int]) -> Image:
+    """Return a picture at another size (width, height) [px]: averaged where it shrinks, interpolated where it grows."""
+    shrinks = size[0] < image.shape[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
 
 
 def _window(strip: FrameStrip) -> tuple[int, int, int, int]:
@@ -214,15 +220,10 @@ def _outline(frame: Image, mask: Image) -> None:
     cv2.drawContours(frame, contours, -1, _OUTLINE, 1, cv2.LINE_AA)
 
 
-def _resized(image: Image, size: tuple[int, int]) -> Image:
-    shrinks = size[0] < image.shape[1]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
-
-
 def _fitted(image: Image, size: tuple[int, int]) -> Image:
     """Return a picture reduced to fit into a tile (width, height) [px], with white beside it."""
     scale = min(size[0] / image.shape[1], size[1] / image.shape[0])
-    small = _resized(image, (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))))
+    small = resized(image, (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))))
     tile = np.full((size[1], size[0], 3), 255, np.uint8)
     top, left = (size[1] - small.shape[0]) // 2, (size[0] - small.shape[1]) // 2
     tile[top : top + small.shape[0], left : left + small.shape[1]] = small
