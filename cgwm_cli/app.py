@@ -17,12 +17,14 @@ from .fit import fit
 from .import_ import import_capture
 from .synthesize import synthesize
 from .validate import validate
+from .view import view
 
 VERBS = (
     ("demo", demo, "The whole pipeline on a scene that it makes itself."),
     ("calibrate", calibrate, "Photos to cameras, with a metric scale."),
     ("fit", fit, "A capture to a world model."),
     ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
+    ("view", view, "A dataset or a model in the browser."),
     ("eval", evaluate, "A model against measurements."),
     ("compare", compare, "Where and when each model fails, side by side."),
     ("diagnose", diagnose, "Which effect a model lacks."),

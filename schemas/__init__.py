@@ -92,6 +92,7 @@ from .model import (
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .results import EpisodeErrors, ErrorSummary, EvalResult
 from .validation import ValidationReport
+from .view import ViewReport
 
 __all__ = [
     "CAMERAS_FORMAT",
@@ -190,6 +191,7 @@ __all__ = [
     "UsageError",
     "ValidationReport",
     "Video",
+    "ViewReport",
     "World",
     "WorstMoment",
     "did_you_mean",
