@@ -40,6 +40,7 @@ _PUBLIC = {
     "import_pinwm": ".datasets.pinwm",
     "import_rosbag": ".datasets.rosbag",
     "import_tum": ".datasets.tum",
+    "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.mystery",
@@ -68,6 +69,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
     from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
     from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
+    from .pipeline.view import open_view  # pyright: ignore[reportMissingImports]
     from .schemas import (  # pyright: ignore[reportMissingImports]
         CalibrateConfig,
         CgwmError,
@@ -109,6 +111,7 @@ __all__ = [
     "import_pinwm",
     "import_rosbag",
     "import_tum",
+    "open_view",
     "read_model",
     "run_demo",
     "run_mystery",

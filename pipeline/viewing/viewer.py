@@ -35,10 +35,11 @@ _LARGEST_HALF_SIGMA = 200.0
 """viser sends covariances as half-precision floats, which end at 65504: the largest sphere of a group, in its unit."""
 _SEE_THROUGH = 0.12
 """Of the opacities: several spheres lie behind each other everywhere."""
-_POINT_RADIUS = 0.09
+_FIELD_OF_VIEW_RAD = 0.9
+_POINT_RADIUS = 0.1
 """Of a contact [radii of the largest free body]."""
 _SPHERE_RGB = (120, 190, 120)
-_AMBIENT, _SUN = 2.2, 1.2
+_AMBIENT, _SUN = 0.9, 0.9
 """Light in which what is no splat has about its own colour; viser's own makes it paler."""
 
 
@@ -126,6 +127,7 @@ class Viewer:
         scene.add_light_directional("/light/sun", intensity=_SUN, position=tuple(eye + 20 * size * up))
         camera = self.server.initial_camera
         camera.position, camera.look_at, camera.up = eye, target, up
+        camera.fov = _FIELD_OF_VIEW_RAD
         background = background_from(model, eye)
         self._background = None if background is None else _add_splats(scene, "/background", background)
         ground = model.file.ground
@@ -321,9 +323,9 @@ def _add_marks(scene: Any, count: int, size_m: float) -> list[Any]:
         "/contacts/impulses",
         np.stack([nowhere, nowhere], axis=1),
         colors,
-        shaft_radius=0.03 * size_m,
-        head_radius=0.08 * size_m,
-        head_length=0.2 * size_m,
+        shaft_radius=0.04 * size_m,
+        head_radius=0.1 * size_m,
+        head_length=0.25 * size_m,
     )
     return [points, arrows]
 
