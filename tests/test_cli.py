@@ -159,7 +159,7 @@ def test_an_unknown_verb(run: Run) -> None:
         2,
         "",
         "cgwm: there is no command 'fti'.\n"
-        "Allowed: demo, calibrate, fit, synthesize, eval, compare, diagnose, import, validate, doctor, effects. "
+        "Allowed: demo, calibrate, fit, synthesize, view, eval, compare, diagnose, import, validate, doctor, effects. "
         "Did you mean 'fit'?\n"
         "Next: run 'cgwm --help'.\n",
     )

@@ -1,8 +1,4 @@
-"""A motion in the browser, by viser: the one module that speaks to it.
-
-viser's splats are marked experimental. They were chosen over point clouds and instanced spheres because they move with
-their body's frame without being sent again, are sorted together with the background, and look like the renderer's.
-"""
+"""A motion in the browser: the page, what it shows and what can be pressed. Only this room speaks to viser."""
 
 from __future__ import annotations
 
@@ -14,32 +10,33 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...datasets.models import Model
-from ...datasets.ply import Splats
 from ...schemas import CgwmError, UsageError
-from .contact_marks import SLIDING_RGB, STICKING_RGB, ContactMarks
+from .contact_marks import SLIDING_RGB, STICKING_RGB
 from .motions import Motion
-from .scene_at import BodyShape, SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
-
-if TYPE_CHECKING:
-    from ...datasets.cameras import Camera
+from .nodes import (
+    add_camera,
+    add_marks,
+    add_spheres,
+    add_splats,
+    as_bytes,
+    place_marks,
+    turn_from_z,
+    vertical_angle_rad,
+)
+from .scene_at import SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
 
 SPEEDS = {"as it was": 1.0, "3 times slower": 1 / 3, "10 times slower": 0.1}
 _MOST_UPDATES_HZ = 30.0
-_LARGEST_HALF_SIGMA = 200.0
-"""viser sends covariances as half-precision floats, which end at 65504: the largest sphere of a group, in its unit."""
 _SEE_THROUGH = 0.12
 """Of the opacities: several spheres lie behind each other everywhere."""
+_OVERVIEW = "overview"
 _FIELD_OF_VIEW_RAD = 0.9
-_POINT_RADIUS = 0.1
-"""Of a contact [radii of the largest free body]."""
-_SPHERE_RGB = (120, 190, 120)
-_AMBIENT, _SUN = 0.9, 0.9
+_AMBIENT, _SUN = 2.2, 1.0
 """Light in which what is no splat has about its own colour; viser's own makes it paler."""
 
 
@@ -125,25 +122,26 @@ class Viewer:
         scene.configure_environment_map(None)
         scene.add_light_ambient("/light/ambient", intensity=_AMBIENT)
         scene.add_light_directional("/light/sun", intensity=_SUN, position=tuple(eye + 20 * size * up))
+        self._view = (eye, target, up)
         camera = self.server.initial_camera
-        camera.position, camera.look_at, camera.up = eye, target, up
+        camera.position, camera.look_at, camera.up = self._view
         camera.fov = _FIELD_OF_VIEW_RAD
         background = background_from(model, eye)
-        self._background = None if background is None else _add_splats(scene, "/background", background)
+        self._background = None if background is None else add_splats(scene, "/background", background)
         ground = model.file.ground
         if background is None and ground is not None:
             place = np.asarray(ground.normal) * ground.offset_m
             side = 20 * size
-            scene.add_grid("/ground", side, side, cell_size=size, wxyz=_turn_from_z(ground.normal), position=place)
+            scene.add_grid("/ground", side, side, cell_size=size, wxyz=turn_from_z(ground.normal), position=place)
         self._frames = [
             scene.add_frame(f"/bodies/{k}", show_axes=False, axes_length=1.5 * size, axes_radius=0.04 * size)
             for k in range(len(self._shapes))
         ]
         self._splats = [
-            None if shape.splats is None else _add_splats(scene, f"/bodies/{k}/splats", shape.splats)
+            None if shape.splats is None else add_splats(scene, f"/bodies/{k}/splats", shape.splats)
             for k, shape in enumerate(self._shapes)
         ]
-        self._spheres = [_add_spheres(scene, f"/bodies/{k}/spheres", shape) for k, shape in enumerate(self._shapes)]
+        self._spheres = [add_spheres(scene, f"/bodies/{k}/spheres", shape) for k, shape in enumerate(self._shapes)]
         self._cameras: dict[str, Any] = {}
         self._marks: list[Any] = []
 
@@ -155,11 +153,10 @@ class Viewer:
                 handle.remove()
             size = self._size_m
             self._cameras = {
-                name: _add_camera(self.server.scene, name, camera, 0.6 * size)
-                for name, camera in motion.cameras.items()
+                name: add_camera(self.server.scene, name, camera, 0.6 * size) for name, camera in motion.cameras.items()
             }
             most = max((len(rows["mode"]) for rows in motion.contacts), default=0)
-            self._marks = _add_marks(self.server.scene, most, size) if most else []
+            self._marks = add_marks(self.server.scene, most, size) if most else []
             self._show_kinds()
             last = max(1, len(motion.times_s) - 1)
             alone = len(motion.times_s) == 1
@@ -177,8 +174,8 @@ class Viewer:
             for k, handle in enumerate(self._frames):
                 handle.position, handle.wxyz = now.position_m[k], now.quat_wxyz[k]
                 if self._splats[k] is not None and self._shapes[k].relit:
-                    self._splats[k].rgbs = _bytes(self._shapes[k].colors_at(now.quat_wxyz[k]))
-            _place_marks(self._marks, now.marks, self._contacts.value)
+                    self._splats[k].rgbs = as_bytes(self._shapes[k].colors_at(now.quat_wxyz[k]))
+            place_marks(self._marks, now.marks, self._contacts.value)
             if self._motion.image is not None and self._frusta.value:
                 for name, handle in self._cameras.items():
                     handle.image = self._motion.image(name, frame)
@@ -195,6 +192,8 @@ class Viewer:
         self._play = gui.add_button("Play", icon=None)
         self._playing = False
         self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value="3 times slower")
+        places = gui.add_button_group("look from", [_OVERVIEW, *self._motion.cameras])
+        places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))
         seen = any(handle is not None for handle in self._splats)
         with gui.add_folder("Show"):
             self._contacts = gui.add_checkbox("contacts", True)
@@ -210,6 +209,23 @@ class Viewer:
         for box in (self._contacts, self._looks, self._colliding, self._axes, self._frusta):
             box.on_update(lambda _: self._guarded(self._refresh))
         self._through.on_update(lambda _: self._guarded(self._make_see_through))
+
+    def _look_from(self, client: Any, place: str) -> None:
+        """Move the view of one page to where it began, or to a camera, whose picture would then hide everything."""
+        camera = self._motion.cameras.get(place)
+        if client is None:
+            return
+        with client.atomic():
+            if camera is None:
+                client.camera.position, client.camera.look_at, client.camera.up_direction = self._view
+                client.camera.fov = _FIELD_OF_VIEW_RAD
+                return
+            forward = camera.T_world_cam[:3, 2]
+            distance = float((self._view[1] - camera.center) @ forward)
+            client.camera.position, client.camera.up_direction = camera.center, -camera.T_world_cam[:3, 1]
+            client.camera.look_at = camera.center + max(distance, self._size_m) * forward
+            client.camera.fov = vertical_angle_rad(camera)
+        self._frusta.value = False
 
     def _toggle(self) -> None:
         self._playing = not self._playing
@@ -237,7 +253,7 @@ class Viewer:
         with self._lock:
             for handle, shape in zip(self._splats, self._shapes, strict=True):
                 if handle is not None and shape.splats is not None:
-                    handle.opacities = _bytes(share * np.asarray(shape.splats.opacities)[:, None])
+                    handle.opacities = as_bytes(share * np.asarray(shape.splats.opacities)[:, None])
 
     def _guarded(self, work: Callable[[], None]) -> None:
         """Do what a click asks for; what it raises stands on the page, and the server goes on."""
@@ -264,84 +280,6 @@ def _free_port(host: str, port: int) -> int:
         return int(trial.getsockname()[1])
 
 
-def _add_splats(scene: Any, name: str, splats: Splats) -> Any:
-    sigma = np.asarray(splats.scales, np.float64)
-    unit = _LARGEST_HALF_SIGMA / float(sigma.max(initial=1e-9))
-    return scene.add_gaussian_splats(
-        name,
-        centers=np.asarray(splats.means, np.float64) * unit,
-        covariances=np.eye(3)[None] * (sigma * unit)[:, None, None] ** 2,
-        rgbs=_bytes(np.asarray(splats.colors)),
-        opacities=_bytes(np.asarray(splats.opacities)[:, None]),
-        scale=1 / unit,
-    )
-
-
-def _add_spheres(scene: Any, name: str, shape: BodyShape) -> Any:
-    if not len(shape.radii_m):
-        return None
-    return _add_balls(scene, name, shape.centers_m, shape.radii_m, np.array(_SPHERE_RGB, np.uint8))
-
-
-def _add_balls(scene: Any, name: str, centers_m: NDArray[Any], radii_m: NDArray[Any], colors: NDArray[np.uint8]) -> Any:
-    import trimesh  # comes with viser  # pyright: ignore[reportMissingImports]
-
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-    return scene.add_batched_meshes_simple(
-        name,
-        vertices=np.asarray(ball.vertices, np.float32),
-        faces=np.asarray(ball.faces, np.uint32),
-        batched_wxyzs=np.tile(np.array([1.0, 0, 0, 0]), (len(radii_m), 1)),
-        batched_positions=centers_m,
-        batched_scales=radii_m,
-        batched_colors=colors,
-        lod="off",
-    )
-
-
-def _add_camera(scene: Any, name: str, camera: Camera, scale_m: float) -> Any:
-    pose = camera.T_world_cam
-    return scene.add_camera_frustum(
-        f"/cameras/{name}",
-        fov=2 * math.atan(0.5 * camera.height / float(camera.K[1, 1])),
-        aspect=camera.width / camera.height,
-        scale=scale_m,
-        thickness=0.03 * scale_m,
-        color=(40, 44, 52),
-        format="jpeg",
-        jpeg_quality=85,
-        wxyz=_quat_of(pose[:3, :3]),
-        position=pose[:3, 3],
-    )
-
-
-def _add_marks(scene: Any, count: int, size_m: float) -> list[Any]:
-    """Add as many points and arrows as a motion has contacts at once: of equal number, they move without flicker."""
-    nowhere, colors = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8)
-    points = _add_balls(scene, "/contacts/points", nowhere, np.full(count, _POINT_RADIUS * size_m), colors)
-    arrows = scene.add_arrows(
-        "/contacts/impulses",
-        np.stack([nowhere, nowhere], axis=1),
-        colors,
-        shaft_radius=0.04 * size_m,
-        head_radius=0.1 * size_m,
-        head_length=0.25 * size_m,
-    )
-    return [points, arrows]
-
-
-def _place_marks(handles: list[Any], marks: ContactMarks, wanted: bool) -> None:
-    for handle in handles:
-        handle.visible = wanted and len(marks) > 0
-    if not handles or not len(marks):
-        return
-    points, arrows = handles
-    # The last contact stands in for those that are not there.
-    chosen = np.minimum(np.arange(len(arrows.points)), len(marks) - 1)
-    points.batched_positions, points.batched_colors = marks.points_m[chosen].astype(np.float32), marks.colors[chosen]
-    arrows.points, arrows.colors = marks.segments_m[chosen].astype(np.float32), marks.colors[chosen]
-
-
 def _words(now: SceneAt, frame: int, count: int) -> str:
     sliding = int(now.marks.sliding.sum())
     parts = [f"{len(now.marks) - sliding} sticking"] * (len(now.marks) > sliding) + [f"{sliding} sliding"] * (
@@ -359,22 +297,3 @@ def _legend(largest_n_s: float) -> str:
     longest = f", the longest {largest_n_s:.2g} N s" if largest_n_s > 0 else ""
     arrows = f"<div>&#8593; impulse on the body since the frame before{longest}</div>"
     return f'<div style="padding: 0 0.75em 0.5em; font-size: 0.8em; line-height: 1.6">{dots}{arrows}</div>'
-
-
-def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    return (np.clip(values, 0.0, 1.0) * 255).round().astype(np.uint8)
-
-
-def _quat_of(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
-
-
-def _turn_from_z(normal: Any) -> NDArray[np.float64]:
-    """Return the quaternion w x y z (4,) of the shortest turn that takes z to a unit normal (3,)."""
-    x, y, z = normal
-    if z < -1 + 1e-9:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quat = np.array([1 + z, -y, x, 0.0])
-    return quat / np.linalg.norm(quat)
