@@ -19,7 +19,7 @@ from ..datasets.cameras import Camera
 from ..datasets.loader import RolloutReader
 from ..datasets.video import encoded_webm
 from ..schemas import CgwmError, DatasetSummary, InputDataError
-from .reporting.pictures import SHEET_BYTES, Image, contact_sheet, evenly, resized, small_png
+from .reporting.pictures import Image, contact_sheet, encoded, evenly, resized
 from .viewing.contact_marks import SLIDING_RGB, STICKING_RGB, ContactMarks, arrow_scale, contact_marks
 
 SHEET, FILM = "preview.png", "preview.webm"
@@ -94,7 +94,7 @@ def preview(shard: Path) -> tuple[bytes, bytes]:
     rows = [np.stack([shot.tile(frame) for frame in telling_frames(shot.strength_n_s, MOMENTS)]) for shot in shots]
     width = len(rows[0]) * (shots[0].camera.width + 4) - 4
     sheet = np.concatenate([contact_sheet(rows), _legend(width, largest, "")])
-    return small_png(sheet, SHEET_BYTES), _film(shots, largest)
+    return encoded(sheet, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 6]), _film(shots, largest)
 
 
 def telling_frames(strength_n_s: NDArray[np.float64], wanted: int) -> list[int]:

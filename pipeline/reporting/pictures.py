@@ -177,12 +177,18 @@ def png_uri(image: Image) -> str:
     return _uri(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9], "image/png")
 
 
+def encoded(image: Image, suffix: str, options: Sequence[int] = ()) -> bytes:
+    """Return an RGB image as a file of OpenCV's format for a suffix, ".png" or ".jpg"."""
+    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
+    return data.tobytes()
+
+
 def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
     """Return an RGB image as a PNG file below a size: noise and fine shades are given up as far as is needed."""
     for bits in range(8, 3, -1):
         step = 1 << (8 - bits)
         reduced = image if bits == 8 else np.minimum(cv2.medianBlur(image, 3) // step * step + step // 2, 255)
-        data = _encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        data = encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9])
         if len(data) <= most_bytes:
             return data
     height, width = image.shape[:2]
@@ -231,9 +237,4 @@ def _fitted(image: Image, size: tuple[int, int]) -> Image:
 
 
 def _uri(image: Image, suffix: str, options: list[int], kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(_encoded(image, suffix, options)).decode('ascii')}"
-
-
-def _encoded(image: Image, suffix: str, options: list[int]) -> bytes:
-    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
-    return data.tobytes()
+    return f"data:{kind};base64,{base64.b64encode(encoded(image, suffix, options)).decode('ascii')}"
