@@ -218,8 +218,7 @@ def _legend(width: int, largest_n_s: float, also: str) -> Image:
 
 
 def _dot(picture: Image, pixel: NDArray[np.float64], color: tuple[int, ...]) -> None:
-    # Pixel centres are at .5 here, at integers in OpenCV.
-    place = tuple(int(value) for value in np.clip(np.round((pixel - 0.5) * 16), -1e8, 1e8))
+    place = _sixteenths(pixel)
     cv2.circle(picture, place, 5 * 16, _PAPER, -1, cv2.LINE_AA, 4)
     cv2.circle(picture, place, round(3.7 * 16), color, -1, cv2.LINE_AA, 4)
 
@@ -230,8 +229,14 @@ def _arrow(
     length = float(np.linalg.norm(tip - start))
     if not 2.0 < length < 1e5:
         return
-    ends = [tuple(int(value) for value in np.round((pixel - 0.5) * 16)) for pixel in (start, tip)]
-    cv2.arrowedLine(picture, *ends, color, thickness, cv2.LINE_AA, 4, min(0.4, 9.0 / length))
+    first, last = (_sixteenths(pixel) for pixel in (start, tip))
+    cv2.arrowedLine(picture, first, last, color, thickness, cv2.LINE_AA, 4, min(0.4, 9.0 / length))
+
+
+def _sixteenths(pixel: NDArray[np.float64]) -> tuple[int, int]:
+    """Return a place for OpenCV with 4 bits of fraction; its pixel centres lie at integers, ours at .5."""
+    x, y = np.clip(np.round((pixel - 0.5) * 16), -1e8, 1e8)
+    return int(x), int(y)
 
 
 def _title(picture: Image, text: str) -> None:

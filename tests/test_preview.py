@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cgwm.cli import main
 from cgwm.datasets import video
 from cgwm.datasets.atomic import sha256
 from cgwm.datasets.cameras import Camera
@@ -109,6 +110,19 @@ def test_pictures_change_no_shard(model_path: Path, dataset: Path, tmp_path: Pat
     assert sorted(path.name for path in (tmp_path / "plain").iterdir()) == ["dataset.json", "model", plain.shard]
     assert sha256(dataset / plain.shard) == plain.sha256
     assert (dataset / "dataset.json").read_bytes() == (tmp_path / "plain/dataset.json").read_bytes()
+
+
+def test_the_command_names_them_or_leaves_them_out(
+    model_path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name, options in (("with", []), ("without", ["--no-preview"])):
+        sizes = [f"--set=synthesize.{setting}" for setting in ("width=32", "height=24", "duration_s=0.1")]
+        out = tmp_path / name
+        with pytest.raises(SystemExit) as ended:
+            main(["synthesize", str(model_path), "--out", str(out), "--rollouts", "1", *sizes, *options])
+        assert ended.value.code == 0
+        told = f"To look at: {out / SHEET}, {out / FILM}" in capfd.readouterr().out.splitlines()
+        assert told == (out / SHEET).is_file() == (out / FILM).is_file() == (name == "with")
 
 
 def test_the_first_shard_has_the_pictures(model_path: Path, tmp_path: Path) -> None:

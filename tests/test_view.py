@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -175,7 +175,7 @@ def test_what_cannot_be_looked_at_is_refused(dataset: Path, tmp_path: Path, capf
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[object]:
+def served(tmp_path: Path) -> Iterator[Callable[[Path], str]]:
     """Start `cgwm view` on a free port; yield a function that returns its URL; end it by Ctrl-C, cleanly."""
     started: list[subprocess.Popen[str]] = []
 
@@ -235,8 +235,8 @@ def click(page: Page, label: str) -> None:
 
 
 @needs_viser
-def test_the_slider_moves_the_splats(dataset: Path, tmp_path: Path, served: object) -> None:
-    url = served(dataset)  # pyright: ignore[reportCallIssue]
+def test_the_slider_moves_the_splats(dataset: Path, tmp_path: Path, served: Callable[[Path], str]) -> None:
+    url = served(dataset)
     with chromium(tmp_path) as page:
         page.open(url)
         page.until_it_says("frame 1 of 16")
@@ -258,8 +258,8 @@ def test_the_slider_moves_the_splats(dataset: Path, tmp_path: Path, served: obje
 
 
 @needs_viser
-def test_a_model_moves_by_itself(dataset: Path, tmp_path: Path, served: object) -> None:
-    url = served(dataset / "model")  # pyright: ignore[reportCallIssue]
+def test_a_model_moves_by_itself(dataset: Path, tmp_path: Path, served: Callable[[Path], str]) -> None:
+    url = served(dataset / "model")
     with chromium(tmp_path) as page:
         page.open(url)
         page.until_it_says("frame 1 of 1")

@@ -73,7 +73,7 @@ class Viewer:
     ) -> None:
         viser = require_viser()
         port = _free_port(host, port)
-        self._made = {name: make for name, make in motions.items()}
+        self._made = dict(motions)
         self._kept: dict[str, Motion] = {}
         self._lock = threading.RLock()
         self._shapes = shapes_of(model)
@@ -171,10 +171,11 @@ class Viewer:
         with self._lock, self.server.atomic():
             frame = min(frame, len(self._motion.times_s) - 1)
             now = scene_at(self._motion, frame, self._size_m)
-            for k, handle in enumerate(self._frames):
-                handle.position, handle.wxyz = now.position_m[k], now.quat_wxyz[k]
-                if self._splats[k] is not None and self._shapes[k].relit:
-                    self._splats[k].rgbs = as_bytes(self._shapes[k].colors_at(now.quat_wxyz[k]))
+            parts = zip(self._frames, self._splats, self._shapes, now.position_m, now.quat_wxyz, strict=True)
+            for handle, splats, shape, position_m, quat_wxyz in parts:
+                handle.position, handle.wxyz = position_m, quat_wxyz
+                if splats is not None and shape.relit:
+                    splats.rgbs = as_bytes(shape.colors_at(quat_wxyz))
             place_marks(self._marks, now.marks, self._contacts.value)
             if self._motion.image is not None and self._frusta.value:
                 for name, handle in self._cameras.items():
