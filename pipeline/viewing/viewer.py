@@ -35,7 +35,7 @@ _MOST_UPDATES_HZ = 30.0
 _SEE_THROUGH = 0.12
 """Of the opacities: several spheres lie behind each other everywhere."""
 _OVERVIEW = "overview"
-_FIELD_OF_VIEW_RAD = 0.9
+FIELD_OF_VIEW_RAD = 0.9
 _AMBIENT, _SUN = 2.2, 1.0
 """Light in which what is no splat has about its own colour; viser's own makes it paler."""
 
@@ -125,7 +125,7 @@ class Viewer:
         self._view = (eye, target, up)
         camera = self.server.initial_camera
         camera.position, camera.look_at, camera.up = self._view
-        camera.fov = _FIELD_OF_VIEW_RAD
+        camera.fov = FIELD_OF_VIEW_RAD
         background = background_from(model, eye)
         self._background = None if background is None else add_splats(scene, "/background", background)
         ground = model.file.ground
@@ -219,7 +219,7 @@ class Viewer:
         with client.atomic():
             if camera is None:
                 client.camera.position, client.camera.look_at, client.camera.up_direction = self._view
-                client.camera.fov = _FIELD_OF_VIEW_RAD
+                client.camera.fov = FIELD_OF_VIEW_RAD
                 return
             forward = camera.T_world_cam[:3, 2]
             distance = float((self._view[1] - camera.center) @ forward)
