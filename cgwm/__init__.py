@@ -44,6 +44,7 @@ _PUBLIC = {
     "import_rosbag": ".datasets.rosbag",
     "import_tum": ".datasets.tum",
     "merge": ".pipeline.merge",
+    "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.mystery",
@@ -74,6 +75,7 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
     from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
     from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
+    from .pipeline.view import open_view  # pyright: ignore[reportMissingImports]
     from .schemas import (  # pyright: ignore[reportMissingImports]
         CalibrateConfig,
         CgwmError,
@@ -121,6 +123,7 @@ __all__ = [
     "import_rosbag",
     "import_tum",
     "merge",
+    "open_view",
     "read_model",
     "run_demo",
     "run_mystery",

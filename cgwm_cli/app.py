@@ -19,6 +19,7 @@ from .import_ import import_capture
 from .merge import merge
 from .synthesize import synthesize
 from .validate import validate
+from .view import view
 
 VERBS = (
     ("demo", demo, "The whole pipeline on a scene that it makes itself."),
@@ -26,6 +27,7 @@ VERBS = (
     ("fit", fit, "A capture to a world model."),
     ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
     ("merge", merge, "The shards of a dataset as one HDF5 file."),
+    ("view", view, "A dataset or a model in the browser."),
     ("eval", evaluate, "A model against measurements."),
     ("compare", compare, "Where and when each model fails, side by side."),
     ("diagnose", diagnose, "Which effect a model lacks."),

@@ -53,6 +53,9 @@ def synthesize(
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep the shards that are complete; with --overwrite remake damaged ones.")
     ] = False,
+    preview: Annotated[
+        bool, typer.Option("--preview/--no-preview", help="Write preview.png and preview.webm beside the first shard.")
+    ] = True,
     seed: Seed = None,
     device: Device = None,
     overwrite: Overwrite = False,
@@ -87,14 +90,14 @@ def synthesize(
         elif shards is None and ray is None:
             from ..pipeline.synthesize import synthesize as work
 
-            done = work(model, out, settings, overwrite, resume)
+            done = work(model, out, settings, overwrite, resume, preview)
             emit(done, lambda found: (_plan(found) if plan is not None else "") + _summary(found, settings.shards))
         else:
             from ..pipeline.cluster import default_shards, synthesize_shards
 
             if "shards" not in settings.model_fields_set:
                 settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
-            made = synthesize_shards(model, out, settings, overwrite, resume, ray)
+            made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview)
             emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
 
 
@@ -128,7 +131,7 @@ def _summary(summary: DatasetSummary, count: int = 1) -> str:
     cameras = ", ".join(summary.cameras) or "none"
     place = f"{summary.dataset}/{summary.shard}"
     head = f"{place} is up to date" if summary.up_to_date else f"Wrote {place}"
-    lines = [f"{head}; cameras: {cameras}.", table(rows)]
+    lines = [f"{head}; cameras: {cameras}.", table(rows), *_preview(summary)]
     if count > 1 and "SLURM_JOB_ID" not in os.environ:
         lines += [f"all {count} on SLURM: {_slurm_line(typed(), count)}", f"then: cgwm merge {summary.dataset}"]
     return "\n".join([*lines, *warnings(summary.notes)])
@@ -140,6 +143,12 @@ def _rejected(summary: DatasetSummary | ShardsSummary) -> list[list[str]]:
     total = sum(summary.rejected.values())
     rules = ", ".join(f"{rule} {count}" for rule, count in summary.rejected.items())
     return [["rejected", f"{total} of {total + summary.rollouts} draws: {rules}"]]
+
+
+def _preview(summary: DatasetSummary | ShardsSummary) -> list[str]:
+    if not summary.preview:
+        return []
+    return [f"To look at: {', '.join(f'{summary.dataset}/{name}' for name in summary.preview)}"]
 
 
 def _slurm_line(arguments: list[str], count: int) -> str:
@@ -175,7 +184,7 @@ def _shards_summary(summary: ShardsSummary) -> str:
     head = f"Wrote {summary.made} of {summary.shards} shards of {summary.dataset}{others}"
     if not summary.made:
         head = f"{summary.dataset} is up to date"
-    lines = [f"{head}.", table(rows)]
+    lines = [f"{head}.", table(rows), *_preview(summary)]
     if summary.shards > 1:
         lines.append(f"to read it as one file: cgwm merge {summary.dataset}")
     return "\n".join([*lines, *warnings(summary.notes)])

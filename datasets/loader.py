@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from ..schemas import InputDataError, UsageError, did_you_mean
+from .cameras import Camera
 from .chunks import image_of
 from .kinds import refuse_other_kind
 from .rollouts import Node, demo_names, open_shard
@@ -48,6 +49,12 @@ def shard_files(path: Path) -> list[Path]:
     if not files:
         raise InputDataError(f"{path}: no shard (rollouts-<i>-of-<n>.h5) in it.")
     return files
+
+
+def camera_of(group: Node) -> Camera:
+    """Read a camera from its group in a rollout, `cameras/<name>`."""
+    read = {name: np.asarray(item[()]) for name, item in group.items()}
+    return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
 
 
 class RolloutReader:
@@ -104,6 +111,10 @@ class RolloutReader:
         """Return the names of the cameras of a rollout."""
         group = self.group(number)
         return sorted(group["cameras"]) if "cameras" in group else []
+
+    def camera(self, number: int, name: str) -> Camera:
+        """Return a camera of a rollout, with its pose."""
+        return camera_of(self.group(number)["cameras"][name])
 
     def parameters(self, number: int) -> dict[str, float]:
         """Return the physical parameters of a rollout, in the unit that their attribute states."""

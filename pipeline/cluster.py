@@ -13,7 +13,7 @@ from contextlib import chdir, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..datasets.dataset import read_manifest, refuse_existing_shards
+from ..datasets.dataset import refuse_existing_shards
 from ..datasets.progress import progress
 from ..datasets.shards import shard_range
 from ..schemas import (
@@ -56,6 +56,7 @@ def synthesize_shards(
     overwrite: bool = False,
     resume: bool = False,
     ray: str | None = None,
+    preview: bool = False,
 ) -> ShardsSummary:
     """Write all shards of a dataset of labelled rollouts.
 
@@ -68,6 +69,7 @@ def synthesize_shards(
         ray: The address of a Ray cluster, ``local`` for one on this machine, ``auto`` for the one that runs (by
             RAY_ADDRESS, or here) or else ``local``. All its machines have to see `model` and `out` at these paths.
             None: without Ray, in this process.
+        preview: Write a contact sheet and a film of the first rollouts beside the first shard.
 
     Returns:
         What the dataset holds now, and the speed.
@@ -82,9 +84,9 @@ def synthesize_shards(
         refuse_existing_shards(out, config.shards)
     parts = [config.model_copy(update={"shard": shard}) for shard in range(config.shards)]
     if ray is None:
-        outcomes = _here(model, out, parts, overwrite, resume)
+        outcomes = _here(model, out, parts, overwrite, resume, preview)
     else:
-        outcomes = _on_ray(model, out, parts, overwrite, resume, ray)
+        outcomes = _on_ray(model, out, parts, overwrite, resume, preview, ray)
     done: dict[int, DatasetSummary] = {}
     failed: dict[int, CgwmError] = {}
     try:
@@ -108,14 +110,20 @@ def synthesize_shards(
 
 
 def _here(
-    model: Path, out: Path, parts: Sequence[SynthesizeConfig], overwrite: bool, resume: bool
+    model: Path, out: Path, parts: Sequence[SynthesizeConfig], overwrite: bool, resume: bool, preview: bool
 ) -> Generator[_Outcome, None, None]:
     for part in parts:
-        yield part.shard, _task(str(model), str(out), part, overwrite, resume)
+        yield part.shard, _task(str(model), str(out), part, overwrite, resume, preview)
 
 
 def _on_ray(
-    model: Path, out: Path, parts: Sequence[SynthesizeConfig], overwrite: bool, resume: bool, address: str
+    model: Path,
+    out: Path,
+    parts: Sequence[SynthesizeConfig],
+    overwrite: bool,
+    resume: bool,
+    preview: bool,
+    address: str,
 ) -> Generator[_Outcome, None, None]:
     with _connected(address) as ray:
         gpus = _gpus(ray, parts[0].device)
@@ -123,7 +131,7 @@ def _on_ray(
         # A task that is begun again may find the shard that it has made before its worker died: it keeps it.
         keep = resume or not overwrite
         places = str(model.resolve()), str(out.resolve())
-        pending = {task.remote(*places, part, overwrite, keep): part.shard for part in parts}
+        pending = {task.remote(*places, part, overwrite, keep, preview): part.shard for part in parts}
         try:
             while pending:
                 ready, _ = ray.wait(list(pending), timeout=1.0)
@@ -137,10 +145,12 @@ def _on_ray(
                 ray.wait(list(pending), num_returns=len(pending), timeout=10.0)
 
 
-def _task(model: str, out: str, config: SynthesizeConfig, overwrite: bool, resume: bool) -> DatasetSummary | CgwmError:
+def _task(
+    model: str, out: str, config: SynthesizeConfig, overwrite: bool, resume: bool, preview: bool
+) -> DatasetSummary | CgwmError:
     """Make one shard; an error that was meant is returned, for Ray would wrap it and show a traceback."""
     try:
-        return synthesize(Path(model), Path(out), config, overwrite, resume)
+        return synthesize(Path(model), Path(out), config, overwrite, resume, preview)
     except CgwmError as error:
         return error
 
@@ -226,7 +236,6 @@ def _failure(failed: dict[int, CgwmError], done: int, count: int) -> CgwmError:
 
 
 def _summary(out: Path, config: SynthesizeConfig, done: dict[int, DatasetSummary], seconds: float) -> ShardsSummary:
-    manifest = read_manifest(out)
     made = [summary for summary in done.values() if not summary.up_to_date]
     rejected: Counter[str] = Counter()
     for summary in done.values():
@@ -242,5 +251,6 @@ def _summary(out: Path, config: SynthesizeConfig, done: dict[int, DatasetSummary
         frames_per_s=sum(summary.frames for summary in made) / seconds,
         rejected=dict(sorted(rejected.items())),
         plan=done[0].plan,
-        notes=manifest.notes,
+        preview=done[0].preview,
+        notes=tuple(dict.fromkeys(note for _, summary in sorted(done.items()) for note in summary.notes)),
     )

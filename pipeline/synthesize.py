@@ -42,6 +42,7 @@ from .labels import LabelRenderer
 from .memory import enough_memory
 from .physics.world import World
 from .posterior import DERIVED, not_varied, require_admissible, with_correlations
+from .preview import with_preview
 from .rejection import Rejection, accepted_rollouts
 from .rollout_batches import ENVIRONMENTS, Diverged, Simulator
 from .rollout_labels import labels_of
@@ -88,6 +89,7 @@ def synthesize(
     config: SynthesizeConfig,
     overwrite: bool = False,
     resume: bool = False,
+    preview: bool = False,
     stopwatch: Stopwatch | None = None,
 ) -> DatasetSummary:
     """Write one shard of a dataset of labelled rollouts.
@@ -101,6 +103,7 @@ def synthesize(
         config: The settings; times, sizes and the sampling plan are in it.
         overwrite: Replace what is there: the dataset where it has one shard, else the shard.
         resume: Keep the shard if it is there and its hash is right. With `overwrite`, a damaged one is made again.
+        preview: Write a contact sheet and a film of the first rollouts beside the first shard.
         stopwatch: To measure where the time goes.
 
     Returns:
@@ -119,7 +122,8 @@ def synthesize(
         job = _prepare(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
-        return _written(job, model, out, config, overwrite, resume, began, stopwatch or Stopwatch())
+        summary = _written(job, model, out, config, overwrite, resume, began, stopwatch or Stopwatch())
+    return with_preview(summary) if preview and config.shard == 0 else summary
 
 
 def _written(

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from ..datasets.cameras import Camera
+from ..datasets.loader import camera_of
 from ..datasets.models import Model
 from ..datasets.rollouts import Node
 from .sampling import rotation_matrix
@@ -62,7 +63,7 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
     names = [name.decode() for name in demo["bodies/names"][()]]
     position, quat = demo["bodies/pos"][()], demo["bodies/quat_wxyz"][()]
     for number, camera_name in enumerate(sorted(demo["cameras"])):
-        camera = _camera(demo[f"cameras/{camera_name}"])
+        camera = camera_of(demo[f"cameras/{camera_name}"])
         findings.frames += count
         sets = [demo[f"obs/{camera_name}_{key}"] for key in ("mask", "depth")]
         size = (camera.height, camera.width)
@@ -99,11 +100,6 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
                         check, text, value, limit = fault
                         place = f"obs/{camera_name}, frame {frame}, body '{names[body]}'"
                         yield Fault(check, f"{place}: {text}", frame, camera_name, names[body], value, limit)
-
-
-def _camera(group: Node) -> Camera:
-    read = {name: np.asarray(group[name][()]) for name in ("width", "height", "K", "dist", "T_world_cam")}
-    return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
 
 
 def _check_counts(

@@ -99,6 +99,7 @@ from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, Sealed
 from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
 from .results import EpisodeErrors, ErrorSummary, EvalResult
 from .validation import Failure, ValidationReport
+from .view import ViewReport
 
 __all__ = [
     "CAMERAS_FORMAT",
@@ -208,6 +209,7 @@ __all__ = [
     "UsageError",
     "ValidationReport",
     "Video",
+    "ViewReport",
     "World",
     "WorstMoment",
     "did_you_mean",

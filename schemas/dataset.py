@@ -81,6 +81,8 @@ class DatasetSummary(FileModel):
     """Draws of this shard that the plan's rules rejected, by rule."""
     plan: SamplingPlan = SamplingPlan()
     """The resolved sampling plan."""
+    preview: tuple[str, ...] = ()
+    """Pictures of the first rollouts, files beside the first shard."""
     up_to_date: bool = False
     """The shard was there already, whole, and was kept."""
     notes: tuple[str, ...] = ()
@@ -104,6 +106,8 @@ class ShardsSummary(FileModel):
     """Draws of all shards that the plan's rules rejected, by rule."""
     plan: SamplingPlan = SamplingPlan()
     """The resolved sampling plan."""
+    preview: tuple[str, ...] = ()
+    """Pictures of the first rollouts, files beside the first shard."""
     notes: tuple[str, ...] = ()
 
 

@@ -383,7 +383,7 @@ def command(*arguments: object, **options: object) -> subprocess.CompletedProces
 def options_of(config: SynthesizeConfig) -> list[str]:
     sizes = {"duration_s": config.duration_s, "width": config.width, "height": config.height}
     pairs = [f"--set=synthesize.{name}={value}" for name, value in sizes.items()]
-    return [f"--rollouts={config.rollouts}", f"--seed={config.seed}", "--device=cpu", *pairs]
+    return [f"--rollouts={config.rollouts}", f"--seed={config.seed}", "--device=cpu", "--no-preview", *pairs]
 
 
 def test_a_full_disk_is_named_and_what_was_complete_stays(model: Path, parts: Path) -> None:
