@@ -147,7 +147,9 @@ def _place_apart(
             if plan.start == "slide":
                 _slide(start, index, model, plan, extents[index], rng)
         centers = [_center(start, index, extents[index]) for index in range(len(extents))]
-        pairs = [(a, b) for a in free for b in range(len(extents)) if a != b]
+        # a driven body is placed afterwards, by where the free ones are
+        others = [index for index, body in enumerate(model.file.bodies) if body.motion != "driven"]
+        pairs = [(a, b) for a in free for b in others if a != b]
         if all(np.linalg.norm(centers[a] - centers[b]) > extents[a].radius_m + extents[b].radius_m for a, b in pairs):
             return
     raise NotConvergedError(

@@ -231,6 +231,21 @@ def test_a_pusher_passes_the_object_on_an_arc(curvature: float) -> None:
         assert len(track.time_s) > 40
 
 
+def test_the_pusher_follows_the_object_to_where_it_rests() -> None:
+    """A body may rest where the photos show the pusher, which comes at it from wherever it rests."""
+    model = small_model(driven=True)
+    plan = resolve_plan(model, SamplingPlan.model_validate({"offset_m": 0.3, "push_miss": 0.0, "push_gap_m": 0.01}))
+    radii = [extent(model, body).radius_m for body in model.file.bodies]
+    places = []
+    for seed in range(30):
+        start = draw_start(model, plan, 1.0, np.random.default_rng(seed))
+        apart = np.linalg.norm(start.position_m[0, :2] - start.position_m[1, :2])
+        assert apart == pytest.approx(sum(radii) + 0.01)
+        places.append(start.position_m[0, :2])
+    assert 0.2 < np.linalg.norm(places, axis=1).max() <= 0.3
+    assert np.linalg.norm(np.array(places) - [0.2, 0], axis=1).min() < sum(radii)
+
+
 def test_pushes_are_their_actions(tmp_path: Path) -> None:
     path = write_small_model(tmp_path / "model", driven=True)
     plan = SamplingPlan.model_validate(

@@ -403,3 +403,16 @@ def test_amodal_masks_are_compared_with_the_poses(broken: Path) -> None:
 
     faults = change(broken, roll)
     assert any("obs/view1, frame 0, body 'cube': amodal mask and pose overlap by 0." in fault for fault in faults)
+
+
+@pytest.mark.parametrize("array", ["bodies/pos", "obs/view0_depth"])
+def test_a_damaged_block_is_named(broken: Path, array: str) -> None:
+    path = broken / SHARD
+    with h5py.File(path) as file:
+        block = file[f"data/demo_1/{array}"].id.get_chunk_info(0)
+    data = bytearray(path.read_bytes())
+    data[block.byte_offset + 4 : block.byte_offset + 20] = bytes(16)
+    path.write_bytes(data)
+    faults = change(broken, lambda demo: None, demo=0)  # with the hash of what is there now
+    assert any(fault.startswith(f"{SHARD}, demo_1: a block cannot be read: ") for fault in faults), faults
+    assert not any("demo_0" in fault for fault in faults)
