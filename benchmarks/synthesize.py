@@ -4,7 +4,8 @@ python benchmarks/synthesize.py [--device auto|cpu|cuda] [--rollouts N] [--durat
 
 A cube of 5,000 visual spheres (64 that collide) is thrown over a scene of 20,000; 320 x 240 px, two cameras, 30 Hz;
 RGB, depth, masks, amodal masks, poses, contacts and forces, zstd. A frame is one camera's. "end_to_end" is `cgwm
-synthesize` from the model on disk to the published, hashed dataset. What follows is each part alone, on the same
+synthesize` from the model on disk to the published, hashed dataset, without its preview; "end_to_end_workers" the same
+with `--workers`, in 4 processes. What follows is each part alone, on the same
 rollouts: what would be reached if nothing else took time. `gpu_waits` is the share of the time in which the GPU has
 nothing to do.
 """
@@ -29,6 +30,7 @@ from cgwm.datasets.processors import processors
 from cgwm.datasets.rollout_writer import RolloutWriter, _encoded_images
 from cgwm.datasets.rollouts import FrameBlock
 from cgwm.pipeline import synthesize as stage
+from cgwm.pipeline.cluster import synthesize_shards
 from cgwm.pipeline.draws import draw_rollout
 from cgwm.pipeline.rollout_batches import Motion
 from cgwm.pipeline.rollout_labels import labels_of
@@ -37,6 +39,7 @@ from cgwm.schemas import SynthesizeConfig
 from store import Store
 
 CAMERAS = 2
+WORKERS = 4
 ROLLOUTS = {"cuda": 256, "cpu": 2}
 DURATION_S = {"cuda": 2.0, "cpu": 1.0}
 ALONE_FRAMES = {"cuda": 20_000, "cpu": 200}
@@ -75,6 +78,32 @@ class Bench:
         if self.device == "cuda":
             figures["gpu_waits"] = 1 - stopwatch.gpu_seconds() / wall_s
         return figures
+
+    def end_to_end_workers(self) -> dict[str, Any]:
+        """Return the speed of the whole in several processes, which share the cores and the GPU.
+
+        Of two datasets: what the larger one has more, by the time that it takes more, is the speed once the processes
+        run; `frames_per_s` of each counts their beginning too.
+        """
+        count = min(WORKERS, processors())
+        few = self.config.model_copy(update={"shards": 2 * count, "rollouts": max(self.config.rollouts, 2 * count)})
+        many = few.model_copy(update={"rollouts": 3 * few.rollouts})
+        runs = []
+        for config in (few, many):
+            out = self.folder / "dataset"
+            began = time.perf_counter()
+            summary = synthesize_shards(self.model, out, config, workers=count)
+            runs.append((summary.frames, time.perf_counter() - began))
+            shutil.rmtree(out)
+        (few_frames, few_s), (many_frames, many_s) = runs
+        return {
+            "workers": count,
+            "frames": many_frames,
+            "wall_s": many_s,
+            "frames_per_s": many_frames / many_s,
+            "frames_per_s_fewer": few_frames / few_s,
+            "frames_per_s_running": (many_frames - few_frames) / (many_s - few_s),
+        }
 
     def _run(self, config: SynthesizeConfig, stopwatch: Stopwatch | None = None) -> tuple[Any, float]:
         began = time.perf_counter()
@@ -220,6 +249,7 @@ def main() -> None:
         read_model(bench.model)
         measures = {
             "end_to_end": lambda: bench.end_to_end("zstd"),
+            "end_to_end_workers": bench.end_to_end_workers,
             "end_to_end_jpeg": lambda: bench.end_to_end("jpeg"),
             "end_to_end_uncompressed": lambda: bench.end_to_end("none"),
             "simulate": bench.simulate,

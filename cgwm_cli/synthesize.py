@@ -50,6 +50,10 @@ def synthesize(
             show_default=False,
         ),
     ] = None,
+    workers: Annotated[
+        int,
+        typer.Option("--workers", min=1, metavar="K", help="Make K shards at a time, in processes of this machine."),
+    ] = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep the shards that are complete; with --overwrite remake damaged ones.")
     ] = False,
@@ -73,6 +77,9 @@ def synthesize(
         if shard is not None and (shards is not None or ray is not None):
             other = "--shards" if shards is not None else "--ray"
             raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
+        if workers > 1 and (shard is not None or ray is not None):
+            other = "--shard makes one" if shard is not None else "--ray has workers of its own"
+            raise UsageError(f"--workers {workers} makes several shards at a time here; {other}.", "one of the two.")
         index, count = _shard(shard) if shard is not None else (None, shards)
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
@@ -87,7 +94,7 @@ def synthesize(
             emit(resolved_plan(model, settings.plan), plan_toml)
         elif out is None:
             raise UsageError("--out is missing.", todo="name the directory to write: --out DATASET.")
-        elif shards is None and ray is None:
+        elif shards is None and ray is None and workers == 1:
             from ..pipeline.synthesize import synthesize as work
 
             done = work(model, out, settings, overwrite, resume, preview)
@@ -97,7 +104,7 @@ def synthesize(
 
             if "shards" not in settings.model_fields_set:
                 settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
-            made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview)
+            made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview, workers)
             emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
 
 

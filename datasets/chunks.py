@@ -6,6 +6,7 @@ Each function here may run in many threads at once: zstd, zlib and OpenCV let go
 from __future__ import annotations
 
 import importlib
+import threading
 import zlib
 from functools import cache
 from typing import Any, Literal
@@ -25,6 +26,8 @@ ZSTD_FILTER = 32015
 ZSTD_LEVEL, GZIP_LEVEL = 1, 4
 JPEG_QUALITY = 95
 """Of JPEG images, colours at half the resolution: errors of about 1.5 grey levels on average."""
+
+_of_thread = threading.local()
 
 
 @cache
@@ -73,24 +76,54 @@ def require_zstd(what: str) -> None:
 def encoded(frames: np.ndarray, compression: Compression, chunk_frames: int) -> bytes | memoryview:
     """Return a chunk as it stands in the file.
 
+    Memory that a thread needs on the way is kept for its next chunk: new memory of megabytes is mapped and cleared by
+    the system each time, in which threads wait for each other.
+
     Args:
         frames: The frames of the chunk, C-contiguous, shape (n, H, W, ...) with n <= chunk_frames.
         compression: Of the dataset.
         chunk_frames: Frames in a chunk; what lacks is filled with zeros, as HDF5 does at the end of a dataset.
     """
-    if len(frames) < chunk_frames:
-        frames = np.concatenate([frames, np.zeros((chunk_frames - len(frames), *frames.shape[1:]), frames.dtype)])
     raw = np.ascontiguousarray(frames).reshape(-1).view(np.uint8)
+    size = chunk_frames * (raw.size // len(frames))
+    if raw.size < size:
+        whole = np.empty(size, np.uint8) if compression == "none" else _scratch("whole", size)
+        whole[: raw.size] = raw
+        whole[raw.size :] = 0
+        raw = whole
     if compression == "none":
         return raw.data
     if frames.itemsize > 1:
-        raw = np.ascontiguousarray(raw.reshape(-1, frames.itemsize).T).reshape(-1)
+        raw = _shuffled(raw, frames.itemsize)
     if compression == "gzip":
         return zlib.compress(raw.data, GZIP_LEVEL)
-    return zstd_module().compress(raw.data, ZSTD_LEVEL)
+    compressor = _compressor()
+    return compressor.compress(raw.data, mode=compressor.FLUSH_FRAME)
 
 
-@cache
+def _shuffled(raw: np.ndarray, itemsize: int) -> np.ndarray:
+    """Return the first bytes of all numbers, then the second ones and so on, in memory that the thread uses again."""
+    planes = _scratch("planes", raw.size).reshape(itemsize, -1)
+    rows = max(row for row in range(1, 65) if planes.shape[1] % row == 0)  # OpenCV wants a picture; its rows are free
+    cv2.split(raw.reshape(rows, -1, itemsize), [plane.reshape(rows, -1) for plane in planes])
+    return planes.reshape(-1)
+
+
+def _scratch(name: str, size: int) -> np.ndarray:
+    """Return bytes of this thread, as they were left."""
+    kept: dict[str, np.ndarray] = _of_thread.__dict__
+    if name not in kept or kept[name].size < size:
+        kept[name] = np.empty(size, np.uint8)
+    return kept[name][:size]
+
+
+def _compressor() -> Any:
+    """Return this thread's compressor. It gets a frame as a whole, and so writes the size that HDF5's filter needs."""
+    if not hasattr(_of_thread, "compressor"):
+        _of_thread.compressor = zstd_module().ZstdCompressor(ZSTD_LEVEL)
+    return _of_thread.compressor
+
+
 def zstd_module() -> Any:
     """Return the standard library's module `compression.zstd`, before Python 3.14 by its backport.
 

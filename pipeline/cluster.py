@@ -1,4 +1,4 @@
-"""All shards of a dataset in one command: one after the other here, or as the tasks of a Ray cluster."""
+"""All shards of a dataset in one command: one after the other, in processes, or as the tasks of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from ..schemas import (
     UsageError,
 )
 from .synthesize import shard_indices, synthesize
+from .workers import in_workers
 
 ROLLOUTS_PER_SHARD = 32
 """Of a Ray task, where nothing else is said: some minutes of work, which is what a dead worker loses."""
@@ -57,6 +58,7 @@ def synthesize_shards(
     resume: bool = False,
     ray: str | None = None,
     preview: bool = False,
+    workers: int = 1,
 ) -> ShardsSummary:
     """Write all shards of a dataset of labelled rollouts.
 
@@ -70,6 +72,8 @@ def synthesize_shards(
             RAY_ADDRESS, or here) or else ``local``. All its machines have to see `model` and `out` at these paths.
             None: without Ray, in this process.
         preview: Write a contact sheet and a film of the first rollouts beside the first shard.
+        workers: Without Ray, make so many shards at a time, in processes that share the cores and the GPU. A script
+            that asks for more than one needs ``if __name__ == "__main__":``, as these processes import it.
 
     Returns:
         What the dataset holds now, and the speed.
@@ -83,7 +87,9 @@ def synthesize_shards(
     if not (resume or overwrite):
         refuse_existing_shards(out, config.shards)
     parts = [config.model_copy(update={"shard": shard}) for shard in range(config.shards)]
-    if ray is None:
+    if ray is None and workers > 1:
+        outcomes = _in_processes(model, out, parts, overwrite, resume, preview, workers)
+    elif ray is None:
         outcomes = _here(model, out, parts, overwrite, resume, preview)
     else:
         outcomes = _on_ray(model, out, parts, overwrite, resume, preview, ray)
@@ -114,6 +120,13 @@ def _here(
 ) -> Generator[_Outcome, None, None]:
     for part in parts:
         yield part.shard, _task(str(model), str(out), part, overwrite, resume, preview)
+
+
+def _in_processes(
+    model: Path, out: Path, parts: Sequence[SynthesizeConfig], overwrite: bool, resume: bool, preview: bool, count: int
+) -> Generator[_Outcome, None, None]:
+    calls = {part.shard: (str(model), str(out), part, overwrite, resume, preview) for part in parts}
+    return in_workers(_task, calls, count)
 
 
 def _on_ray(

@@ -77,6 +77,11 @@ class Simulator:
         self._device = device
         self._together = device == "cuda" and unsupported(on_device(self._world, device)) is None
 
+    @property
+    def engine(self) -> str:
+        """What simulates: engines agree to rounding, not to the byte."""
+        return "fused on cuda" if self._together else "torch"
+
     @torch.no_grad()
     def run(self, draws: Sequence[Draw], seed: int) -> list[Motion | Diverged]:
         """Simulate some rollouts; equal to simulating each alone, bit for bit.

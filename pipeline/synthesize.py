@@ -8,6 +8,7 @@ that are simulated with it.
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -143,7 +144,7 @@ def _written(
         return _summary(out, job, kept, contact_count(out / kept.file), time.perf_counter() - began, True, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
     contacts, outcome = 0, _Outcome(Counter(), [])
-    with _one_thread(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
+    with _one_thread(), _quick_turns(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
         with RolloutWriter(path, config.seed, config_json, f"cgwm {version('cgwm')}", config.compression) as writer:
             with closing(_rollouts(job, indices, outcome, stopwatch)) as found:
                 for draw, labels in progress(found, "rollouts", len(indices), "rollout"):
@@ -297,6 +298,21 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+@contextmanager
+def _quick_turns() -> Iterator[None]:
+    """Let threads take turns with the interpreter after 0.2 ms instead of 5.
+
+    The thread that launches the work of a GPU lets go of the interpreter at each launch, and waits for its turn to go
+    on while others compress and write.
+    """
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(2e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
 def _device(config: SynthesizeConfig) -> str:
     if config.device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
@@ -314,7 +330,7 @@ def _manifest(path: Path, job: _Job, notes: tuple[str, ...]) -> DatasetManifest:
         shard_count=job.config.shards,
         bodies=tuple(body.name for body in job.model.file.bodies),
         cameras=tuple(job.cameras),
-        versions={name: version(name) for name in RECORDED_PACKAGES},
+        versions={name: version(name) for name in RECORDED_PACKAGES} | {"rollout_engine": job.simulator.engine},
         notes=notes,
     )
 

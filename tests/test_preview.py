@@ -106,7 +106,7 @@ def test_a_dataset_ends_with_pictures(dataset: Path) -> None:
 
 def test_pictures_change_no_shard(model_path: Path, dataset: Path, tmp_path: Path) -> None:
     plain = synthesize(model_path, tmp_path / "plain", CONFIG)
-    assert plain.preview == () and plain.notes == ()
+    assert plain.preview == ()
     assert sorted(path.name for path in (tmp_path / "plain").iterdir()) == ["dataset.json", "model", plain.shard]
     assert sha256(dataset / plain.shard) == plain.sha256
     assert (dataset / "dataset.json").read_bytes() == (tmp_path / "plain/dataset.json").read_bytes()
