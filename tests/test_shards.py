@@ -271,6 +271,17 @@ def foreign_version(a: Path, b: Path) -> str:
     return r"b/dataset.json: another dataset: its versions.numpy is '1.0', in "
 
 
+def foreign_engine(a: Path, b: Path) -> str:
+    edited(b / "dataset.json", versions=read_manifest(b).versions | {"rollout_engine": "fused on cuda"})
+    return r"b/dataset.json: another dataset: its versions.rollout_engine is 'fused on cuda', in \S+ 'torch'\."
+
+
+def foreign_engine_of_a_shard(a: Path, b: Path) -> str:
+    file = (b / shard_name(1, 3)).with_suffix(".json")
+    edited(file, versions=read_manifest(b).versions | {"rollout_engine": "fused on cuda"})
+    return r"b/rollouts-0001-of-0003.h5: made with rollout_engine fused on cuda; the dataset's is torch\."
+
+
 def foreign_entry(a: Path, b: Path) -> str:
     file = (b / shard_name(1, 3)).with_suffix(".json")
     edited(file, model_sha256="1" * 64)
@@ -319,6 +330,8 @@ FAULTS = [
     foreign_plan,
     foreign_model,
     foreign_version,
+    foreign_engine,
+    foreign_engine_of_a_shard,
     foreign_entry,
     other_rollouts,
     corrupted_block,
