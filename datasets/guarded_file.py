@@ -50,8 +50,9 @@ class GuardedFile(io.RawIOBase):
 
     def seek(self, place: int, origin: int = os.SEEK_SET) -> int:
         """Go to a place of the file."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: os.fstat(self._descriptor).st_size}[origin]
-        self._place = start + place
+        if origin == os.SEEK_END:
+            place += os.fstat(self._descriptor).st_size
+        self._place = place + (self._place if origin == os.SEEK_CUR else 0)
         return self._place
 
     def tell(self) -> int:

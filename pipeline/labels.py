@@ -120,15 +120,16 @@ class LabelRenderer:
                 pictures, ready = _to_host(pictures)
                 if wait:
                     ready()
+            # cut by numpy: each call of torch would give the interpreter to other threads, and wait to get it back
+            whole = {name: self._arrays(picture) for name, picture in pictures.items()}
             for start in range(0, count, CHUNK_FRAMES):
-                for name, picture in pictures.items():
-                    yield self._block(name, first + start, picture, slice(start, start + CHUNK_FRAMES), ready)
+                for name, arrays in whole.items():
+                    rows = {key: values[start : start + CHUNK_FRAMES] for key, values in arrays.items()}
+                    yield FrameBlock(name, first + start, **rows, ready=ready)
 
-    def _block(
-        self, name: str, start: int, picture: _Pictures, rows: slice, ready: Callable[[], None] | None
-    ) -> FrameBlock:
-        arrays = {field.name: getattr(picture, field.name)[rows].numpy() for field in fields(_Pictures)}
-        return FrameBlock(name, start, **{**arrays, "amodal": arrays["amodal"].view(self._amodal_dtype)}, ready=ready)
+    def _arrays(self, picture: _Pictures) -> dict[str, np.ndarray]:
+        arrays = {field.name: getattr(picture, field.name).numpy() for field in fields(_Pictures)}
+        return {**arrays, "amodal": arrays["amodal"].view(self._amodal_dtype)}
 
     def _frames_at_once(self) -> int:
         spheres = max(len(view.still) for view in self._views.values()) + self._scene.moving_count

@@ -156,8 +156,8 @@ def _check_forces(
     total = [_impulses(contacts, frame, index, len(time)) for index in range(len(read["motions"]))]
     force = np.stack(total, axis=1) / length[:, None, None]
     row_force = contacts["impulse_world"] / length[frame][:, None]
-    keys = ("quat_wxyz", "omega_body", "inertia")
-    torque = contact_torque_n_m(*(read[key] for key in keys), time, read["motions"] == b"free")
+    free = read["motions"] == b"free"
+    torque = contact_torque_n_m(read["quat_wxyz"], read["omega_body"], read["inertia"], time, free)
     numbers = np.arange(len(time))
     impulses, turns = "the impulses over the time between frames", "the change of angular momentum over that time"
     for name, found, expected, frames, what, unit in (
