@@ -29,6 +29,7 @@ from cgwm.datasets.models import read_model
 from cgwm.datasets.processors import processors
 from cgwm.datasets.rollout_writer import RolloutWriter, _encoded_images
 from cgwm.datasets.rollouts import FrameBlock
+from cgwm.pipeline import synthesis_job
 from cgwm.pipeline import synthesize as stage
 from cgwm.pipeline.cluster import synthesize_shards
 from cgwm.pipeline.draws import draw_rollout
@@ -56,7 +57,7 @@ class Bench:
     @property
     def device(self) -> str:
         """Cpu or cuda."""
-        return stage._device(self.config)
+        return synthesis_job.device_of(self.config)
 
     def end_to_end(self, compression: str) -> dict[str, Any]:
         """Return the speed of the whole."""
@@ -115,7 +116,7 @@ class Bench:
 
     def job(self) -> Any:
         """Return what the stage prepares once."""
-        return stage._prepare(self.model, self.config)
+        return synthesis_job.prepared(self.model, self.config)
 
     def motions(self, job: Any, count: int) -> list[Motion]:
         """Return the first rollouts."""

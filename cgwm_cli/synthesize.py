@@ -89,7 +89,7 @@ def synthesize(
                 raise UsageError("--plan, and synthesize.plan in the settings.", "one of the two.")
             settings = settings.model_copy(update={"plan": read_plan(plan)})
         if print_plan:
-            from ..pipeline.synthesize import resolved_plan
+            from ..pipeline.synthesis_job import resolved_plan
 
             emit(resolved_plan(model, settings.plan), plan_toml)
         elif out is None:

@@ -11,69 +11,37 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from ..datasets.atomic import sha256
-from ..datasets.cameras import Camera
 from ..datasets.dataset import finished_shard, new_dataset, shard_entry
-from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
 from ..datasets.rollout_writer import RolloutWriter
 from ..datasets.rollouts import FrameBlock, RolloutLabels
 from ..datasets.shards import contact_count, shard_name, shard_range
 from ..schemas import (
-    DatasetManifest,
     DatasetSummary,
-    InputDataError,
-    SamplingPlan,
     ShardEntry,
     SynthesizeConfig,
     UsageError,
 )
 from .draws import Draw, draw_rollout
-from .labels import LabelRenderer
 from .memory import enough_memory
-from .physics.world import World
-from .posterior import DERIVED, not_varied, require_admissible, with_correlations
 from .preview import with_preview
-from .rejection import Rejection, accepted_rollouts
-from .rollout_batches import ENVIRONMENTS, Diverged, Simulator
+from .rejection import accepted_rollouts
+from .rollout_batches import ENVIRONMENTS, Diverged
 from .rollout_labels import labels_of
-from .sampling import look_at_cameras, resolve_plan
 from .stopwatch import Stopwatch
+from .synthesis_job import Job, manifest_of, notes_of, prepared
 
-STATE_ONLY = (
-    "state only: the model has no visual spheres, so there is nothing to render; "
-    "obs/ holds the bodies' state and no images"
-)
-RECORDED_PACKAGES = ("cgwm", "h5py", "hdf5plugin", "mujoco", "numpy", "torch")
 ROLLOUTS_AT_ONCE = {"cuda": ENVIRONMENTS, "cpu": 1}
 """Drawn and simulated together where the settings do not say, one batch ahead of the pictures."""
-NOT_CONTENT = {"shard", "batch"}
-"""Settings that change no rollout."""
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What all rollouts of a shard share."""
-
-    model: Model
-    config: SynthesizeConfig
-    plan: SamplingPlan
-    times_s: np.ndarray
-    cameras: Mapping[str, Camera]
-    renderer: LabelRenderer | None
-    simulator: Simulator
-    rejection: Rejection
-    device: str
 
 
 @dataclass(frozen=True)
@@ -120,7 +88,7 @@ def synthesize(
     """
     began = time.perf_counter()
     with _one_thread():
-        job = _prepare(model, config)
+        job = prepared(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
         summary = _written(job, model, out, config, overwrite, resume, began, stopwatch or Stopwatch())
@@ -128,7 +96,7 @@ def synthesize(
 
 
 def _written(
-    job: _Job,
+    job: Job,
     model: Path,
     out: Path,
     config: SynthesizeConfig,
@@ -138,8 +106,8 @@ def _written(
     stopwatch: Stopwatch,
 ) -> DatasetSummary:
     indices = shard_indices(config)
-    notes = _notes(job)
-    manifest = _manifest(model, job, notes)
+    notes = notes_of(job)
+    manifest = manifest_of(model, job, notes)
     if resume and (kept := finished_shard(out, manifest, config.shard, overwrite)) is not None:
         return _summary(out, job, kept, contact_count(out / kept.file), time.perf_counter() - began, True, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
@@ -163,7 +131,7 @@ def _written(
 
 
 def _summary(
-    out: Path, job: _Job, entry: ShardEntry, contacts: int, seconds: float, up_to_date: bool, notes: tuple[str, ...]
+    out: Path, job: Job, entry: ShardEntry, contacts: int, seconds: float, up_to_date: bool, notes: tuple[str, ...]
 ) -> DatasetSummary:
     return DatasetSummary(
         dataset=str(out),
@@ -198,7 +166,7 @@ def shard_indices(config: SynthesizeConfig) -> range:
 
 
 def _rollouts(
-    job: _Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch
+    job: Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch
 ) -> Generator[tuple[Draw, RolloutLabels], None, None]:
     """Yield the accepted rollouts in the order of their numbers; the next batch is simulated meanwhile."""
     size = job.config.batch or ROLLOUTS_AT_ONCE[job.device]
@@ -213,7 +181,7 @@ def _rollouts(
             yield from found
 
 
-def _batch(job: _Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch) -> list[tuple[Draw, RolloutLabels]]:
+def _batch(job: Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch) -> list[tuple[Draw, RolloutLabels]]:
     duration_s = float(job.times_s[-1])
 
     def draw(index: int, attempt: int) -> Draw:
@@ -232,55 +200,6 @@ def _batch(job: _Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch) -
 
     attempts = job.plan.reject.attempts
     return list(accepted_rollouts(indices, draw, simulate, job.rejection.reason, attempts, outcome.rejected))
-
-
-def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
-    """Return a plan with what it leaves out filled in for a model.
-
-    Args:
-        model: MODEL.
-        plan: The plan.
-
-    Raises:
-        InputDataError: If `model` is no model or has no fitted physics, or the plan does not fit it.
-    """
-    return _with_plan(model, plan)[1]
-
-
-def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
-    model = read_model(path)
-    lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
-    if lacking:
-        raise InputDataError(
-            f"{path}: the body '{lacking[0]}' has no colliding spheres.",
-            todo="fit it again: cgwm fit CAPTURE --out MODEL.",
-        )
-    if model.file.contact is None:
-        World.from_model(model)  # says what is missing, and how to get it
-    model = replace(model, file=with_correlations(model))
-    require_admissible(model.file, plan.parameters)
-    return model, resolve_plan(model, plan)
-
-
-def _prepare(path: Path, config: SynthesizeConfig) -> _Job:
-    model, plan = _with_plan(path, config.plan)
-    count = round(config.duration_s * config.frame_rate_hz) + 1
-    if count < 2:
-        raise UsageError(
-            f"{config.duration_s:g} s at {config.frame_rate_hz:g} frames/s is one frame.", "two frames or more."
-        )
-    device = _device(config)
-    visible = bool(model.body_splats)
-    if plan.reject.unseen_share is not None and not visible:
-        raise InputDataError(
-            f"{path}: the model has no visual spheres, so that no camera sees it, and the plan has unseen_share.",
-            todo="leave unseen_share out of [reject].",
-        )
-    cameras = look_at_cameras(model, plan, config) if visible else {}
-    renderer = LabelRenderer(model, cameras, device) if visible else None
-    times = np.arange(count) / config.frame_rate_hz
-    simulator, rejection = Simulator(model, times, device), Rejection.of(model, plan.reject)
-    return _Job(model, config, plan, times, cameras, renderer, simulator, rejection, device)
 
 
 @contextmanager
@@ -313,54 +232,12 @@ def _quick_turns() -> Iterator[None]:
         sys.setswitchinterval(before)
 
 
-def _device(config: SynthesizeConfig) -> str:
-    if config.device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if config.device == "cuda" and not torch.cuda.is_available():
-        raise UsageError("--device cuda: no CUDA device is there.", "auto, cpu.", "see 'cgwm doctor'.")
-    return config.device
-
-
-def _manifest(path: Path, job: _Job, notes: tuple[str, ...]) -> DatasetManifest:
-    settings = job.config.model_copy(update={"plan": job.plan, "shard": 0})
-    return DatasetManifest(
-        model_sha256=sha256(path),
-        config=settings.model_dump(mode="json", exclude=NOT_CONTENT),
-        rollouts=job.config.rollouts,
-        shard_count=job.config.shards,
-        bodies=tuple(body.name for body in job.model.file.bodies),
-        cameras=tuple(job.cameras),
-        versions={name: version(name) for name in RECORDED_PACKAGES} | {"rollout_engine": job.simulator.engine},
-        notes=notes,
-    )
-
-
-def _notes(job: _Job) -> tuple[str, ...]:
-    notes = [] if job.renderer is not None else [STATE_ONLY]
-    kept = not_varied(job.model.file)
-    if kept and job.plan.parameter_spread > 0:
-        notes.append(f"kept at their estimate, because nothing sets them in a rollout: {', '.join(kept)}")
-    spread = [p.name for p in job.model.file.parameters if p.std_error and p.name not in kept]
-    if job.plan.parameter_spread > 0 and not spread:
-        notes.append("no physical parameter has a standard error, so all rollouts have the same physics")
-    together = {name for block in job.model.file.correlations for name in block.parameters}
-    alone = [name for name in spread if name not in together and name not in DERIVED]
-    if job.plan.parameter_spread > 0 and len(alone) > 1:
-        notes.append(f"drawn each by itself, because the model has no correlations of them: {', '.join(alone)}")
-    if job.plan.light_turn_deg.support != (0.0, 0.0) and job.model.file.light is None:
-        notes.append("light_turn_deg turns nothing: the model has no light")
-    unseen = [b.name for b in job.model.file.bodies if b.name not in job.model.body_splats]
-    if job.renderer is not None and unseen:
-        notes.append(f"not in the images, because they have no visual spheres: {', '.join(unseen)}")
-    return tuple(notes)
-
-
-def _entry(path: Path, job: _Job, rollouts: int, frames: int) -> ShardEntry:
+def _entry(path: Path, job: Job, rollouts: int, frames: int) -> ShardEntry:
     index, name = job.config.shard, shard_name(job.config.shard, job.config.shards)
     return shard_entry(path, index, rollouts, frames, name, torch.device(job.device).type)
 
 
-def _frames(job: _Job, draw: Draw, labels: RolloutLabels, stopwatch: Stopwatch) -> Iterator[FrameBlock]:
+def _frames(job: Job, draw: Draw, labels: RolloutLabels, stopwatch: Stopwatch) -> Iterator[FrameBlock]:
     if job.renderer is None:
         return
     with stopwatch.part("render", job.device == "cuda"):

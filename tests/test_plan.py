@@ -20,7 +20,8 @@ from cgwm.pipeline.posterior import draw_parameters, require_admissible, with_co
 from cgwm.pipeline.pushes import push_track
 from cgwm.pipeline.rejection import Rejection, accepted_rollouts
 from cgwm.pipeline.sampling import draw_start, extent, look_at_cameras, resolve_plan, rotation_matrix
-from cgwm.pipeline.synthesize import resolved_plan, synthesize
+from cgwm.pipeline.synthesis_job import resolved_plan
+from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import (
     Correlation,
     Distribution,
