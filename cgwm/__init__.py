@@ -18,10 +18,12 @@ _PUBLIC = {
     "Capture": ".datasets.capture",
     "CgwmError": ".schemas",
     "CheckFailedError": ".schemas",
+    "DamagedShardError": ".schemas",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
     "NotConvergedError": ".schemas",
     "NotEnoughMemoryError": ".schemas",
+    "NotEnoughSpaceError": ".schemas",
     "PhysConfig": ".schemas",
     "SplatConfig": ".schemas",
     "SynthesizeConfig": ".schemas",
@@ -31,6 +33,7 @@ _PUBLIC = {
     "diagnose": ".pipeline.diagnose",
     "doctor": ".pipeline.doctor",
     "evaluate": ".pipeline.eval",
+    "export": ".pipeline.export",
     "fit": ".pipeline.fit",
     "import_balldrops": ".datasets.balldrops",
     "import_contactnets": ".datasets.contactnets",
@@ -40,6 +43,8 @@ _PUBLIC = {
     "import_pinwm": ".datasets.pinwm",
     "import_rosbag": ".datasets.rosbag",
     "import_tum": ".datasets.tum",
+    "merge": ".pipeline.merge",
+    "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.mystery",
@@ -64,17 +69,22 @@ if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tre
     from .pipeline.diagnose import diagnose  # pyright: ignore[reportMissingImports]
     from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
     from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
+    from .pipeline.export import export  # pyright: ignore[reportMissingImports]
     from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
+    from .pipeline.merge import merge  # pyright: ignore[reportMissingImports]
     from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
     from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
     from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
+    from .pipeline.view import open_view  # pyright: ignore[reportMissingImports]
     from .schemas import (  # pyright: ignore[reportMissingImports]
         CalibrateConfig,
         CgwmError,
         CheckFailedError,
+        DamagedShardError,
         InputDataError,
         NotConvergedError,
         NotEnoughMemoryError,
+        NotEnoughSpaceError,
         PhysConfig,
         SplatConfig,
         SynthesizeConfig,
@@ -86,10 +96,12 @@ __all__ = [
     "Capture",
     "CgwmError",
     "CheckFailedError",
+    "DamagedShardError",
     "InputDataError",
     "Model",
     "NotConvergedError",
     "NotEnoughMemoryError",
+    "NotEnoughSpaceError",
     "PhysConfig",
     "SplatConfig",
     "SynthesizeConfig",
@@ -100,6 +112,7 @@ __all__ = [
     "diagnose",
     "doctor",
     "evaluate",
+    "export",
     "fit",
     "import_balldrops",
     "import_contactnets",
@@ -109,6 +122,8 @@ __all__ = [
     "import_pinwm",
     "import_rosbag",
     "import_tum",
+    "merge",
+    "open_view",
     "read_model",
     "run_demo",
     "run_mystery",

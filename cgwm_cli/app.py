@@ -13,20 +13,26 @@ from .diagnose import diagnose
 from .doctor import doctor
 from .effects import list_effects, new_effect, show_effect
 from .eval import evaluate
+from .export import export
 from .fit import fit
 from .import_ import import_capture
+from .merge import merge
 from .synthesize import synthesize
 from .validate import validate
+from .view import view
 
 VERBS = (
     ("demo", demo, "The whole pipeline on a scene that it makes itself."),
     ("calibrate", calibrate, "Photos to cameras, with a metric scale."),
     ("fit", fit, "A capture to a world model."),
     ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
+    ("merge", merge, "The shards of a dataset as one HDF5 file."),
+    ("view", view, "A dataset or a model in the browser."),
     ("eval", evaluate, "A model against measurements."),
     ("compare", compare, "Where and when each model fails, side by side."),
     ("diagnose", diagnose, "Which effect a model lacks."),
     ("import", import_capture, "Recordings in another format to a capture."),
+    ("export", export, "A dataset or a model in the format of another tool."),
     ("validate", validate, "Check a capture, a model or a dataset."),
     ("doctor", doctor, "What this machine has, and what would be used."),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import traceback
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 _interrupted = False
+_typed: list[str] = []
+_RAY_ADDRESS = re.compile(r"auto|local|ray://.+|[\w.-]+:\d+")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -72,11 +75,31 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
         raise typer.Exit(_report(error, debug)) from None
 
 
+def with_values(arguments: list[str]) -> list[str]:
+    """Give `--ray` its value where it stands alone: typer has no options whose value may be left out.
+
+    >>> with_values(["synthesize", "--ray", "model", "--out", "data"])
+    ['synthesize', '--ray', 'auto', 'model', '--out', 'data']
+    """
+    completed: list[str] = []
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=False):
+        completed.append(word)
+        if word == "--ray" and not _RAY_ADDRESS.fullmatch(following):
+            completed.append("auto")
+    return completed
+
+
+def typed() -> list[str]:
+    """Return the arguments that the command was called with."""
+    return _typed
+
+
 def _invoke(arguments: list[str]) -> int:
     from .app import app
 
+    _typed[:] = arguments
     try:
-        return int(app(arguments, prog_name="cgwm", standalone_mode=False) or 0)
+        return int(app(with_values(arguments), prog_name="cgwm", standalone_mode=False) or 0)
     except Exception as error:
         # Typer's own errors are told by their shape: since 0.26 their classes are private.
         if not hasattr(error, "format_message"):
@@ -89,7 +112,7 @@ def _invoke(arguments: list[str]) -> int:
 
 def _report(error: BaseException, debug: bool) -> int:
     if _interrupted or isinstance(error, KeyboardInterrupt):
-        return _say_interrupted()
+        return _say_interrupted(str(error) if isinstance(error, KeyboardInterrupt) else "")
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 1
     from ..schemas import CgwmError
@@ -115,8 +138,10 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
     return f"A fault inside cgwm: {type(error).__name__}: {error}{hint}"
 
 
-def _say_interrupted() -> int:
-    print("Interrupted; nothing was left under the output's name.", file=sys.stderr)
+def _say_interrupted(state: str = "") -> int:
+    """Say it, and what the work says about its state; most work leaves nothing."""
+    state = state or "nothing was left under the output's name."
+    print(f"Interrupted; {state}", file=sys.stderr)
     return INTERRUPTED
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import Debug, Json, Quiet
+from .options import Debug, Json, Quiet, Seed
 from .run import running
 
 if TYPE_CHECKING:
@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 
 def validate(
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A capture, model or dataset.", show_default=False)],
+    sample: Annotated[
+        int | None,
+        typer.Option("--sample", metavar="N", help="Of a dataset, N rollouts drawn at random.", show_default="all"),
+    ] = None,
+    seed: Seed = None,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -24,7 +29,7 @@ def validate(
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.validate import validate as work
 
-        report = work(thing)
+        report = work(thing, sample, seed or 0)
         emit(report, _summary)
     if report.faults:
         raise typer.Exit(1)

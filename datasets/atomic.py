@@ -75,6 +75,41 @@ def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def scratch_file(path: Path) -> Iterator[Path]:
+    """Yield the path of a file to write beside `path`, which is removed at the end unless it was moved meanwhile.
+
+    For what becomes complete in more than one step: :func:`move_into_place` gives it its name.
+    """
+    _clean_stale(path)
+    temporary = _temporary(path, path.suffix)
+    try:
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def move_into_place(temporary: Path, path: Path) -> None:
+    """Give a complete file its name; what stood there is replaced in the same instant."""
+    _sync(temporary)
+    os.replace(temporary, path)
+    _sync(path.parent)
+
+
+def leftovers(folder: Path, names: re.Pattern[str]) -> tuple[list[Path], list[Path]]:
+    """Find unfinished outputs in a folder whose names match: those of dead processes, and those that may be alive.
+
+    Only the processes of this machine are known: what another one of a cluster left may be in use.
+    """
+    dead: list[Path] = []
+    unknown: list[Path] = []
+    for entry in sorted(folder.glob(f".*.{_PARTIAL}-*")):
+        match = re.fullmatch(rf"\.(.+)\.{_PARTIAL}-(\d+)-([0-9a-f]{{8}})-[^-]*", entry.name)
+        if match is not None and names.fullmatch(match[1]):
+            (dead if match[3] == _host() and not _alive(int(match[2])) else unknown).append(entry)
+    return dead, unknown
+
+
 def sha256(path: Path | str) -> str:
     """Return the SHA-256 (hex) of a file; of a directory, that of its files' sorted relative names and hashes."""
     path = Path(path)
@@ -117,7 +152,12 @@ def _sibling(path: Path, kind: str, suffix: str = "") -> Path:
 
 
 def _host() -> str:
-    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+    """Return where process numbers mean the same: the machine, and the container where it counts its own."""
+    try:
+        counted = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        counted = ""
+    return hashlib.sha256(f"{socket.gethostname()} {counted}".encode()).hexdigest()[:8]
 
 
 def _clean_stale(path: Path) -> None:

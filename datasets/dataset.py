@@ -1,38 +1,52 @@
 """The directory of a dataset: its manifest, its shards, and a copy of the model that made it.
 
 With one shard the directory appears complete. With several (`--shard I/N`, in any order and from any machine that
-sees the directory) the first shard that is ready makes the directory, and each adds itself to the manifest.
+sees the directory) the first shard that is ready makes the directory, and each adds itself.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from ..schemas import DatasetManifest, ShardEntry, UsageError, read_json
-from .atomic import new_directory, new_file, sha256
+from ..schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError, read_json
+from .atomic import move_into_place, new_directory, new_file, scratch_file, sha256
+from .index import index_fault
 from .kinds import refuse_other_kind
+from .room import enough_room
+from .shards import gathered, shard_fault, shard_name, tidied, write_entry
 
 MANIFEST = "dataset.json"
 MODEL_FOLDER = "model"
 
 
-def shard_name(index: int, count: int) -> str:
-    """Return the file name of a shard, numbered from 0: ``rollouts-0003-of-0064.h5``."""
-    return f"rollouts-{index:04d}-of-{count:04d}.h5"
-
-
 def read_manifest(path: Path) -> DatasetManifest:
-    """Read the manifest of a dataset directory."""
+    """Read the manifest of a dataset directory, with all shards that are complete."""
     if not (path / MANIFEST).is_file():
         refuse_other_kind(path, "dataset")
-    return read_json(path / MANIFEST, DatasetManifest)
+    return gathered(path, read_json(path / MANIFEST, DatasetManifest))
 
 
-def shard_entry(path: Path, index: int, rollouts: int, frames: int, name: str = "") -> ShardEntry:
+def write_manifest(path: Path, manifest: DatasetManifest) -> None:
+    """Write the manifest of a dataset directory."""
+    with new_file(path / MANIFEST, overwrite=True) as temporary:
+        temporary.write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def settings_text(manifest: DatasetManifest) -> str:
+    """Return the settings as the shards carry them."""
+    return json.dumps(manifest.config, sort_keys=True)
+
+
+def shard_entry(
+    path: Path, index: int, rollouts: int, frames: int, name: str = "", device: str | None = None
+) -> ShardEntry:
     """Describe a finished shard, with its hash; `name` is its final name where `path` is a temporary one."""
     size = path.stat().st_size
     return ShardEntry(
@@ -42,6 +56,39 @@ def shard_entry(path: Path, index: int, rollouts: int, frames: int, name: str = 
         bytes=size,
         rollouts=rollouts,
         frames=frames,
+        device=device,
+    )
+
+
+def finished_shard(path: Path, manifest: DatasetManifest, index: int, overwrite: bool) -> ShardEntry | None:
+    """Return the entry of a shard that is there and whole, or None if it is to be made (again).
+
+    Args:
+        path: DATASET, which need not exist.
+        manifest: The manifest of what would be written, without shards.
+        index: Number of the shard, from 0.
+        overwrite: A damaged shard is to be made again.
+
+    Raises:
+        UsageError: If `path` is no dataset, or one of other rollouts.
+        DamagedShardError: If the shard is damaged and `overwrite` is not set.
+    """
+    if not path.exists():
+        return None
+    refuse_other_dataset(path, manifest)
+    name = shard_name(index, manifest.shard_count)
+    entry = next((entry for entry in read_manifest(path).shards if entry.index == index), None)
+    if not (path / name).exists():
+        return None
+    fault = shard_fault(path / name, entry) if entry else f"{name}: there, but without an entry in {MANIFEST}."
+    if entry is not None and fault is None:
+        return entry
+    if overwrite:
+        return None
+    raise DamagedShardError(
+        f"{path}/{fault}",
+        "the bytes that were written, or no such file.",
+        "pass --overwrite as well, which keeps whole shards and makes this one again, or move it away.",
     )
 
 
@@ -61,104 +108,144 @@ def new_dataset(
     Raises:
         UsageError: Before anything is written, if the output exists and `overwrite` is not set, or if the shard
             belongs to another dataset than the one that is there.
+        NotEnoughSpaceError: If there is no room; what was complete before is still there.
     """
     entries: list[ShardEntry] = []
-    if manifest.shard_count == 1:
-        with new_directory(path, overwrite) as folder:
-            yield folder / shard_name(index, 1), entries
-            shutil.copytree(model, folder / MODEL_FOLDER)
-            _write(folder, manifest.model_copy(update={"shards": tuple(entries)}))
-        return
     name = shard_name(index, manifest.shard_count)
+    if manifest.shard_count == 1:
+        with enough_room(path, name), new_directory(path, overwrite) as folder:
+            yield folder / name, entries
+            shutil.copytree(model, folder / MODEL_FOLDER)
+            write_manifest(folder, manifest.model_copy(update={"shards": _stamped(entries, manifest)}))
+        return
+    home = path.resolve()  # beside the directory itself, so that renaming stays on one file system
     if path.exists():
-        _refuse_other(path, manifest)
+        refuse_other_dataset(path, manifest)
         if (path / name).exists() and not overwrite:
-            raise UsageError(f"{path / name} exists.", todo="choose another name or pass --overwrite.")
-    waiting = path.parent / f".{path.name}.{name}"
-    with new_file(waiting, overwrite=True) as temporary:
+            raise _exists(path / name)
+        tidied(home)
+    with enough_room(path, name), scratch_file(home.parent / f"{home.name}.{name}") as temporary:
         yield temporary, entries
-    try:
-        _publish(path, manifest, model, waiting, name, entries)
-    finally:
-        waiting.unlink(missing_ok=True)
+        _publish(path, manifest, model, temporary, _stamped(entries, manifest)[0], overwrite)
 
 
 def _publish(
-    path: Path, manifest: DatasetManifest, model: Path, waiting: Path, name: str, entries: list[ShardEntry]
+    path: Path, manifest: DatasetManifest, model: Path, temporary: Path, entry: ShardEntry, overwrite: bool
 ) -> None:
     if not path.exists():
         try:
             with new_directory(path) as folder:
                 shutil.copytree(model, folder / MODEL_FOLDER)
-                _write(folder, manifest)
+                write_manifest(folder, manifest)
         except (UsageError, OSError):
-            if not (path / MANIFEST).is_file():  # not the case that another shard was faster
+            if not _appears(path / MANIFEST):  # not the case that another shard was faster
                 raise
-    _refuse_other(path, manifest)
-    with _locked(path):
-        os.replace(waiting, path / name)
-        present = read_manifest(path)
-        others = [shard for shard in present.shards if shard.file != name]
-        shards = tuple(sorted([*others, *entries], key=lambda shard: shard.index))
-        _write(path, present.model_copy(update={"shards": shards}))
+    refuse_other_dataset(path, manifest)
+    if (path / entry.file).exists() and not overwrite:  # by a second task of the same number, meanwhile
+        others = {shard.index: shard.sha256 for shard in read_manifest(path).shards}
+        if others.get(entry.index) != entry.sha256:
+            raise _exists(path / entry.file)
+        return
+    write_entry(path, entry)
+    move_into_place(temporary, path / entry.file)
 
 
-def _refuse_other(path: Path, manifest: DatasetManifest) -> None:
-    """Refuse to add a shard to a directory that is no dataset, or a dataset of other rollouts."""
+def _appears(file: Path, seconds: float = 10.0) -> bool:
+    """Tell whether a file is there, where its directory is; a network file system may show it some seconds late."""
+    end = time.monotonic() + seconds
+    while not file.is_file():
+        if not os.path.lexists(file.parent) or time.monotonic() > end:
+            return False
+        time.sleep(0.2)
+        os.listdir(file.parent)  # asks the server again
+    return True
+
+
+def _stamped(entries: list[ShardEntry], manifest: DatasetManifest) -> tuple[ShardEntry, ...]:
+    made_of = {"model_sha256": manifest.model_sha256, "versions": manifest.versions}
+    return tuple(entry.model_copy(update=made_of) for entry in entries)
+
+
+def refuse_existing_shards(path: Path, count: int) -> None:
+    """Refuse to make shards of which one is there already; called before long work starts.
+
+    Raises:
+        UsageError: With the first that exists.
+    """
+    for index in range(count):
+        if (path / shard_name(index, count)).exists():
+            raise _exists(path / shard_name(index, count))
+
+
+def _exists(path: Path) -> UsageError:
+    return UsageError(
+        f"{path} exists.", todo="choose another name or pass --overwrite, or --resume, which keeps what is whole."
+    )
+
+
+def refuse_other_dataset(path: Path, manifest: DatasetManifest) -> None:
+    """Refuse to add a shard to a directory that is no dataset, or a dataset of other rollouts.
+
+    Raises:
+        UsageError: With the first thing that differs.
+    """
     if not (path / MANIFEST).is_file():
         raise UsageError(f"{path} exists and is no dataset.", todo="choose another name.")
-    present = read_manifest(path)
-    for field in ("model_sha256", "config", "rollouts", "shard_count"):
-        found, wanted = getattr(present, field), getattr(manifest, field)
-        if found != wanted:
-            raise UsageError(
-                f"{path / MANIFEST}: another dataset: its {field} is {_short(found)}, here {_short(wanted)}.",
-                "shards of one model with one set of options.",
-                "choose another name for --out, or repeat the options of the first shard.",
-            )
+    other = difference(read_json(path / MANIFEST, DatasetManifest), manifest)
+    if other is not None:
+        name, found, wanted = other
+        raise UsageError(
+            f"{path / MANIFEST}: another dataset: its {name} is {_short(found)}, here {_short(wanted)}.",
+            "shards of one model with one set of options, made with the same versions.",
+            "choose another name for --out, or repeat the options of the first shard.",
+        )
+
+
+def difference(found: DatasetManifest, wanted: DatasetManifest) -> tuple[str, Any, Any] | None:
+    """Return the first thing in which two datasets differ, other than by their shards: its name, and both values."""
+    for field in ("format", "model_sha256", "config", "rollouts", "shard_count", "versions"):
+        pair = getattr(found, field), getattr(wanted, field)
+        if pair[0] != pair[1]:
+            return _deepest(field, *pair)
+    return None
+
+
+def _deepest(name: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        for key in sorted({*found, *wanted}):
+            if found.get(key) != wanted.get(key):
+                return _deepest(f"{name}.{key}", found.get(key), wanted.get(key))
+    return name, found, wanted
 
 
 def _short(value: object) -> str:
     return f"{value!r:.200}"
 
 
-def _write(folder: Path, manifest: DatasetManifest) -> None:
-    with new_file(folder / MANIFEST, overwrite=True) as temporary:
-        temporary.write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the directory's advisory lock, so that shards that end together do not lose each other's entries."""
-    try:
-        import fcntl
-    except ImportError:  # no POSIX: there, shards have to end one after the other
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
-
-
-def missing_shards(manifest: DatasetManifest) -> list[str]:
-    """Return the names of the shards that a dataset still lacks."""
+def missing_shards(manifest: DatasetManifest) -> list[int]:
+    """Return the numbers of the shards that a dataset still lacks."""
     present = {shard.index for shard in manifest.shards}
-    return [shard_name(index, manifest.shard_count) for index in range(manifest.shard_count) if index not in present]
+    return [index for index in range(manifest.shard_count) if index not in present]
 
 
-def check_hashes(path: Path, manifest: DatasetManifest) -> list[str]:
-    """Compare the shards and the model's copy with the manifest; return one sentence a fault."""
-    faults = [f"{name}: this shard is missing." for name in missing_shards(manifest)]
-    for shard in manifest.shards:
-        file = path / shard.file
-        if not file.is_file():
-            faults.append(f"{shard.file}: listed in {MANIFEST}, but no such file.")
-        elif sha256(file) != shard.sha256:
-            faults.append(f"{shard.file}: its sha256 differs from {MANIFEST}: changed or damaged since it was written.")
+def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] | None = None) -> list[str]:
+    """Compare the shards, their index and the model's copy with the manifest; return one sentence a fault.
+
+    Args:
+        path: DATASET.
+        manifest: Its manifest.
+        files: Names of the shards to read for their hash, of the others the size is compared; all where left out.
+    """
+    faults = [
+        f"{shard_name(index, manifest.shard_count)}: this shard is missing." for index in missing_shards(manifest)
+    ]
+    found = (shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards)
+    faults += [fault for fault in found if fault is not None]
     listed = {shard.file for shard in manifest.shards}
+    if manifest.index is not None:
+        listed.add(manifest.index.file)
+        fault = index_fault(path / manifest.index.file, manifest)
+        faults += [fault] if fault else []
     extra = sorted(file.name for file in path.glob("*.h5") if file.name not in listed)
     faults += [f"{name}: not listed in {MANIFEST}." for name in extra]
     model = path / manifest.model

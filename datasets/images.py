@@ -84,6 +84,14 @@ def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -
     path.write_bytes(data.tobytes())
 
 
+def write_depth(path: Path | str, depth: NDArray[np.uint16]) -> None:
+    """Write depth (height, width) in whole steps of a unit of one's own as a PNG of 16 bits."""
+    done, data = cv2.imencode(".png", depth)
+    if depth.dtype != np.uint16 or depth.ndim != 2 or not done:
+        raise ValueError(f"depth is uint16 (H, W); found {depth.dtype} {depth.shape}")
+    Path(path).write_bytes(data.tobytes())
+
+
 def image_size(path: Path | str) -> tuple[int, int]:
     """Return (width, height) [px] of a PNG or JPEG from its headers, after a check that it is complete.
 

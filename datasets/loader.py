@@ -12,6 +12,8 @@ import h5py
 import numpy as np
 
 from ..schemas import InputDataError, UsageError, did_you_mean
+from .cameras import Camera
+from .chunks import image_of
 from .kinds import refuse_other_kind
 from .rollouts import Node, demo_names, open_shard
 
@@ -26,15 +28,33 @@ class RolloutInfo:
     frames: int
 
 
+INDEX = "index.h5"
+"""The file that `cgwm merge` writes: all shards as one, by virtual datasets."""
+MOST_OPEN = 64
+"""Shards that a process keeps open: of more, the one that was opened first is closed. Systems allow about a thousand
+files, and each has a cache of decoded chunks."""
+
+
 def shard_files(path: Path) -> list[Path]:
-    """Return the shards of a dataset directory, by name; or `path` itself where it is one shard."""
+    """Return the files to read of a dataset directory: the index of a merged one, else its shards, by name.
+
+    A `path` that is a file, a shard or an index, is returned itself.
+    """
     if path.is_file():
         return [path]
     refuse_other_kind(path, "dataset")
+    if (path / INDEX).is_file():
+        return [path / INDEX]
     files = sorted(path.glob("rollouts-*-of-*.h5"))
     if not files:
         raise InputDataError(f"{path}: no shard (rollouts-<i>-of-<n>.h5) in it.")
     return files
+
+
+def camera_of(group: Node) -> Camera:
+    """Read a camera from its group in a rollout, `cameras/<name>`."""
+    read = {name: np.asarray(item[()]) for name, item in group.items()}
+    return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
 
 
 class RolloutReader:
@@ -75,6 +95,9 @@ class RolloutReader:
         info = self.rollouts[number]
         key = (os.getpid(), info.file)  # a handle that a fork inherits is not safe to use
         if key not in self._files:
+            mine = [other for other in self._files if other[0] == key[0]]
+            if len(mine) >= MOST_OPEN:
+                self._files.pop(mine[0]).close()
             self._files[key] = open_shard(info.file)
         return self._files[key]["data"][info.demo]
 
@@ -89,6 +112,10 @@ class RolloutReader:
         group = self.group(number)
         return sorted(group["cameras"]) if "cameras" in group else []
 
+    def camera(self, number: int, name: str) -> Camera:
+        """Return a camera of a rollout, with its pose."""
+        return camera_of(self.group(number)["cameras"][name])
+
     def parameters(self, number: int) -> dict[str, float]:
         """Return the physical parameters of a rollout, in the unit that their attribute states."""
         return {name: float(item[()]) for name, item in self.group(number)["parameters"].items()}
@@ -96,28 +123,35 @@ class RolloutReader:
     def read(self, number: int, key: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return an array of a rollout, its first axis cut to `start:stop` (frames, for what has a time axis)."""
         group = self.group(number)
-        if key not in group:
+        try:
+            data = group[key]
+        except KeyError:
             names = self.keys(number)
-            raise UsageError(f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names))
-        data = group[key]
+            raise UsageError(
+                f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names)
+            ) from None
+        if data.attrs.get("encoding") == "jpeg":
+            return np.stack([image_of(row) for row in data[start:stop]])
         return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
-        """Return the contacts of one frame: body_a, body_b, pos_world, normal_world, distance, impulse_world, mode."""
+        """Return the contacts of one frame: the arrays of the group `contacts` but `offsets`, cut to it."""
         group = self.group(number)["contacts"]
         first, last = group["offsets"][frame : frame + 2]
         return {name: item[first:last] for name, item in group.items() if name != "offsets"}
 
-    def window(self, number: int, start: int, length: int, keys: Iterable[str]) -> dict[str, np.ndarray]:
-        """Return `length` successive frames of some arrays with a time axis."""
-        frames = self.rollouts[number].frames
-        if start < 0 or length < 1 or start + length > frames:
-            raise UsageError(f"frames {start} to {start + length} of rollout {number}, which has {frames}.")
-        return {key: self.read(number, key, start, start + length) for key in keys}
+    def window(
+        self, number: int, start: int, length: int, keys: Iterable[str], every: int = 1
+    ) -> dict[str, np.ndarray]:
+        """Return `length` frames of some arrays with a time axis: successive ones, or each `every`-th."""
+        frames, stop = self.rollouts[number].frames, start + (length - 1) * every + 1
+        if start < 0 or length < 1 or every < 1 or stop > frames:
+            raise UsageError(f"frames {start} to {stop} of rollout {number}, which has {frames}.")
+        return {key: self.read(number, key, start, stop)[::every] for key in keys}
 
 
 class RolloutDataset:
-    """Windows of frames, as a map-style dataset: `torch.utils.data.DataLoader` takes it as it is.
+    """Windows of frames, as a map-style dataset: `torch.utils.data.DataLoader` takes it as it is, with workers or not.
 
     An item is a dictionary of numpy arrays: the windows of `keys`, and for each camera named in them `<camera>_K`
     (3, 3) and `<camera>_T_world_cam` (4, 4); `rollout` (global index) and `start` (first frame).
@@ -125,9 +159,15 @@ class RolloutDataset:
     Args:
         path: DATASET or a shard.
         length: Frames in a window.
-        stride: Frames from one window's start to the next.
-        keys: Arrays with a time axis; default: the bodies' poses and every camera's image.
+        stride: Frames from one window's start to the next; default: windows do not overlap.
+        keys: Arrays with a time axis; `{camera}` in a name stands for each of `cameras`. Default: the bodies' poses
+            and every camera's image.
         split: ``train``, ``valid`` or all.
+        cameras: Names of the cameras to read; default: all of the first rollout.
+        every: Frames of the recording from one frame of a window to the next.
+
+    Raises:
+        UsageError: If the dataset has no such key, camera or split, or a number is not positive.
     """
 
     def __init__(
@@ -137,30 +177,51 @@ class RolloutDataset:
         stride: int | None = None,
         keys: Iterable[str] | None = None,
         split: str | None = None,
+        cameras: Iterable[str] | None = None,
+        every: int = 1,
     ):
+        span, step = (length - 1) * every + 1, stride or length * every
+        if min(length, every, step) < 1:
+            raise UsageError(f"length {length}, stride {stride}, every {every}.", "1 or more.")
         self.reader = RolloutReader(path, split)
-        self.length = length
-        step = stride or length
+        self.length, self.every = length, every
         self.windows = [
             (number, start)
             for number, info in enumerate(self.reader.rollouts)
-            for start in range(0, info.frames - length + 1, step)
+            for start in range(0, info.frames - span + 1, step)
         ]
-        self.cameras = self.reader.cameras() if len(self.reader) else []
-        default = ["bodies/pos", "bodies/quat_wxyz", *(f"obs/{name}_image" for name in self.cameras)]
-        self.keys = list(keys) if keys is not None else default
+        self.cameras, self.keys = self._chosen(cameras, keys)
         self.reader.close()
+
+    def _chosen(self, cameras: Iterable[str] | None, keys: Iterable[str] | None) -> tuple[list[str], list[str]]:
+        """Return the cameras to read and the names of the arrays."""
+        there = self.reader.cameras() if len(self.reader) else []
+        names = there if cameras is None else list(cameras)
+        for name in set(names) - set(there):
+            raise UsageError(f"no camera '{name}'.{did_you_mean(name, there)}", ", ".join(there) or "none.")
+        wanted = ["bodies/pos", "bodies/quat_wxyz", "obs/{camera}_image"] if keys is None else keys
+        every = [key.replace("{camera}", name) for key in wanted for name in (names if "{camera}" in key else [""])]
+        for key in every if len(self.reader) else []:  # before workers start
+            self.reader.read(0, key, 0, 1)
+            axes = str(self.reader.group(0)[key].attrs["shape_meaning"])
+            if not axes.startswith("(T,"):
+                raise UsageError(
+                    f"'{key}' has the axes {axes}, so it has no windows of frames.",
+                    "arrays whose first axis is the time.",
+                    "read it by itself: dataset.reader.read(...), or dataset.reader.contacts(...).",
+                )
+        shown = [name for name in there if any(key.startswith(f"obs/{name}_") for key in every)]
+        return shown, every
 
     def __len__(self) -> int:
         return len(self.windows)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         number, start = self.windows[index]
-        item: dict[str, Any] = self.reader.window(number, start, self.length, self.keys)
+        item: dict[str, Any] = self.reader.window(number, start, self.length, self.keys, self.every)
         for name in self.cameras:
-            if any(key.startswith(f"obs/{name}_") for key in self.keys):
-                for field in ("K", "T_world_cam"):
-                    item[f"{name}_{field}"] = self.reader.read(number, f"cameras/{name}/{field}")
+            for field in ("K", "T_world_cam"):
+                item[f"{name}_{field}"] = self.reader.read(number, f"cameras/{name}/{field}")
         item["rollout"] = np.int64(self.reader.rollouts[number].index)
         item["start"] = np.int64(start)
         return item

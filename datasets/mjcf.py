@@ -7,6 +7,7 @@ gives the same restitution and contact time; the rest depth is MuJoCo's own.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -21,7 +22,28 @@ IMPEDANCE = 0.99
 """solimp's d: rest depth in MuJoCo is (1 - d) g tau^2 / number of contacts."""
 
 
-def write_mjcf(model: Model, cameras: Mapping[str, Camera] | None = None) -> str:
+@dataclass(frozen=True)
+class Keyframe:
+    """Poses and velocities of all bodies, to be written as a `key`. B bodies.
+
+    Attributes:
+        name: Its name.
+        position_m: Body frame origins [m], world, shape (B, 3).
+        quat_wxyz: T_world_body, shape (B, 4).
+        velocity_m_s: Of the origins, world axes, shape (B, 3).
+        omega_body_rad_s: Body axes, shape (B, 3).
+    """
+
+    name: str
+    position_m: np.ndarray
+    quat_wxyz: np.ndarray
+    velocity_m_s: np.ndarray
+    omega_body_rad_s: np.ndarray
+
+
+def write_mjcf(
+    model: Model, cameras: Mapping[str, Camera] | None = None, keyframe: Keyframe | None = None, source: str = ""
+) -> str:
     """Return the model as MJCF text.
 
     Free bodies get a free joint, driven ones are mocap bodies, fixed ones stand at their photo pose. Collision spheres
@@ -31,6 +53,8 @@ def write_mjcf(model: Model, cameras: Mapping[str, Camera] | None = None) -> str
     Args:
         model: A model with fitted physics.
         cameras: Cameras to add, by name; without distortion, which MJCF cannot say.
+        keyframe: A start to add.
+        source: Where the model comes from, to stand in the file.
     """
     file = model.file
     root = ET.Element("mujoco", model="cgwm")
@@ -49,6 +73,10 @@ def write_mjcf(model: Model, cameras: Mapping[str, Camera] | None = None) -> str
         _add_body(world, body, model)
     for name, camera in (cameras or {}).items():
         _add_camera(world, name, camera)
+    if keyframe is not None:
+        _add_keyframe(root, file, keyframe)
+    if source:
+        ET.SubElement(ET.SubElement(root, "custom"), "text", name="source", data=source)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -110,6 +138,16 @@ def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:
         ET.SubElement(element, "geom", type="box", size=_text(body.shape.box.half_extents_m))
     elif body.shape is not None and body.shape.sphere is not None:
         ET.SubElement(element, "geom", type="sphere", size=_text(body.shape.sphere.radius_m))
+
+
+def _add_keyframe(root: ET.Element, file: ModelFile, keyframe: Keyframe) -> None:
+    free, driven = ([k for k, body in enumerate(file.bodies) if body.motion == kind] for kind in ("free", "driven"))
+    rows = {"qpos": (free, keyframe.position_m, keyframe.quat_wxyz)}
+    rows["qvel"] = (free, keyframe.velocity_m_s, keyframe.omega_body_rad_s)
+    values = {name: np.concatenate([a[who], b[who]], 1).ravel() for name, (who, a, b) in rows.items()}
+    values |= {"mpos": keyframe.position_m[driven].ravel(), "mquat": keyframe.quat_wxyz[driven].ravel()}
+    texts = {name: _text(numbers) for name, numbers in values.items() if numbers.size}
+    ET.SubElement(ET.SubElement(root, "keyframe"), "key", name=keyframe.name).attrib.update(texts)
 
 
 def _add_camera(world: ET.Element, name: str, camera: Camera) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,17 +127,51 @@ def encoded_video(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float) -> 
 
     The codec is VP9, which browsers play, where this OpenCV has it; otherwise MPEG-4 part 2, which players play.
     """
+    return _encoded(frames, frame_rate_hz, ".mp4", ("vp09", "mp4v"))
+
+
+def encoded_webm(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float) -> bytes:
+    """Return RGB frames, each (height, width, 3) with even sides, as a WebM file, which browsers play.
+
+    The codec is VP8: this OpenCV writes it five times faster than VP9, at a third more bytes.
+
+    Raises:
+        InputDataError: If this OpenCV writes neither.
+    """
+    return _encoded(frames, frame_rate_hz, ".webm", ("VP80", "VP90"))
+
+
+def _encoded(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float, suffix: str, codecs: Sequence[str]) -> bytes:
     height, width = frames[0].shape[:2]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "film.mp4"
-        for codec in ("vp09", "mp4v"):
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), frame_rate_hz, (width, height))
+        path = Path(folder) / f"film{suffix}"
+        for codec in codecs:
+            with _quiet():
+                writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), frame_rate_hz, (width, height))
             if writer.isOpened():
                 break
+        else:
+            raise InputDataError(
+                f"this OpenCV ({cv2.__version__}) writes no {suffix} video.", todo="pip install opencv-python-headless"
+            )
         for frame in frames:
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
         writer.release()
         return path.read_bytes()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from the terminal what OpenCV's writer says of its own choice of a codec's tag, past any log level."""
+    sys.stderr.flush()
+    saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(nowhere)
 
 
 def _open(path: Path) -> cv2.VideoCapture:

@@ -129,7 +129,7 @@ def _run(demo: _Demo, scene: str, renderer: str) -> DemoResult:
         images_only = _fit_from_images(demo)
     with demo.stage("synthesize"):
         config = _seeded(settings.synthesize, seed=demo.seed, device=demo.device)
-        summary = synthesize(folder / "model", dataset, config)
+        summary = synthesize(folder / "model", dataset, config, preview=True)
     with demo.stage("evaluate"):
         evaluation = _evaluate(demo, "model", keep_frames=True)
         if images_only.outcome == "fitted":

@@ -12,7 +12,7 @@ from .diagnosis.linear import linearised
 from .diagnosis.prepared import prepare
 from .diagnosis.refit import refit
 from .diagnosis.segments import world_for
-from .first_contacts import UNOBSERVABLE_SHARE, FirstContacts, described, few_covariance, placed
+from .first_contacts import UNOBSERVABLE_SHARE, FirstContacts, correlation_of, described, few_covariance, placed
 from .physics.parameters import Parameter
 from .physics.world import World
 
@@ -56,4 +56,5 @@ def fit_effect_flights(
         return None
     parameters = tuple(described(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True))
     record = {"flights": len(prepared.flight.items), "costs": [found.cost], "chi2": excess}
-    return FirstContacts(placed(world, names, found.values), parameters, record)
+    correlation = correlation_of([p.name for p in names], covariance)
+    return FirstContacts(placed(world, names, found.values), parameters, record, (correlation,))

@@ -62,7 +62,7 @@ def fit_effect_windows(
         return touched
     record = touched.record | {"in_flight": flown.record}
     parameters, constants = (*flown.parameters, *touched.parameters), flown.constants | touched.constants
-    return FirstContacts(touched.world, parameters, record, constants)
+    return FirstContacts(touched.world, parameters, record, (*flown.correlations, *touched.correlations), constants)
 
 
 def _with_own_numbers(

@@ -17,6 +17,7 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from ..datasets.tracks import Track
+from ..schemas import Correlation
 from ..schemas import Parameter as FittedParameter
 from .estimation.least_squares import minimise
 from .estimation.observations import Observations
@@ -52,7 +53,7 @@ UNOBSERVABLE_SHARE = 0.8
 class FirstContacts:
     """What was found: the world with it, the parameters for `model.json`, and how the fit went for `fit.json`.
 
-    constants: of effects, `effect.constant` by name.
+    correlations: of the parameters, in blocks; constants: of effects, `effect.constant` by name.
     ground: how far the ground was moved in this world, where ends of episodes showed its height; own: by session or
     episode, values of `effect.parameter` that are its own; spread: of these from unit to unit.
     """
@@ -60,6 +61,7 @@ class FirstContacts:
     world: World
     parameters: tuple[FittedParameter, ...]
     record: dict[str, Any]
+    correlations: tuple[Correlation, ...] = ()
     constants: dict[str, float] = field(default_factory=dict)
     ground: FittedParameter | None = None
     own: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -119,7 +121,14 @@ def fit_first_contacts(
         placed(world, found, coordinates),
         tuple(described(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)),
         record,
+        (correlation_of([p.name for p in found], covariance[:count, :count]),),
     )
+
+
+def correlation_of(names: Sequence[str], covariance: Array) -> Correlation:
+    """Return the correlations of fitted coordinates with a covariance (P, P), as `model.json` has them."""
+    std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
+    return Correlation(parameters=tuple(names), matrix=tuple(map(tuple, (covariance / np.outer(std, std)).tolist())))
 
 
 def few_covariance(information: Array, scores: Array) -> Array:

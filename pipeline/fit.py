@@ -368,6 +368,7 @@ def _has_video(capture: Capture, split: str) -> bool:
 def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     fresh = {parameter.name for parameter in found.parameters}
     kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
+    correlations = [block for block in file.correlations if not fresh & set(block.parameters)]
     ground = file.ground
     if ground is not None and found.ground_offset_m is not None:
         ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
@@ -391,6 +392,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
             "contact": found.contact,
             "ground": ground,
             "parameters": (*found.parameters, *kept),
+            "correlations": (*found.correlations, *correlations),
             "effects": fitted_effects(
                 file.effects,
                 {e.name: load_effect(e.name).name for e in file.effects},

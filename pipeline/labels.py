@@ -1,79 +1,71 @@
-"""Labelled images of a moving model: colour, depth and instance masks, from one pass of the renderer.
+"""Labelled images of a moving model: colour, depth, instance masks and amodal masks.
 
-The depth of a pixel is the expected depth of the one surface that its mask names, so that no depths float between an
-object and what is behind it.
+Colour, depth and masks come from one pass of the renderer. The depth of a pixel is the expected depth of the one
+surface that its mask names, so that no depths float between an object and what is behind it. Amodal masks are made of
+each body's own spheres alone.
 
-What never moves (the background and fixed bodies) is rendered once a camera. In each frame only the tiles that the
-moving bodies can reach are rendered again, with everything in them: outside, nothing of a body contributes, so the
-result is that of rendering the whole picture.
+On a CUDA device many frames of all cameras are rendered at once, whole. On the CPU what never moves (the background
+and fixed bodies) is rendered once a camera, and in each frame only the tiles that the moving bodies can reach are
+rendered again, with everything in them: outside, nothing of a body contributes, so the result is that of rendering the
+whole picture.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from itertools import groupby, pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..datasets.cameras import Camera
+from ..datasets.chunks import CHUNK_FRAMES
 from ..datasets.models import Model
-from ..datasets.rollouts import CHUNK_FRAMES, FrameBlock
-from .physics.rotation import quat_to_matrix
-from .splats.relighting import Relighting
-from .splats.render import MIN_ALPHA, render
-from .splats.spheres import Spheres
+from ..datasets.processors import processors
+from ..datasets.rollouts import FrameBlock, amodal_dtype
+from ..schemas import Exposure, Light
+from .label_reach import TILE, Box, inside, reach, spans
+from .labelled_spheres import Labelled, LabelledModel
+from .splats.render import RenderOutput, render
 
-TILE = 8
-"""Crops begin and end on multiples of the renderer's tile [px], so that its tiles are those of the whole picture."""
 SOLID_ALPHA = 0.5
 """A pixel shows a surface (and gets a depth and a label) where the spheres let less than half of the light through."""
+NUMBERS_AT_ONCE = 100_000_000
+"""Of the largest arrays of one call on a GPU: features of spheres, and of pixels."""
+_SIGNED = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+"""Torch's integers with the bits of the amodal masks' types, by size in bytes."""
 
 
 @dataclass(frozen=True)
-class _Spheres:
-    """Spheres to render, float32; `features` are colour and a one-hot label (background, body 1, ...)."""
+class _Pictures:
+    """Labels of n views, as `FrameBlock` has them; amodal as numbers of the same bits that torch can work with."""
 
-    means: Tensor
-    scales: Tensor
-    opacities: Tensor
-    features: Tensor
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
+    image: Tensor
+    depth: Tensor
+    mask: Tensor
+    amodal: Tensor
+    visible_px: Tensor
+    amodal_px: Tensor
 
 
 @dataclass(frozen=True)
-class _Moving:
-    body: int
-    spheres: _Spheres
-    relighting: Relighting | None
-
-    def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> _Spheres:
-        spheres = _placed(self.spheres, position_m, quat_wxyz)
-        if self.relighting is None:
-            return spheres
-        features = spheres.features.clone()
-        features[:, :3] = (features[:, :3] * self.relighting.factors(quat_wxyz)[:, None]).clamp(0, 1)
-        return replace(spheres, features=features)
-
-
-@dataclass
 class _View:
-    """A camera; what never moves, as it sees it; and its picture of that.
+    """A camera and what never moves, as it sees it.
 
-    features (H, W, F) as :func:`_render` makes them, alpha (H, W).
+    alone (H, W, B): which fixed bodies are seen if they are alone. On the CPU only: plate, the labels of what never
+    moves; reaches (N, 4): `spans` of its spheres.
     """
 
-    static: _Spheres
+    camera: Camera
     viewmat: Tensor
     K: Tensor
-    width: int
-    height: int
-    features: Tensor
-    alpha: Tensor
+    still: Labelled
+    alone: Tensor
+    plate: _Pictures | None
+    reaches: Tensor | None
 
 
 class LabelRenderer:
@@ -86,159 +78,217 @@ class LabelRenderer:
     """
 
     def __init__(self, model: Model, cameras: Mapping[str, Camera], device: str = "cpu"):
-        self._device = device
-        self._labels = 1 + len(model.file.bodies)
-        fixed, self._moving = [], []
-        self._scene = None if model.scene is None else Spheres.from_numpy(model.scene, device=device)
-        for index, body in enumerate(model.file.bodies):
-            if body.name not in model.body_splats:
-                continue
-            spheres = self._labelled(Spheres.from_numpy(model.body_splats[body.name], device=device), index + 1)
-            if body.motion == "fixed":
-                pose = body.photo_pose
-                fixed.append(_placed(spheres, self._float(pose.position_m), self._float(pose.quat_wxyz)))
-            else:
-                light, normals = model.file.light, model.body_splats[body.name].normals
-                relighting = None
-                if light is not None and normals is not None:
-                    relighting = Relighting.of(light, body, self._float(normals))
-                self._moving.append(_Moving(index, spheres, relighting))
-        nothing = torch.zeros(0, 3, device=device)
-        empty = _Spheres(nothing, nothing[:, 0], nothing[:, 0], torch.zeros(0, 3 + self._labels, device=device))
-        self._fixed = _joined([*fixed, empty])
+        self._scene = LabelledModel(model, device)
+        self._together = torch.device(device).type == "cuda"
+        self._amodal_dtype = amodal_dtype(self._scene.bodies)
+        self._threads = ThreadPoolExecutor(processors(), "cgwm-render")
+        self.set_cameras(cameras)
+
+    def set_cameras(self, cameras: Mapping[str, Camera]) -> None:
+        """Look through these cameras from now on."""
         self._views = {name: self._view(camera) for name, camera in cameras.items()}
 
+    def set_light(self, light: Light | None) -> None:
+        """Shade what moves in this light from now on; None: in that of the photos."""
+        self._scene.set_light(light)
+
     @torch.no_grad()
-    def blocks(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> Iterator[FrameBlock]:
-        """Render a rollout, a chunk of frames of one camera at a time.
+    def blocks(
+        self,
+        position_m: np.ndarray,
+        quat_wxyz: np.ndarray,
+        wait: bool = True,
+        exposures: Mapping[str, Exposure] | None = None,
+    ) -> Iterator[FrameBlock]:
+        """Render a rollout, a chunk of frames of one camera after the other.
 
         Args:
             position_m: Body frame origins [m], world, shape (T, B, 3).
             quat_wxyz: T_world_body, shape (T, B, 4).
+            wait: Whether to wait for the device; without, whoever reads a block calls its `ready` first.
+            exposures: Of some of the cameras; the others show the model's colours.
         """
-        count = len(position_m)
-        for start in range(0, count, CHUNK_FRAMES):
-            frames = range(start, min(start + CHUNK_FRAMES, count))
-            placed = [self._place(position_m[frame], quat_wxyz[frame]) for frame in frames]
-            for name, view in self._views.items():
-                pictures = [self._frame(view, spheres) for spheres in placed]
-                image, depth, mask = (np.stack(parts) for parts in zip(*pictures, strict=True))
-                yield FrameBlock(name, start, image, depth, mask)
+        at_once = self._frames_at_once() if self._together else CHUNK_FRAMES
+        for first in range(0, len(position_m), at_once):
+            placed = self._scene.placed(position_m[first : first + at_once], quat_wxyz[first : first + at_once])
+            count = len(position_m[first : first + at_once])
+            pictures = self._all_at_once(placed, count) if self._together else self._one_by_one(placed, count)
+            for name, exposure in (exposures or {}).items():
+                pictures[name] = replace(pictures[name], image=_exposed(pictures[name].image, exposure))
+            ready = None
+            if self._together:
+                pictures, ready = _to_host(pictures)
+                if wait:
+                    ready()
+            # cut by numpy: each call of torch would give the interpreter to other threads, and wait to get it back
+            whole = {name: self._arrays(picture) for name, picture in pictures.items()}
+            for start in range(0, count, CHUNK_FRAMES):
+                for name, arrays in whole.items():
+                    rows = {key: values[start : start + CHUNK_FRAMES] for key, values in arrays.items()}
+                    yield FrameBlock(name, first + start, **rows, ready=ready)
 
-    def _labelled(self, spheres: Spheres, label: int) -> _Spheres:
-        one_hot = torch.zeros(len(spheres), self._labels, device=self._device)
-        one_hot[:, label] = 1.0
-        features = torch.cat([spheres.colors, one_hot], 1)
-        return _Spheres(spheres.means, spheres.scales, spheres.opacities, features)
+    def _arrays(self, picture: _Pictures) -> dict[str, np.ndarray]:
+        arrays = {field.name: getattr(picture, field.name).numpy() for field in fields(_Pictures)}
+        return {**arrays, "amodal": arrays["amodal"].view(self._amodal_dtype)}
 
-    def _float(self, values: object) -> Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self._device)
+    def _frames_at_once(self) -> int:
+        spheres = max(len(view.still) for view in self._views.values()) + self._scene.moving_count
+        pixels = max(view.camera.width * view.camera.height for view in self._views.values())
+        numbers = max(spheres, pixels) * (5 + 2 * self._scene.bodies) * len(self._views)
+        return max(1, NUMBERS_AT_ONCE // (numbers * CHUNK_FRAMES)) * CHUNK_FRAMES
 
+    @torch.no_grad()
     def _view(self, camera: Camera) -> _View:
-        viewmat, K = self._float(camera.T_cam_world), self._float(camera.K)
-        size = (camera.width, camera.height)
-        static = self._fixed
-        if self._scene is not None:
-            seen = self._scene.seen_from(self._float(camera.center))
-            static = _joined([self._labelled(seen, 0), static])
-        with torch.no_grad():
-            picture = _render(static, viewmat, K, *size)
-        return _View(static, viewmat, K, *size, *picture)
+        viewmat, K = self._scene.tensor(camera.T_cam_world), self._scene.tensor(camera.K)
+        still, whole = self._scene.still(camera), Box(0, 0, camera.width, camera.height)
+        alone = torch.zeros(1, camera.height, camera.width, self._scene.bodies, dtype=torch.bool, device=K.device)
+        for body, spheres in self._scene.fixed:
+            picture = _rendered(spheres, spheres.opacities[:, None], viewmat[None], K[None], whole)
+            alone[..., body] = picture.alpha > SOLID_ALPHA
+        if self._together:
+            return _View(camera, viewmat, K, still, alone[0], None, None)
+        plate = self._labels([], still, viewmat[None], K[None], whole, alone)
+        return _View(camera, viewmat, K, still, alone[0], plate, spans(still, viewmat, K))
 
-    def _place(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> _Spheres:
-        moved = [
-            part.placed(self._float(position_m[part.body]), self._float(quat_wxyz[part.body])) for part in self._moving
-        ]
-        return _joined([*moved, _cut(self._fixed, slice(0, 0))])
+    def _all_at_once(self, placed: Sequence[tuple[int, Labelled]], count: int) -> dict[str, _Pictures]:
+        """Return the labels of so many frames for each camera; cameras of one size in one call."""
+        found: dict[str, _Pictures] = {}
+        order = sorted(self._views, key=lambda name: _size(self._views[name].camera))
+        for size, group in groupby(order, key=lambda name: _size(self._views[name].camera)):
+            names = list(group)
+            views = [self._views[name] for name in names]
+            viewmats = torch.stack([view.viewmat for view in views]).repeat_interleave(count, 0)
+            Ks = torch.stack([view.K for view in views]).repeat_interleave(count, 0)
+            still = Labelled(
+                views[0].still.means, views[0].still.scales, views[0].still.opacities,
+                torch.stack([view.still.colors for view in views]).repeat_interleave(count, 0), views[0].still.labels,
+            )  # fmt: skip
+            moving = [(body, spheres.repeated(len(views))) for body, spheres in placed]
+            alone = torch.stack([view.alone for view in views]).repeat_interleave(count, 0)
+            labels = self._labels(moving, still, viewmats, Ks, Box(0, 0, *size), alone)
+            for number, name in enumerate(names):
+                rows = slice(number * count, (number + 1) * count)
+                found[name] = _Pictures(*(getattr(labels, field.name)[rows] for field in fields(_Pictures)))
+        return {name: found[name] for name in self._views}
 
-    def _frame(self, view: _View, moving: _Spheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        features, alpha = view.features, view.alpha
-        box = _reach(moving, view)
-        if box is not None:
-            left, top, right, bottom = box
-            K = view.K.clone()
-            K[0, 2] -= left
-            K[1, 2] -= top
-            everything = _joined([moving, view.static])
-            crop = _render(everything, view.viewmat, K, right - left, bottom - top)
-            features, alpha = features.clone(), alpha.clone()
-            for whole, part in zip((features, alpha), crop, strict=True):
-                whole[top:bottom, left:right] = part
-        solid = alpha > SOLID_ALPHA
-        color, weight, weighted_depth = features.split([3, self._labels, self._labels], dim=-1)
+    def _one_by_one(self, placed: Sequence[tuple[int, Labelled]], count: int) -> dict[str, _Pictures]:
+        """Return the labels of so many frames for each camera: the plate, and on it what moving bodies can reach."""
+        names = [field.name for field in fields(_Pictures)]
+        made: dict[str, dict[str, Tensor]] = {}
+        for camera, view in self._views.items():
+            assert view.plate is not None  # on the CPU
+            made[camera] = {name: getattr(view.plate, name).repeat_interleave(count, 0) for name in names}
+        tasks = [(camera, frame) for camera in self._views for frame in range(count)]
+        crops = self._threads.map(lambda task: self._crop(self._views[task[0]], placed, task[1]), tasks)
+        for (camera, frame), crop in zip(tasks, crops, strict=True):
+            if crop is not None:
+                for name in ("image", "depth", "mask", "amodal"):
+                    made[camera][name][frame][crop[0].place] = getattr(crop[1], name)[0]
+        for arrays in made.values():
+            arrays["visible_px"], arrays["amodal_px"] = self._pixels(arrays["mask"], arrays["amodal"])
+        return {camera: _Pictures(**arrays) for camera, arrays in made.items()}
+
+    @torch.no_grad()
+    def _crop(self, view: _View, placed: Sequence[tuple[int, Labelled]], frame: int) -> tuple[Box, _Pictures] | None:
+        """Return what the moving bodies can reach in one frame, and its labels; None where they reach nothing."""
+        assert view.reaches is not None  # on the CPU
+        moving = [(body, spheres.view(frame)) for body, spheres in placed]
+        bodies = Labelled.joined([self._scene.none, *(spheres for _, spheres in moving)])
+        box = reach(bodies, view.viewmat, view.K, view.camera.width, view.camera.height)
+        if box is None:
+            return None
+        near = view.still.rows(inside(view.reaches, box))
+        viewmats, Ks = view.viewmat[None], box.camera_matrix(view.K)[None]
+        return box, self._labels(moving, near, viewmats, Ks, box, view.alone[box.place][None])
+
+    def _labels(
+        self,
+        moving: Sequence[tuple[int, Labelled]],
+        still: Labelled,
+        viewmats: Tensor,
+        Ks: Tensor,
+        box: Box,
+        alone: Tensor,
+    ) -> _Pictures:
+        """Render views of all that there is.
+
+        Args:
+            moving: What moves, by body; of one view, or of n.
+            still: What does not.
+            viewmats: (n, 4, 4).
+            Ks: (n, 3, 3).
+            box: The picture.
+            alone: Which bodies that do not move are seen if they are alone, (n, H, W, B).
+        """
+        spheres = Labelled.joined([*(part for _, part in moving), still])
+        ends = np.cumsum([0, *(len(part) for _, part in moving)]).tolist()
+        kinds = 1 + self._scene.bodies
+        one_hot = torch.eye(kinds, device=viewmats.device)[spheres.labels]
+        if spheres.means.dim() == 2:
+            weighted = one_hot * (spheres.means @ viewmats[0, 2, :3] + viewmats[0, 2, 3])[:, None]
+            features = torch.cat([spheres.colors, one_hot, weighted], -1)
+        else:
+            depth = spheres.means @ viewmats[:, 2, :3, None] + viewmats[:, 2, 3, None, None]
+            one_hot = one_hot.expand(len(viewmats), -1, -1)
+            features = torch.cat([spheres.colors, one_hot, one_hot * depth], -1)
+        picture = _rendered(spheres, features, viewmats, Ks, box, [slice(*pair) for pair in pairwise(ends)])
+        color, weight, weighted_depth = picture.features.split([3, kinds, kinds], dim=-1)
         # Of equal weights the first counts, and a solid pixel has a weight above 0.
+        solid = picture.alpha > SOLID_ALPHA
         most, surface = weight.max(-1)
         label = torch.where(solid, surface, 0)
-        image = (color.clamp(0, 1) * 255).round()
         nearest = weighted_depth.gather(-1, surface[..., None])[..., 0]
         depth = torch.where(solid, nearest / most.clamp_min(1e-6), 0.0)
-        return (
-            image.to(torch.uint8).cpu().numpy(),
-            depth.to(torch.float32).cpu().numpy(),
-            label.to(torch.uint8).cpu().numpy(),
-        )
+        whole = torch.zeros_like(label)
+        seen = {body: alone[..., body] for body in range(self._scene.bodies)}
+        if picture.alone is not None:
+            seen |= {body: picture.alone[..., number] > SOLID_ALPHA for number, (body, _) in enumerate(moving)}
+        for body, there in seen.items():
+            whole |= (there | (label == body + 1)).to(whole.dtype) << body
+        mask, amodal = label.to(torch.uint8), whole.to(_SIGNED[self._amodal_dtype.itemsize])
+        image = (color.clamp(0, 1) * 255).round().to(torch.uint8)
+        return _Pictures(image, depth, mask, amodal, *self._pixels(mask, amodal))
+
+    def _pixels(self, mask: Tensor, amodal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pixels (n, B) of each body in masks and in amodal masks (n, H, W)."""
+        bodies = range(self._scene.bodies)
+        visible = [(mask == body + 1).flatten(1).sum(1) for body in bodies]
+        whole = [((amodal >> body) & 1).flatten(1).sum(1) for body in bodies]
+        return tuple(torch.stack(counts, 1).to(torch.int32) for counts in (visible, whole))  # type: ignore[return-value]
 
 
-def _render(spheres: _Spheres, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Return colour, weight of each label, weight times depth of each label (H, W, 3 + 2 labels), and alpha (H, W)."""
-    depth = spheres.means @ viewmat[2, :3] + viewmat[2, 3]
-    features = torch.cat([spheres.features, spheres.features[:, 3:] * depth[:, None]], 1)
+def _exposed(image: Tensor, exposure: Exposure) -> Tensor:
+    """Return images as a camera of that exposure shows them, cut off at black and white."""
+    if exposure == Exposure():
+        return image
+    gain, offset = (torch.tensor(three, device=image.device) for three in (exposure.gain_rgb, exposure.offset_rgb))
+    return (image * gain + 255 * offset).clamp(0, 255).round().to(torch.uint8)
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
+
+
+def _rendered(
+    spheres: Labelled, features: Tensor, viewmats: Tensor, Ks: Tensor, box: Box, groups: Sequence[slice] = ()
+) -> RenderOutput:
     if len(spheres) == 0:
-        return features.new_zeros(height, width, features.shape[1]), features.new_zeros(height, width)
-    picture = render(
-        spheres.means,
-        spheres.scales,
-        spheres.opacities,
-        features,
-        viewmat[None],
-        K[None],
-        width,
-        height,
-        tile_size=TILE,
-    )
-    return picture.features[0], picture.alpha[0]
+        nothing = viewmats.new_zeros(len(viewmats), box.height, box.width)
+        return RenderOutput(nothing[..., None].expand(-1, -1, -1, features.shape[-1]), nothing, nothing)
+    return render(
+        spheres.means, spheres.scales, spheres.opacities, features, viewmats, Ks, box.width, box.height,
+        tile_size=TILE, groups=groups, group_transmittance=0.99 * (1 - SOLID_ALPHA),
+    )  # fmt: skip
 
 
-def _placed(spheres: _Spheres, position_m: Tensor, quat_wxyz: Tensor) -> _Spheres:
-    means = spheres.means @ quat_to_matrix(quat_wxyz).T + position_m
-    return _Spheres(means, spheres.scales, spheres.opacities, spheres.features)
-
-
-def _joined(parts: list[_Spheres]) -> _Spheres:
-    fields = ("means", "scales", "opacities", "features")
-    return _Spheres(*(torch.cat([getattr(part, field) for part in parts]) for field in fields))
-
-
-def _cut(spheres: _Spheres, rows: slice) -> _Spheres:
-    return _Spheres(spheres.means[rows], spheres.scales[rows], spheres.opacities[rows], spheres.features[rows])
-
-
-def _reach(spheres: _Spheres, view: _View) -> tuple[int, int, int, int] | None:
-    """Return the box (left, top, right, bottom) [px], on tile borders, outside which no sphere reaches MIN_ALPHA.
-
-    Derived: the rays that pass a centre (x, z) within r lie, in the plane of x and z, within asin(r / |(x, z)|) of
-    its direction; so for y. A sphere around the camera reaches everywhere.
-    """
-    if len(spheres) == 0:
-        return None
-    local = spheres.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    reach = spheres.scales * (2 * (spheres.opacities / MIN_ALPHA).clamp_min(1.0).log()).sqrt()
-    depth = local[:, 2]
-    drawn = (spheres.opacities > MIN_ALPHA) & (depth > -reach)
-    if not bool(drawn.any()):
-        return None
-    local, reach, depth = local[drawn], reach[drawn], depth[drawn]
-    if bool((depth <= reach).any()):
-        return 0, 0, view.width, view.height
-    limits = []
-    for axis, size in ((0, view.width), (1, view.height)):
-        middle = torch.atan2(local[:, axis], depth)
-        half = torch.asin((reach / torch.hypot(local[:, axis], depth)).clamp_max(1.0))
-        ends = torch.tan(torch.stack([middle - half, middle + half])) * view.K[axis, axis] + view.K[axis, 2]
-        low, high = float(ends[0].min()) - 1, float(ends[1].max()) + 1  # a pixel against rounding
-        if high <= 0 or low >= size:
-            return None
-        low = max(0, math.floor(low / TILE) * TILE)
-        limits.append((low, min(size, math.ceil(high / TILE) * TILE)))
-    (left, right), (top, bottom) = limits
-    return left, top, right, bottom
+def _to_host(pictures: dict[str, _Pictures]) -> tuple[dict[str, _Pictures], Callable[[], None]]:
+    """Copy pictures from the device into pinned memory, and return what waits for that; nothing waits here."""
+    names = [field.name for field in fields(_Pictures)]
+    copied: dict[str, _Pictures] = {}
+    for camera, picture in pictures.items():
+        there = [getattr(picture, name) for name in names]
+        here = [torch.empty(x.shape, dtype=x.dtype, pin_memory=True).copy_(x, non_blocking=True) for x in there]
+        copied[camera] = _Pictures(*here)
+    done = torch.cuda.Event()
+    done.record()
+    return copied, done.synchronize

@@ -28,7 +28,7 @@ from .estimation.least_squares import Solution, minimise
 from .estimation.noise import MAD_TO_STD
 from .estimation.observations import Observations
 from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
-from .first_contacts import ITERATIONS, MODEL_ERROR, FirstContacts, described, windows_of
+from .first_contacts import ITERATIONS, MODEL_ERROR, FirstContacts, correlation_of, described, windows_of
 from .physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
 from .window_errors import ROBUST_SCALE, WindowErrors
@@ -317,4 +317,9 @@ def _result(
         "degrees_of_freedom": found.dof,
         "spread": spread,
     }
-    return FirstContacts(moved, tuple(rows), record, own=own, spread=spread)
+    single = [k for k, p in enumerate(numbers) if p.shared == "all"]
+    places = [int(np.flatnonzero(owner == k)[0]) for k in single]
+    blocks = (
+        [correlation_of([numbers[k].name for k in single], found.covariance[np.ix_(places, places)])] if single else []
+    )
+    return FirstContacts(moved, tuple(rows), record, tuple(blocks), own=own, spread=spread)

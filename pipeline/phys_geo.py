@@ -29,7 +29,7 @@ from ..datasets.capture import Capture
 from ..datasets.ply import Splats
 from ..datasets.progress import progress
 from ..datasets.tracks import Track
-from ..schemas import ContactParameters, InputDataError, NotConvergedError, PhysConfig
+from ..schemas import ContactParameters, Correlation, InputDataError, NotConvergedError, PhysConfig
 from ..schemas import Parameter as FittedParameter
 from .diagnosis.segments import world_for
 from .diagnosis.usable import refuse_slow_times
@@ -41,7 +41,7 @@ from .estimation.shooting import Prior as ShotPrior
 from .estimation.shooting import Shooting
 from .estimation.tempering import tempered
 from .estimation.warmup import estimate_states, flight_frames, warmup_frames
-from .first_contacts import FirstContacts, bound_warnings, described
+from .first_contacts import FirstContacts, bound_warnings, correlation_of, described
 from .mass_distribution import fit_mass_distribution
 from .physics.contact import restitution
 from .physics.measured import measure
@@ -102,7 +102,7 @@ class PhysicsFit:
     is none; noise: position [m], rotation [rad]; record: for `fit.json`; warnings; mass, effects: where these were
     fitted; constants: of effects, `effect.constant` by name; starts: time [s] and state of the first frame of each
     episode, where shooting found it; collision: colliding spheres by body, where they were moved; tracks: what was
-    found in videos, by episode and body.
+    found in videos, by episode and body; correlations: of the numbers of the contact, then of effects and of the mass.
     """
 
     contact: ContactParameters
@@ -117,6 +117,7 @@ class PhysicsFit:
     starts: dict[str, tuple[float, State]] = field(default_factory=dict)
     collision: dict[str, Splats] = field(default_factory=dict)
     tracks: dict[str, dict[str, Track]] = field(default_factory=dict)
+    correlations: tuple[Correlation, ...] = ()
 
 
 def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
@@ -220,7 +221,6 @@ def fit_physics(
             names, best, covariance, starts = _shot(
                 world, searched, (observations, warm), names, search, sigma, config, record
             )
-        record["correlation"] = _correlation(covariance).tolist()
         found = physics_fit(world, names, best, covariance, sigma, record)
     return _completed(found, world, mass, effects, starts)
 
@@ -243,7 +243,8 @@ def _completed(
     starts: dict[str, tuple[float, State]],
 ) -> PhysicsFit:
     """Return the fit of the contact with what was found of effects and of the mass."""
-    more = [parameter for part in (effects, mass) if part is not None for parameter in part.parameters]
+    parts = [part for part in (effects, mass) if part is not None]
+    more = [parameter for part in parts for parameter in part.parameters]
     if effects is not None and effects.ground is not None and world.ground_offset is not None:
         more.append(_absolute(effects.ground, float(world.ground_offset[0]) - effects.ground.estimate))
         found = replace(found, ground_offset_m=more[-1].estimate)
@@ -252,6 +253,7 @@ def _completed(
     return replace(
         found,
         parameters=(*found.parameters, *more),
+        correlations=(*found.correlations, *(block for part in parts for block in part.correlations)),
         warnings=(*found.warnings, *bound_warnings(known, more)),
         mass=mass,
         effects=effects,
@@ -439,11 +441,6 @@ def _surface_radius(world: World, index: int) -> Tensor:
     return ((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).mean()
 
 
-def _correlation(covariance: np.ndarray) -> np.ndarray:
-    std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
-    return covariance / np.outer(std, std)
-
-
 def physics_fit(
     world: World,
     names: list[Parameter],
@@ -485,6 +482,7 @@ def physics_fit(
         sigma,
         record,
         tuple(warnings),
+        correlations=(correlation_of([p.name for p in fitted], covariance),),
     )
 
 

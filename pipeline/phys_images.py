@@ -149,6 +149,7 @@ def fit_physics_from_images(
     return replace(
         found,
         parameters=(*parameters, *effects),
+        correlations=(*found.correlations, *start.correlations[1:]),
         effects=start.effects,
         constants=start.constants,
         warnings=(*found.warnings, *left_out, *doubts, *track_warnings(episodes)),
@@ -201,7 +202,7 @@ def _covariance(names: Sequence[Parameter], fit: PhysicsFit) -> np.ndarray:
     for parameter in names:
         found = by_name["ground_offset_m" if parameter is GROUND_SHIFT else parameter.name]
         std.append((found.std_error or 0.0) / (found.estimate if parameter.logarithmic else 1.0))
-    return np.asarray(fit.record["correlation"]) * np.outer(std, std)
+    return np.asarray(fit.correlations[0].matrix) * np.outer(std, std)
 
 
 def _objective(

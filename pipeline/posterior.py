@@ -3,40 +3,182 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
+import torch
+from pydantic import ValidationError
 from scipy.special import ndtr, ndtri
 
+from ..datasets.models import Model
 from ..datasets.rollouts import RolloutParameter
-from ..schemas import BodyModel, EffectModel, InputDataError, ModelFile, Parameter
+from ..schemas import (
+    BodyModel,
+    ContactParameters,
+    Correlation,
+    Distribution,
+    EffectModel,
+    InputDataError,
+    ModelFile,
+    Parameter,
+    did_you_mean,
+)
+from .distributions import draw
+from .physics.contact import restitution
 from .physics.effects.registry import load_effect
+
+_UNITS = {"friction": "1", "contact_time_s": "s", "damping_ratio": "1", "ground_offset_m": "m", "mass_kg": "kg"}
 
 
 def draw_parameters(
-    file: ModelFile, spread: float, rng: np.random.Generator
+    file: ModelFile, spread: float, rng: np.random.Generator, replaced: Mapping[str, Distribution] | None = None
 ) -> tuple[ModelFile, tuple[RolloutParameter, ...]]:
-    """Draw the physical parameters of a rollout from what the fit knows about them.
+    """Draw the physical parameters of a rollout from what the fit knows about them together.
 
-    Each is drawn independently (the fit's covariances are not stored): normal about its estimate with its standard
-    error, cut off at its bounds; where the bounds are positive, the logarithm is normal, as in the fit.
+    Each is normal about its estimate with its standard error, cut off at its bounds; where the bounds are positive, the
+    logarithm is normal, as in the fit. Parameters that were fitted together are drawn together, by a Gaussian copula
+    (Nelsen, An Introduction to Copulas, 2nd ed., 2.3): where no bound is near, that is the joint normal posterior of
+    the fit, and near a bound each still has its own distribution.
 
     Args:
         file: The model.
         spread: Factor of the standard errors.
-        rng: Source of randomness; one number is drawn for each parameter, varied or not.
+        rng: Source of randomness; one number is drawn for each parameter, varied or not, then those of `replaced`.
+        replaced: Distributions of parameters by name, in place of the fit's.
 
     Returns:
-        The model with these parameters, and the parameters.
+        The model with these parameters, and the parameters; numbers that follow from others (restitution, ...) fit
+        them.
     """
-    drawn = []
-    for parameter in file.parameters:
-        quantile = float(rng.random())
-        varied = can_vary(file, parameter.name) and spread > 0
-        value = _draw(parameter, spread, quantile) if varied else parameter.estimate
-        file = with_parameter(file, parameter.name, value) if varied else file
-        entry = RolloutParameter(parameter.name, parameter.unit, value, parameter.estimate, parameter.std_error)
-        drawn.append(entry)
-    return file, tuple(drawn)
+    replaced = replaced or {}
+    quantiles = {parameter.name: float(rng.random()) for parameter in file.parameters}
+    for block in file.correlations:
+        normal = _root(block) @ ndtri([quantiles[name] for name in block.parameters])
+        quantiles |= dict(zip(block.parameters, map(float, ndtr(normal)), strict=True))
+    known = {parameter.name: parameter for parameter in file.parameters}
+    values = {name: draw(replaced[name], rng) for name in sorted(replaced)}
+    for name, parameter in known.items():
+        if name not in values and can_vary(file, name):
+            values[name] = _draw(parameter, spread, quantiles[name]) if spread > 0 else parameter.estimate
+    drawn = file
+    for name in [*known, *sorted(set(values) - set(known))]:
+        if name in values and not (name in known and values[name] == known[name].estimate):
+            drawn = with_parameter(drawn, name, values[name])
+    entries = []
+    for name in [*known, *sorted(set(values) - set(known))]:
+        old = known.get(name) or Parameter(name=name, unit=_unit(file, name), estimate=_present(file, name))
+        value = values.get(name, _derived(drawn, name, old.estimate))
+        entries.append(RolloutParameter(name, old.unit, value, old.estimate, old.std_error))
+    return drawn, tuple(entries)
+
+
+def with_correlations(model: Model) -> ModelFile:
+    """Return the model's file with the correlations of its fit, also of models that have them in `fit.json` only."""
+    found = model.fit.stages.get("phys-geo", {}).get("correlation")
+    if model.file.correlations or not found:
+        return model.file
+    names = tuple(parameter.name for parameter in model.file.parameters[: len(found)])
+    block = Correlation(parameters=names, matrix=tuple(map(tuple, found)))
+    return model.file.model_copy(update={"correlations": (block,)})
+
+
+def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution]) -> None:
+    """Check that a plan's distributions of parameters name what the model has, and stay within what is admissible.
+
+    Raises:
+        InputDataError: If not, with the name, what is admissible and what was found.
+    """
+    legal = settable(file)
+    for name, distribution in replaced.items():
+        if name not in legal:
+            raise InputDataError(
+                f"the plan's [parameters] has '{name}', which is no parameter of this model.",
+                f"{', '.join(legal)}.{did_you_mean(name, legal)}",
+                "correct the name.",
+            )
+        low, high = distribution.support
+        first, last = _bounds(file, name)
+        if not (first <= low and high <= last):
+            raise InputDataError(
+                f"the plan's [parameters] {name} reaches from {low:g} to {high:g}.",
+                f"{first:g} to {last:g} {_unit(file, name)}.",
+                "narrow the distribution.",
+            )
+        for end in (low, high):
+            try:
+                ModelFile.model_validate(with_parameter(file, name, end).model_dump())
+            except ValidationError as error:
+                fault = error.errors()[0]["msg"]
+                raise InputDataError(f"the plan's [parameters] {name} reaches {end:g}: {fault}.") from None
+
+
+def settable(file: ModelFile) -> list[str]:
+    """Return the names of all parameters that a rollout can set, fitted or not."""
+    names = [parameter.name for parameter in file.parameters]
+    names += [*ContactParameters.model_fields, "ground_offset_m"]
+    names += [f"{body.name}.{key}" for body in file.bodies for key in ("mass_kg", "com_x_m", "com_y_m", "com_z_m")]
+    names += [f"{_own_name(effect)}.{key}" for effect in file.effects for key in effect.parameters]
+    return [name for name in dict.fromkeys(names) if can_vary(file, name)]
+
+
+def _root(block: Correlation) -> np.ndarray:
+    """Return the symmetric square root of a correlation matrix: it is unique, and rounding below 0 does not matter."""
+    values, vectors = np.linalg.eigh(np.asarray(block.matrix))
+    return (vectors * np.sqrt(values.clip(0))) @ vectors.T
+
+
+def _bounds(file: ModelFile, name: str) -> tuple[float, float]:
+    """Return the admissible range of a parameter: the fit's, or an effect's own."""
+    listed = next((parameter.bounds for parameter in file.parameters if parameter.name == name), None)
+    if listed is not None:
+        return listed
+    owner, _, number = name.partition(".")
+    for effect in file.effects:
+        for entry in load_effect(effect.name).parameters if _own_name(effect) == owner else ():
+            if entry.name == number:
+                return (0.0 if entry.nonnegative else -entry.limit), entry.limit
+    return -math.inf, math.inf
+
+
+def _unit(file: ModelFile, name: str) -> str:
+    owner, _, number = name.rpartition(".")
+    for effect in file.effects:
+        loaded = load_effect(effect.name)
+        for entry in (*loaded.parameters, *loaded.constants) if loaded.name == owner else ():
+            if entry.name == number:
+                return entry.unit
+    return _UNITS.get(number, "m" if number.startswith("com_") else "1")
+
+
+def _present(file: ModelFile, name: str) -> float:
+    """Return the value of a parameter that the model's list does not have."""
+    if name == "ground_offset_m" and file.ground is not None:
+        return file.ground.offset_m
+    if file.contact is not None and name in type(file.contact).model_fields:
+        return getattr(file.contact, name)
+    owner, _, number = name.partition(".")
+    for effect in file.effects:
+        if _own_name(effect) == owner:
+            return effect.parameters[number]
+    body = next(body for body in file.bodies if body.name == owner)
+    return body.mass_kg if number == "mass_kg" else body.com_m["xyz".index(number.split("_")[1])]
+
+
+def _derived(file: ModelFile, name: str, estimate: float) -> float:
+    """Return a number that follows from the drawn ones; another's estimate. Formulas as in the stage phys-geo."""
+    law = file.contact
+    mass = next((body.mass_kg for body in file.bodies if body.motion == "free"), None)
+    if law is None or mass is None or name not in DERIVED:
+        return estimate
+    if name == "restitution":
+        return float(restitution(torch.tensor(law.damping_ratio, dtype=torch.float64)))
+    if name == "stiffness_n_m":
+        return mass / law.contact_time_s**2
+    return 2 * law.damping_ratio * mass / law.contact_time_s
+
+
+DERIVED = ("restitution", "stiffness_n_m", "damping_n_s_m")
+"""What follows from the numbers of the contact and a mass."""
 
 
 def _draw(parameter: Parameter, spread: float, quantile: float) -> float:
@@ -64,8 +206,9 @@ def can_vary(file: ModelFile, name: str) -> bool:
     owner, _, number = name.partition(".")
     if any(_own_name(effect) == owner and number in effect.parameters for effect in file.effects):
         return True
-    legal = ("mass_kg", "com_x_m", "com_y_m", "com_z_m")
-    return number in legal and any(body.name == owner for body in file.bodies)
+    legal = ("mass_kg", *(f"com_{axis}_m" for axis in "xyz"))
+    moments = tuple(f"moment_{axis}" for axis in "xyz") if any(p.name == name for p in file.parameters) else ()
+    return number in (*legal, *moments) and any(body.name == owner for body in file.bodies)
 
 
 def _own_name(effect: EffectModel) -> str:
@@ -92,6 +235,8 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
         else effect
         for effect in file.effects
     )
+    if number.startswith("moment_"):  # a factor of what the model had before the fit; its inertia has the estimate
+        value /= next(parameter.estimate for parameter in file.parameters if parameter.name == name)
     bodies = tuple(_with_number(body, number, value) if body.name == owner else body for body in file.bodies)
     return file.model_copy(update={"bodies": bodies, "effects": effects})
 
@@ -100,6 +245,16 @@ def _with_number(body: BodyModel, number: str, value: float) -> BodyModel:
     if number == "mass_kg":
         inertia = tuple(entry * value / body.mass_kg for entry in body.inertia_kg_m2)
         return body.model_copy(update={"mass_kg": value, "inertia_kg_m2": inertia})
+    if number.startswith("moment_"):
+        xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        axis = "xyz".index(number[-1])
+        moments[axis] *= math.sqrt(value)
+        moments[:, axis] *= math.sqrt(value)
+        new = np.trace(moments) * np.eye(3) - moments
+        six = tuple(float(new[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+        return body.model_copy(update={"inertia_kg_m2": six})
     com = list(body.com_m)
     com["xyz".index(number.split("_")[1])] = value
     return body.model_copy(update={"com_m": tuple(com)})
@@ -107,4 +262,4 @@ def _with_number(body: BodyModel, number: str, value: float) -> BodyModel:
 
 def not_varied(file: ModelFile) -> list[str]:
     """Return the names of fitted parameters that rollouts keep at their estimate, because nothing here sets them."""
-    return [p.name for p in file.parameters if p.std_error and not can_vary(file, p.name)]
+    return [p.name for p in file.parameters if p.std_error and p.name not in DERIVED and not can_vary(file, p.name)]

@@ -11,12 +11,17 @@ from ..datasets.capture import Capture
 from ..datasets.check import find_faults
 from ..datasets.kinds import kind_of
 from ..datasets.models import Model, read_model
-from ..schemas import InputDataError
+from ..schemas import InputDataError, UsageError
 from ..schemas.validation import ValidationReport
 
 
-def validate(thing: Path | str) -> ValidationReport:
+def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> ValidationReport:
     """Check a capture, a model or a dataset.
+
+    Args:
+        thing: CAPTURE, MODEL or DATASET.
+        sample: Of a dataset, look at so many rollouts, drawn at random; all where left out.
+        seed: Of that draw.
 
     Returns:
         The facts that were found and measured; its `faults` are those of what cgwm itself wrote (hashes,
@@ -25,9 +30,12 @@ def validate(thing: Path | str) -> ValidationReport:
     Raises:
         InputDataError: If the directory is none of the three or a file in it cannot be read, and for everything
             that is wrong with a capture, which is the user's to correct: all faults in one message.
+        UsageError: If a sample is asked for of what is no dataset.
     """
     path = Path(thing)
     kind = kind_of(path)
+    if sample is not None and kind in ("capture", "model"):
+        raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "leave --sample out.")
     if kind == "capture":
         return validate_capture(path)
     if kind == "model":
@@ -35,7 +43,7 @@ def validate(thing: Path | str) -> ValidationReport:
     if kind == "dataset":
         from .validate_dataset import validate_dataset
 
-        return validate_dataset(path)
+        return validate_dataset(path, sample, seed)
     found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset"
     raise InputDataError(f"{path}: {found}.", "a directory with capture.toml, model.json or dataset.json.")
 

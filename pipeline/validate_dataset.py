@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 
-from ..datasets.cameras import Camera
 from ..datasets.dataset import check_hashes, read_manifest
 from ..datasets.models import Model, read_model
 from ..datasets.progress import progress
 from ..datasets.rollouts import Node, demo_names, open_shard
-from ..schemas import DatasetManifest, InputDataError, ValidationReport
-from .sampling import rotation_matrix
+from ..schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
+from .validate_faults import Fault
+from .validate_motion import MotionFindings, check_motion, motion_facts
+from .validate_pictures import PictureFindings, check_pictures, picture_facts
 
 QUATERNION_TOLERANCE = 1e-6
-IMPULSE_TOLERANCE = 1e-6
-"""Largest excess of momentum change over impulse, as a fraction of the largest momentum change: float64 sums."""
-SPHERE_RADIUS = 1.177
-"""A lone opaque sphere lets half of the light through at this many s: sqrt(2 ln 2)."""
-MARGIN_PX = 2
-"""A mask may reach this far beyond the projected spheres, which overlap more than one by one."""
-MIN_INSIDE = 0.95
-"""Fraction of a body's mask that has to lie within its projected spheres."""
-MIN_DEPTH_AGREEMENT = 0.9
-"""Fraction of a body's mask whose depth has to lie within the body's depths."""
-MIN_PIXELS = 20
-"""Smaller masks are not judged."""
-FRAMES_PER_ROLLOUT = 4
-"""Frames of each camera whose masks and depth are looked at, evenly spread."""
 SHOWN_FAULTS = 20
 
 
@@ -43,50 +29,72 @@ class _Findings:
     """What the checks gathered over all rollouts."""
 
     faults: list[str] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
     rollouts: int = 0
-    frames: int = 0
     contacts: int = 0
-    impulse_excess: float = 0.0
     quaternion_error: float = 0.0
-    iou: list[float] = field(default_factory=list)
-    inside: list[float] = field(default_factory=list)
-    depth: list[float] = field(default_factory=list)
-    centre_px: list[float] = field(default_factory=list)
+    motion: MotionFindings = field(default_factory=MotionFindings)
+    pictures: PictureFindings = field(default_factory=PictureFindings)
     units: dict[str, str] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class _Seen:
-    """A body in one image: centres in the image, their depths and radii, from pose and camera alone."""
-
-    pixels: np.ndarray
-    depths: np.ndarray
-    radii_m: np.ndarray
-    focal_px: float
+    def add(self, shard: str, demo: str, fault: Fault) -> None:
+        """Take a fault of a rollout."""
+        failure = fault.at(shard, demo)
+        self.failures.append(failure)
+        self.faults.append(failure.text)
 
 
-def validate_dataset(path: Path | str) -> ValidationReport:
-    """Check every rollout of a dataset.
+def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0) -> ValidationReport:
+    """Check every rollout of a dataset, or some.
+
+    Args:
+        path: DATASET.
+        sample: Look at so many rollouts, drawn at random from all shards that are there, and at the hashes of their
+            shards alone; all where left out.
+        seed: Of that draw.
 
     Raises:
         InputDataError: If the manifest or a shard cannot be read at all.
+        UsageError: If the sample is not positive.
     """
     root = Path(path)
     manifest = read_manifest(root)
-    findings = _Findings(faults=check_hashes(root, manifest))
+    chosen = None if sample is None else _sample(manifest.shards, sample, seed)
+    findings = _Findings(faults=check_hashes(root, manifest, None if chosen is None else set(chosen)))
     model = _model(root, manifest, findings)
-    for shard in progress(manifest.shards, "shards"):
+    shards = [shard for shard in manifest.shards if chosen is None or shard.file in chosen]
+    for shard in progress(shards, "shards"):
         file = root / shard.file
         if not file.is_file():
             continue  # told by check_hashes
         try:
             with open_shard(file) as handle:
-                _check_shard(handle, shard.file, model, manifest, findings)
+                _check_shard(handle, shard, model, findings, None if chosen is None else chosen[shard.file])
         except InputDataError as error:
             findings.faults.append(f"{shard.file}: {error.found}")
+    facts = _facts(manifest, findings)
+    if chosen is not None:
+        facts = {"sampled": f"{findings.rollouts} of {manifest.rollouts} rollouts, seed {seed}", **facts}
     return ValidationReport(
-        path=str(root), kind="dataset", facts=_facts(manifest, findings), faults=_shortened(findings.faults)
+        path=str(root),
+        kind="dataset",
+        facts=facts,
+        faults=_shortened(findings.faults),
+        failures=tuple(findings.failures),
     )
+
+
+def _sample(shards: Sequence[ShardEntry], count: int, seed: int) -> dict[str, list[int]]:
+    """Return places of rollouts within their shards, by file: `count` of all, or all where there are fewer."""
+    if count < 1:
+        raise UsageError(f"--sample {count}: no number of rollouts.", "1 or more.")
+    places = [(shard.file, place) for shard in shards for place in range(shard.rollouts)]
+    order = np.random.default_rng(seed).permutation(len(places))[:count]
+    chosen: dict[str, list[int]] = {}
+    for number in order:
+        file, place = places[number]
+        chosen.setdefault(file, []).append(place)
+    return chosen
 
 
 def _model(root: Path, manifest: DatasetManifest, findings: _Findings) -> Model | None:
@@ -104,65 +112,87 @@ def _shortened(faults: list[str]) -> tuple[str, ...]:
 
 
 def _facts(manifest: DatasetManifest, findings: _Findings) -> dict[str, Any]:
-    facts: dict[str, Any] = {
+    return {
         "rollouts": findings.rollouts,
-        "camera_frames": findings.frames,
+        "camera_frames": findings.pictures.frames,
         "contacts": findings.contacts,
         "shards": f"{len(manifest.shards)} of {manifest.shard_count}",
         "bodies": list(manifest.bodies),
         "cameras": list(manifest.cameras),
-        "impulse_excess_n_s": findings.impulse_excess,
         "quaternion_norm_error": findings.quaternion_error,
+        **motion_facts(findings.motion),
+        **picture_facts(findings.pictures),
+        "rejected_draws": _rejected(manifest),
         "units": findings.units,
         "notes": list(manifest.notes),
     }
-    if findings.iou:
-        facts["mask_iou_median"] = float(np.median(findings.iou))
-        facts["mask_inside_projection_min"] = float(min(findings.inside))
-        facts["mask_centre_error_px_median"] = float(np.median(findings.centre_px))
-    if findings.depth:
-        facts["depth_agreement_min"] = float(min(findings.depth))
-    return facts
 
 
-def _check_shard(file: Node, name: str, model: Model | None, manifest: DatasetManifest, findings: _Findings) -> None:
+def _rejected(manifest: DatasetManifest) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for shard in manifest.shards:
+        for rule, count in shard.rejected.items():
+            total[rule] = total.get(rule, 0) + count
+    return total
+
+
+def _check_shard(
+    file: Node, shard: ShardEntry, model: Model | None, findings: _Findings, places: list[int] | None
+) -> None:
     names = demo_names(file)
-    listed = next(shard.rollouts for shard in manifest.shards if shard.file == name)
-    if len(names) != listed:
-        findings.faults.append(f"{name}: {len(names)} rollouts; dataset.json says {listed}.")
+    if len(names) != shard.rollouts:
+        findings.faults.append(f"{shard.file}: {len(names)} rollouts; dataset.json says {shard.rollouts}.")
     total = sum(int(demo.attrs["num_samples"]) for demo in file["data"].values())
     if total != int(file["data"].attrs["total"]):
-        findings.faults.append(f"{name}: data/@total is {file['data'].attrs['total']}; the demos sum up to {total}.")
-    for demo_name in names:
-        place = f"{name}, {demo_name}"
-        demo = file["data"][demo_name]
+        listed = file["data"].attrs["total"]
+        findings.faults.append(f"{shard.file}: data/@total is {listed}; the demos sum up to {total}.")
+    chosen = names if places is None else [names[place] for place in sorted(places) if place < len(names)]
+    for name in progress(chosen, shard.file, len(chosen), "rollout"):
         try:
-            findings.faults += [f"{place}: {fault}" for fault in _check_demo(demo, model, findings)]
+            for fault in _check_demo(file["data"][name], model, findings):
+                findings.add(shard.file, name, fault)
         except KeyError as error:
-            findings.faults.append(f"{place}: an array or attribute is missing: {error.args[0]}.")
+            text = f"an array or attribute is missing: {error.args[0]}."
+            findings.add(shard.file, name, Fault("schema", text))
         except OSError as error:
-            findings.faults.append(f"{place}: a block cannot be read: {str(error).splitlines()[0]}.")
+            text = f"a block cannot be read: {str(error).splitlines()[0]}."
+            findings.add(shard.file, name, Fault("readable", text))
 
 
-def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterator[str]:
+def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterator[Fault]:
     findings.rollouts += 1
     count = int(demo.attrs["num_samples"])
     yield from _check_arrays(demo, count, findings)
     time = demo["time"][()]
     if not (np.diff(time) > 0).all():
-        yield f"time: not increasing at frame {int(np.argmin(np.diff(time) > 0)) + 1}."
+        frame = int(np.argmin(np.diff(time) > 0)) + 1
+        yield Fault("time", f"time: not increasing at frame {frame}.", frame, value=float(time[frame]))
         return
+    yield from _check_states(demo, findings)
+    yield from _check_parameters(demo, model)
+    yield from _check_contacts(demo, count, model, findings)
+    if model is not None and "cameras" in demo:
+        yield from check_pictures(demo, model, count, findings.pictures)
+
+
+def _check_states(demo: Node, findings: _Findings) -> Iterator[Fault]:
+    """Quaternions have length 1, and robomimic's low-dimensional state is that of the bodies."""
     norms = np.linalg.norm(demo["bodies/quat_wxyz"][()], axis=-1)
-    error = float(np.abs(norms - 1).max())
+    errors = np.abs(norms - 1).max(axis=1)
+    error = float(errors.max())
     findings.quaternion_error = max(findings.quaternion_error, error)
     if not error <= QUATERNION_TOLERANCE:
-        yield f"bodies/quat_wxyz: a norm is off 1 by {error:.2g}; {QUATERNION_TOLERANCE:g} is allowed."
-    yield from _check_contacts(demo, count, findings)
-    if model is not None and "cameras" in demo:
-        yield from _check_images(demo, model, count, findings)
+        frame = int(errors.argmax())
+        text = f"bodies/quat_wxyz: frame {frame}: a norm is off 1 by {error:.2g}; {QUATERNION_TOLERANCE:g} is allowed."
+        yield Fault("quaternions", text, frame, value=error, limit=QUATERNION_TOLERANCE)
+    parts = [demo[f"bodies/{key}"][()] for key in ("pos", "quat_wxyz", "vel", "omega_body")]
+    expected = np.concatenate(parts, axis=-1).reshape(len(norms), -1)
+    found = demo["obs/object"][()]
+    if found.shape != expected.shape or not np.array_equal(found, expected, equal_nan=True):
+        yield Fault("schema", "obs/object: differs from the bodies' poses and velocities.")
 
 
-def _check_arrays(demo: Node, count: int, findings: _Findings) -> Iterator[str]:
+def _check_arrays(demo: Node, count: int, findings: _Findings) -> Iterator[Fault]:
     """Every array has its unit, the right number of frames, and finite numbers."""
     arrays: dict[str, h5py.Dataset] = {}
 
@@ -174,17 +204,17 @@ def _check_arrays(demo: Node, count: int, findings: _Findings) -> Iterator[str]:
     for name, item in arrays.items():
         lacking = [key for key in ("unit", "frame", "order", "shape_meaning", "description") if key not in item.attrs]
         if lacking:
-            yield f"{name}: has no attribute {', '.join(lacking)}."
+            yield Fault("schema", f"{name}: has no attribute {', '.join(lacking)}.")
             continue
         if not name.startswith(("parameters/", "cameras/", "obs/")):
             findings.units[name] = str(item.attrs["unit"])
         if str(item.attrs["shape_meaning"]).startswith("(T,") and item.shape[0] != count:
-            yield f"{name}: {item.shape[0]} frames; num_samples says {count}."
+            yield Fault("schema", f"{name}: {item.shape[0]} frames; num_samples says {count}.")
         if item.dtype.kind == "f" and item.size and not _finite(item):
-            yield f"{name}: holds numbers that are not finite."
+            yield Fault("finite", f"{name}: holds numbers that are not finite.")
     for name in json.loads(str(demo.attrs["params_json"])):
         if f"parameters/{name}" not in arrays:
-            yield f"params_json names '{name}', which is not in parameters/."
+            yield Fault("schema", f"params_json names '{name}', which is not in parameters/.")
 
 
 def _finite(item: h5py.Dataset) -> bool:
@@ -193,138 +223,42 @@ def _finite(item: h5py.Dataset) -> bool:
     return all(bool(np.isfinite(item[rows]).all()) for rows in item.iter_chunks())
 
 
-def _check_contacts(demo: Node, count: int, findings: _Findings) -> Iterator[str]:
+def _check_parameters(demo: Node, model: Model | None) -> Iterator[Fault]:
+    """Physical parameters lie within the bounds that the model gives them."""
+    for listed in model.file.parameters if model is not None else ():
+        if listed.bounds is None or listed.name not in demo["parameters"]:
+            continue
+        value, (low, high) = float(demo["parameters"][listed.name][()]), listed.bounds
+        if not low <= value <= high:
+            text = f"parameters/{listed.name}: {value:g} {listed.unit}; {low:g} to {high:g} is admissible."
+            yield Fault("parameters", text, value=value, limit=low if value < low else high)
+
+
+def _check_contacts(demo: Node, count: int, model: Model | None, findings: _Findings) -> Iterator[Fault]:
     contacts: dict[str, np.ndarray] = {name: item[()] for name, item in demo["contacts"].items()}
     offsets = contacts["offsets"]
     rows = len(contacts["body_a"])
     findings.contacts += rows
     if len(offsets) != count + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
-        yield f"contacts/offsets: they do not divide {rows} contacts among {count} frames."
+        yield Fault("contacts", f"contacts/offsets: they do not divide {rows} contacts among {count} frames.")
         return
     bodies = len(demo["bodies/names"])
     indices = np.concatenate([contacts["body_a"], contacts["body_b"]])
     if rows and (indices.min() < -1 or indices.max() >= bodies or contacts["body_a"].min() < 0):
-        yield f"contacts: body indices outside 0 to {bodies - 1} (-1 = ground, only as body_b)."
+        text = f"contacts: body indices outside 0 to {bodies - 1} (-1 = ground, only as body_b)."
+        yield Fault("contacts", text)
         return
-    normals = np.linalg.norm(contacts["normal_world"], axis=-1)
-    if rows and not np.abs(normals - 1).max() <= 1e-6:
-        yield "contacts/normal_world: not all of unit length."
+    errors = np.abs(np.linalg.norm(contacts["normal_world"], axis=-1) - 1)
+    if rows and not errors.max() <= QUATERNION_TOLERANCE:
+        row = int(errors.argmax())
+        frame = int(np.searchsorted(offsets, row, side="right")) - 1
+        text = f"contacts/normal_world: frame {frame}, row {row}: not all of unit length, off by {errors[row]:.2g}."
+        yield Fault("contacts", text, frame, value=float(errors[row]), limit=QUATERNION_TOLERANCE)
     pulls = (contacts["impulse_world"] * contacts["normal_world"]).sum(-1)
     scale = float(np.abs(contacts["impulse_world"]).max()) if rows else 0.0
     if rows and pulls.min() < -1e-6 * scale and not json.loads(str(demo.attrs["effects_json"])):
-        yield f"contacts/impulse_world: a contact pulls by {-pulls.min():.2g} N s; contacts can only push."
-    yield from _check_newton(demo, contacts, findings)
-
-
-def _check_newton(demo: Node, contacts: dict[str, np.ndarray], findings: _Findings) -> Iterator[str]:
-    """Momentum change minus gravity equals the sum of the contact impulses, in every interval and for every free body.
-
-    With effects in the model other forces act, whose impulses are no labels; then there is nothing to compare.
-    """
-    if json.loads(str(demo.attrs["effects_json"])):
-        return
-    read = {name: item[()] for name, item in demo["bodies"].items()}
-    rotation = rotation_matrix(read["quat_wxyz"])
-    swing = np.cross(read["omega_body"], read["com"][None])
-    velocity = read["vel"] + np.einsum("tbij,tbj->tbi", rotation, swing)
-    interval = np.diff(demo["time"][()])[:, None]
-    frame = np.repeat(np.arange(len(contacts["offsets"]) - 1), np.diff(contacts["offsets"]))
-    for body, motion in enumerate(read["motions"]):
-        if motion != b"free":
-            continue
-        change = read["mass"][body] * (np.diff(velocity[:, body], axis=0) - interval * read["gravity"])
-        impulse = np.zeros((len(contacts["offsets"]) - 1, 3))
-        for sign, side in ((1.0, "body_a"), (-1.0, "body_b")):
-            mine = contacts[side] == body
-            np.add.at(impulse, frame[mine], sign * contacts["impulse_world"][mine])
-        excess = np.linalg.norm(change - impulse[1:], axis=1)
-        gravity = read["mass"][body] * np.linalg.norm(read["gravity"]) * interval.max()
-        scale = max(float(np.linalg.norm(change, axis=1).max()), float(gravity), 1e-12)
-        findings.impulse_excess = max(findings.impulse_excess, float(excess.max()))
-        if not excess.max() <= IMPULSE_TOLERANCE * scale:
-            worst = int(excess.argmax()) + 1
-            name = read["names"][body].decode()
-            yield (
-                f"contacts/impulse_world: body '{name}', frame {worst}: momentum changed by {excess.max():.3g} N s "
-                f"more than the impulses and gravity say; {IMPULSE_TOLERANCE * scale:.2g} is allowed."
-            )
-
-
-def _check_images(demo: Node, model: Model, count: int, findings: _Findings) -> Iterator[str]:
-    names = [name.decode() for name in demo["bodies/names"][()]]
-    position, quat = demo["bodies/pos"][()], demo["bodies/quat_wxyz"][()]
-    frames = np.unique(np.linspace(0, count - 1, FRAMES_PER_ROLLOUT).round().astype(int))
-    for camera_name in demo["cameras"]:
-        camera = _camera(demo[f"cameras/{camera_name}"])
-        findings.frames += count
-        mask_set, depth_set = (demo[f"obs/{camera_name}_{key}"] for key in ("mask", "depth"))
-        size = (camera.height, camera.width)
-        if mask_set.shape[1:] != size or depth_set.shape[1:] != size:
-            yield f"obs/{camera_name}_mask: shape {mask_set.shape[1:]}; the camera has {size}."
-            continue
-        for frame in frames:
-            mask, depth = mask_set[frame], depth_set[frame]
-            if mask.max(initial=0) > len(names):
-                yield f"obs/{camera_name}_mask, frame {frame}: label {mask.max()}; there are {len(names)} bodies."
-                continue
-            for body, name in enumerate(names):
-                if name not in model.body_splats:
-                    continue
-                seen = _project(model, name, position[frame, body], quat[frame, body], camera)
-                fault = _compare(seen, mask == body + 1, depth, findings)
-                if fault:
-                    yield f"obs/{camera_name}, frame {frame}, body '{name}': {fault}"
-
-
-def _camera(group: Node) -> Camera:
-    read = {name: np.asarray(item[()]) for name, item in group.items()}
-    return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
-
-
-def _project(model: Model, name: str, position: np.ndarray, quat: np.ndarray, camera: Camera) -> _Seen:
-    """Project a body's spheres by the labels alone: no renderer, so that its conventions are tested too."""
-    splats = model.body_splats[name]
-    solid = np.asarray(splats.opacities) > 0.1
-    points = np.asarray(splats.means, float)[solid] @ rotation_matrix(quat).T + position
-    pixels, depths = camera.project(points)
-    return _Seen(pixels, depths, np.asarray(splats.scales, float)[solid], float(camera.K[0, 0]))
-
-
-def _compare(seen: _Seen, mask: np.ndarray, depth: np.ndarray, findings: _Findings) -> str | None:
-    """Compare a body's mask and depth with its projected spheres; return the fault, if there is one."""
-    area = int(mask.sum())
-    if area < MIN_PIXELS:
-        return None
-    silhouette = _silhouette(seen, mask.shape)
-    wide = cv2.dilate(silhouette, np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)).astype(bool)
-    inside = float((mask & wide).sum() / area)
-    whole = silhouette.astype(bool)
-    findings.iou.append(float((mask & whole).sum() / max(1, (mask | whole).sum())))
-    findings.inside.append(inside)
-    if whole.any():
-        centres = [np.argwhere(part).mean(0) for part in (mask, whole)]
-        findings.centre_px.append(float(np.linalg.norm(centres[0] - centres[1])))
-    if inside < MIN_INSIDE:
-        return f"{100 * (1 - inside):.0f} % of its mask lies outside the projected body; pose or camera is wrong."
-    reach = 3 * float(seen.radii_m.max())
-    shown = depth[mask]
-    agreement = float(((shown > seen.depths.min() - reach) & (shown < seen.depths.max() + reach)).mean())
-    findings.depth.append(agreement)
-    if agreement < MIN_DEPTH_AGREEMENT:
-        return (
-            f"the depth of {100 * (1 - agreement):.0f} % of its mask lies outside the body "
-            f"({seen.depths.min():.3f} to {seen.depths.max():.3f} m)."
-        )
-    return None
-
-
-def _silhouette(seen: _Seen, shape: tuple[int, ...]) -> np.ndarray:
-    """Paint a disc for each sphere in front of the camera; uint8 (H, W). OpenCV's pixel centres are whole numbers."""
-    painted = np.zeros(shape, np.uint8)
-    shift = 4
-    front = np.isfinite(seen.pixels).all(1) & (seen.depths > 0)
-    radii = SPHERE_RADIUS * seen.radii_m[front] * seen.focal_px / seen.depths[front]
-    centres = np.clip((seen.pixels[front] - 0.5) * 2**shift, -(2**20), 2**20).round().astype(int)
-    for (x, y), radius in zip(centres, radii, strict=True):
-        cv2.circle(painted, (int(x), int(y)), round(float(radius) * 2**shift), 1, -1, shift=shift)
-    return painted
+        row = int(pulls.argmin())
+        frame = int(np.searchsorted(offsets, row, side="right")) - 1
+        text = f"contacts/impulse_world: frame {frame}: a contact pulls by {-pulls.min():.2g} N s; contacts only push."
+        yield Fault("contacts", text, frame, value=float(pulls.min()), limit=0.0)
+    yield from check_motion(demo, contacts, model, findings.motion)

@@ -40,8 +40,10 @@ from .dataset import (
     ROLLOUTS_FORMAT,
     DatasetManifest,
     DatasetSummary,
-    SamplingPlan,
+    IndexEntry,
+    MergeSummary,
     ShardEntry,
+    ShardsSummary,
 )
 from .demo import (
     BodyCheck,
@@ -69,17 +71,21 @@ from .doctor import DoctorReport, Missing, PackageState
 from .errors import (
     CgwmError,
     CheckFailedError,
+    DamagedShardError,
     InputDataError,
     NotConvergedError,
     NotEnoughMemoryError,
+    NotEnoughSpaceError,
     UsageError,
     did_you_mean,
 )
+from .exports import ExportFormat, ExportResult
 from .imports import ImportResult
 from .model import (
     MODEL_FORMAT,
     BodyModel,
     ContactParameters,
+    Correlation,
     EffectModel,
     Exposure,
     FitFile,
@@ -90,8 +96,10 @@ from .model import (
     Solver,
 )
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
+from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
 from .results import EpisodeErrors, ErrorSummary, EvalResult
-from .validation import ValidationReport
+from .validation import Failure, ValidationReport
+from .view import ViewReport
 
 __all__ = [
     "CAMERAS_FORMAT",
@@ -119,12 +127,15 @@ __all__ = [
     "CompareResult",
     "ComparedParameter",
     "ContactParameters",
+    "Correlation",
+    "DamagedShardError",
     "DatasetManifest",
     "DatasetSummary",
     "DemoResult",
     "DemoTarget",
     "Device",
     "DiagnoseResult",
+    "Distribution",
     "DoctorReport",
     "EffectEstimate",
     "EffectModel",
@@ -134,7 +145,10 @@ __all__ = [
     "ErrorCurve",
     "ErrorSummary",
     "EvalResult",
+    "ExportFormat",
+    "ExportResult",
     "Exposure",
+    "Failure",
     "FileModel",
     "FileShape",
     "FitFile",
@@ -144,6 +158,7 @@ __all__ = [
     "ImageVerdict",
     "ImagesOnlyFit",
     "ImportResult",
+    "IndexEntry",
     "InputDataError",
     "KnownCameraDistance",
     "KnownDistance",
@@ -151,6 +166,7 @@ __all__ = [
     "Light",
     "Marker",
     "Measurement",
+    "MergeSummary",
     "Missing",
     "ModelComparison",
     "ModelFile",
@@ -158,6 +174,7 @@ __all__ = [
     "NextExperiment",
     "NotConvergedError",
     "NotEnoughMemoryError",
+    "NotEnoughSpaceError",
     "Organiser",
     "Outcome",
     "PackageState",
@@ -173,6 +190,7 @@ __all__ = [
     "PosedVideo",
     "Provenance",
     "RankedEffect",
+    "RejectionRules",
     "ResidualLaw",
     "SamplingPlan",
     "Scale",
@@ -180,6 +198,7 @@ __all__ = [
     "SelfCheckFigures",
     "Shape",
     "ShardEntry",
+    "ShardsSummary",
     "Solver",
     "SphereShape",
     "SplatCheck",
@@ -190,10 +209,13 @@ __all__ = [
     "UsageError",
     "ValidationReport",
     "Video",
+    "ViewReport",
     "World",
     "WorstMoment",
     "did_you_mean",
     "parse",
+    "plan_toml",
     "read_json",
+    "read_plan",
     "read_toml",
 ]

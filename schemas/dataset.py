@@ -1,59 +1,16 @@
-"""A dataset on disk, `dataset.json`: its sampling plan, its shards, and what `cgwm synthesize` prints."""
+"""A dataset on disk, `dataset.json`: its shards, and what `cgwm synthesize` prints."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from .base import FileModel
+from .plan import SamplingPlan
 
 DATASET_FORMAT = "cgwm-dataset/1"
 ROLLOUTS_FORMAT = "cgwm-rollouts/1"
-
-NonNegative = Annotated[float, Field(ge=0)]
-Range = tuple[float, float]
-
-
-class SamplingPlan(FileModel):
-    """Distributions that rollouts are drawn from, all uniform; what is left out follows from the bodies."""
-
-    height_m: Range | None = None
-    """Gap between the bounding sphere and the ground at the start [m]; default 0.5 to 3 radii."""
-    offset_m: NonNegative | None = None
-    """Largest horizontal distance from the place in the photos [m]; default half a bounding radius."""
-    horizontal_speed_m_s: Range | None = None
-    """Initial horizontal speed, in any direction [m/s]; default up to that of a fall from three radii."""
-    vertical_speed_m_s: Range | None = None
-    """Initial vertical velocity, positive upwards [m/s]; default from minus to plus half of that."""
-    spin_rad_s: Range | None = None
-    """Initial angular speed about a random axis [rad/s]; default up to that speed divided by the radius."""
-    push_speed_m_s: Range = (0.1, 0.4)
-    """Speed of a driven body, straight towards a free one [m/s]."""
-    push_gap_m: Range = (0.005, 0.03)
-    """Gap between the bounding spheres of pusher and object at the start [m]."""
-    push_miss: Annotated[float, Field(ge=0, le=1)] = 0.4
-    """Largest sideways miss of the pusher's line past the object's centre [bounding radii]."""
-    parameter_spread: NonNegative = 1.0
-    """Standard errors by which the physical parameters vary: 1 is the posterior, 0 the estimate."""
-    views: Annotated[int, Field(ge=1, le=16)] = 2
-    """Number of cameras, evenly spread over `view_azimuth_deg`, looking at the bodies."""
-    view_azimuth_deg: Range = (-50.0, 50.0)
-    """First and last camera's direction as seen from the bodies [deg], about world z, 0 = from -y."""
-    view_elevation_deg: Annotated[float, Field(ge=-85, le=85)] = 30.0
-    """Cameras' elevation above the bodies [deg]."""
-    view_angle_deg: Annotated[float, Field(gt=1, lt=150)] = 50.0
-    """Cameras' full vertical angle of view [deg]."""
-    view_distance_m: Annotated[float, Field(gt=0)] | None = None
-    """Cameras' distance from the bodies [m]; default: the sampled starts fill most of the image."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> SamplingPlan:
-        for name in type(self).model_fields:
-            value = getattr(self, name)
-            if isinstance(value, tuple) and value[1] < value[0]:
-                raise ValueError(f"{name} is a range [low, high]; found {list(value)}")
-        return self
 
 
 class ShardEntry(FileModel):
@@ -66,6 +23,22 @@ class ShardEntry(FileModel):
     rollouts: int
     frames: int
     """Labelled camera images: rollouts x frames x cameras; time steps where there are no cameras."""
+    rejected: dict[str, int] = {}
+    """Draws that the plan's rules rejected, by rule; each was drawn again."""
+    model_sha256: str | None = None
+    """Hash of the model that it was made of."""
+    versions: dict[str, str] = {}
+    """What it was made with, as in the manifest."""
+    device: str | None = None
+    """cpu or cuda: the two agree to a tolerance, not to the byte."""
+
+
+class IndexEntry(FileModel):
+    """The file that `cgwm merge` writes: all shards as one, by HDF5 virtual datasets."""
+
+    file: str
+    sha256: str
+    bytes: int
 
 
 class DatasetManifest(FileModel):
@@ -81,7 +54,8 @@ class DatasetManifest(FileModel):
     """Rollouts of all shards together, whether they are there yet or not."""
     shard_count: Annotated[int, Field(ge=1)]
     shards: tuple[ShardEntry, ...] = ()
-    """The shards that are complete, by index."""
+    """The shards that are complete, by index; of several shards each has an entry file, until `cgwm merge`."""
+    index: IndexEntry | None = None
     bodies: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     versions: dict[str, str] = {}
@@ -103,4 +77,51 @@ class DatasetSummary(FileModel):
     cameras: tuple[str, ...]
     seconds: float
     frames_per_s: float
+    rejected: dict[str, int] = {}
+    """Draws of this shard that the plan's rules rejected, by rule."""
+    plan: SamplingPlan = SamplingPlan()
+    """The resolved sampling plan."""
+    preview: tuple[str, ...] = ()
+    """Pictures of the first rollouts, files beside the first shard."""
+    up_to_date: bool = False
+    """The shard was there already, whole, and was kept."""
+    notes: tuple[str, ...] = ()
+
+
+class ShardsSummary(FileModel):
+    """What `cgwm synthesize` reports of several shards at once."""
+
+    dataset: str
+    shards: int
+    made: int
+    """Shards that this run made; the others were there already, whole."""
+    rollouts: int
+    frames: int
+    """Labelled camera images of all shards; time steps where there are no cameras."""
+    bytes: int
+    seconds: float
+    frames_per_s: float
+    """Of the frames that this run made."""
+    rejected: dict[str, int] = {}
+    """Draws of all shards that the plan's rules rejected, by rule."""
+    plan: SamplingPlan = SamplingPlan()
+    """The resolved sampling plan."""
+    preview: tuple[str, ...] = ()
+    """Pictures of the first rollouts, files beside the first shard."""
+    notes: tuple[str, ...] = ()
+
+
+class MergeSummary(FileModel):
+    """What `cgwm merge` reports."""
+
+    index: str
+    sha256: str
+    bytes: int
+    """Of the index itself; the shards stay where they are."""
+    shards: int
+    rollouts: int
+    frames: int
+    shard_bytes: int
+    up_to_date: bool = False
+    """The index was there already, of the same shards, and was kept."""
     notes: tuple[str, ...] = ()

@@ -50,6 +50,14 @@ class NotEnoughMemoryError(CgwmError):
     """What was asked for needs more memory than there is (exit code 1)."""
 
 
+class NotEnoughSpaceError(CgwmError):
+    """What was asked for needs more room on the disk than there is (exit code 1)."""
+
+
+class DamagedShardError(InputDataError):
+    """A finished shard is not what it was when it was written (exit code 2)."""
+
+
 class CheckFailedError(CgwmError):
     """A check found faults (exit code 1)."""
 

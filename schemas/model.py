@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .base import FileModel
 from .capture import Ground, Name, Pose, Shape, Vector3
@@ -27,6 +27,22 @@ class Parameter(FileModel):
     state: Literal["fitted", "given", "on_bound", "not_observable", "derived"] = "fitted"
     note: str = ""
     """What it is confounded with, or the motion that would reveal it."""
+
+
+class Correlation(FileModel):
+    """How the errors of parameters that were fitted together go together: with the standard errors, their posterior."""
+
+    parameters: tuple[str, ...]
+    """Names in `parameters`."""
+    matrix: tuple[tuple[float, ...], ...]
+    """Correlations of the fitted coordinates: logarithms of parameters whose bounds are positive, else values."""
+
+    @model_validator(mode="after")
+    def _square(self) -> Correlation:
+        size = len(self.parameters)
+        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+            raise ValueError(f"the matrix of {size} parameters has {size} rows of {size} numbers")
+        return self
 
 
 class BodyModel(FileModel):
@@ -128,6 +144,8 @@ class ModelFile(FileModel):
     contact: ContactParameters | None = None
     """None until the stage phys-geo has run."""
     parameters: tuple[Parameter, ...] = ()
+    correlations: tuple[Correlation, ...] = ()
+    """Of parameters that were fitted together; between two of these blocks, none is known."""
     effects: tuple[EffectModel, ...] = ()
     solver: Solver = Solver()
     measurement_std: dict[str, float] = {}

@@ -6,6 +6,7 @@ import signal
 import statistics
 import subprocess
 import sys
+import tomllib
 import types
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,6 +28,7 @@ from cgwm.schemas import (
     SynthesizeConfig,
     ValidationReport,
 )
+from small_model import write_small_model
 
 CGWM = [sys.executable, "-m", "cgwm"]
 Run = Callable[..., tuple[int, str, str]]
@@ -159,7 +161,8 @@ def test_an_unknown_verb(run: Run) -> None:
         2,
         "",
         "cgwm: there is no command 'fti'.\n"
-        "Allowed: demo, calibrate, fit, synthesize, eval, compare, diagnose, import, validate, doctor, effects. "
+        "Allowed: demo, calibrate, fit, synthesize, merge, view, eval, compare, diagnose, import, export, validate, "
+        "doctor, effects. "
         "Did you mean 'fit'?\n"
         "Next: run 'cgwm --help'.\n",
     )
@@ -177,7 +180,7 @@ def test_an_unknown_option(run: Run) -> None:
         2,
         "",
         "cgwm validate: there is no option '--jsno'.\n"
-        "Allowed: --debug, --json, --quiet, --help. Did you mean '--json'?\n"
+        "Allowed: --debug, --json, --quiet, --sample, --seed, --help. Did you mean '--json'?\n"
         "Next: run 'cgwm validate --help'.\n",
     )
 
@@ -286,6 +289,26 @@ def test_a_wrong_shard(run: Run, stage: Callable[..., None], shard: str) -> None
     )
 
 
+def test_the_command_makes_a_template_and_prints_the_plan_resolved(run: Run, tmp_path: Path) -> None:
+    model = write_small_model(tmp_path / "model", visible=False)
+    code, template, _ = run("synthesize", model, "--print-plan")
+    assert code == 0 and "# Brightness of a rollout's light" in template
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model"]
+    plan = tmp_path / "plan.toml"
+    plan.write_text(template.replace("no_contact = false", "no_contact = true\npenetration_m = 0.05"))
+    command = ("synthesize", model, "--rollouts", 1, "--set", "synthesize.duration_s=0.5", "--plan", plan)
+    code, out, _ = run(*command, "--out", tmp_path / "one")
+    assert code == 0 and out.startswith('The plan, resolved:\n\nstart = "throw"\n')
+    resolved = tomllib.loads(out.split("resolved:\n\n")[1].split("\nWrote ")[0])
+    assert resolved["reject"] == {"no_contact": True, "penetration_m": 0.05, "attempts": 100}
+    code, out, _ = run(*command, "--out", tmp_path / "two", "--json")
+    assert code == 0 and json.loads(out)["plan"]["reject"]["no_contact"] is True
+    code, _, err = run(*command)
+    assert (code, err) == (2, "--out is missing.\nNext: name the directory to write: --out DATASET.\n")
+    code, _, err = run(*command, "--set", "synthesize.plan.views=1", "--out", tmp_path / "three")
+    assert code == 2 and err.startswith("--plan, and synthesize.plan in the settings.")
+
+
 # Outcomes
 
 
@@ -337,7 +360,7 @@ def test_validate_prints_its_report_either_way(
     run: Run, stage: Callable[..., None], faults: tuple[str, ...], code: int
 ) -> None:
     report = ValidationReport(path="c", kind="capture", facts={"episodes": 3}, faults=faults)
-    stage("cgwm.pipeline.validate", "validate", lambda thing: report)
+    stage("cgwm.pipeline.validate", "validate", lambda thing, *sample: report)
     ended, out, err = run("validate", "c", "--json")
     assert (ended, err) == (code, "")
     assert ValidationReport.model_validate_json(out) == report
@@ -354,7 +377,7 @@ import logging, os, sys, types, warnings
 from cgwm.cli import main
 from cgwm.schemas import ValidationReport
 
-def noisy(thing):
+def noisy(thing, *sample):
     print("a library talks")
     os.write(1, b"a compiled library talks\\n")
     os.write(2, b"a compiled library logs\\n")
@@ -368,7 +391,7 @@ main(["validate", "c", "--json"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""
-    assert json.loads(done.stdout) == {"path": "c", "kind": "capture", "facts": {}, "faults": []}
+    assert json.loads(done.stdout) == {"path": "c", "kind": "capture", "facts": {}, "faults": [], "failures": []}
 
 
 def test_doctor_prints_one_json_document() -> None:

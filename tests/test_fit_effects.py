@@ -61,6 +61,7 @@ def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest
     drag = next(p for p in found.parameters if p.name == "quadratic_drag.k")
     assert drag.interval_95 is not None and drag.interval_95[0] < 0.2 < drag.interval_95[1]
     assert drag.estimate == pytest.approx(0.2, rel=0.25) and drag.unit == "1/m"
+    assert [block.parameters for block in found.correlations][1] == ("quadratic_drag.k",)
     assert found.record["search_open_loop_m"][-1] < 0.75 * plain.record["search_open_loop_m"][-1]
 
 

@@ -14,6 +14,7 @@ from cgwm.pipeline.fit import fit
 from cgwm.pipeline.mass_distribution import fit_mass_distribution
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
+from cgwm.pipeline.posterior import draw_parameters
 from cgwm.schemas import (
     Body,
     BoxShape,
@@ -126,6 +127,18 @@ def test_a_model_holds_the_mass_distribution_that_was_fitted(
     np.testing.assert_allclose(file.bodies[0].com_m, COM_M, atol=2e-3)
     assert {numbers[f"box.{name}"].state for name in ("com_z_m", "moment_z")} == {"fitted"}
     np.testing.assert_allclose(file.bodies[0].inertia_kg_m2[:3], _diagonal(weighted_world()), rtol=0.2)
+    contact, mass = file.correlations
+    assert contact.parameters[:3] == ("friction", "contact_time_s", "damping_ratio")
+    names = {f"box.com_{axis}_m" for axis in "xyz"} | {f"box.moment_{axis}" for axis in "xyz"}
+    assert set(mass.parameters) == names
+    for block in file.correlations:
+        matrix = np.array(block.matrix)
+        np.testing.assert_allclose(np.diag(matrix), 1, rtol=1e-9)
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-9)
+        assert np.linalg.eigvalsh(matrix).min() > -1e-9 and np.abs(matrix - np.eye(len(matrix))).max() > 0.01
+    drawn, entries = draw_parameters(file, 1.0, np.random.default_rng(0))  # all of it varies in rollouts
+    assert drawn.bodies[0].inertia_kg_m2 != file.bodies[0].inertia_kg_m2
+    assert all(entry.value != entry.estimate for entry in entries if entry.name in mass.parameters)
 
 
 def test_images_do_not_show_where_the_mass_is(capture: Path, tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_another_device_is_named_where_there_is_one() -> None:
 
 def test_synthesize_names_spheres_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = write_small_model(tmp_path / "model")
-    monkeypatch.setattr(synthesis, "simulate_rollout", raising)
+    monkeypatch.setattr(synthesis, "draw_rollout", raising)
     config = SynthesizeConfig(rollouts=1, duration_s=0.1, width=64, height=48, device="cpu")
     with pytest.raises(NotEnoughMemoryError, match=r"'cpu': 800 spheres, pictures of 64x48 px\."):
         synthesis.synthesize(model, tmp_path / "dataset", config)

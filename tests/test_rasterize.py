@@ -313,3 +313,25 @@ def test_distorted_cameras_take_the_kernels_and_equal_the_torch_renderer():
     assert output.pairs is not None
     assert (output.features.double().cpu() - exact.features).norm() < 1e-3 * exact.features.norm()
     assert (output.alpha.double().cpu() - exact.alpha).norm() < 1e-3 * exact.alpha.norm()
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("channels", [3, 9])
+def test_features_may_differ_by_camera(kernels, channels):
+    means, scales, opacities, _, viewmats, Ks = scene(24)
+    features = torch.rand(len(Ks), len(means), channels, generator=torch.Generator().manual_seed(0)).double()
+    exact = render(means, scales, opacities, features, viewmats, Ks, *SIZE, min_transmittance=0.0).features
+    leaves = [value.float().to(DEVICE) for value in (means, scales, opacities, features, viewmats, Ks)]
+    found = rasterize(*leaves, Raster(*SIZE, 1 / 255, 0.0, kernels=kernels))[0]
+    torch.testing.assert_close(found.double().cpu(), exact, atol=5e-5, rtol=5e-5)
+    with pytest.raises(ValueError, match="no derivative on CUDA"):
+        rasterize(leaves[0].requires_grad_(), *leaves[1:], Raster(*SIZE, 1 / 255, 0.0, kernels=kernels))
+
+
+@pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
+def test_groups_are_seen_alone_on_a_gpu():
+    arguments = scene(40)
+    groups = [slice(0, 10), slice(25, 40)]
+    exact = render(*arguments, 24, 17, groups=groups).alone
+    found = render(*(value.float().cuda() for value in arguments), 24, 17, groups=groups).alone
+    torch.testing.assert_close(found.double().cpu(), exact, atol=5e-5, rtol=5e-5)

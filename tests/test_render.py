@@ -321,3 +321,27 @@ def test_nothing_to_see():
     clear = render(means, scales, 0 * opacities, features, viewmats, Ks, 25, 19)
     assert clear.alpha.max() == 0
     assert torch.isfinite(clear.depth).all()
+
+
+def test_groups_are_seen_alone():
+    """The opacity of some spheres alone is that of a picture of these alone, whatever hides them."""
+    means, scales, opacities, features, viewmats, Ks = scene(40)
+    groups = [slice(0, 10), slice(25, 40)]
+    seen = render(means, scales, opacities, features, viewmats, Ks, 24, 17, groups=groups)
+    assert seen.alone.shape == (2, 17, 24, 2)
+    for number, group in enumerate(groups):
+        alone = render(means[group], scales[group], opacities[group], features[group], viewmats, Ks, 24, 17)
+        torch.testing.assert_close(seen.alone[..., number], alone.alpha)
+        assert float(alone.alpha.max()) > 0.5
+        short = render(means, scales, opacities, features, viewmats, Ks, 24, 17, groups=groups, group_transmittance=0.4)
+        assert ((short.alone > 0.6) == (seen.alone > 0.6)).all() and (short.alone <= seen.alone + 1e-12).all()
+
+
+def test_features_may_differ_by_camera():
+    means, scales, opacities, features, viewmats, Ks = scene(40, cameras=3)
+    each = torch.stack([features, features.flip(0), 2 * features])
+    seen = render(means, scales, opacities, each, viewmats, Ks, 24, 17)
+    for camera in range(3):
+        one = slice(camera, camera + 1)
+        alone = render(means, scales, opacities, each[camera], viewmats[one], Ks[one], 24, 17)
+        torch.testing.assert_close(seen.features[one], alone.features)

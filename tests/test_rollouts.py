@@ -14,12 +14,12 @@ from cgwm.datasets.atomic import sha256
 from cgwm.datasets.cameras import Camera
 from cgwm.datasets.loader import RolloutDataset, RolloutReader
 from cgwm.datasets.mjcf import mujoco_states, write_mjcf
+from cgwm.datasets.rollout_writer import RolloutWriter
 from cgwm.datasets.rollouts import (
     ContactTable,
     FrameBlock,
     RolloutLabels,
     RolloutParameter,
-    RolloutWriter,
     open_shard,
 )
 from cgwm.pipeline.sampling import look_at
@@ -74,6 +74,8 @@ def labels(index: int, seed: int = 3) -> RolloutLabels:
         omega_body_rad_s=speeds[1],
         gravity_m_s2=np.array([0, 0, -9.81]),
         contacts=table,
+        contact_force_n=rng.normal(size=(FRAMES, 1, 3)),
+        contact_torque_n_m=rng.normal(size=(FRAMES, 1, 3)),
         parameters=(RolloutParameter("friction", "1", 0.41, 0.4, 0.05),),
         cameras={"left": camera()},
     )
@@ -84,8 +86,11 @@ def blocks(index: int) -> list[FrameBlock]:
     image = rng.integers(0, 256, (FRAMES, *SIZE, 3), dtype=np.uint8)
     depth = rng.random((FRAMES, *SIZE)).astype(np.float32)
     mask = rng.integers(0, 2, (FRAMES, *SIZE), dtype=np.uint8)
+    amodal = mask | rng.integers(0, 2, (FRAMES, *SIZE), dtype=np.uint8)
+    counts = (mask.sum((1, 2), dtype=np.int32)[:, None], amodal.sum((1, 2), dtype=np.int32)[:, None])
+    arrays = (image, depth, mask, amodal, *counts)
     parts = (slice(0, 8), slice(8, FRAMES))
-    return [FrameBlock("left", part.start, image[part], depth[part], mask[part]) for part in parts]
+    return [FrameBlock("left", part.start, *(array[part] for array in arrays)) for part in parts]
 
 
 def write(path: Path, indices: tuple[int, ...] = (0, 1, 4), compression: str = "zstd") -> Path:
@@ -110,7 +115,9 @@ def test_robomimic_finds_its_names(tmp_path: Path) -> None:
             assert demo["dones"][:].tolist() == [0] * (FRAMES - 1) + [1]
             assert np.abs(demo["actions"][:]).max() <= 1
             assert (
-                sorted(demo["obs"]) == sorted(demo["next_obs"]) == ["left_depth", "left_image", "left_mask", "object"]
+                sorted(demo["obs"])
+                == sorted(demo["next_obs"])
+                == ["left_amodal", "left_depth", "left_image", "left_mask", "object"]
             )
             for key in demo["obs"]:
                 now, after = demo["obs"][key][()], demo["next_obs"][key][()]
@@ -144,11 +151,12 @@ def test_what_is_written_is_read_back(tmp_path: Path, compression: str) -> None:
     np.testing.assert_array_equal(reader.read(0, "bodies/pos"), truth.position_m)
     np.testing.assert_array_equal(reader.read(0, "contacts/impulse_world"), truth.contacts.impulse_n_s)
     np.testing.assert_array_equal(reader.read(0, "cameras/left/T_world_cam"), camera().T_world_cam)
-    for key in ("image", "depth", "mask"):
+    for key in ("image", "depth", "mask", "amodal"):
         written = np.concatenate([getattr(block, key) for block in blocks(2)])
         np.testing.assert_array_equal(reader.read(0, f"obs/left_{key}"), written)
-    visible = np.concatenate([block.mask for block in blocks(2)]).sum((1, 2))
+    visible, whole = (np.concatenate([getattr(b, key) for b in blocks(2)]).sum((1, 2)) for key in ("mask", "amodal"))
     np.testing.assert_array_equal(reader.read(0, "bodies/visible_px")[:, 0, 0], visible)
+    np.testing.assert_array_equal(reader.read(0, "bodies/visible_fraction")[:, 0, 0], visible / whole)
     assert reader.parameters(0) == {"friction": 0.41}
     assert reader.group(0)["obs/left_image"].chunks == (8, *SIZE, 3)
     reader.close()

@@ -13,7 +13,8 @@ from cgwm.datasets.dataset import read_manifest
 from cgwm.datasets.loader import RolloutReader
 from cgwm.datasets.models import read_model, write_model
 from cgwm.pipeline import labels as labels_module
-from cgwm.pipeline import synthesize as stage
+from cgwm.pipeline import rollout_batches as batches
+from cgwm.pipeline.label_reach import Box
 from cgwm.pipeline.labels import LabelRenderer
 from cgwm.pipeline.posterior import draw_parameters, with_parameter
 from cgwm.pipeline.sampling import draw_start, extent, look_at_cameras, resolve_plan, rotation_matrix
@@ -21,7 +22,9 @@ from cgwm.pipeline.splats.render import render
 from cgwm.pipeline.synthesize import shard_indices, synthesize
 from cgwm.schemas import (
     EffectModel,
+    Exposure,
     InputDataError,
+    Light,
     NotConvergedError,
     Parameter,
     SamplingPlan,
@@ -83,7 +86,9 @@ def test_a_foreign_shard_is_refused(model_path: Path, tmp_path: Path) -> None:
     two = CONFIG.model_copy(update={"shards": 2, "duration_s": 0.1})
     synthesize(model_path, tmp_path / "out", two)
     before = sha256(tmp_path / "out")
-    with pytest.raises(UsageError, match=r"another dataset: its config is[\s\S]*repeat the options of the first shard"):
+    with pytest.raises(
+        UsageError, match=r"another dataset: its config.seed is 5, here 99[\s\S]*repeat the options of the first shard"
+    ):
         synthesize(model_path, tmp_path / "out", two.model_copy(update={"shard": 1, "seed": 99}))
     with pytest.raises(UsageError, match=r"rollouts-0000-of-0002.h5 exists.\nNext: choose another name or pass --over"):
         synthesize(model_path, tmp_path / "out", two)
@@ -101,8 +106,8 @@ def test_a_failure_leaves_nothing(
         rollout = simulate(*arguments, **options)  # pyright: ignore
         return replace(rollout, position_m=rollout.position_m * torch.nan)
 
-    simulate = stage.roll_out
-    monkeypatch.setattr(stage, "roll_out", diverge)
+    simulate = batches.roll_out
+    monkeypatch.setattr(batches, "roll_out", diverge)
     with pytest.raises(NotConvergedError, match=r"rollout 0 \(seed 5\) diverged by step 0(.|\n)*Its start is in"):
         synthesize(model_path, tmp_path / "out", CONFIG.model_copy(update={"shards": shards}))
     assert list(tmp_path.iterdir()) == []
@@ -161,10 +166,11 @@ def test_crops_are_the_whole_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     quat = rng.normal(size=(6, 2, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     crops = list(renderer.blocks(position, quat))
-    monkeypatch.setattr(labels_module, "_reach", lambda spheres, view: (0, 0, view.width, view.height))
+    monkeypatch.setattr(labels_module, "reach", lambda spheres, viewmat, K, width, height: Box(0, 0, width, height))
     for crop, whole in zip(crops, renderer.blocks(position, quat), strict=True):
         np.testing.assert_array_equal(crop.image, whole.image)
         np.testing.assert_array_equal(crop.mask, whole.mask)
+        np.testing.assert_array_equal(crop.amodal, whole.amodal)
         np.testing.assert_allclose(crop.depth, whole.depth, atol=1e-6)
 
 
@@ -194,6 +200,99 @@ def test_labels_agree_with_a_plain_rendering() -> None:
     assert len(on_body) > 100 and on_body.min() >= z.min() and on_body.max() <= z.max()
     pure = (block.mask[0] == 1) & (share > 0.995 * alpha)
     np.testing.assert_allclose(block.depth[0][pure], picture.depth[0].numpy()[pure], atol=2e-3)
+
+
+def test_all_at_once_is_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a GPU does in one call, here by the torch renderer: the same labels, in the same order of blocks."""
+    model = small_model(driven=True)
+    fixed = model.file.bodies[1].model_copy(update={"name": "post", "motion": "fixed"})
+    file = model.file.model_copy(update={"bodies": (*model.file.bodies, fixed)})
+    splats = {**model.body_splats, "post": replace(model.body_splats["tip"], scales=np.array([0.02]))}
+    model = replace(model, file=file, body_splats=splats, collision={**model.collision, "post": splats["post"]})
+    plan = resolve_plan(model, SamplingPlan(views=2))
+    cameras = look_at_cameras(model, plan, SynthesizeConfig(width=72, height=48))
+    cameras["small"] = look_at_cameras(model, plan, SynthesizeConfig(width=40, height=32))["view1"]
+    rng = np.random.default_rng(0)
+    position = rng.uniform(-0.1, 0.1, (11, 3, 3)) + np.array([0, 0, 0.15])
+    quat = rng.normal(size=(11, 3, 4))
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    renderer = LabelRenderer(model, cameras)
+    expected = list(renderer.blocks(position, quat))
+    monkeypatch.setattr(labels_module, "_to_host", lambda pictures: (pictures, lambda: None))
+    monkeypatch.setattr(renderer, "_together", True)
+    renderer.set_cameras(cameras)
+    for numbers in (labels_module.NUMBERS_AT_ONCE, 1):  # one call, and one for each chunk of frames
+        monkeypatch.setattr(labels_module, "NUMBERS_AT_ONCE", numbers)
+        found = list(renderer.blocks(position, quat))
+        assert [(b.camera, b.start, len(b.image)) for b in found] == [
+            (b.camera, b.start, len(b.image)) for b in expected
+        ]
+        for one, other in zip(found, expected, strict=True):
+            assert np.abs(one.image.astype(int) - other.image).max() <= 1
+            for key in ("mask", "amodal"):
+                assert (getattr(one, key) != getattr(other, key)).mean() < 1e-3
+            same = one.mask == other.mask
+            np.testing.assert_allclose(one.depth[same], other.depth[same], atol=1e-5)
+            assert np.abs(one.visible_px - other.visible_px).max() <= 2
+            assert np.abs(one.amodal_px - other.amodal_px).max() <= 2
+    assert set(np.unique(np.concatenate([b.mask.ravel() for b in expected]))) == {0, 1, 2, 3}
+
+
+def test_amodal_masks_show_what_is_hidden() -> None:
+    """The tip stands between the camera and the cube: amodal masks are those of each body rendered alone."""
+    model = small_model(driven=True)
+    plan = resolve_plan(model, SamplingPlan(views=1))
+    cameras = look_at_cameras(model, plan, SynthesizeConfig(width=96, height=72))
+    camera = cameras["view0"]
+    eye = camera.T_world_cam[:3, 3]
+    cube = np.array([0.0, 0.0, 0.12])
+    position = np.stack([np.stack([cube, cube + step * (eye - cube)]) for step in (0.25, -0.25)])
+    quat = np.tile([1.0, 0, 0, 0], (2, 2, 1))
+    (block,) = LabelRenderer(model, cameras).blocks(position, quat)
+    for body, name in enumerate(("cube", "tip")):
+        splats = model.body_splats[name]
+        for frame in range(2):
+            means = torch.as_tensor(splats.means + position[frame, body])
+            values = [torch.as_tensor(getattr(splats, key)) for key in ("scales", "opacities", "colors")]
+            pose, K = torch.as_tensor(camera.T_cam_world)[None], torch.as_tensor(camera.K)[None]
+            alpha = render(means, *values, pose, K, 96, 72).alpha[0].numpy()
+            seen = (block.amodal[frame] >> body & 1).astype(bool)
+            sure = np.abs(alpha - 0.5) > 1e-3
+            shown = (block.mask[frame] == body + 1) & (alpha < 0.5)  # edges that shine through count as seen
+            np.testing.assert_array_equal(seen[sure & ~shown], (alpha > 0.5)[sure & ~shown])
+            assert block.amodal_px[frame, body] == seen.sum() > 1
+            assert block.visible_px[frame, body] == (block.mask[frame] == body + 1).sum()
+    assert block.visible_px[0, 0] < block.amodal_px[0, 0] and block.visible_px[0, 1] == block.amodal_px[0, 1]
+    assert block.visible_px[1, 1] == 0 < block.amodal_px[1, 1]
+
+
+def test_cameras_light_and_exposure_may_change_between_rollouts() -> None:
+    """What a renderer is told later is what one that is made so shows."""
+    normals = np.tile([0.0, 0, 1], (400, 1))
+    model = small_model()
+    model = replace(model, body_splats={"cube": replace(model.body_splats["cube"], normals=normals)})
+    dark, light = (Light(lamp=lamp, sky=0.1) for lamp in ((0.0, 0.0, 0.1), (0.3, 0.2, 0.5)))
+    lit = [replace(model, file=model.file.model_copy(update={"light": one})) for one in (dark, light)]
+    settings = SynthesizeConfig(width=64, height=48)
+    views = [
+        look_at_cameras(model, resolve_plan(model, SamplingPlan(views=2, view_elevation_deg=angle)), settings)
+        for angle in (20, 50)
+    ]
+    poses = np.tile([0.0, 0, 0.15], (3, 1, 1)), np.tile([0.6, 0.8, 0, 0], (3, 1, 1))
+    told = LabelRenderer(lit[0], views[0])
+    before = list(told.blocks(*poses))
+    told.set_cameras(views[1])
+    told.set_light(light)
+    for block, expected in zip(told.blocks(*poses), LabelRenderer(lit[1], views[1]).blocks(*poses), strict=True):
+        np.testing.assert_array_equal(block.image, expected.image)
+        np.testing.assert_array_equal(block.mask, expected.mask)
+        assert (block.image != before[0].image).any()
+    exposure = Exposure(gain_rgb=(0.5, 1.0, 2.0), offset_rgb=(0.1, 0.0, 0.0))
+    plain = list(told.blocks(*poses))
+    exposed = list(told.blocks(*poses, exposures={"view1": exposure}))
+    np.testing.assert_array_equal(exposed[0].image, plain[0].image)
+    wanted = (plain[1].image * np.array([0.5, 1, 2]) + [25.5, 0, 0]).clip(0, 255)
+    np.testing.assert_allclose(exposed[1].image, wanted, atol=0.51)
 
 
 def test_labels_obey_newton_and_the_states_are_the_bodies(dataset: Path) -> None:
@@ -230,7 +329,7 @@ def test_starts_are_above_the_ground_and_within_the_plan() -> None:
         assert 0.02 - 1e-12 <= gap <= 0.2 + 1e-12
         assert np.linalg.norm(start.position_m[0, :2]) <= 0.1 + 1e-12
         assert np.linalg.norm(start.quat_wxyz[0]) == pytest.approx(1)
-        assert plan.spin_rad_s and np.linalg.norm(start.omega_body_rad_s[0]) <= plan.spin_rad_s[1]
+        assert plan.spin_rad_s and np.linalg.norm(start.omega_body_rad_s[0]) <= plan.spin_rad_s.support[1]
 
 
 def test_two_bodies_start_apart() -> None:

@@ -110,8 +110,13 @@ def require_state(state: State, names: Sequence[str]) -> None:
             )
 
 
-def require_apart(world: World, state: State) -> None:
+def require_apart(world: World, state: State, name: str | None = None) -> None:
     """Check that no two bodies, and no body and the ground, begin deep inside each other.
+
+    Args:
+        world: The world.
+        state: The start.
+        name: What the environment is called, where there is one; its number where left out.
 
     Raises:
         InputDataError: If two do, with their names, the depth and the environment.
@@ -122,8 +127,8 @@ def require_apart(world: World, state: State) -> None:
         limit = float(DEEPEST_SHARE * size[deepest])
         if float(depth[deepest]) > limit:
             raise InputDataError(
-                f"environment {deepest}: body '{overlap.body}' begins {1e3 * float(depth[deepest]):.1f} mm "
-                f"deep inside {overlap.other}.",
+                f"{name or f'environment {deepest}'}: body '{overlap.body}' begins "
+                f"{1e3 * float(depth[deepest]):.1f} mm deep inside {overlap.other}.",
                 f"up to {1e3 * limit:.1f} mm; deeper, the contact would throw them apart.",
                 "check the start's poses, the ground's height and the sizes of the bodies.",
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -172,6 +172,16 @@ class Engine:
             if wrench.torque is not None:
                 spin = spin + h[:, None] * wrench.torque
         return replace(motion, velocity=velocity, spin=spin)
+
+    def loads(self, motions: Sequence[Motion]) -> dict[int, tuple[Tensor, Tensor]]:
+        """Return what effects give each free body now: acceleration (B, 3) [m/s2], torque (B, 3) [N m], world frame."""
+        found = {}
+        for index, (body, motion) in enumerate(zip(self.world.bodies, motions, strict=True)):
+            if body.free:
+                one = torch.ones_like(motion.com[:, 0])
+                after = self._free(index, motion, quat_to_matrix(motion.quat_wxyz), one)
+                found[index] = after.velocity - motion.velocity - self.world.gravity, after.spin - motion.spin
+        return found
 
     def _seen(self, index: int, motion: Motion, rotation: Tensor) -> BodyMotion:
         """Return what effects see of a free body."""

@@ -95,8 +95,16 @@ class World:
         return torch.where(size > 0, -self.gravity / safe.sqrt(), other)
 
     @staticmethod
-    def from_model(model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu") -> World:
+    def from_model(
+        model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu", geometry: World | None = None
+    ) -> World:
         """Build the world of a fitted model.
+
+        Args:
+            model: The model.
+            dtype: Of all tensors.
+            device: Of all tensors.
+            geometry: A world of the same model with other numbers, to share the colliding spheres with.
 
         Raises:
             InputDataError: If the model has no fitted physics yet.
@@ -112,9 +120,15 @@ class World:
             return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)[None]
 
         bodies = []
-        for body in file.bodies:
-            spheres = model.collision[body.name]
-            centers, radii = tensor(spheres.means), tensor(spheres.scales * body.radius_factor)
+        for index, body in enumerate(file.bodies):
+            if geometry is None:
+                spheres = model.collision[body.name]
+                centers, radii = tensor(spheres.means), tensor(spheres.scales * body.radius_factor)
+                place = tensor((*body.photo_pose.position_m, *body.photo_pose.quat_wxyz))
+                on_plane = plane_contacts(centers[0], radii[0])
+            else:
+                known = geometry.bodies[index]
+                centers, radii, place, on_plane = known.centers, known.radii, known.place, known.on_plane
             bodies.append(
                 Body(
                     body.name,
@@ -124,8 +138,8 @@ class World:
                     tensor(body.com_m),
                     centers,
                     radii,
-                    tensor((*body.photo_pose.position_m, *body.photo_pose.quat_wxyz)),
-                    plane_contacts(centers[0], radii[0]),
+                    place,
+                    on_plane,
                 )
             )
         law = ContactLaw(

@@ -67,8 +67,8 @@ def tiles(strip: FrameStrip, width: int = TILE_WIDTH, outlined: bool = True) -> 
     x, y, w, h = _window(strip)
     size = (width, round(width / _ASPECT))
     cut = (slice(None), slice(y, y + h), slice(x, x + w))
-    real = np.stack([_resized(frame, size) for frame in strip.real[cut]])
-    predicted = np.stack([_resized(frame, size) for frame in strip.predicted[cut]])
+    real = np.stack([resized(frame, size) for frame in strip.real[cut]])
+    predicted = np.stack([resized(frame, size) for frame in strip.predicted[cut]])
     if outlined and strip.masks is not None:
         for frame, mask in zip(predicted, strip.masks[cut], strict=True):
             _outline(frame, mask)
@@ -177,16 +177,28 @@ def png_uri(image: Image) -> str:
     return _uri(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9], "image/png")
 
 
+def encoded(image: Image, suffix: str, options: Sequence[int] = ()) -> bytes:
+    """Return an RGB image as a file of OpenCV's format for a suffix, ".png" or ".jpg"."""
+    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
+    return data.tobytes()
+
+
 def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
     """Return an RGB image as a PNG file below a size: noise and fine shades are given up as far as is needed."""
     for bits in range(8, 3, -1):
         step = 1 << (8 - bits)
         reduced = image if bits == 8 else np.minimum(cv2.medianBlur(image, 3) // step * step + step // 2, 255)
-        data = _encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        data = encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9])
         if len(data) <= most_bytes:
             return data
     height, width = image.shape[:2]
-    return small_png(_resized(image, (round(0.8 * width), round(0.8 * height))), most_bytes)
+    return small_png(resized(image, (round(0.8 * width), round(0.8 * height))), most_bytes)
+
+
+def resized(image: Image, size: tuple[int, int]) -> Image:
+    """Return a picture at another size (width, height) [px]: averaged where it shrinks, interpolated where it grows."""
+    shrinks = size[0] < image.shape[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
 
 
 def _window(strip: FrameStrip) -> tuple[int, int, int, int]:
@@ -214,15 +226,10 @@ def _outline(frame: Image, mask: Image) -> None:
     cv2.drawContours(frame, contours, -1, _OUTLINE, 1, cv2.LINE_AA)
 
 
-def _resized(image: Image, size: tuple[int, int]) -> Image:
-    shrinks = size[0] < image.shape[1]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
-
-
 def _fitted(image: Image, size: tuple[int, int]) -> Image:
     """Return a picture reduced to fit into a tile (width, height) [px], with white beside it."""
     scale = min(size[0] / image.shape[1], size[1] / image.shape[0])
-    small = _resized(image, (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))))
+    small = resized(image, (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))))
     tile = np.full((size[1], size[0], 3), 255, np.uint8)
     top, left = (size[1] - small.shape[0]) // 2, (size[0] - small.shape[1]) // 2
     tile[top : top + small.shape[0], left : left + small.shape[1]] = small
@@ -230,9 +237,4 @@ def _fitted(image: Image, size: tuple[int, int]) -> Image:
 
 
 def _uri(image: Image, suffix: str, options: list[int], kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(_encoded(image, suffix, options)).decode('ascii')}"
-
-
-def _encoded(image: Image, suffix: str, options: list[int]) -> bytes:
-    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
-    return data.tobytes()
+    return f"data:{kind};base64,{base64.b64encode(encoded(image, suffix, options)).decode('ascii')}"

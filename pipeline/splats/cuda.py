@@ -163,7 +163,9 @@ __device__ __forceinline__ int stage(const Lists& lists, const Patch& patch, int
             sources->places[slot] = row;
         }
 #pragma unroll
-        for (int c = 0; c < CHANNELS; c++) staged.colors[slot][c] = lists.features[sphere * F + channel + c];
+        for (int c = 0; c < CHANNELS; c++) {
+            staged.colors[slot][c] = lists.features[(BY_CAMERA ? row : sphere) * F + channel + c];
+        }
     }
     __syncwarp();
     return __popc(mask);
@@ -328,8 +330,9 @@ def gradient_width(channels: int) -> int:
 
 
 @cache
-def _kernel(name: str, device: int, channels: int, first: int, rays: bool) -> Any:
+def _kernel(name: str, device: int, channels: int, first: int, rays: bool, by_camera: bool) -> Any:
     defines = {"F": channels, "FIRST": first, "COUNT": min(CHANNELS, channels - first), "RAYS": int(rays)}
+    defines["BY_CAMERA"] = int(by_camera)
     source = "".join(f"#define {key} {value}\n" for key, value in defines.items()) + SOURCE
     return nvrtc.compiled(source, name, device)
 
@@ -342,12 +345,14 @@ def launch(
     Args:
         name: The kernel.
         blocks: One for each tile of 16 x 16 pixels.
-        tensors: Its pointers, in order, contiguous; the fourth are the features (N, F), the eighth the rays or None.
+        tensors: Its pointers, in order, contiguous; the fourth are the features (N, F) or (C, N, F), the eighth the
+            rays or None.
         numbers: Its int32 and float32 arguments, in order.
         first: First channel of the forward kernel.
     """
     features = tensors[3]
     assert features is not None
-    kernel = _kernel(name, features.device.index or 0, features.shape[1], first, tensors[7] is not None)
+    rays, by_camera = tensors[7] is not None, features.dim() == 3
+    kernel = _kernel(name, features.device.index or 0, features.shape[-1], first, rays, by_camera)
     words = [np.int32(number) if isinstance(number, int) else np.float32(number) for number in numbers]
     nvrtc.launch(kernel, features.device, blocks, THREADS, tensors, *words)

@@ -82,7 +82,7 @@ def trace(
 @triton.jit
 def _spheres(
     position, end, centres, log_opacities, features, rows, x, y, inverse, N, min_alpha,
-    F: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+    F: tl.constexpr, CHANNELS: tl.constexpr, BY_CAMERA: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Load the next spheres of a tile, and return what pixels see of them.
 
@@ -107,7 +107,8 @@ def _spheres(
     alpha = tl.where(valid[:, None] & (raw >= min_alpha), tl.minimum(raw, 0.99), 0.0)
     channel = tl.arange(0, CHANNELS)
     known = valid[:, None] & (channel < F)[None, :]
-    value = tl.load(features + sphere[:, None] * F + channel[None, :], mask=known, other=0.0)
+    source = row if BY_CAMERA else sphere
+    value = tl.load(features + source[:, None] * F + channel[None, :], mask=known, other=0.0)
     return row, valid, value, known, raw, alpha, z, k, a, b, c
 
 
@@ -115,9 +116,12 @@ def _spheres(
 def composite_forward(
     centres, log_opacities, features, rows, starts, Ks, rays, out, out_left, out_depth, out_median,
     N, COLUMNS, ROWS, WIDTH, HEIGHT, min_alpha, min_transmittance,
-    F: tl.constexpr, CHANNELS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
+    F: tl.constexpr, CHANNELS: tl.constexpr, BY_CAMERA: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Composite one tile front to back; CHANNELS is F filled up to a power of two."""
+    """Composite one tile front to back; CHANNELS is F filled up to a power of two.
+
+    BY_CAMERA tells whether the features (N, F) are (C, N, F).
+    """
     program = tl.program_id(0)
     tiles = COLUMNS * ROWS
     camera = program // tiles
@@ -132,8 +136,9 @@ def composite_forward(
     most = 1.0
     while (position < end) & (most > min_transmittance):
         _, _, value, _, _, alpha, z, _, _, _, _ = _spheres(
-            position, end, centres, log_opacities, features, rows, x, y, inverse, N, min_alpha, F, CHANNELS, BLOCK
-        )
+            position, end, centres, log_opacities, features, rows, x, y, inverse, N, min_alpha, F, CHANNELS, BY_CAMERA,
+            BLOCK,
+        )  # fmt: skip
         keep = 1 - alpha
         after = left[None, :] * tl.associative_scan(keep, 0, _multiply)
         before = after / keep
@@ -177,8 +182,9 @@ def composite_backward(
     most = 1.0
     while (position < end) & (most > min_transmittance):
         row, valid, value, known, raw, alpha, z, k, a, b, c = _spheres(
-            position, end, centres, log_opacities, features, rows, x, y, inverse, N, min_alpha, F, CHANNELS, BLOCK
-        )
+            position, end, centres, log_opacities, features, rows, x, y, inverse, N, min_alpha, F, CHANNELS, False,
+            BLOCK,
+        )  # fmt: skip
         keep = 1 - alpha
         before = left[None, :] * tl.associative_scan(keep, 0, _multiply) / keep
         weight = alpha * before

@@ -112,6 +112,9 @@ def rasterize(
     """Return features (C, H, W, F), alpha (C, H, W), depth times alpha, median depth, and the number of pairs ().
 
     Shapes as `render.render` has them; all float32 on one CUDA device. The last two have no derivative.
+
+    Raises:
+        ValueError: If a derivative is asked for with features that differ by camera.
     """
     arguments = (means, scales, opacities, features, viewmats, Ks, raster, distortion)
     return _Rasterize.apply(*arguments)  # type: ignore[return-value]
@@ -134,8 +137,11 @@ class _Rasterize(torch.autograd.Function):
             value.contiguous() for value in (means, scales, opacities, features, viewmats, Ks)
         )
         rays = _Rays() if distortion is None else _trace(Ks, distortion, raster)
+        by_camera = features.dim() == 3
+        if by_camera and any(ctx.needs_input_grad[:5]):
+            raise ValueError("features that differ by camera have no derivative on CUDA")
         lists = _bin(means, scales, opacities, viewmats, Ks, rays, raster)
-        cameras, channels = viewmats.shape[0], features.shape[1]
+        cameras, channels = viewmats.shape[0], features.shape[-1]
         shape = (cameras, raster.height, raster.width)
         out = features.new_empty(*shape, channels)
         left, depth, median = (features.new_empty(shape) for _ in range(3))
@@ -149,7 +155,7 @@ class _Rasterize(torch.autograd.Function):
             kernels.composite_forward[(tiles,)](
                 *lists[:2], features, *lists[3:5], Ks, rays.rays, out, left, depth, median,
                 *numbers, *raster.thresholds,
-                F=channels, CHANNELS=_filled(channels), TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
+                F=channels, CHANNELS=_filled(channels), BY_CAMERA=by_camera, TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
             )  # fmt: skip
         ctx.save_for_backward(means, scales, opacities, features, viewmats, Ks, rays.rays, out, left, depth, *lists)
         ctx.raster = raster

@@ -21,11 +21,11 @@ DARKEST = 0.2
 
 
 def light_terms(normals: Tensor, lamp: Tensor) -> Tensor:
-    """Return what the numbers of a light (lamp, sky) are multiplied by (N, 4) at unit normals (N, 3), world frame.
+    """Return what the numbers of a light (lamp, sky) are multiplied by (..., 4) at unit normals (..., 3), world frame.
 
     L - 1 is linear in them on each side of the lamp's terminator, whose place `lamp` (3,) tells.
     """
-    return torch.cat((normals * (normals @ lamp > 0).to(normals)[:, None], normals[:, 2:]), -1)
+    return torch.cat((normals * (normals @ lamp > 0).to(normals)[..., None], normals[..., 2:]), -1)
 
 
 def brightness(light: Light, normals: Tensor) -> Tensor:
@@ -67,5 +67,5 @@ class Relighting:
         return self.turned(quat_to_matrix(quat_wxyz))
 
     def turned(self, rotation: Tensor) -> Tensor:
-        """Return the factors (N,) of the colours at an orientation (3, 3)."""
-        return _brightness(self.numbers, self.normals @ rotation.T) / self.in_photos
+        """Return the factors (N,) of the colours at an orientation (3, 3), or (n, N) at n of them (n, 3, 3)."""
+        return _brightness(self.numbers, self.normals @ rotation.mT) / self.in_photos

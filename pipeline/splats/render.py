@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -40,6 +41,8 @@ class RenderOutput:
             0 where more does. It has no derivative. None where it was not asked for.
         pairs: From the kernels of `rasterize`: how many pairs of tiles and spheres there are, to compare with the
             capacity, int32 () on the device; otherwise None.
+        alone: Opacity of each group of spheres if it were alone, shape (C, H, W, G); it has no derivative. None where
+            there are no groups.
     """
 
     features: Tensor
@@ -47,6 +50,7 @@ class RenderOutput:
     weighted_depth: Tensor
     median_depth: Tensor | None = None
     pairs: Tensor | None = None
+    alone: Tensor | None = None
 
     @property
     def depth(self) -> Tensor:
@@ -72,6 +76,8 @@ def render(
     tile_size: int = _TILE,
     median: bool = False,
     capacity: int | None = None,
+    groups: Sequence[slice] = (),
+    group_transmittance: float = MIN_TRANSMITTANCE,
 ) -> RenderOutput:
     """Render spheres into C cameras.
 
@@ -84,7 +90,8 @@ def render(
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
         scales: Standard deviations s > 0 [m], shape (N,).
         opacities: Peak alphas in [0, 1], shape (N,).
-        features: Colours or any other channels, shape (N, F).
+        features: Colours or any other channels, shape (N, F), or (C, N, F) where they differ by camera; these have no
+            derivative on CUDA.
         viewmats: T_cam_world, camera axes OpenCV, shape (C, 4, 4).
         Ks: Camera matrices [px], shape (C, 3, 3); the centre of the top-left pixel is (0.5, 0.5).
         width: Image width [px].
@@ -96,6 +103,9 @@ def render(
         tile_size: Side of the tiles of the torch path [px]; changes the speed only.
         median: Whether to return the median depth.
         capacity: Room for pairs of tiles and spheres in the kernels, see `rasterize.Raster`.
+        groups: Spheres whose opacities alone are asked for, too: G slices of the N.
+        group_transmittance: `min_transmittance` of the groups: where a group lets less through, its opacity may be
+            told too low, but not below 1 minus this.
 
     Returns:
         Features, alpha and depth.
@@ -107,7 +117,16 @@ def render(
         values, alpha, depth, middle, pairs = rasterize(
             means, scales, opacities, features, viewmats, Ks, raster, distortion
         )
-        return replace(_finished(values, alpha, depth, background, middle if median else None), pairs=pairs)
+        made = _finished(values, alpha, depth, background, middle if median else None)
+        single = replace(raster, min_transmittance=group_transmittance, capacity=None)
+        alphas = [
+            rasterize(
+                means[..., group, :], scales[group], opacities[group], opacities[group, None], viewmats, Ks, single,
+                distortion,
+            )[1]
+            for group in groups
+        ]  # fmt: skip
+        return replace(made, pairs=pairs, alone=torch.stack(alphas, -1).detach() if groups else None)
     camera_count = viewmats.shape[0]
     local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     tiles = _Tiles.make(Ks, distortion, width, height, tile_size)
@@ -124,15 +143,29 @@ def render(
         scales.index_select(0, spheres),
         opacities.index_select(0, spheres),
     )
-    channels = torch.cat([features.index_select(0, spheres), centres[:, 2:]], 1)
+    seen = features.index_select(0, spheres) if features.dim() == 2 else features.flatten(0, 1).index_select(0, flat)
+    channels = torch.cat([seen, centres[:, 2:]], 1)
     every_tile = torch.arange(counts.shape[0], device=means.device)
     lists = TileLists(
         tiles.basis, tiles.frame_of(every_tile), counts.cumsum(0) - counts, counts, min_alpha, min_transmittance
     )
     values, alpha, middle = composite(coefficients, channels, lists, median)
+    alone = None
+    if groups:
+        with torch.no_grad():
+            single = replace(lists, min_transmittance=group_transmittance)
+            alphas = [_alone(coefficients, tile_ids, (spheres >= g.start) & (spheres < g.stop), single) for g in groups]
+            alone = tiles.to_image(torch.stack(alphas, 2), camera_count)
     image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
     median_depth = tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None
-    return _finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth)
+    return replace(_finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth), alone=alone)
+
+
+def _alone(coefficients: Tensor, tile_ids: Tensor, chosen: Tensor, lists: TileLists) -> Tensor:
+    """Return the alpha (T, P) of some of the pairs alone."""
+    counts = torch.bincount(tile_ids[chosen], minlength=lists.counts.shape[0])
+    own = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
+    return composite(coefficients[chosen], coefficients[chosen, :1], own)[1]
 
 
 @cache
@@ -298,11 +331,26 @@ def _meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[
     block_axes = torch.nn.functional.normalize((flat_axes[members] * valid[..., None]).sum(1), dim=1)
     apart = _angle((flat_axes[members] * block_axes[:, None]).sum(-1)) + flat_half[members]
     block_half = torch.where(valid, apart, 0.0).amax(1)
-    block, sphere = (_angle(block_axes @ direction.T) <= block_half[:, None] + cone).nonzero(as_tuple=True)
-    angles = _angle((flat_axes[members[block]] @ direction[sphere, :, None])[..., 0])
-    meets = (angles <= flat_half[members[block]] + cone[sphere, None]) & valid[block]
-    pair, member = meets.nonzero(as_tuple=True)
-    return members[block[pair], member], sphere[pair]
+    near = _angle(block_axes @ direction.T) <= block_half[:, None] + cone
+    found: list[tuple[Tensor, Tensor]] = []
+    for block, spheres in enumerate(near):
+        chosen, tiles = spheres.nonzero()[:, 0], members[block, valid[block]]
+        tile, place = _cones_meet(flat_axes[tiles], flat_half[tiles], direction[chosen], cone[chosen])
+        found.append((tiles[tile], chosen[place]))
+    tile_ids, spheres = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return tile_ids, spheres
+
+
+def _cones_meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the meetings of cones, by axes (t, 3) and (n, 3) and half angles (t,) and (n,); all angles to pi.
+
+    Cosines are compared, not angles: cos a >= cos(b + c) where b + c stays within pi.
+    """
+    limit = half.cos()[:, None] * cone.cos() - half.sin()[:, None] * cone.sin()
+    limit = limit - 8 * torch.finfo(limit.dtype).eps  # culling must not lose what is visible
+    meets = (axes @ direction.T >= limit) | (half[:, None] + cone >= math.pi)
+    tile, place = meets.nonzero(as_tuple=True)
+    return tile, place
 
 
 def _angle(cosine: Tensor) -> Tensor:

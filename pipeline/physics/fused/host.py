@@ -31,7 +31,7 @@ from .structure import Structure
 if TYPE_CHECKING:
     from ....datasets.tracks import Track
 
-FLAGS = ("-std=c++17", "-O2", "-shared", "-fPIC", "-pthread", "-w")
+FLAGS = ("-std=c++17", "-O2", "-shared", "-fPIC", "-pthread", "-ffp-contract=off", "-w")
 """Nothing that lets the compiler reorder sums, or use what only this processor has: what is kept serves others too."""
 BUILD_S = 120.0
 """A compiler that takes longer is given up."""

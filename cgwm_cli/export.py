@@ -1,0 +1,129 @@
+"""`cgwm export`: a dataset or a model in the format of another tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from .options import Debug, Json, Overwrite, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import ExportResult
+
+
+def export(
+    thing: Annotated[Path, typer.Argument(metavar="THING", help="A dataset or a model.", show_default=False)],
+    to: Annotated[
+        Literal["lerobot", "bop", "nerfstudio", "mjcf", "ply", "colmap", "glb"],
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help="Of a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout). "
+            "Of a model: mjcf, ply (3D Gaussian splatting), colmap, glb (KHR_gaussian_splatting).",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="PATH",
+            help="The directory to write; for mjcf an .xml, for glb a .glb, for ply a directory or one .ply of all.",
+            show_default=False,
+        ),
+    ],
+    split: Annotated[
+        str | None, typer.Option("--split", help="lerobot, bop: only these rollouts (all).", show_default=False)
+    ] = None,
+    cameras: Annotated[
+        str | None,
+        typer.Option(
+            "--cameras", metavar="NAME,...", help="lerobot, bop, nerfstudio: only these (all).", show_default=False
+        ),
+    ] = None,
+    every: Annotated[
+        int | None,
+        typer.Option("--every", min=1, help="lerobot, bop, nerfstudio: every n-th frame (1).", show_default=False),
+    ] = None,
+    task: Annotated[
+        str | None, typer.Option("--task", help="lerobot: what the task is, in words.", show_default=False)
+    ] = None,
+    rollout: Annotated[
+        int | None, typer.Option("--rollout", min=0, help="nerfstudio: number of the rollout (0).", show_default=False)
+    ] = None,
+    mask: Annotated[
+        Literal["none", "scene", "bodies"] | None,
+        typer.Option(
+            "--mask",
+            help="nerfstudio: pixels that count; scene leaves the moving bodies out (none: all count).",
+            show_default=False,
+        ),
+    ] = None,
+    sh_degree: Annotated[
+        int | None,
+        typer.Option(
+            "--sh-degree", min=0, max=3, help="ply: pad with zeros; INRIA's viewer wants 3 (0).", show_default=False
+        ),
+    ] = None,
+    capture: Annotated[
+        Path | None,
+        typer.Option(
+            "--capture", metavar="CAPTURE", help="colmap: the capture with photos and cameras.", show_default=False
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="mjcf: of the throw or push to compare by (0).", show_default=False),
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option("--duration", min=0.02, help="mjcf: how long it is compared [s] (1).", show_default=False),
+    ] = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """A dataset or a model in the format of another tool."""
+    given = {"split": split, "cameras": cameras, "every": every, "task": task, "rollout": rollout, "mask": mask}
+    given |= {"sh_degree": sh_degree, "capture": capture, "seed": seed, "duration_s": duration}
+    with running(json=json, quiet=quiet, debug=debug) as emit:
+        from ..pipeline.export import ExportOptions
+        from ..pipeline.export import export as work
+
+        words = {name: value for name, value in given.items() if value is not None}
+        _refuse(to, words)
+        if cameras is not None:
+            words["cameras"] = tuple(name.strip() for name in cameras.split(","))
+        emit(work(thing, to, out, ExportOptions(**words), overwrite), _summary)
+
+
+def _refuse(format_: Any, given: dict[str, Any]) -> None:
+    """Refuse options that mean nothing for a format."""
+    from ..pipeline.export import OPTIONS
+    from ..schemas import UsageError
+
+    legal = OPTIONS[format_]
+    for name in given:
+        if name not in legal:
+            allowed = ", ".join(map(_option, legal)) or "no option of its own"
+            raise UsageError(f"{_option(name)} with --to {format_}: it means nothing there.", f"{allowed}.")
+
+
+def _option(name: str) -> str:
+    return "--" + name.removesuffix("_s").replace("_", "-")
+
+
+def _summary(result: ExportResult) -> str:
+    from .output import table, warnings
+
+    rows = [[name.replace("_", " "), _text(value)] for name, value in result.facts.items()]
+    return "\n".join([f"Wrote {result.out} ({result.format}).", table(rows), *warnings(result.notes)])
+
+
+def _text(value: float | str) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

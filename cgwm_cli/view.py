@@ -1,0 +1,54 @@
+"""`cgwm view`: a dataset or a model in the browser."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import Debug, Json, Quiet
+from .run import running
+
+if TYPE_CHECKING:
+    from ..schemas import ViewReport
+
+
+def view(
+    thing: Annotated[Path, typer.Argument(metavar="DATASET|MODEL", help="What to look at.", show_default=False)],
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port to listen at; 0: any free one.")] = 8080,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to listen at; with 0.0.0.0 everyone on the network can look.")
+    ] = "127.0.0.1",
+    open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Show a dataset's rollouts, or a model and its own motion, in the browser; Ctrl-C ends it."""
+    with contextlib.ExitStack() as ends:
+        with running(json=json, quiet=quiet, debug=debug) as emit:
+            from ..pipeline.view import open_view
+            from ..schemas import ViewReport
+
+            viewer = ends.enter_context(open_view(thing, host, port))
+            emit(ViewReport(url=viewer.url, showing=str(thing)), _summary)
+        if open_:
+            _open(viewer.url)
+        with contextlib.suppress(KeyboardInterrupt):
+            viewer.run()
+
+
+def _summary(report: ViewReport) -> str:
+    return f"Showing {report.showing} at {report.url} (Ctrl-C ends it)."
+
+
+def _open(url: str) -> None:
+    """Open a page where there is a screen; a browser in the terminal would take the terminal over."""
+    import os
+    import sys
+    import webbrowser
+
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(url)

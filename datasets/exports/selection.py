@@ -1,0 +1,143 @@
+"""What of a dataset is exported: which rollouts, cameras and frames; and their pictures, a few at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import InputDataError, UsageError, did_you_mean
+from ..cameras import Camera
+from ..dataset import missing_shards, read_manifest
+from ..loader import RolloutReader
+
+READ_FRAMES = 8
+"""Frames read at a time: those of a chunk, which is decoded as a whole."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One frame of one camera.
+
+    Attributes:
+        frame: Its number in the rollout.
+        image: uint8 RGB, shape (H, W, 3).
+        depth_m: float32 [m] along the optical axis, 0 = no surface, shape (H, W).
+        mask: uint8, visible instance: 0 background, k the k-th body, shape (H, W).
+        amodal: Whole silhouettes, hidden parts included, bool, shape (B, H, W); None where the dataset has none.
+    """
+
+    frame: int
+    image: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    amodal: NDArray[np.bool_] | None
+
+
+class Selection:
+    """Rollouts, cameras and frames of a dataset.
+
+    Args:
+        path: DATASET.
+        split: Only the rollouts of `mask/<split>`; all where left out.
+        cameras: Names of the cameras; all where left out.
+        every: Every n-th frame, beginning with the first.
+
+    Raises:
+        InputDataError: If `path` is no dataset, or has no images.
+        UsageError: If there is no such split or camera.
+    """
+
+    def __init__(self, path: Path, split: str | None = None, cameras: tuple[str, ...] | None = None, every: int = 1):
+        self.path = path
+        self.manifest = read_manifest(path)
+        self.reader = RolloutReader(path, split)
+        if len(self.reader) == 0:
+            raise InputDataError(f"{path}: no rollout{f' in the split {split!r}' if split else ''}.")
+        if every < 1:
+            raise UsageError(f"--every {every}: no step from frame to frame.", "1 or more.")
+        self.every = every
+        there = self.reader.cameras()
+        if not there:
+            raise InputDataError(
+                f"{path}: this dataset has states and no images.",
+                "a dataset whose model has visual spheres.",
+                "fit the model to photos, and synthesize again.",
+            )
+        for name in cameras or ():
+            if name not in there:
+                raise UsageError(f"{path} has no camera '{name}'.{did_you_mean(name, there)}", ", ".join(there))
+        self.cameras = tuple(cameras or there)
+
+    def __len__(self) -> int:
+        return len(self.reader)
+
+    @property
+    def notes(self) -> list[str]:
+        """Say what the dataset itself lacks."""
+        lacking = missing_shards(self.manifest)
+        return [f"the dataset lacks {len(lacking)} of {self.manifest.shard_count} shards"] if lacking else []
+
+    def frames(self, number: int) -> range:
+        """Return the frames of the rollout at place `number` that are exported."""
+        return range(0, self.reader.rollouts[number].frames, self.every)
+
+    def frame_rate_hz(self, number: int = 0) -> float:
+        """Return the exported frames per second.
+
+        Raises:
+            InputDataError: If they are not evenly spaced.
+        """
+        steps = np.diff(self.reader.read(number, "time"))
+        step = float(np.median(steps))
+        if np.abs(steps - step).max() > 1e-6 * max(1.0, step):
+            raise InputDataError(f"{self.path}: the frames of rollout {number} are not evenly spaced in time.")
+        return 1 / (step * self.every)
+
+    def bodies(self, number: int = 0) -> list[str]:
+        """Return the names of the bodies; body k has the value k + 1 in the masks."""
+        return [name.decode() for name in self.reader.read(number, "bodies/names")]
+
+    def camera(self, number: int, name: str, frame: int) -> Camera:
+        """Return a camera at a frame."""
+        there = f"cameras/{name}"
+        pose = self.reader.read(number, f"{there}/T_world_cam")
+        return Camera(
+            int(self.reader.read(number, f"{there}/width")),
+            int(self.reader.read(number, f"{there}/height")),
+            self.reader.read(number, f"{there}/K"),
+            self.reader.read(number, f"{there}/dist"),
+            pose if pose.ndim == 2 else pose[frame],
+        )
+
+    def pictures(self, number: int, camera: str, labels: bool = True) -> Iterator[Picture]:
+        """Yield the exported frames of a camera, reading a chunk at a time.
+
+        Args:
+            number: Place of the rollout in `reader`.
+            camera: The camera.
+            labels: Read depth and masks too; otherwise they are empty.
+        """
+        keys = [f"obs/{camera}_image"] + ([f"obs/{camera}_depth", f"obs/{camera}_mask"] if labels else [])
+        frames, last = self.frames(number), self.reader.rollouts[number].frames
+        for start in range(0, last, READ_FRAMES):
+            wanted = [frame for frame in range(start, min(start + READ_FRAMES, last)) if frame in frames]
+            if not wanted:
+                continue
+            block = self.reader.window(number, start, min(READ_FRAMES, last - start), keys)
+            amodal = self._amodal(number, camera, start, min(start + READ_FRAMES, last)) if labels else None
+            for frame in wanted:
+                image, *others = (block[key][frame - start] for key in keys)
+                depth, mask = others or (np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint8))
+                yield Picture(frame, image, depth, mask, None if amodal is None else amodal[frame - start])
+
+    def _amodal(self, number: int, camera: str, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Return the whole silhouettes of a chunk, shape (n, B, H, W); bit k of a pixel is body k's."""
+        key = f"obs/{camera}_amodal"
+        if key not in self.reader.group(number):
+            return None
+        bits = self.reader.read(number, key, start, stop)
+        return np.stack([(bits >> body) & 1 for body in range(len(self.bodies(number)))], axis=1).astype(bool)

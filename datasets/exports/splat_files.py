@@ -1,0 +1,73 @@
+"""A model's visual spheres as .ply of 3D Gaussian splatting: one file of all, or a folder with one for each part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..atomic import new_directory
+from ..colmap_model import rotation_from_quat_wxyz
+from ..models import Model
+from ..ply import Splats, write_splats
+
+
+def write_splat_files(path: Path, model: Model, sh_degree: int = 0, overwrite: bool = False) -> dict[str, int]:
+    """Write the spheres; return how many are in which file.
+
+    Args:
+        path: A name that ends in .ply takes all of them, bodies at their photo poses, in the world's frame. Any other
+            becomes a folder with `scene.ply` (world frame) and `<body>.ply` (body frame).
+        model: A model with visual spheres.
+        sh_degree: Pad with zeros up to this degree of harmonics; INRIA's own loader wants 3.
+        overwrite: Replace what exists.
+    """
+    if path.suffix.lower() == ".ply":
+        whole = in_world(model)
+        write_splats(path, whole, "world", sh_degree, overwrite)
+        return {path.name: len(whole)}
+    counts: dict[str, int] = {}
+    with new_directory(path, overwrite) as folder:
+        if model.scene is not None:
+            write_splats(folder / "scene.ply", model.scene, "world", sh_degree)
+            counts["scene.ply"] = len(model.scene)
+        for name, splats in model.body_splats.items():
+            file = f"{name}.ply" if f"{name}.ply" not in counts else f"{name}-body.ply"
+            write_splats(folder / file, splats, "body", sh_degree)
+            counts[file] = len(splats)
+    return counts
+
+
+def in_world(model: Model, poses: dict[str, tuple[np.ndarray, np.ndarray]] | None = None) -> Splats:
+    """Return all visual spheres in the world's frame.
+
+    Args:
+        model: A model with visual spheres.
+        poses: position_m (3,) and quat_wxyz (4,) by body; the photo poses where left out.
+    """
+    parts = [] if model.scene is None else [model.scene]
+    for name, splats in model.body_splats.items():
+        photo = model.body(name).photo_pose
+        position, quat = (poses or {}).get(name, (np.array(photo.position_m), np.array(photo.quat_wxyz)))
+        rotation = rotation_from_quat_wxyz(quat)
+        normals = None if splats.normals is None else splats.normals @ rotation.T
+        parts.append(replace(splats, means=splats.means @ rotation.T + position, normals=normals))
+    return _joined(parts)
+
+
+def _joined(parts: list[Splats]) -> Splats:
+    fields = ("means", "scales", "opacities", "colors")
+    terms = max((part.harmonics.shape[1] for part in parts if part.harmonics is not None), default=0)
+    harmonics = None
+    if terms:
+        zeros = [np.zeros((len(part), terms, 3)) for part in parts]
+        for zero, part in zip(zeros, parts, strict=True):
+            if part.harmonics is not None:
+                zero[:, : part.harmonics.shape[1]] = part.harmonics
+        harmonics = np.concatenate(zeros)
+    # unknown normals are zeros in the file
+    normals = [np.zeros((len(part), 3)) if part.normals is None else part.normals for part in parts]
+    some = any(part.normals is not None for part in parts)
+    joined = [np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in fields]
+    return Splats(*joined, normals=np.concatenate(normals) if some else None, harmonics=harmonics)

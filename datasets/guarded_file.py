@@ -1,0 +1,75 @@
+"""A file for HDF5 that never fails: what goes wrong is kept, for the writer to tell, instead of told to HDF5.
+
+HDF5 cannot close a file that it could not write to the end: on a full disk h5py 3.16 crashes the process at its exit.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+
+class GuardedFile(io.RawIOBase):
+    """The file object that h5py's driver `fileobj` asks for.
+
+    Attributes:
+        error: The first write that failed; what is written after it is lost, and the file is worth nothing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0), 0o666)
+        self._place = 0
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of the data at the current place."""
+        view = memoryview(data).cast("B")
+        size = len(view)
+        try:
+            os.lseek(self._descriptor, self._place, os.SEEK_SET)
+            while self.error is None and len(view):
+                view = view[os.write(self._descriptor, view) :]
+        except OSError as error:
+            self.error = error
+        self._place += size
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """Read at the current place; zeros where the file ends."""
+        view = memoryview(buffer).cast("B")
+        os.lseek(self._descriptor, self._place, os.SEEK_SET)
+        done = 0
+        while done < len(view) and (part := os.read(self._descriptor, len(view) - done)):
+            view[done : done + len(part)] = part
+            done += len(part)
+        view[done:] = bytes(len(view) - done)
+        self._place += len(view)
+        return len(view)
+
+    def seek(self, place: int, origin: int = os.SEEK_SET) -> int:
+        """Go to a place of the file."""
+        if origin == os.SEEK_END:
+            place += os.fstat(self._descriptor).st_size
+        self._place = place + (self._place if origin == os.SEEK_CUR else 0)
+        return self._place
+
+    def tell(self) -> int:
+        """Return the current place."""
+        return self._place
+
+    def truncate(self, size: int | None = None) -> int:
+        """Make the file so long."""
+        length = self._place if size is None else size
+        try:
+            os.ftruncate(self._descriptor, length)
+        except OSError as error:
+            self.error = self.error or error
+        return length
+
+    def close(self) -> None:
+        """Close the file."""
+        if not self.closed:
+            os.close(self._descriptor)
+        super().close()

@@ -1,0 +1,152 @@
+"""One rollout in its file: its images chunk by chunk, and what is known of them at the end."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .cameras import Camera
+from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked
+from .described import new_dataset, new_group, put, write_number, write_text
+from .rollout_tables import link_next_observations, write_tables
+from .rollouts import Node, RolloutLabels, amodal_dtype
+
+_IMAGES = {
+    "image": ("1", "row, column, RGB", "(T, H, W, 3)", "Rendered colour, 0 to 255."),
+    "depth": ("m", "row, column", "(T, H, W)", "Depth along the optical axis of what the mask names; 0 = no surface."),
+    "mask": ("1", "row, column", "(T, H, W)", "Visible instance: 0 = background, k = the k-th body."),
+    "amodal": (
+        "1",
+        "row, column; bit k - 1 of a pixel belongs to the k-th body",
+        "(T, H, W)",
+        "Amodal masks as bits: (pixel >> (k - 1)) & 1 is 1 where the k-th body would be seen if it were alone, hidden "
+        "or not.",
+    ),
+}
+_JPEG = (
+    "1",
+    "bytes of a JPEG file, filled up with zeros",
+    "(T, longest)",
+    "Rendered colour, lossy: decode each row with any JPEG reader (cv2.imdecode), to height x width, RGB.",
+)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A block on its way: what it is, and its images as they will stand in the file, by name."""
+
+    camera: str
+    start: int
+    count: int
+    size: int
+    visible_px: np.ndarray
+    amodal_px: np.ndarray
+    images: Future[dict[str, Any]]
+
+
+def chunk_frames_of(frames: int) -> int:
+    """Return how many frames a chunk has, of a rollout of so many."""
+    return min(CHUNK_FRAMES, frames)
+
+
+class Demo:
+    """One rollout while it is written.
+
+    Args:
+        data: The group of all rollouts.
+        labels: All but its images, which is written at once.
+        compression: Of its images.
+    """
+
+    def __init__(self, data: Node, labels: RolloutLabels, compression: Compression) -> None:
+        self.labels = labels
+        self._group = new_group(data, f"demo_{labels.episode_index}")
+        self._obs: Node = write_tables(self._group, labels)
+        self._compression: Compression = compression
+        count, bodies = len(labels.time_s), len(labels.bodies)
+        cameras = labels.cameras or {}
+        self._counts = {name: np.full((2, count, bodies), -1, np.int32) for name in cameras}
+        self._jpegs: dict[str, dict[int, np.ndarray]] = {name: {} for name in cameras}
+        self._images = {name: self._datasets(name, camera, count, bodies) for name, camera in cameras.items()}
+
+    def _datasets(self, name: str, camera: Camera, count: int, bodies: int) -> dict[str, Any]:
+        size = (camera.height, camera.width)
+        kinds = {
+            "image": (np.dtype(np.uint8), (*size, 3)),
+            "depth": (np.dtype(np.float32), size),
+            "mask": (np.dtype(np.uint8), size),
+            "amodal": (amodal_dtype(bodies), size),
+        }
+        if self._compression == "jpeg":
+            del kinds["image"]
+        made: dict[str, Any] = {}
+        for key, (dtype, shape) in kinds.items():
+            properties = chunked(self._compression, dtype, (chunk_frames_of(count), *shape))
+            unit, order, axes, text = _IMAGES[key]
+            texts = (unit, f"image of camera {name}", order, axes, text)
+            made[key] = new_dataset(self._obs, f"{name}_{key}", dtype, (count, *shape), properties, *texts)
+        return made
+
+    def write(self, chunk: Chunk) -> None:
+        """Put a chunk's images in their place."""
+        stop = chunk.start + chunk.count
+        for key, data in chunk.images.result().items():
+            if key == "jpeg":
+                self._jpegs[chunk.camera].update(zip(range(chunk.start, stop), data, strict=True))
+                continue
+            made = self._images[chunk.camera][key]
+            made.write_direct_chunk((chunk.start, *(0 for _ in made.shape[1:])), data)
+        self._counts[chunk.camera][:, chunk.start : stop] = chunk.visible_px, chunk.amodal_px
+
+    def finish(self) -> None:
+        """Write what needs all frames.
+
+        Raises:
+            ValueError: If some frames were not written.
+        """
+        for name, counts in self._counts.items():
+            lacking = int((counts[0, :, 0] < 0).sum())
+            if lacking:
+                raise ValueError(f"camera {name}: {lacking} of {counts.shape[1]} frames were not written")
+        if self._counts:
+            self._write_visibility()
+        if self._compression == "jpeg":
+            for name, camera in (self.labels.cameras or {}).items():
+                self._write_jpegs(name, camera)
+        link_next_observations(self._group, self._obs)
+
+    def _write_visibility(self) -> None:
+        bodies = self._group["bodies"]
+        counts = np.stack([self._counts[name] for name in sorted(self._counts)], axis=2)
+        visible, whole = counts
+        fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
+        axes, cameras = "(T, camera, body)", "cameras in the order of their names"
+        texts = {
+            "visible_px": (visible, "px", f"Pixels of the body in the mask; {cameras}."),
+            "amodal_px": (whole, "px", f"Pixels of the body in the image, hidden ones too; {cameras}."),
+            "visible_fraction": (
+                fraction,
+                "1",
+                f"visible_px over amodal_px: how much of what is in the image is not hidden, 0 where nothing is; "
+                f"{cameras}.",
+            ),
+        }
+        for name, (values, unit, text) in texts.items():
+            put(bodies, name, values, unit, "image", "-", axes, text)
+
+    def _write_jpegs(self, name: str, camera: Camera) -> None:
+        files = [data for _, data in sorted(self._jpegs[name].items())]
+        rows = np.zeros((len(files), max(map(len, files))), np.uint8)
+        for row, data in zip(rows, files, strict=True):
+            row[: len(data)] = data
+        unit, order, axes, text = _JPEG
+        # not in chunks: a frame is read without its neighbours
+        made = put(
+            self._obs, f"{name}_image", rows, unit, f"image of camera {name}", order, axes, text, in_chunks=False
+        )
+        write_text(made, b"encoding", "jpeg")
+        for key, value in {"quality": JPEG_QUALITY, "height": camera.height, "width": camera.width}.items():
+            write_number(made, key, np.int64(value))

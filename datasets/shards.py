@@ -1,0 +1,169 @@
+"""The shards of a dataset: their names, their rollouts, their entries, and whether they are still what they were.
+
+Each shard has an entry file beside it, `rollouts-0003-of-0064.json`, with its sha256, which is written first. So
+shards that end at the same moment on many machines change no file together, and need no lock: every file appears by
+a rename, which network file systems do at once too. `cgwm merge` gathers the entries in `dataset.json`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import h5py
+
+from ..schemas import DatasetManifest, InputDataError, ShardEntry, read_json
+from .atomic import leftovers, new_file, sha256
+from .rollouts import Node, demo_names, open_shard
+
+SHARD = re.compile(r"rollouts-(\d{4,})-of-(\d{4,})\.h5")
+
+
+def shard_name(index: int, count: int) -> str:
+    """Return the file name of a shard, numbered from 0: ``rollouts-0003-of-0064.h5``."""
+    return f"rollouts-{index:04d}-of-{count:04d}.h5"
+
+
+def shard_range(rollouts: int, count: int, index: int) -> range:
+    """Return the rollouts of a shard: successive ones, in shares that differ by at most one.
+
+    >>> [list(shard_range(5, 2, index)) for index in (0, 1)]
+    [[0, 1], [2, 3, 4]]
+    """
+    return range(rollouts * index // count, rollouts * (index + 1) // count)
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Write numbers as SLURM's --array takes them.
+
+    >>> ranges([0, 1, 2, 5, 7, 8])
+    '0-2,5,7-8'
+    """
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+
+
+def entry_file(path: Path, shard: str) -> Path:
+    """Return where the entry of a shard lies until the shards are merged."""
+    return (path / shard).with_suffix(".json")
+
+
+def write_entry(path: Path, entry: ShardEntry) -> None:
+    """Write the entry of a shard that is about to get its name."""
+    with new_file(entry_file(path, entry.file), overwrite=True) as temporary:
+        temporary.write_text(entry.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def gathered(path: Path, listed: DatasetManifest) -> DatasetManifest:
+    """Return a manifest with the shards that came since it was written; an entry of its own says more than the list.
+
+    An entry whose shard is not there is that of a task that was killed between the two: the shard is missing.
+    """
+    entries = {entry.index: entry for entry in listed.shards}
+    for file in sorted(path.glob("rollouts-*-of-*.json")):
+        if SHARD.fullmatch(file.with_suffix(".h5").name) and file.with_suffix(".h5").is_file():
+            entry = read_json(file, ShardEntry)
+            entries[entry.index] = entry
+    return listed.model_copy(update={"shards": tuple(entries[index] for index in sorted(entries))})
+
+
+def shard_fault(file: Path, entry: ShardEntry, hashes: bool = True) -> str | None:
+    """Say in one sentence why a shard is not what was written, or return None.
+
+    Args:
+        file: Where the shard lies.
+        entry: Its entry in the manifest.
+        hashes: Compare its bytes too, not only their number.
+    """
+    if not file.is_file():
+        return f"{file.name}: listed in dataset.json, but no such file."
+    size = file.stat().st_size
+    if not hashes:
+        return None if size == entry.bytes else f"{file.name}: {size} bytes; dataset.json says {entry.bytes}."
+    if sha256(file) == entry.sha256:
+        return None
+    place = unreadable_block(file)
+    how = f"{place} cannot be read." if place else "changed since it was written; all its blocks can be read."
+    return f"{file.name}: its sha256 differs from dataset.json: {how}"
+
+
+def unreadable_block(file: Path) -> str | None:
+    """Return the first array whose blocks fail their checksum or cannot be unpacked, with its frames, or None."""
+    found: list[str] = []
+
+    def visit(name: str, item: object) -> bool | None:
+        if isinstance(item, h5py.Dataset) and not item.is_virtual:
+            blocks = item.iter_chunks() if item.chunks else [()]
+            for block in blocks:
+                try:
+                    item[block]
+                except OSError:
+                    rows = block[0] if block else slice(0, 1)
+                    found.append(f"{name}, rows {rows.start} to {rows.stop - 1},")
+                    return True
+        return None
+
+    try:
+        with open_shard(file) as handle:
+            handle.visititems(visit)
+    except (InputDataError, OSError, RuntimeError, KeyError) as error:
+        return f"the HDF5 structure ({str(error).splitlines()[0][:120]})"
+    return found[0] if found else None
+
+
+def contact_count(file: Path) -> int:
+    """Return the number of contact labels in a shard."""
+    with open_shard(file) as handle:
+        data: Node = handle["data"]
+        return sum(len(demo["contacts"]["body_a"]) for demo in data.values())
+
+
+def foreign(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_json: str) -> str | None:
+    """Say in one sentence why a whole shard does not belong to a dataset, or return None.
+
+    Args:
+        file: The shard.
+        entry: Its entry.
+        manifest: The dataset's.
+        config_json: The dataset's settings, as the shards carry them.
+    """
+    return next(_strange(file, entry, manifest, config_json), None)
+
+
+def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_json: str) -> Iterator[str]:
+    if entry.model_sha256 not in (None, manifest.model_sha256):
+        yield f"{file.name}: made from another model ({entry.model_sha256}; the dataset's is {manifest.model_sha256})."
+    for name, version in entry.versions.items():
+        if manifest.versions.get(name) != version:
+            yield f"{file.name}: made with {name} {version}; the dataset's is {manifest.versions.get(name, 'none')}."
+    with open_shard(file) as handle:
+        attributes: Node = handle.attrs
+        if int(attributes["seed"]) != manifest.config.get("seed"):
+            yield f"{file.name}: made with seed {attributes['seed']}; the dataset's is {manifest.config.get('seed')}."
+        if attributes["config_json"] != config_json:
+            yield f"{file.name}: made with other settings (its attribute config_json)."
+        found = [int(name.removeprefix("demo_")) for name in demo_names(handle)]
+    wanted = shard_range(manifest.rollouts, manifest.shard_count, entry.index)
+    if not set(found) <= set(wanted):  # fewer are right: rollouts that diverge are left out
+        yield f"{file.name}: holds the rollouts {ranges(found)}; its number stands for {ranges(wanted)}."
+    if len(found) != entry.rollouts:
+        yield f"{file.name}: holds {len(found)} rollouts; its entry says {entry.rollouts}."
+
+
+def tidied(path: Path) -> list[str]:
+    """Remove what dead processes of this machine left of a dataset's shards; return what may be in use elsewhere."""
+    beside = re.compile(rf"{re.escape(path.name)}\.{SHARD.pattern}")
+    inside = re.compile(r"rollouts-\d+-of-\d+\.json|index\.h5|dataset\.json")
+    kept: list[str] = []
+    for folder, names in ((path.parent, beside), (path, inside)):
+        dead, unknown = leftovers(folder, names)
+        for file in dead:
+            file.unlink(missing_ok=True)
+        kept += [str(file) for file in unknown]
+    return kept

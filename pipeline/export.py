@@ -1,0 +1,247 @@
+"""The stage export: a dataset or a model in the format of another tool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..datasets.atomic import new_file, refuse_existing
+from ..datasets.cameras import read_cameras
+from ..datasets.capture import Capture
+from ..datasets.exports.bop import write_bop
+from ..datasets.exports.bop_models import ObjectModel
+from ..datasets.exports.colmap import write_colmap
+from ..datasets.exports.glb import write_glb
+from ..datasets.exports.lerobot import write_lerobot
+from ..datasets.exports.nerfstudio import MaskUse, write_nerfstudio
+from ..datasets.exports.selection import Selection
+from ..datasets.exports.splat_files import in_world, write_splat_files
+from ..datasets.kinds import Kind, kind_of, refuse_other_kind
+from ..datasets.mjcf import write_mjcf
+from ..datasets.models import Model, read_model
+from ..schemas import ExportFormat, ExportResult, InputDataError, UsageError
+
+DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio")
+MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "ply", "colmap", "glb")
+SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "glb": ".glb"}
+"""What the name of a single file ends with."""
+
+LEROBOT_NOTES = (
+    "videos are lossy: the HDF5 file stays the master",
+    "depth, masks and contacts are left out; cameras and parameters are in meta/cgwm.json",
+)
+BOP_NOTE = "the objects' meshes are the surface of their colliding spheres"
+NERFSTUDIO_NOTE = (
+    "time runs from 0 to 1; nerfstudio keeps the metres with --orientation-method none --center-method none "
+    "--auto-scale-poses False"
+)
+NO_TURNING = "in the .ply and .glb the bodies have the light of the photos, however they are turned"
+NO_DRIVEN = "driven bodies are mocap bodies, whose speed MuJoCo's friction does not know"
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What is asked for beyond the format; each format takes its own (see :data:`OPTIONS`).
+
+    Attributes:
+        split: Only the rollouts of `mask/<split>`.
+        cameras: Only these cameras of the dataset.
+        every: Every n-th frame.
+        task: LeRobot's task text.
+        rollout: Global index of the rollout.
+        mask: Which pixels nerfstudio's masks keep.
+        sh_degree: Degree of harmonics to pad the .ply to.
+        capture: The capture whose photos' cameras are taken.
+        seed: Seed of the start that is simulated again.
+        duration_s: How long that is simulated.
+    """
+
+    split: str | None = None
+    cameras: tuple[str, ...] | None = None
+    every: int = 1
+    task: str | None = None
+    rollout: int = 0
+    mask: MaskUse = "none"
+    sh_degree: int = 0
+    capture: Path | None = None
+    seed: int = 0
+    duration_s: float = 1.0
+
+
+OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
+    "lerobot": ("split", "cameras", "every", "task"),
+    "bop": ("split", "cameras", "every"),
+    "nerfstudio": ("rollout", "cameras", "every", "mask"),
+    "mjcf": ("seed", "duration_s"),
+    "ply": ("sh_degree",),
+    "colmap": ("capture",),
+    "glb": (),
+}
+"""Which options mean something for which format."""
+
+Facts = dict[str, int | float | str]
+
+
+def export(
+    thing: Path, format_: ExportFormat, out: Path, options: ExportOptions | None = None, overwrite: bool = False
+) -> ExportResult:
+    """Write a dataset or a model in another format.
+
+    Args:
+        thing: DATASET for lerobot, bop and nerfstudio; MODEL for mjcf, ply, colmap and glb.
+        format_: The format.
+        out: The file (.xml, .glb, .ply) or directory to write; it appears when it is complete.
+        options: What else is asked for.
+        overwrite: Replace what exists.
+
+    Raises:
+        InputDataError: If `thing` is of another kind, or lacks what the format needs.
+        UsageError: If `out` exists, or an option names what is not there.
+    """
+    thing, out, chosen = Path(thing), Path(out), options or ExportOptions()
+    _refuse_kind(thing, format_)
+    suffix = SUFFIXES.get(format_)
+    if suffix and out.suffix.lower() != suffix:
+        raise UsageError(f"--out {out}: --to {format_} writes one file.", f"a name that ends in {suffix}.")
+    refuse_existing(out, overwrite)
+    facts, notes = _WORK[format_](thing, out, chosen, overwrite)
+    return ExportResult(source=str(thing), format=format_, out=str(out), facts=facts, notes=tuple(notes))
+
+
+def _refuse_kind(thing: Path, format_: ExportFormat) -> None:
+    wanted: Kind = "dataset" if format_ in DATASET_FORMATS else "model"
+    found = kind_of(thing)
+    if found is not None and found != wanted:
+        raise InputDataError(
+            f"{thing} is a {found}; --to {format_} takes a {wanted}.",
+            f"of a dataset: {', '.join(DATASET_FORMATS)}; of a model: {', '.join(MODEL_FORMATS)}.",
+        )
+    refuse_other_kind(thing, wanted)
+
+
+def _lerobot(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    chosen = Selection(thing, options.split, options.cameras, options.every)
+    return write_lerobot(out, chosen, options.task, overwrite), [*chosen.notes, *LEROBOT_NOTES]
+
+
+def _bop(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    chosen = Selection(thing, options.split, options.cameras, options.every)
+    model = read_model(thing / chosen.manifest.model)
+    meshes = {name: object_model(model, name) for name in chosen.bodies()}
+    counts, notes = write_bop(out, chosen, meshes, overwrite)
+    return {**counts}, [*chosen.notes, BOP_NOTE, *notes]
+
+
+def _nerfstudio(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    chosen = Selection(thing, None, options.cameras, options.every)
+    return write_nerfstudio(out, chosen, options.rollout, options.mask, overwrite), [*chosen.notes, NERFSTUDIO_NOTE]
+
+
+def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    from .resimulate import AFTER_CONTACT_S, keyframe_of, resimulate, start_of
+
+    model = _simulated(thing)
+    start = start_of(model, options.seed, options.duration_s)
+    text = write_mjcf(model, keyframe=keyframe_of(start), source=f"cgwm, of {model.file.provenance.capture}")
+    away = resimulate(model, text, start, options.duration_s)
+    with new_file(out, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    facts: Facts = {"duration_s": away.duration_s}
+    if away.first_contact_s is not None:
+        facts["first_contact_s"] = away.first_contact_s
+    after = f"{AFTER_CONTACT_S:g}_s_after_contact"
+    for name, part in (("in_flight", away.flight), (f"until_{after}", away.impact), ("at_the_end", away.end)):
+        if part is not None:
+            facts |= {f"deviation_{name}_mm": part[0], f"deviation_{name}_deg": part[1]}
+    notes = [f"the effect {effect.name} is not in the MJCF" for effect in model.file.effects]
+    driven = any(body.motion == "driven" for body in model.file.bodies)
+    return facts, notes + ([NO_DRIVEN] if driven else [])
+
+
+def _ply(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    model = _visible(thing)
+    if not 0 <= options.sh_degree <= 3:
+        raise UsageError(f"--sh-degree {options.sh_degree}: no degree of harmonics.", "0 to 3.")
+    counts = write_splat_files(out, model, options.sh_degree, overwrite)
+    return {f"{name}_spheres": count for name, count in counts.items()}, _light_notes(model)
+
+
+def _glb(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    model = _visible(thing)
+    counts = write_glb(out, model, overwrite)
+    return {f"{name}_spheres": count for name, count in counts.items()}, _light_notes(model)
+
+
+def _colmap(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    model, capture = _visible(thing), options.capture
+    # what the fit refined comes before what it began with
+    cameras = model.cameras
+    if cameras is None and capture is not None:
+        cameras = read_cameras(Capture.open(capture, check=False).root)
+    if cameras is None or not cameras.images:
+        raise InputDataError(
+            f"{thing if capture is None else capture}: no cameras of photos in it.",
+            "a model whose fit refined the cameras (cameras.json), or the capture with the photos' cameras.",
+            f"cgwm export {thing} --to colmap --capture CAPTURE --out {out}",
+        )
+    photos = None if capture is None else capture / "images"
+    counts = write_colmap(out, cameras, in_world(model), photos, overwrite)
+    notes = [] if cameras.scale.kind == "metric" else ["the cameras are unscaled: their unit is no metre"]
+    if capture is None:
+        notes.append("without --capture the photos were not copied")
+    return {**counts}, notes
+
+
+def object_model(model: Model, name: str) -> ObjectModel:
+    """Return the surface of a body's colliding spheres, coloured by the nearest visual sphere; grey without one."""
+    from .splats.surface_nets import union_mesh
+
+    body, spheres = model.body(name), model.collision[name]
+    means = np.asarray(spheres.means, np.float64)
+    radii = np.asarray(spheres.scales, np.float64) * body.radius_factor
+    vertices, faces = union_mesh(means, radii)
+    colors = np.full((len(vertices), 3), 128, np.uint8)
+    visual = model.body_splats.get(name)
+    if visual is not None:
+        nearest = KDTree(visual.means).query(vertices)[1]
+        colors = np.round(np.clip(np.asarray(visual.colors)[nearest], 0, 1) * 255).astype(np.uint8)
+    off = body.collision_distance_m
+    far = "" if off is None else f", at most {1e3 * off:.2g} mm from the fitted surface"
+    return ObjectModel(vertices, faces, colors, f"surface of {len(means)} colliding spheres{far}")
+
+
+def _simulated(thing: Path) -> Model:
+    model = read_model(thing)
+    lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
+    if lacking or model.file.contact is None:
+        what = f"the body '{lacking[0]}' has no colliding spheres" if lacking else "its physics are not fitted"
+        raise InputDataError(f"{thing}: {what}.", todo="fit it: cgwm fit CAPTURE --out MODEL.")
+    return model
+
+
+def _visible(thing: Path) -> Model:
+    model = read_model(thing)
+    if model.visual_count == 0:
+        raise InputDataError(
+            f"{thing}: the model has no visual spheres.", todo="fit it to photos: cgwm fit CAPTURE --out MODEL."
+        )
+    return model
+
+
+def _light_notes(model: Model) -> list[str]:
+    return [] if model.file.light is None else [NO_TURNING]
+
+
+_WORK: dict[ExportFormat, Callable[[Path, Path, ExportOptions, bool], tuple[Facts, list[str]]]] = {
+    "lerobot": _lerobot,
+    "bop": _bop,
+    "nerfstudio": _nerfstudio,
+    "mjcf": _mjcf,
+    "ply": _ply,
+    "colmap": _colmap,
+    "glb": _glb,
+}

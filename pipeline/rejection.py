@@ -1,0 +1,173 @@
+"""Which rollouts a plan draws again, and the loop that draws until enough are accepted.
+
+A rollout's draws depend on the seed, its number and the attempt alone, so neither sharding nor batches change them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from ..datasets.models import Model
+from ..datasets.rollouts import RolloutLabels
+from ..schemas import NotConvergedError, RejectionRules
+from .rollout_batches import Diverged
+from .sampling import Extent, extent, rotation_matrix, up_direction
+
+DrawT = TypeVar("DrawT")
+DIVERGED = "diverged"
+"""What a draw that did not stay finite is counted as, beside those that broke a rule."""
+MOST_DIVERGED = 5
+"""Draws of one rollout that may diverge: then the fault is in the model, not in the draw."""
+REMEDY = {
+    "off_table_m": "slow the starts down, shorten the rollouts or raise off_table_m",
+    "no_contact": "start lower, aim the pusher better (push_miss) or lengthen the rollouts",
+    "penetration_m": "slow the starts down or raise penetration_m",
+    "unrest_m_s": "lengthen the rollouts or raise unrest_m_s",
+    "unseen_share": "move the cameras back (view_distance_m) or raise unseen_share",
+}
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """The rules of a plan for a model.
+
+    Attributes:
+        rules: The rules.
+        extents: Bounding spheres of the bodies.
+        home_m: Where the photos show the middles of the bodies' bounding spheres [m], world, shape (B, 3).
+        up: The ground's normal, shape (3,).
+    """
+
+    rules: RejectionRules
+    extents: tuple[Extent, ...]
+    home_m: np.ndarray
+    up: np.ndarray
+
+    @staticmethod
+    def of(model: Model, rules: RejectionRules) -> Rejection:
+        """Prepare the rules for a model."""
+        extents = tuple(extent(model, body) for body in model.file.bodies)
+        poses = [body.photo_pose for body in model.file.bodies]
+        home = np.array(
+            [
+                rotation_matrix(np.array(pose.quat_wxyz)) @ size.center_m + pose.position_m
+                for pose, size in zip(poses, extents, strict=True)
+            ]
+        )
+        return Rejection(rules, extents, home, up_direction(model.file))
+
+    def reason(self, labels: RolloutLabels) -> str | None:
+        """Return the name of the first rule that a rollout breaks; None where it is accepted."""
+        free = [index for index, motion in enumerate(labels.motions) if motion == "free"]
+        centers = {
+            index: labels.position_m[:, index]
+            + rotation_matrix(labels.quat_wxyz[:, index]) @ self.extents[index].center_m
+            for index in free
+        }
+        rules = self.rules
+        if rules.off_table_m is not None:
+            for index, center in centers.items():
+                away = center - self.home_m[index]
+                level = away - (away @ self.up)[:, None] * self.up
+                if np.linalg.norm(level, axis=1).max() > rules.off_table_m:
+                    return "off_table_m"
+        if rules.no_contact and not self._touched(labels, free):
+            return "no_contact"
+        if rules.penetration_m is not None:
+            deepest = -labels.contacts.distance_m.min(initial=0.0)
+            if deepest > rules.penetration_m:
+                return "penetration_m"
+        if rules.unrest_m_s is not None:
+            for index in free:
+                spin = float(np.linalg.norm(labels.omega_body_rad_s[-1, index])) * self.extents[index].radius_m
+                if np.linalg.norm(labels.velocity_m_s[-1, index]) + spin > rules.unrest_m_s:
+                    return "unrest_m_s"
+        if rules.unseen_share is not None and labels.cameras:
+            for center in centers.values():
+                if self._unseen_share(labels, center) > rules.unseen_share:
+                    return "unseen_share"
+        return None
+
+    @staticmethod
+    def _touched(labels: RolloutLabels, free: Sequence[int]) -> bool:
+        a, b = labels.contacts.body_a, labels.contacts.body_b
+        pushed = np.abs(labels.contacts.impulse_n_s).max(-1, initial=0.0) > 0
+        driven = [index for index, motion in enumerate(labels.motions) if motion == "driven"]
+        if driven:
+            pair = (np.isin(a, free) & np.isin(b, driven)) | (np.isin(a, driven) & np.isin(b, free))
+        else:
+            pair = np.isin(a, free) | np.isin(b, free)
+        return bool((pair & pushed).any())
+
+    @staticmethod
+    def _unseen_share(labels: RolloutLabels, center: np.ndarray) -> float:
+        seen = np.zeros(len(center), bool)
+        for camera in (labels.cameras or {}).values():
+            pixels, depth = camera.project(center)
+            inside = (pixels >= 0).all(1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
+            seen |= (depth > 0) & inside
+        return float(1.0 - seen.mean())
+
+
+def accepted_rollouts(
+    indices: Sequence[int],
+    draw: Callable[[int, int], DrawT],
+    simulate: Callable[[Sequence[DrawT]], Sequence[RolloutLabels | Diverged]],
+    reason: Callable[[RolloutLabels], str | None],
+    attempts: int,
+    rejected: Counter[str],
+) -> Iterator[tuple[DrawT, RolloutLabels]]:
+    """Yield the accepted rollout of each number, in order: what is rejected is drawn again, the batch's rest waits.
+
+    Args:
+        indices: Global numbers of the rollouts of a batch.
+        draw: Draws the rollout of a number at an attempt.
+        simulate: Simulates draws, in their order.
+        reason: Names the rule that a rollout breaks, or None.
+        attempts: Most draws for one rollout.
+        rejected: Counts the rejected draws by rule, in place; those that diverged under `DIVERGED`.
+
+    Raises:
+        NotConvergedError: If all draws for a rollout are rejected, with the count by rule; or `MOST_DIVERGED` of them
+            diverged, with where the last one began.
+    """
+    found: dict[int, tuple[DrawT, RolloutLabels]] = {}
+    broken: dict[int, Counter[str]] = {index: Counter() for index in indices}
+    waiting = list(indices)
+    for attempt in range(attempts):
+        draws = [draw(index, attempt) for index in waiting]
+        again = []
+        for index, drawn, result in zip(waiting, draws, simulate(draws), strict=True):
+            if isinstance(result, Diverged):
+                rule = DIVERGED
+                if broken[index][rule] + 1 >= min(MOST_DIVERGED, attempts):
+                    raise result.error
+            else:
+                rule = reason(result)
+                if rule is None:
+                    found[index] = drawn, result
+                    continue
+            broken[index][rule] += 1
+            rejected[rule] += 1
+            again.append(index)
+        waiting = again
+        if not waiting:
+            break
+    if waiting:
+        raise _exhausted(waiting[0], attempts, broken[waiting[0]])
+    for index in indices:
+        yield found[index]
+
+
+def _exhausted(index: int, attempts: int, broken: Mapping[str, int]) -> NotConvergedError:
+    counts = ", ".join(f"{rule} {count}" for rule, count in sorted(broken.items(), key=lambda item: -item[1]))
+    worst = max((rule for rule in broken if rule in REMEDY), key=lambda rule: broken[rule])
+    return NotConvergedError(
+        f"the plan's rules rejected all {attempts} draws for rollout {index}: {counts}.",
+        todo=f"{REMEDY[worst]}, under [reject].",
+    )

@@ -1,0 +1,135 @@
+"""How far MuJoCo's simulation of an exported model is from our own engine's rollout."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+
+from ..datasets.mjcf import Keyframe
+from ..datasets.models import Model
+from ..datasets.tracks import Track
+from ..schemas import SamplingPlan
+from .physics.checks import require_finite
+from .physics.rollout import simulate
+from .physics.world import State, World
+from .sampling import Start, draw_start, resolve_plan
+
+mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs, so a checker knows none of its names
+
+FRAME_S = 0.01
+AFTER_CONTACT_S = 0.1
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """MuJoCo against our engine, the largest over the free bodies; None where that part of the motion is missing.
+
+    Attributes:
+        duration_s: Length of the rollout [s].
+        first_contact_s: When something touches in our engine [s]; None: never.
+        flight: Largest position [mm] and rotation [deg] deviation before that.
+        impact: Largest ones up to `AFTER_CONTACT_S` after it.
+        end: Those of the last frame.
+    """
+
+    duration_s: float
+    first_contact_s: float | None
+    flight: tuple[float, float] | None
+    impact: tuple[float, float] | None
+    end: tuple[float, float]
+
+
+def start_of(model: Model, seed: int, duration_s: float) -> Start:
+    """Draw the start that `cgwm synthesize` would draw for its rollout 0, parameters at their estimate."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+    return draw_start(model, resolve_plan(model, SamplingPlan()), duration_s, rng)
+
+
+def keyframe_of(start: Start) -> Keyframe:
+    """Return a start as a keyframe of MJCF."""
+    return Keyframe("start", start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s)
+
+
+def resimulate(model: Model, mjcf: str, start: Start, duration_s: float) -> Deviation:
+    """Roll out a model in our engine and its MJCF in MuJoCo, both from the keyframe `start`, and compare.
+
+    Args:
+        model: The model.
+        mjcf: Its MJCF, with a keyframe of that start. Its time step is lowered to the next divisor of `FRAME_S`.
+        start: Where both begin.
+        duration_s: Length [s], rounded to whole frames of `FRAME_S`.
+
+    Raises:
+        NotConvergedError: If our rollout diverges.
+    """
+    times = np.arange(round(duration_s / FRAME_S) + 1) * FRAME_S
+    world = World.from_model(model, torch.float64)
+    parts = (start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s)
+    state = State(*(torch.as_tensor(part, dtype=torch.float64)[None] for part in parts))
+    with torch.no_grad():
+        ours = simulate(world, state, torch.as_tensor(times), start.driven, record_contacts=True)
+    require_finite(ours, world, state, ["the rollout to compare with"])
+    free = [k for k, body in enumerate(model.file.bodies) if body.motion == "free"]
+    theirs = _mujoco_poses(model, mjcf, start.driven, times, [model.file.bodies[k].name for k in free])
+    away = ours.position_m[0, :, free].numpy() - theirs[0]
+    position_mm = 1e3 * np.linalg.norm(away, axis=-1).max(1)
+    cosine = np.abs((ours.quat_wxyz[0, :, free].numpy() * theirs[1]).sum(-1)).clip(0, 1)
+    rotation_deg = np.degrees(2 * np.arccos(cosine)).max(1)
+    assert ours.contacts is not None  # asked for above
+    touching = np.flatnonzero((ours.contacts.impulse_n_s[0].numpy() != 0).any((1, 2)))
+    first = int(touching[0]) if len(touching) else None
+    last = len(times) if first is None else first + round(AFTER_CONTACT_S / FRAME_S)
+
+    def largest(part: slice) -> tuple[float, float]:
+        return float(position_mm[part].max()), float(rotation_deg[part].max())
+
+    return Deviation(
+        duration_s=float(times[-1]),
+        first_contact_s=None if first is None else float(times[first]),
+        flight=largest(slice(0, first)) if first != 0 else None,
+        impact=None if first is None else largest(slice(first, last + 1)),
+        end=(float(position_mm[-1]), float(rotation_deg[-1])),
+    )
+
+
+def _mujoco_poses(
+    model: Model, mjcf: str, driven: dict[str, Track], times_s: np.ndarray, names: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [m] (T, F, 3) and quaternions (T, F, 4) of the bodies `names` in MuJoCo."""
+    loaded = mujoco.MjModel.from_xml_string(mjcf)
+    steps = int(np.ceil(FRAME_S / loaded.opt.timestep - 1e-9))
+    loaded.opt.timestep = FRAME_S / steps
+    data = mujoco.MjData(loaded)
+    mujoco.mj_resetDataKeyframe(loaded, data, loaded.key("start").id)
+    mujoco.mj_forward(loaded, data)
+    frames = [_poses(data, names)]
+    for _ in times_s[1:]:
+        for _ in range(steps):
+            for body, track in driven.items():
+                mocap = int(loaded.body(body).mocapid[0])
+                # the command at the end of the step: where the body is when the step's contacts are solved
+                pose = _commanded(track, data.time + loaded.opt.timestep)
+                data.mocap_pos[mocap], data.mocap_quat[mocap] = pose
+            mujoco.mj_step(loaded, data)
+        frames.append(_poses(data, names))
+    position, quat = zip(*frames, strict=True)
+    return np.array(position), np.array(quat)
+
+
+def _commanded(track: Track, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return position (3,) and quaternion w x y z (4,) of a command at a time; held still outside of it."""
+    now = np.clip(time_s, track.time_s[0], track.time_s[-1])
+    position = np.array([np.interp(now, track.time_s, axis) for axis in track.position_m.T])
+    assert track.quat_wxyz is not None  # sampled commands have orientations
+    turns = Slerp(track.time_s, Rotation.from_quat(track.quat_wxyz, scalar_first=True))
+    return position, turns(now).as_quat(scalar_first=True)
+
+
+def _poses(data: Any, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    joints = [data.joint(f"{name}_free").qpos for name in names]
+    return np.array([joint[:3] for joint in joints]), np.array([joint[3:] for joint in joints])

@@ -1,0 +1,76 @@
+"""What a dataset says of a simulated rollout, all but its images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..datasets.mjcf import mujoco_states, write_mjcf
+from ..datasets.rollouts import RolloutLabels
+from ..schemas import ModelFile, SamplingPlan
+from .net_forces import contact_force_n, contact_torque_n_m
+from .rollout_batches import Motion
+from .sampling import Start
+
+
+def labels_of(motion: Motion, plan: SamplingPlan, seed: int, times_s: np.ndarray) -> RolloutLabels:
+    """Return the labels of a motion.
+
+    Args:
+        motion: What was simulated.
+        plan: The resolved plan that it was drawn from.
+        seed: The root seed.
+        times_s: Times of the frames, shape (T,).
+    """
+    draw, contacts, file = motion.draw, motion.contacts, motion.file
+    bodies = file.bodies
+    actions, meaning = _actions(file, draw.start, plan, times_s)
+    poses = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
+    inertia = np.array([body.inertia_kg_m2 for body in bodies])
+    free = np.array([body.motion == "free" for body in bodies])
+    return RolloutLabels(
+        episode_index=draw.index,
+        seed=seed,
+        attempt=draw.attempt,
+        model_mjcf=write_mjcf(replace(draw.model, file=file), draw.cameras),
+        time_s=times_s,
+        states=mujoco_states(file, times_s, poses),
+        actions=actions,
+        action_meaning=meaning,
+        bodies=tuple(body.name for body in bodies),
+        motions=tuple(body.motion for body in bodies),
+        mass_kg=np.array([body.mass_kg for body in bodies]),
+        com_m=np.array([body.com_m for body in bodies]),
+        inertia_kg_m2=inertia,
+        position_m=motion.position_m,
+        quat_wxyz=motion.quat_wxyz,
+        velocity_m_s=motion.velocity_m_s,
+        omega_body_rad_s=motion.omega_body_rad_s,
+        gravity_m_s2=np.array(file.gravity_m_s2),
+        contacts=contacts,
+        contact_force_n=contact_force_n(contacts, times_s, len(bodies)),
+        contact_torque_n_m=contact_torque_n_m(motion.quat_wxyz, motion.omega_body_rad_s, inertia, times_s, free),
+        parameters=draw.parameters,
+        effects={effect.name: effect.parameters for effect in file.effects},
+        cameras=draw.cameras,
+        exposures=draw.lighting.exposures,
+        light_gain_rgb=draw.lighting.gain_rgb,
+        light=draw.lighting.light,
+    )
+
+
+def _actions(file: ModelFile, start: Start, plan: SamplingPlan, times_s: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return the commands (T, A): velocities of the driven bodies over the plan's largest push speed."""
+    driven = [index for index, body in enumerate(file.bodies) if body.motion == "driven"]
+    if not driven:
+        return np.zeros((len(times_s), 1)), "No body is driven: zero."
+    scale = max(plan.push_speed_m_s.support[1], 1e-9)
+    names = ", ".join(file.bodies[index].name for index in driven)
+    commands = []
+    for index in driven:
+        track = start.driven[file.bodies[index].name]
+        assert track.velocity_m_s is not None  # a push has it
+        commands.append(track.velocity_m_s[np.searchsorted(track.time_s, times_s, side="right") - 1])
+    text = f"Velocity command of {names}, world axes, in units of {scale:g} m/s."
+    return np.concatenate(commands, axis=1) / scale, text

@@ -1,0 +1,149 @@
+"""What all rollouts of a shard share: the model, the resolved plan, the cameras, and who simulates and renders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..datasets.atomic import sha256
+from ..datasets.cameras import Camera
+from ..datasets.models import Model, read_model
+from ..schemas import DatasetManifest, InputDataError, SamplingPlan, SynthesizeConfig, UsageError
+from .labels import LabelRenderer
+from .physics.world import World
+from .posterior import DERIVED, not_varied, require_admissible, with_correlations
+from .rejection import Rejection
+from .rollout_batches import Simulator
+from .sampling import look_at_cameras, resolve_plan
+
+STATE_ONLY = (
+    "state only: the model has no visual spheres, so there is nothing to render; "
+    "obs/ holds the bodies' state and no images"
+)
+RECORDED_PACKAGES = ("cgwm", "h5py", "hdf5plugin", "mujoco", "numpy", "torch")
+NOT_CONTENT = {"shard", "batch"}
+"""Settings that change no rollout."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all rollouts of a shard share."""
+
+    model: Model
+    config: SynthesizeConfig
+    plan: SamplingPlan
+    times_s: np.ndarray
+    cameras: Mapping[str, Camera]
+    renderer: LabelRenderer | None
+    simulator: Simulator
+    rejection: Rejection
+    device: str
+
+
+def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
+    """Return a plan with what it leaves out filled in for a model.
+
+    Args:
+        model: MODEL.
+        plan: The plan.
+
+    Raises:
+        InputDataError: If `model` is no model or has no fitted physics, or the plan does not fit it.
+    """
+    return _with_plan(model, plan)[1]
+
+
+def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
+    model = read_model(path)
+    lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
+    if lacking:
+        raise InputDataError(
+            f"{path}: the body '{lacking[0]}' has no colliding spheres.",
+            todo="fit it again: cgwm fit CAPTURE --out MODEL.",
+        )
+    if model.file.contact is None:
+        World.from_model(model)  # says what is missing, and how to get it
+    model = replace(model, file=with_correlations(model))
+    require_admissible(model.file, plan.parameters)
+    return model, resolve_plan(model, plan)
+
+
+def prepared(path: Path, config: SynthesizeConfig) -> Job:
+    """Read the model and make ready what all rollouts share.
+
+    Raises:
+        InputDataError: If `path` is no model, has no fitted physics, or the plan does not fit it.
+        UsageError: If the settings cannot be met.
+    """
+    model, plan = _with_plan(path, config.plan)
+    count = round(config.duration_s * config.frame_rate_hz) + 1
+    if count < 2:
+        raise UsageError(
+            f"{config.duration_s:g} s at {config.frame_rate_hz:g} frames/s is one frame.", "two frames or more."
+        )
+    device = device_of(config)
+    visible = bool(model.body_splats)
+    if plan.reject.unseen_share is not None and not visible:
+        raise InputDataError(
+            f"{path}: the model has no visual spheres, so that no camera sees it, and the plan has unseen_share.",
+            todo="leave unseen_share out of [reject].",
+        )
+    cameras = look_at_cameras(model, plan, config) if visible else {}
+    renderer = LabelRenderer(model, cameras, device) if visible else None
+    times = np.arange(count) / config.frame_rate_hz
+    simulator, rejection = Simulator(model, times, device), Rejection.of(model, plan.reject)
+    return Job(model, config, plan, times, cameras, renderer, simulator, rejection, device)
+
+
+def device_of(config: SynthesizeConfig) -> str:
+    """Return cpu or cuda.
+
+    Raises:
+        UsageError: If CUDA is asked for and not there.
+    """
+    if config.device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: no CUDA device is there.", "auto, cpu.", "see 'cgwm doctor'.")
+    return config.device
+
+
+def manifest_of(path: Path, job: Job, notes: tuple[str, ...]) -> DatasetManifest:
+    """Return the manifest of the dataset, without shards."""
+    settings = job.config.model_copy(update={"plan": job.plan, "shard": 0})
+    return DatasetManifest(
+        model_sha256=sha256(path),
+        config=settings.model_dump(mode="json", exclude=NOT_CONTENT),
+        rollouts=job.config.rollouts,
+        shard_count=job.config.shards,
+        bodies=tuple(body.name for body in job.model.file.bodies),
+        cameras=tuple(job.cameras),
+        versions={name: version(name) for name in RECORDED_PACKAGES} | {"rollout_engine": job.simulator.engine},
+        notes=notes,
+    )
+
+
+def notes_of(job: Job) -> tuple[str, ...]:
+    """Return what users ought to know of the rollouts."""
+    notes = [] if job.renderer is not None else [STATE_ONLY]
+    kept = not_varied(job.model.file)
+    if kept and job.plan.parameter_spread > 0:
+        notes.append(f"kept at their estimate, because nothing sets them in a rollout: {', '.join(kept)}")
+    spread = [p.name for p in job.model.file.parameters if p.std_error and p.name not in kept]
+    if job.plan.parameter_spread > 0 and not spread:
+        notes.append("no physical parameter has a standard error, so all rollouts have the same physics")
+    together = {name for block in job.model.file.correlations for name in block.parameters}
+    alone = [name for name in spread if name not in together and name not in DERIVED]
+    if job.plan.parameter_spread > 0 and len(alone) > 1:
+        notes.append(f"drawn each by itself, because the model has no correlations of them: {', '.join(alone)}")
+    if job.plan.light_turn_deg.support != (0.0, 0.0) and job.model.file.light is None:
+        notes.append("light_turn_deg turns nothing: the model has no light")
+    unseen = [b.name for b in job.model.file.bodies if b.name not in job.model.body_splats]
+    if job.renderer is not None and unseen:
+        notes.append(f"not in the images, because they have no visual spheres: {', '.join(unseen)}")
+    return tuple(notes)

@@ -1,0 +1,283 @@
+"""Newton's law for the labels: momentum and angular momentum change by what the contacts and all else give.
+
+Impulses of contacts and gravity are labels. What effects add (drag, ...) is computed here from their formulas, at the
+labelled states, and integrated from frame to frame by the trapezoidal rule.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..datasets.models import Model
+from ..datasets.rollouts import Node
+from ..schemas import EffectModel
+from .net_forces import contact_torque_n_m
+from .physics.effects import load_effect
+from .physics.rollout import Engine
+from .physics.world import State, World
+from .sampling import rotation_matrix
+from .validate_faults import Fault
+
+IMPULSE_TOLERANCE = 1e-6
+"""Largest excess of momentum change over impulse, as a fraction of the largest momentum change: float64 sums."""
+LEVER_SHARE = 0.25
+"""Largest median, over the frames with contact, of the excess of angular momentum over what the contacts turn, as a
+fraction of the sum of impulses times their levers: places in a wrong frame give about 1, those of the demo 0.0005."""
+ENOUGH_FRAMES = 5
+"""Of fewer frames with contact a median says nothing."""
+
+
+@dataclass
+class MotionFindings:
+    """Measured over all rollouts: the largest excess of momentum [N s], and the lever shares of frames in contact."""
+
+    impulse_excess_n_s: float = 0.0
+    angular_excess_share: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Body:
+    """A free body over a rollout: T frames.
+
+    mass [kg]; com (T, 3) [m], velocity (T, 3) [m/s] of it, spin (T, 3) [N m s] angular momentum about it, omega (T,)
+    [rad/s], all world; pull (T, 3) [m/s2] and torque (T, 3) [N m] of effects.
+    """
+
+    name: str
+    mass: float
+    com: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    omega: np.ndarray
+    pull: np.ndarray
+    torque: np.ndarray
+
+
+def check_motion(
+    demo: Node, contacts: dict[str, np.ndarray], model: Model | None, findings: MotionFindings
+) -> Iterator[Fault]:
+    """Compare the changes of momentum and of angular momentum of every free body with its contacts.
+
+    Args:
+        demo: The rollout.
+        contacts: The arrays of its contacts; their offsets and bodies were checked.
+        model: The dataset's model, for the formulas of its effects; without it, rollouts with effects are passed over.
+        findings: Takes what was measured.
+    """
+    effects: dict[str, dict[str, float]] = json.loads(str(demo.attrs["effects_json"]))
+    if effects and model is None:
+        return
+    read: dict[str, np.ndarray] = {name: item[()] for name, item in demo["bodies"].items()}
+    time = demo["time"][()]
+    frame = np.repeat(np.arange(len(time)), np.diff(contacts["offsets"]))
+    turned = any(load_effect(name).has("contact") for name in effects)
+    yield from _check_forces(contacts, read, time, frame)
+    for index, motion in enumerate(read["motions"]):
+        if motion == b"free":
+            body = _body(read, index, model, effects)
+            yield from _check_momentum(
+                body, read["gravity"], time, _impulses(contacts, frame, index, len(time)), findings
+            )
+            yield from _check_spin(body, read["gravity"], time, _levers(contacts, frame, index), turned, findings)
+
+
+def _body(read: dict[str, np.ndarray], index: int, model: Model | None, effects: dict[str, dict[str, float]]) -> _Body:
+    rotation = rotation_matrix(read["quat_wxyz"][:, index])
+    com, omega = read["com"][index], read["omega_body"][:, index]
+    xx, yy, zz, xy, xz, yz = read["inertia"][index]
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    count = len(rotation)
+    pull, torque = np.zeros((count, 3)), np.zeros((count, 3))
+    if effects and model is not None:
+        pull, torque = _loads(read, index, model, effects)
+    return _Body(
+        read["names"][index].decode(),
+        float(read["mass"][index]),
+        read["pos"][:, index] + rotation @ com,
+        read["vel"][:, index] + np.einsum("tij,tj->ti", rotation, np.cross(omega, com)),
+        np.einsum("tij,jk,tk->ti", rotation, inertia, omega),
+        np.linalg.norm(omega, axis=1),
+        pull,
+        torque,
+    )
+
+
+def _loads(
+    read: dict[str, np.ndarray], index: int, model: Model, effects: dict[str, dict[str, float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the effects give a body at each frame: acceleration [m/s2] and torque [N m], world, shape (T, 3)."""
+    bodies = [
+        # what commands a driven body does not matter here
+        body.model_copy(update={"motion": "fixed" if body.motion == "driven" else body.motion})
+        for body in model.file.bodies
+    ]
+    active = tuple(EffectModel(name=name, parameters=values) for name, values in effects.items())
+    file = model.file.model_copy(update={"bodies": tuple(bodies), "effects": active})
+    keys = ("pos", "quat_wxyz", "vel", "omega_body")
+    state = State(*(torch.as_tensor(read[key], dtype=torch.float64) for key in keys))
+    times = torch.tensor([[0.0, 1.0]], dtype=torch.float64).expand(len(read["pos"]), -1)
+    engine = Engine(World.from_model(replace(model, file=file)), state, times, {})
+    with torch.no_grad():
+        pull, torque = engine.loads(engine.begin(state))[index]
+    return pull.numpy(), torque.numpy()
+
+
+def _impulses(contacts: dict[str, np.ndarray], frame: np.ndarray, index: int, count: int) -> np.ndarray:
+    """Return the sum of the impulses on a body since the frame before [N s], world, shape (T, 3)."""
+    total = np.zeros((count, 3))
+    for sign, side in ((1.0, "body_a"), (-1.0, "body_b")):
+        mine = contacts[side] == index
+        np.add.at(total, frame[mine], sign * contacts["impulse_world"][mine])
+    return total
+
+
+def _levers(
+    contacts: dict[str, np.ndarray], frame: np.ndarray, index: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return frames (n,), places (n, 3) [m] and impulses (n, 3) [N s] of the contacts of a body, on that body."""
+    sides = [(1.0, contacts["body_a"] == index), (-1.0, contacts["body_b"] == index)]
+    frames = np.concatenate([frame[mine] for _, mine in sides])
+    places = np.concatenate([contacts["pos_world"][mine] for _, mine in sides])
+    impulses = np.concatenate([sign * contacts["impulse_world"][mine] for sign, mine in sides])
+    return frames, places, impulses
+
+
+def _check_forces(
+    contacts: dict[str, np.ndarray], read: dict[str, np.ndarray], time: np.ndarray, frame: np.ndarray
+) -> Iterator[Fault]:
+    """Labelled forces are the impulses, and torques the changes of angular momentum, by time between the frames."""
+    length = np.concatenate([[np.inf], np.diff(time)])
+    total = [_impulses(contacts, frame, index, len(time)) for index in range(len(read["motions"]))]
+    force = np.stack(total, axis=1) / length[:, None, None]
+    row_force = contacts["impulse_world"] / length[frame][:, None]
+    free = read["motions"] == b"free"
+    torque = contact_torque_n_m(read["quat_wxyz"], read["omega_body"], read["inertia"], time, free)
+    numbers = np.arange(len(time))
+    impulses, turns = "the impulses over the time between frames", "the change of angular momentum over that time"
+    for name, found, expected, frames, what, unit in (
+        ("contacts/force_world", contacts["force_world"], row_force, frame, impulses, "N"),
+        ("bodies/contact_force", read["contact_force"], force, numbers, impulses, "N"),
+        ("bodies/contact_torque", read["contact_torque"], torque, numbers, turns, "N m"),
+    ):
+        if not len(frames):
+            continue
+        errors = np.abs(found - expected).reshape(len(frames), -1).max(1)
+        limit = IMPULSE_TOLERANCE * max(float(np.abs(expected).max()), 1e-12)
+        if not errors.max() <= limit:
+            worst = int(frames[errors.argmax()])
+            text = f"{name}: frame {worst}: off {what} by {errors.max():.3g} {unit}."
+            yield Fault("forces", text, worst, value=float(errors.max()), limit=limit)
+
+
+def _check_momentum(
+    body: _Body, gravity: np.ndarray, time: np.ndarray, impulse: np.ndarray, findings: MotionFindings
+) -> Iterator[Fault]:
+    step = np.diff(time)[:, None]
+    effects = 0.5 * (body.pull[1:] + body.pull[:-1])
+    change = body.mass * (np.diff(body.velocity, axis=0) - step * (gravity + effects))
+    excess = np.linalg.norm(change - impulse[1:], axis=1)
+    scale = max(
+        float(np.linalg.norm(change, axis=1).max()), float(body.mass * np.linalg.norm(gravity) * step.max()), 1e-12
+    )
+    bent = _bent(body.pull, np.abs(impulse[1:]).max(1) > 0)
+    allowed = IMPULSE_TOLERANCE * scale + body.mass * step[:, 0] * bent
+    findings.impulse_excess_n_s = max(findings.impulse_excess_n_s, float(excess.max()))
+    wrong = ~(excess <= allowed)
+    if wrong.any():
+        worst = int(np.where(wrong, excess / allowed, 0).argmax())
+        yield Fault(
+            "momentum",
+            f"contacts/impulse_world: body '{body.name}', frame {worst + 1}: momentum changed by {excess[worst]:.3g} "
+            f"N s more than impulses, gravity and effects say; {allowed[worst]:.2g} is allowed. "
+            f"So in {int(wrong.sum())} frames.",
+            frame=worst + 1,
+            body=body.name,
+            value=float(excess[worst]),
+            limit=float(allowed[worst]),
+        )
+
+
+def _bent(values: np.ndarray, touching: np.ndarray) -> np.ndarray:
+    """Return what the trapezoidal rule may miss of values (T, 3), by interval and second, shape (T - 1,).
+
+    Less than they change by; where an impact may hide that, they may be anything up to twice their size.
+    """
+    size = np.linalg.norm(values, axis=1)
+    return np.linalg.norm(np.diff(values, axis=0), axis=1) + 2 * np.maximum(size[1:], size[:-1]) * touching
+
+
+def _check_spin(
+    body: _Body,
+    gravity: np.ndarray,
+    time: np.ndarray,
+    levers: tuple[np.ndarray, np.ndarray, np.ndarray],
+    turned: bool,
+    findings: MotionFindings,
+) -> Iterator[Fault]:
+    """Compare the change of angular momentum about the centre of mass with the moments of the contacts.
+
+    Where in an interval an impulse acted is not labelled, only its mean place; so each lever may be off by the way that
+    body and contact move within the interval.
+    """
+    frames, places, impulses = levers
+    step = np.diff(time)
+    middle = 0.5 * (body.com[1:] + body.com[:-1])
+    moment, reach = np.zeros((len(time), 3)), np.zeros(len(time))
+    later = frames > 0
+    frames, places, impulses = frames[later], places[later], impulses[later]
+    arms = places - middle[frames - 1]
+    np.add.at(moment, frames, np.cross(arms, impulses))
+    size = np.linalg.norm(impulses, axis=1)
+    np.add.at(reach, frames, size * np.linalg.norm(arms, axis=1))
+    pushed = np.zeros(len(time))
+    np.add.at(pushed, frames, size)
+    effects = 0.5 * (body.torque[1:] + body.torque[:-1]) * step[:, None]
+    excess = np.linalg.norm(np.diff(body.spin, axis=0) - effects - moment[1:], axis=1)
+    speed, lever = np.linalg.norm(body.velocity, axis=1), float(np.linalg.norm(arms, axis=1).max(initial=0.0))
+    fastest = np.maximum(speed[1:], speed[:-1]) + step * np.linalg.norm(gravity)
+    fastest += lever * np.maximum(body.omega[1:], body.omega[:-1])
+    bent = step * _bent(body.torque, pushed[1:] > 0)
+    scale = max(float(np.linalg.norm(body.spin, axis=1).max()), 1e-12)
+    allowed = IMPULSE_TOLERANCE * scale + bent + pushed[1:] * 2 * fastest * step
+    touching = pushed[1:] > 0
+    wrong = ~(excess <= allowed) & ~(touching & turned)
+    if wrong.any():
+        worst = int(np.where(wrong, excess / allowed, 0).argmax())
+        yield Fault(
+            "angular momentum",
+            f"bodies/omega_body: body '{body.name}', frame {worst + 1}: angular momentum changed by "
+            f"{excess[worst]:.3g} N m s more than the contacts turn it; {allowed[worst]:.2g} is allowed. "
+            f"So in {int(wrong.sum())} frames.",
+            frame=worst + 1,
+            body=body.name,
+            value=float(excess[worst]),
+            limit=float(allowed[worst]),
+        )
+    shares = excess[touching] / np.maximum(reach[1:][touching], 1e-30)
+    if turned or not len(shares):
+        return
+    findings.angular_excess_share += shares.tolist()
+    if len(shares) >= ENOUGH_FRAMES and not np.median(shares) <= LEVER_SHARE:
+        yield Fault(
+            "angular momentum",
+            f"contacts/pos_world: body '{body.name}': in half of the {len(shares)} frames with contact the angular "
+            f"momentum differs by {100 * np.median(shares):.0f} % or more of what the contacts can turn; "
+            f"{100 * LEVER_SHARE:.0f} % is allowed.",
+            body=body.name,
+            value=float(np.median(shares)),
+            limit=LEVER_SHARE,
+        )
+
+
+def motion_facts(findings: MotionFindings) -> dict[str, Any]:
+    """Return what was measured, for the report."""
+    facts: dict[str, Any] = {"impulse_excess_n_s": findings.impulse_excess_n_s}
+    if findings.angular_excess_share:
+        facts["angular_excess_share_median"] = float(np.median(findings.angular_excess_share))
+    return facts

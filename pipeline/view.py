@@ -1,0 +1,57 @@
+"""`cgwm view`: a dataset's rollouts, or a model and its own motion, in the browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from ..datasets.dataset import read_manifest
+from ..datasets.kinds import kind_of
+from ..datasets.loader import RolloutReader
+from ..datasets.models import read_model
+from ..schemas import InputDataError
+from .viewing.motions import Motion, can_move, own_motion, recorded_motion, still
+from .viewing.viewer import Viewer, require_viser
+
+OWN_MOTIONS = 6
+
+
+def open_view(thing: Path | str, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+    """Start a server that shows a dataset or a model; it ends with the process, or with the returned context.
+
+    Args:
+        thing: DATASET or MODEL.
+        host: Address to listen at.
+        port: Port to listen at; 0 takes a free one.
+
+    Raises:
+        UsageError: If viser is not installed, or the address cannot be had.
+        InputDataError: If the directory is neither, or a file in it is missing or wrong.
+    """
+    path = Path(thing)
+    require_viser()
+    kind = kind_of(path)
+    if kind == "dataset":
+        return _dataset(path, host, port)
+    if kind == "model":
+        return _model(path, host, port)
+    found = "no such directory" if not path.exists() else f"a {kind}" if kind else "neither a dataset nor a model"
+    raise InputDataError(f"{path}: {found}.", "a directory with dataset.json or model.json.")
+
+
+def _dataset(path: Path, host: str, port: int) -> Viewer:
+    model = read_model(path / read_manifest(path).model)
+    reader = RolloutReader(path)
+    if not len(reader):
+        raise InputDataError(f"{path}: no rollout in it.")
+    motions = {info.demo: partial(recorded_motion, reader, number) for number, info in enumerate(reader.rollouts)}
+    return Viewer(f"dataset {path.resolve().name}", model, motions, host, port)
+
+
+def _model(path: Path, host: str, port: int) -> Viewer:
+    model = read_model(path)
+    motions: dict[str, Callable[[], Motion]] = {"as in the photos": partial(still, model)}
+    if can_move(model):
+        motions |= {f"rollout {number}": partial(own_motion, model, number) for number in range(OWN_MOTIONS)}
+    return Viewer(f"model {path.resolve().name}", model, motions, host, port)

@@ -1,0 +1,138 @@
+"""What a viser scene is filled with: splats, balls, cameras and the marks of contacts.
+
+viser's splats are marked experimental. They move with their body's frame without being sent again, are sorted together
+with the background, and look like the renderer's, so bodies are no point clouds here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ...datasets.cameras import Camera
+from ...datasets.ply import Splats
+from .contact_marks import ContactMarks
+from .scene_at import BodyShape
+
+_LARGEST_HALF_SIGMA = 200.0
+"""viser sends covariances as half-precision floats, which end at 65504: the largest sphere of a group, in its unit."""
+_POINT_RADIUS = 0.1
+"""Of a contact [radii of the largest free body]."""
+_SPHERE_RGB = (120, 190, 120)
+
+
+def add_splats(scene: Any, name: str, splats: Splats) -> Any:
+    """Add spherical Gaussians, and return their handle; centres in the frame of the parent node."""
+    sigma = np.asarray(splats.scales, np.float64)
+    unit = _LARGEST_HALF_SIGMA / float(sigma.max(initial=1e-9))
+    return scene.add_gaussian_splats(
+        name,
+        centers=np.asarray(splats.means, np.float64) * unit,
+        covariances=np.eye(3)[None] * (sigma * unit)[:, None, None] ** 2,
+        rgbs=as_bytes(np.asarray(splats.colors)),
+        opacities=as_bytes(np.asarray(splats.opacities)[:, None]),
+        scale=1 / unit,
+    )
+
+
+def add_spheres(scene: Any, name: str, shape: BodyShape) -> Any:
+    """Add the spheres of a body that collide, and return their handle; None where there are none."""
+    if not len(shape.radii_m):
+        return None
+    return _add_balls(scene, name, shape.centers_m, shape.radii_m, np.array(_SPHERE_RGB, np.uint8))
+
+
+def _add_balls(scene: Any, name: str, centers_m: NDArray[Any], radii_m: NDArray[Any], colors: NDArray[np.uint8]) -> Any:
+    import trimesh  # comes with viser  # pyright: ignore[reportMissingImports]
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    return scene.add_batched_meshes_simple(
+        name,
+        vertices=np.asarray(ball.vertices, np.float32),
+        faces=np.asarray(ball.faces, np.uint32),
+        batched_wxyzs=np.tile(np.array([1.0, 0, 0, 0]), (len(radii_m), 1)),
+        batched_positions=centers_m,
+        batched_scales=radii_m,
+        batched_colors=linear(colors),
+        lod="off",
+    )
+
+
+def add_camera(scene: Any, name: str, camera: Camera, scale_m: float) -> Any:
+    """Add a camera without a picture, `/cameras/<name>`, so far in front of its centre as `scale_m` [m] tells."""
+    pose = camera.T_world_cam
+    return scene.add_camera_frustum(
+        f"/cameras/{name}",
+        fov=vertical_angle_rad(camera),
+        aspect=camera.width / camera.height,
+        scale=scale_m,
+        thickness=0.03 * scale_m,
+        color=(40, 44, 52),
+        format="jpeg",
+        jpeg_quality=85,
+        wxyz=quat_of(pose[:3, :3]),
+        position=pose[:3, 3],
+    )
+
+
+def vertical_angle_rad(camera: Camera) -> float:
+    """Return a camera's vertical angle of view [rad]."""
+    return 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
+
+
+def add_marks(scene: Any, count: int, size_m: float) -> list[Any]:
+    """Add as many points and arrows as a motion has contacts at once: of equal number, they move without flicker."""
+    nowhere, colors = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8)
+    points = _add_balls(scene, "/contacts/points", nowhere, np.full(count, _POINT_RADIUS * size_m), colors)
+    arrows = scene.add_arrows(
+        "/contacts/impulses",
+        np.stack([nowhere, nowhere], axis=1),
+        colors,
+        shaft_radius=0.035 * size_m,
+        head_radius=0.08 * size_m,
+        head_length=0.16 * size_m,
+    )
+    return [points, arrows]
+
+
+def place_marks(handles: list[Any], marks: ContactMarks, wanted: bool) -> None:
+    """Put the marks of `add_marks` where the contacts of a frame are; hide them where there are none."""
+    for handle in handles:
+        handle.visible = wanted and len(marks) > 0
+    if not handles or not len(marks):
+        return
+    points, arrows = handles
+    # The last contact stands in for those that are not there.
+    chosen = np.minimum(np.arange(len(arrows.points)), len(marks) - 1)
+    colors = linear(marks.colors[chosen])
+    points.batched_positions, points.batched_colors = marks.points_m[chosen].astype(np.float32), colors
+    arrows.points, arrows.colors = marks.segments_m[chosen].astype(np.float32), colors
+
+
+def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return values in [0, 1] as bytes."""
+    return (np.clip(values, 0.0, 1.0) * 255).round().astype(np.uint8)
+
+
+def linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return what viser's page has to be sent for instances and arrows to show these sRGB values (IEC 61966-2-1)."""
+    values = colors / 255.0
+    return as_bytes(np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4))
+
+
+def quat_of(rotation: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the quaternion w x y z (4,) of a rotation matrix (3, 3)."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+
+
+def turn_from_z(normal: Any) -> NDArray[np.float64]:
+    """Return the quaternion w x y z (4,) of the shortest turn that takes z to a unit normal (3,)."""
+    x, y, z = normal
+    if z < -1 + 1e-9:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    quat = np.array([1 + z, -y, x, 0.0])
+    return quat / np.linalg.norm(quat)

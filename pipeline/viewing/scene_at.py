@@ -1,0 +1,135 @@
+"""Where everything is at a moment of a motion: bodies, what they are made of, and the marks of the contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...datasets.models import Model
+from ...datasets.ply import Splats
+from ..sampling import up_direction
+from ..splats.relighting import Relighting
+from ..splats.spheres import Spheres
+from .contact_marks import ContactMarks, arrow_scale, contact_marks
+from .motions import Motion
+
+Array = NDArray[np.float64]
+
+LONGEST_ARROW = 2.5
+"""Length of the arrow of a motion's largest impulse [radii of the largest free body]."""
+_UNKNOWN_RADIUS_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class BodyShape:
+    """What a body is made of, in its own frame.
+
+    Attributes:
+        name: Of the body.
+        splats: What is seen, or None.
+        centers_m: Of the spheres that collide [m], shape (N, 3); N = 0 where there are none.
+        radii_m: Their radii [m], shape (N,).
+    """
+
+    name: str
+    splats: Splats | None
+    centers_m: Array
+    radii_m: Array
+    _relighting: Relighting | None = None
+
+    def colors_at(self, quat_wxyz: Array) -> Array:
+        """Return the colours of the splats (M, 3) at an orientation (4,), in the model's light."""
+        if self.splats is None:
+            return np.zeros((0, 3))
+        colors = np.asarray(self.splats.colors, np.float64)
+        if self._relighting is not None:
+            factors = self._relighting.factors(torch.as_tensor(quat_wxyz, dtype=torch.float64))
+            colors = colors * factors.numpy()[:, None]
+        return np.clip(colors, 0.0, 1.0)
+
+    @property
+    def relit(self) -> bool:
+        """Whether the colours change as the body turns."""
+        return self._relighting is not None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneAt:
+    """A moment: poses of B bodies, T_world_body, and the contacts' marks."""
+
+    time_s: float
+    position_m: Array
+    """Shape (B, 3)."""
+    quat_wxyz: Array
+    """Shape (B, 4)."""
+    marks: ContactMarks
+    largest_impulse_n_s: float
+    """Of the contacts at this moment [N s]; 0 without any."""
+
+
+def shapes_of(model: Model) -> list[BodyShape]:
+    """Return what each body of a model is made of, in the order of the model."""
+    shapes = []
+    for body in model.file.bodies:
+        splats, colliding = model.body_splats.get(body.name), model.collision.get(body.name)
+        relighting = None
+        if model.file.light is not None and splats is not None and splats.normals is not None:
+            normals = torch.as_tensor(np.asarray(splats.normals, np.float64))
+            relighting = Relighting.of(model.file.light, body, normals)
+        centers = np.zeros((0, 3)) if colliding is None else np.asarray(colliding.means, np.float64)
+        radii = np.zeros(0) if colliding is None else np.asarray(colliding.scales, np.float64) * body.radius_factor
+        shapes.append(BodyShape(body.name, splats, centers, radii, relighting))
+    return shapes
+
+
+def background_from(model: Model, eye_m: Array) -> Splats | None:
+    """Return the background with the colours that it shows to a camera at `eye_m` (3,), world frame."""
+    if model.scene is None:
+        return None
+    return Spheres.from_numpy(model.scene).seen_from(torch.as_tensor(eye_m, dtype=torch.float32)).to_numpy()
+
+
+def radius_m(model: Model, shapes: list[BodyShape]) -> float:
+    """Return the size that marks are drawn by: the radius of the largest free body about its origin [m]."""
+    free = {body.name for body in model.file.bodies if body.motion == "free"}
+    reaches = []
+    for shape in (shape for shape in shapes if shape.name in free):
+        centers = shape.centers_m if shape.splats is None else np.asarray(shape.splats.means, np.float64)
+        reaches += [float(np.linalg.norm(centers - centers.mean(0), axis=1).max())] if len(centers) else []
+        reaches += [float(shape.radii_m.max())] if len(shape.radii_m) else []
+    return max(reaches, default=0.0) or _UNKNOWN_RADIUS_M
+
+
+def scene_at(motion: Motion, frame: int, size_m: float) -> SceneAt:
+    """Return a moment of a motion; arrows are as long as `LONGEST_ARROW` times `size_m` [m] at its largest impulse."""
+    scale = arrow_scale(motion.largest_impulse_n_s, LONGEST_ARROW * size_m)
+    contacts = motion.contacts[frame]
+    sizes = np.linalg.norm(contacts["impulse_world"], axis=-1)
+    return SceneAt(
+        time_s=float(motion.times_s[frame]),
+        position_m=motion.position_m[frame],
+        quat_wxyz=motion.quat_wxyz[frame],
+        marks=contact_marks(contacts, scale),
+        largest_impulse_n_s=float(sizes.max(initial=0.0)),
+    )
+
+
+def viewpoint(model: Model, motion: Motion, size_m: float) -> tuple[Array, Array, Array]:
+    """Return where to look from first, what at, and which way is up: three (3,), world frame, the first two in metres.
+
+    From between the cameras, a little farther off than they are; without cameras from a little above.
+    """
+    up = up_direction(model.file)
+    moving = [k for k, body in enumerate(model.file.bodies) if body.motion == "free"] or slice(None)
+    paths = motion.position_m[:, moving].reshape(-1, 3)
+    target = 0.5 * (paths.min(0) + paths.max(0))
+    if motion.cameras:
+        middle = np.mean([camera.center for camera in motion.cameras.values()], axis=0)
+        return target + 1.2 * (middle - target), target, up
+    across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    away = 0.6 * up - across / np.linalg.norm(across)
+    reach = max(5.0 * size_m, 1.5 * float(np.ptp(paths, axis=0).max()))
+    return target + reach * away, target, up

@@ -1,0 +1,300 @@
+"""A motion in the browser: the page, what it shows and what can be pressed. Only this room speaks to viser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from ...datasets.models import Model
+from ...schemas import CgwmError, UsageError
+from .contact_marks import SLIDING_RGB, STICKING_RGB
+from .motions import Motion
+from .nodes import (
+    add_camera,
+    add_marks,
+    add_spheres,
+    add_splats,
+    as_bytes,
+    place_marks,
+    turn_from_z,
+    vertical_angle_rad,
+)
+from .scene_at import SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
+
+SPEEDS = {"as it was": 1.0, "3 times slower": 1 / 3, "10 times slower": 0.1}
+_MOST_UPDATES_HZ = 30.0
+_SEE_THROUGH = 0.12
+"""Of the opacities: several spheres lie behind each other everywhere."""
+_OVERVIEW = "overview"
+FIELD_OF_VIEW_RAD = 0.9
+_AMBIENT, _SUN = 2.2, 1.0
+"""Light in which what is no splat has about its own colour; viser's own makes it paler."""
+
+
+def require_viser() -> Any:
+    """Return the package viser.
+
+    Raises:
+        UsageError: If it is not installed.
+    """
+    try:
+        import viser  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise UsageError("'cgwm view' needs the package viser.", todo="pip install 'cgwm[view]'.") from None
+    return viser
+
+
+class Viewer:
+    """A page with a time slider that shows one of several motions of a model.
+
+    Args:
+        title: What is shown.
+        model: Its bodies, background, ground and light.
+        motions: What can be chosen, by name; each is made when it is chosen first, and the first at once.
+        host: Address to listen at.
+        port: Port to listen at; 0 takes a free one.
+
+    Raises:
+        UsageError: If viser is not installed, or the address cannot be had.
+        CgwmError: If the first motion cannot be made.
+    """
+
+    def __init__(
+        self, title: str, model: Model, motions: Mapping[str, Callable[[], Motion]], host: str, port: int
+    ) -> None:
+        viser = require_viser()
+        port = _free_port(host, port)
+        self._made = dict(motions)
+        self._kept: dict[str, Motion] = {}
+        self._lock = threading.RLock()
+        self._shapes = shapes_of(model)
+        self._size_m = radius_m(model, self._shapes)
+        self._motion = self._load(next(iter(motions)))
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner; our URL is the one line that is printed
+            self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        self.url = f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{self.server.get_port()}"
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._add_scene(model)
+        self._add_controls()
+        self._begin(self._motion)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def run(self) -> None:
+        """Play whenever that is asked for; returns only by an exception, such as KeyboardInterrupt."""
+        while True:
+            times_s = self._motion.times_s
+            pace = SPEEDS[self._speed.value]
+            step_s = float(times_s[-1] - times_s[0]) / max(1, len(times_s) - 1) / pace
+            stride = max(1, math.ceil(1 / (_MOST_UPDATES_HZ * step_s))) if step_s > 0 else 1
+            time.sleep(max(step_s * stride, 1 / _MOST_UPDATES_HZ))
+            if self._playing and len(times_s) > 1:
+                self._frame.value = (self._frame.value + stride) % len(times_s)  # shows it, too
+
+    def _load(self, name: str) -> Motion:
+        if name not in self._kept:
+            self._kept[name] = self._made[name]()
+        return self._kept[name]
+
+    # What stands in the scene
+
+    def _add_scene(self, model: Model) -> None:
+        scene, size = self.server.scene, self._size_m
+        eye, target, up = viewpoint(model, self._motion, size)
+        scene.set_up_direction(tuple(up))
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/light/ambient", intensity=_AMBIENT)
+        scene.add_light_directional("/light/sun", intensity=_SUN, position=tuple(eye + 20 * size * up))
+        self._view = (eye, target, up)
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, camera.up = self._view
+        camera.fov = FIELD_OF_VIEW_RAD
+        background = background_from(model, eye)
+        self._background = None if background is None else add_splats(scene, "/background", background)
+        ground = model.file.ground
+        if background is None and ground is not None:
+            place = np.asarray(ground.normal) * ground.offset_m
+            side = 20 * size
+            scene.add_grid("/ground", side, side, cell_size=size, wxyz=turn_from_z(ground.normal), position=place)
+        self._frames = [
+            scene.add_frame(f"/bodies/{k}", show_axes=False, axes_length=1.5 * size, axes_radius=0.04 * size)
+            for k in range(len(self._shapes))
+        ]
+        self._splats = [
+            None if shape.splats is None else add_splats(scene, f"/bodies/{k}/splats", shape.splats)
+            for k, shape in enumerate(self._shapes)
+        ]
+        self._spheres = [add_spheres(scene, f"/bodies/{k}/spheres", shape) for k, shape in enumerate(self._shapes)]
+        self._cameras: dict[str, Any] = {}
+        self._marks: list[Any] = []
+
+    def _begin(self, motion: Motion) -> None:
+        """Put what belongs to a motion, and not to a moment of it, into the scene."""
+        with self._lock, self.server.atomic():
+            self._motion = motion
+            for handle in [*self._cameras.values(), *self._marks]:
+                handle.remove()
+            size = self._size_m
+            self._cameras = {
+                name: add_camera(self.server.scene, name, camera, 0.6 * size) for name, camera in motion.cameras.items()
+            }
+            most = max((len(rows["mode"]) for rows in motion.contacts), default=0)
+            self._marks = add_marks(self.server.scene, most, size) if most else []
+            self._show_kinds()
+            last = max(1, len(motion.times_s) - 1)
+            alone = len(motion.times_s) == 1
+            self._frame.max, self._frame.disabled, self._play.disabled = last, alone, alone
+            self._arrow_note.content = _legend(motion.largest_impulse_n_s)
+            if self._frame.value != 0:
+                self._frame.value = 0
+            else:
+                self._show(0)
+
+    def _show(self, frame: int) -> None:
+        with self._lock, self.server.atomic():
+            frame = min(frame, len(self._motion.times_s) - 1)
+            now = scene_at(self._motion, frame, self._size_m)
+            parts = zip(self._frames, self._splats, self._shapes, now.position_m, now.quat_wxyz, strict=True)
+            for handle, splats, shape, position_m, quat_wxyz in parts:
+                handle.position, handle.wxyz = position_m, quat_wxyz
+                if splats is not None and shape.relit:
+                    splats.rgbs = as_bytes(shape.colors_at(quat_wxyz))
+            place_marks(self._marks, now.marks, self._contacts.value)
+            if self._motion.image is not None and self._frusta.value:
+                for name, handle in self._cameras.items():
+                    handle.image = self._motion.image(name, frame)
+            self._status.content = _words(now, frame, len(self._motion.times_s))
+
+    # What can be pressed
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        names = list(self._made)
+        self._choice = gui.add_dropdown("motion", names, initial_value=names[0])
+        self._frame = gui.add_slider("frame", min=0, max=1, step=1, initial_value=0)
+        self._status = gui.add_markdown("")
+        self._play = gui.add_button("Play", icon=None)
+        self._playing = False
+        self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value="3 times slower")
+        places = gui.add_button_group("look from", [_OVERVIEW, *self._motion.cameras])
+        places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))
+        seen = any(handle is not None for handle in self._splats)
+        with gui.add_folder("Show"):
+            self._contacts = gui.add_checkbox("contacts", True)
+            self._looks = gui.add_checkbox("splats", seen, disabled=not seen and self._background is None)
+            self._through = gui.add_checkbox("see-through bodies", False, disabled=not seen)
+            self._colliding = gui.add_checkbox("collision spheres", not seen)
+            self._axes = gui.add_checkbox("body frames", False)
+            self._frusta = gui.add_checkbox("cameras", True)
+        self._arrow_note = gui.add_html("")
+        self._frame.on_update(lambda _: self._guarded(lambda: self._show(self._frame.value)))
+        self._choice.on_update(lambda _: self._guarded(lambda: self._begin(self._load(self._choice.value))))
+        self._play.on_click(lambda _: self._toggle())
+        for box in (self._contacts, self._looks, self._colliding, self._axes, self._frusta):
+            box.on_update(lambda _: self._guarded(self._refresh))
+        self._through.on_update(lambda _: self._guarded(self._make_see_through))
+
+    def _look_from(self, client: Any, place: str) -> None:
+        """Move the view of one page to where it began, or to a camera, whose picture would then hide everything."""
+        camera = self._motion.cameras.get(place)
+        if client is None:
+            return
+        with client.atomic():
+            if camera is None:
+                client.camera.position, client.camera.look_at, client.camera.up_direction = self._view
+                client.camera.fov = FIELD_OF_VIEW_RAD
+                return
+            forward = camera.T_world_cam[:3, 2]
+            distance = float((self._view[1] - camera.center) @ forward)
+            client.camera.position, client.camera.up_direction = camera.center, -camera.T_world_cam[:3, 1]
+            client.camera.look_at = camera.center + max(distance, self._size_m) * forward
+            client.camera.fov = vertical_angle_rad(camera)
+        self._frusta.value = False
+
+    def _toggle(self) -> None:
+        self._playing = not self._playing
+        self._play.label = "Pause" if self._playing else "Play"
+
+    def _refresh(self) -> None:
+        with self._lock:
+            self._show_kinds()
+            self._show(self._frame.value)
+
+    def _show_kinds(self) -> None:
+        for handle in [*self._splats, self._background]:
+            if handle is not None:
+                handle.visible = self._looks.value
+        for handle in self._spheres:
+            if handle is not None:
+                handle.visible = self._colliding.value
+        for handle in self._frames:
+            handle.show_axes = self._axes.value
+        for handle in self._cameras.values():
+            handle.visible = self._frusta.value
+
+    def _make_see_through(self) -> None:
+        share = _SEE_THROUGH if self._through.value else 1.0
+        with self._lock:
+            for handle, shape in zip(self._splats, self._shapes, strict=True):
+                if handle is not None and shape.splats is not None:
+                    handle.opacities = as_bytes(share * np.asarray(shape.splats.opacities)[:, None])
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do what a click asks for; what it raises stands on the page, and the server goes on."""
+        try:
+            work()
+        except CgwmError as error:
+            self._status.content = f"**{error.found}**"
+        except OSError as error:
+            self._status.content = f"**Cannot be read: {error}**"
+
+
+def _free_port(host: str, port: int) -> int:
+    """Return a port that is free at an address; viser would silently take another one than was asked for."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((host, port))
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise UsageError(
+                f"{host}, port {port}: {reason}.", todo="choose another one: --port 0 takes any that is free."
+            ) from None
+        return int(trial.getsockname()[1])
+
+
+def _words(now: SceneAt, frame: int, count: int) -> str:
+    sliding = int(now.marks.sliding.sum())
+    parts = [f"{len(now.marks) - sliding} sticking"] * (len(now.marks) > sliding) + [f"{sliding} sliding"] * (
+        sliding > 0
+    )
+    contacts = f"contacts: {', '.join(parts)}; largest impulse {now.largest_impulse_n_s:.2g} N s" if parts else ""
+    return f"**{now.time_s:.3f} s**, frame {frame + 1} of {count}\n\n{contacts or 'no contact'}"
+
+
+def _legend(largest_n_s: float) -> str:
+    dots = "".join(
+        f'<div><span style="color: rgb{color}">&#9679;</span> contact, {word}</div>'
+        for color, word in ((STICKING_RGB, "sticking"), (SLIDING_RGB, "sliding"))
+    )
+    longest = f", the longest {largest_n_s:.2g} N s" if largest_n_s > 0 else ""
+    arrows = f"<div>&#8593; impulse on the body since the frame before{longest}</div>"
+    return f'<div style="padding: 0 0.75em 0.5em; font-size: 0.8em; line-height: 1.6">{dots}{arrows}</div>'

@@ -1,0 +1,14 @@
+"""What `cgwm view` prints."""
+
+from __future__ import annotations
+
+from .base import FileModel
+
+
+class ViewReport(FileModel):
+    """Where to look."""
+
+    url: str
+    """Address of the page."""
+    showing: str
+    """The dataset or model."""
