@@ -328,12 +328,13 @@ def test_groups_are_seen_alone():
     means, scales, opacities, features, viewmats, Ks = scene(40)
     groups = [slice(0, 10), slice(25, 40)]
     seen = render(means, scales, opacities, features, viewmats, Ks, 24, 17, groups=groups)
-    assert seen.alone.shape == (2, 17, 24, 2)
+    assert seen.alone is not None and seen.alone.shape == (2, 17, 24, 2)
     for number, group in enumerate(groups):
         alone = render(means[group], scales[group], opacities[group], features[group], viewmats, Ks, 24, 17)
         torch.testing.assert_close(seen.alone[..., number], alone.alpha)
         assert float(alone.alpha.max()) > 0.5
         short = render(means, scales, opacities, features, viewmats, Ks, 24, 17, groups=groups, group_transmittance=0.4)
+        assert short.alone is not None and seen.alone is not None
         assert ((short.alone > 0.6) == (seen.alone > 0.6)).all() and (short.alone <= seen.alone + 1e-12).all()
 
 
