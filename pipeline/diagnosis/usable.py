@@ -76,7 +76,7 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
             f"{where}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
             f"size is {1e3 * size:.0f} mm.",
             "a shape, a ground and tracks that belong together.",
-            "check [[bodies]] shape, [world] ground, and which body was tracked.",
+            "check [[bodies]] shape, [world] ground, whether the frame of the tracks is level, and which body was tracked.",
         )
 
 
@@ -143,7 +143,7 @@ def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
             f"{where}: in {100 * share:.0f} % of the frames the body is {1e3 * float(gap[high].median()):.0f} mm above "
             f"the ground and does not fall; its size is {1e3 * size:.0f} mm.",
             "a shape, a ground and tracks that belong together.",
-            "check [[bodies]] shape, [world] ground, and which body was tracked.",
+            "check [[bodies]] shape, [world] ground, whether the frame of the tracks is level, and which body was tracked.",
         )
 
 
