@@ -35,6 +35,10 @@ LEAST_SEEN = 0.25
 """Share of gravity: where no force below it could be told from the noise, nothing that is worth a name could."""
 SURE = 4.0
 SHARE_OF_SIZE = 0.25
+_BELONG_TOGETHER = (
+    "a shape, a ground and tracks that belong together.",
+    "check [[bodies]] shape, [world] ground, whether the tracks' frame is level, and which body was tracked.",
+)
 
 
 def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
@@ -75,8 +79,7 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
         raise InputDataError(
             f"{where}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
             f"size is {1e3 * size:.0f} mm.",
-            "a shape, a ground and tracks that belong together.",
-            "check [[bodies]] shape, [world] ground, whether the frame of the tracks is level, and which body was tracked.",
+            *_BELONG_TOGETHER,
         )
 
 
@@ -142,8 +145,7 @@ def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
         raise InputDataError(
             f"{where}: in {100 * share:.0f} % of the frames the body is {1e3 * float(gap[high].median()):.0f} mm above "
             f"the ground and does not fall; its size is {1e3 * size:.0f} mm.",
-            "a shape, a ground and tracks that belong together.",
-            "check [[bodies]] shape, [world] ground, whether the frame of the tracks is level, and which body was tracked.",
+            *_BELONG_TOGETHER,
         )
 
 
