@@ -18,6 +18,8 @@ from ..schemas import CgwmError
 
 GRACE_S = 10.0
 """What is interrupted gets this time to remove what is unfinished."""
+LOOK_UP_S = 0.5
+"""An interrupt that reached another thread than the one that waits is seen after so long."""
 
 
 def in_workers(
@@ -51,7 +53,7 @@ def in_workers(
             processes[here] = process
             _hand_out(here, calls, waiting, busy)
         while busy:
-            for connection in wait(list(busy)):
+            for connection in wait(list(busy), LOOK_UP_S):
                 assert isinstance(connection, Connection)
                 number = busy.pop(connection)
                 try:

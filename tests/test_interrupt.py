@@ -67,7 +67,8 @@ def fit_case(folder: Path) -> Case:
     capture, out = folder / "capture", folder / "model"
     source = tosses(folder / "source", 60)
     subprocess.run([*CGWM, "import", "contactnets", str(source), "--out", str(capture)], check=True, timeout=120)
-    return ["fit", str(capture), "--out", str(out)], out
+    # so long that a fast machine, too, is still at it when the signal comes
+    return ["fit", str(capture), "--out", str(out), "--set", "phys-geo.generations=400"], out
 
 
 def synthesize_case(folder: Path) -> Case:
