@@ -69,7 +69,10 @@ def judged(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
         return "refused"
     verdict = found["verdict"]
     if not case.effects:
-        return "right" if verdict == "none_missing" else "false alarm"
+        # what the engine's own law brings along is there, though nothing was hidden
+        brought = set(truth["engine"].get("comes_with", ()))
+        named = verdict == "missing_effect" and set(found["selected"]) <= brought
+        return "right" if verdict == "none_missing" or named else "false alarm"
     if verdict == "none_missing":
         return "silent"
     if all(EFFECTS[name].acts == "unknown" for name in case.effects):
