@@ -215,4 +215,5 @@ def _shares(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     narrow = cv2.erode(wide, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), borderValue=1)
     size = (inside.shape[1] // SUPERSAMPLED, inside.shape[0] // SUPERSAMPLED)
     # the mean of blocks; 64 cells of 0, 1 or 2 add up exactly
-    return cv2.resize(cv2.add(wide, narrow).astype(np.float32), size, interpolation=cv2.INTER_AREA) / 2
+    means = cv2.resize(cv2.add(wide, narrow).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return (0.5 * means).astype(np.float32)
