@@ -15,7 +15,12 @@ from cgwm.schemas import CgwmError, SynthesizeConfig, UsageError
 from small_model import write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=5, duration_s=0.3, width=32, height=24, device="cpu", seed=3, shards=3)
-_CLI = "import sys; from cgwm.cli.run import main; main(sys.argv[1:])"
+_CLI = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, and so inherited, where tests run in the background
+from cgwm.cli.run import main
+main(sys.argv[1:])
+"""
 
 
 @pytest.fixture(scope="module")
