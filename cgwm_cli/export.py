@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from .options import Debug, Json, Overwrite, Quiet
 from .run import running
+from .usage import refuse_foreign
 
 if TYPE_CHECKING:
     from ..schemas import ExportResult
@@ -92,30 +93,14 @@ def export(
     given = {"split": split, "cameras": cameras, "every": every, "task": task, "rollout": rollout, "mask": mask}
     given |= {"sh_degree": sh_degree, "capture": capture, "seed": seed, "duration_s": duration}
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.export import ExportOptions
+        from ..pipeline.export import OPTIONS, ExportOptions
         from ..pipeline.export import export as work
 
         words = {name: value for name, value in given.items() if value is not None}
-        _refuse(to, words)
+        refuse_foreign(words, OPTIONS[to], f"--to {to}")
         if cameras is not None:
             words["cameras"] = tuple(name.strip() for name in cameras.split(","))
         emit(work(thing, to, out, ExportOptions(**words), overwrite), _summary)
-
-
-def _refuse(format_: Any, given: dict[str, Any]) -> None:
-    """Refuse options that mean nothing for a format."""
-    from ..pipeline.export import OPTIONS
-    from ..schemas import UsageError
-
-    legal = OPTIONS[format_]
-    for name in given:
-        if name not in legal:
-            allowed = ", ".join(map(_option, legal)) or "no option of its own"
-            raise UsageError(f"{_option(name)} with --to {format_}: it means nothing there.", f"{allowed}.")
-
-
-def _option(name: str) -> str:
-    return "--" + name.removesuffix("_s").replace("_", "-")
 
 
 def _summary(result: ExportResult) -> str:

@@ -9,6 +9,7 @@ import typer
 
 from .options import Debug, Json, Overwrite, Quiet
 from .run import running
+from .usage import refuse_foreign
 
 if TYPE_CHECKING:
     from ..schemas import ImportResult
@@ -108,21 +109,8 @@ def import_capture(
     given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic}
     with running(json=json, quiet=quiet, debug=debug) as emit:
         words = {name: value for name, value in given.items() if value is not None}
-        _refuse(format_, words)
+        refuse_foreign(words, _OPTIONS[format_], format_, "leave it out.")
         emit(_imported(format_, source, out, words, overwrite), _summary)
-
-
-def _refuse(format_: str, given: dict[str, Any]) -> None:
-    """Refuse options that mean nothing for a format."""
-    from ..schemas import UsageError
-
-    legal = [f"--{name.replace('_', '-')}" for name in _OPTIONS[format_]]
-    for name in given:
-        option = f"--{name.replace('_', '-')}"
-        if option not in legal:
-            raise UsageError(
-                f"{option} with {format_}: it means nothing there.", f"{', '.join(legal)}.", "leave it out."
-            )
 
 
 def _imported(format_: str, source: Path, out: Path, given: dict[str, Any], overwrite: bool) -> ImportResult:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -28,6 +29,32 @@ def explain(error: Any, arguments: list[str]) -> str:
         found = f"{command}: there is no command '{verb}'."
         return str(UsageError(found, f"{', '.join(verbs)}.{did_you_mean(verb, verbs)}", todo))
     return str(UsageError(f"{command}: {message}{_nearest_choice(message)}", todo=todo))
+
+
+def refuse_foreign(given: Iterable[str], legal: Iterable[str], where: str, todo: str = "") -> None:
+    """Refuse options of a verb that mean nothing for one of its formats.
+
+    Args:
+        given: Names of the arguments that were given; an option is spelt like its argument, without its unit.
+        legal: Names of those that mean something there.
+        where: What the options stood with, for the message.
+        todo: What to do next.
+
+    Raises:
+        UsageError: If one means nothing.
+    """
+    from ..schemas import UsageError
+
+    options = [option_name(name) for name in legal]
+    for name in given:
+        if option_name(name) not in options:
+            allowed = ", ".join(options) or "no option of its own"
+            raise UsageError(f"{option_name(name)} with {where}: it means nothing there.", f"{allowed}.", todo)
+
+
+def option_name(name: str) -> str:
+    """Return how the option of an argument is spelt: without its unit."""
+    return "--" + name.removesuffix("_s").replace("_", "-")
 
 
 def _nearest_choice(message: str) -> str:

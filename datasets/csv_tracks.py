@@ -12,21 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import Body, InputDataError, did_you_mean
+from ..schemas import InputDataError, did_you_mean
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
-from .recordings import (
-    SI,
-    Recording,
-    Units,
-    drawn_splits,
-    episode_names,
-    from_zero,
-    read_text,
-    track_files,
-    upright,
-    write_recordings,
-)
+from .recordings import SI, Units, read_text, track_files, write_tracks
 from .tracks import Track
 
 Array = NDArray[np.float64]
@@ -87,14 +76,8 @@ def import_csv(
                     f"{', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}",
                 )
         files = track_files(Path(source), (".csv",))
-        names = episode_names([path.stem for path in files])
-        recordings = [
-            Recording(name, from_zero(_tracks(path, columns or {}, units, body)))
-            for name, path in zip(names, files, strict=True)
-        ]
-        bodies = dict.fromkeys(name for recording in recordings for name in recording.tracks)
-        splits = drawn_splits(recordings, n_train, n_test, seed)
-        return write_recordings(directory, out, upright(up), map(_body, bodies), recordings, splits)
+        tracks = (_tracks(path, columns or {}, units, body) for path in files)
+        return write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
 
 
 @dataclass(frozen=True)
@@ -189,7 +172,3 @@ def _number(path: Path, line: int, row: list[str], header: _Header, key: str) ->
         raise InputDataError(
             f"{path}, line {line}: {key}: {shown}.", "numbers; empty where nothing was seen."
         ) from None
-
-
-def _body(name: str) -> Body:
-    return Body(name=name)

@@ -10,20 +10,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import Body, InputDataError, did_you_mean
+from ..schemas import InputDataError, did_you_mean
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
-from .recordings import (
-    SI,
-    Recording,
-    Units,
-    drawn_splits,
-    episode_names,
-    from_zero,
-    track_files,
-    upright,
-    write_recordings,
-)
+from .recordings import SI, Units, track_files, write_tracks
 from .tracks import Track
 
 Array = NDArray[np.float64]
@@ -82,12 +72,9 @@ def import_hdf5(
         files = track_files(Path(source), (".h5", ".hdf5"))
         found = [(path, name, track) for path in files for name, track in _episodes(path, columns or {}, units)]
         several = len(files) > 1
-        names = episode_names([f"{path.stem}-{name}" if several else name for path, name, _ in found])
-        recordings = [
-            Recording(name, from_zero({body: track})) for name, (_, _, track) in zip(names, found, strict=True)
-        ]
-        splits = drawn_splits(recordings, n_train, n_test, seed)
-        return write_recordings(directory, out, upright(up), (Body(name=body),), recordings, splits)
+        stems = [f"{path.stem}-{name}" if several else name for path, name, _ in found]
+        tracks = ({body: track} for _, _, track in found)
+        return write_tracks(directory, out, stems, tracks, up, (n_train, n_test, seed))
 
 
 def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tuple[str, Track]]:

@@ -169,6 +169,30 @@ def episode_names(stems: Sequence[str]) -> list[str]:
     return names
 
 
+def write_tracks(
+    directory: Path,
+    out: Path | str,
+    stems: Sequence[str],
+    tracks: Iterable[dict[str, Track]],
+    up: Literal["z", "y"],
+    splits: tuple[int | None, int | None, int],
+) -> ImportResult:
+    """Write tracks of one's own as a capture, each an episode that begins at zero, with splits that are drawn.
+
+    Args:
+        directory: To write into.
+        out: What the directory will be called.
+        stems: What the episodes are called where they come from.
+        tracks: By body, of each episode.
+        up: Which axis points up.
+        splits: Episodes to fit on, to test on, and the seed of the permutation: see `drawn_splits`.
+    """
+    recordings = [Recording(name, from_zero(own)) for name, own in zip(episode_names(stems), tracks, strict=True)]
+    bodies = dict.fromkeys(name for recording in recordings for name in recording.tracks)
+    drawn = drawn_splits(recordings, *splits)
+    return write_recordings(directory, out, upright(up), (Body(name=name) for name in bodies), recordings, drawn)
+
+
 def drawn_splits(
     recordings: Sequence[Recording], n_train: int | None, n_test: int | None, seed: int
 ) -> dict[str, tuple[str, ...]]:

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..schemas import Body, InputDataError, UsageError, did_you_mean
+from ..schemas import InputDataError, UsageError, did_you_mean
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
 from .progress import note
-from .recordings import Recording, Units, drawn_splits, episode_names, from_zero, upright, write_recordings
+from .recordings import Units, write_tracks
 from .tracks import Track
 
 POSES = {
@@ -65,12 +65,8 @@ def import_rosbag(
         raise UsageError("ROS bags need the package rosbags.", todo="pip install 'cgwm[ros]'.") from None
     with new_directory(out, overwrite) as directory:
         bags = _bags(Path(source))
-        names = episode_names([path.stem for path in bags])
-        recordings = [
-            Recording(name, from_zero({body: _track(path, topic)})) for name, path in zip(names, bags, strict=True)
-        ]
-        splits = drawn_splits(recordings, n_train, n_test, seed)
-        return write_recordings(directory, out, upright(up), (Body(name=body),), recordings, splits)
+        tracks = ({body: _track(path, topic)} for path in bags)
+        return write_tracks(directory, out, [path.stem for path in bags], tracks, up, (n_train, n_test, seed))
 
 
 def _bags(source: Path) -> list[Path]:

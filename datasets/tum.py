@@ -7,21 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..schemas import Body, InputDataError
+from ..schemas import InputDataError
 from ..schemas.imports import ImportResult
 from .atomic import new_directory
-from .recordings import (
-    SI,
-    Recording,
-    Units,
-    drawn_splits,
-    episode_names,
-    from_zero,
-    read_text,
-    track_files,
-    upright,
-    write_recordings,
-)
+from .recordings import SI, Units, read_text, track_files, write_tracks
 from .tracks import Track
 
 
@@ -58,12 +47,8 @@ def import_tum(
     """
     with new_directory(out, overwrite) as directory:
         files = track_files(Path(source), (".txt", ".tum"))
-        names = episode_names([path.stem for path in files])
-        recordings = [
-            Recording(name, from_zero({body: _track(path, units)})) for name, path in zip(names, files, strict=True)
-        ]
-        splits = drawn_splits(recordings, n_train, n_test, seed)
-        return write_recordings(directory, out, upright(up), (Body(name=body),), recordings, splits)
+        tracks = ({body: _track(path, units)} for path in files)
+        return write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
 
 
 def _track(path: Path, units: Units) -> Track:

@@ -189,18 +189,39 @@ def _check_momentum(
     allowed = IMPULSE_TOLERANCE * scale + body.mass * step[:, 0] * bent
     findings.impulse_excess_n_s = max(findings.impulse_excess_n_s, float(excess.max()))
     wrong = ~(excess <= allowed)
-    if wrong.any():
-        worst = int(np.where(wrong, excess / allowed, 0).argmax())
-        yield Fault(
-            "momentum",
-            f"contacts/impulse_world: body '{body.name}', frame {worst + 1}: momentum changed by {excess[worst]:.3g} "
-            f"N s more than impulses, gravity and effects say; {allowed[worst]:.2g} is allowed. "
-            f"So in {int(wrong.sum())} frames.",
-            frame=worst + 1,
-            body=body.name,
-            value=float(excess[worst]),
-            limit=float(allowed[worst]),
-        )
+    yield from _worst(
+        "momentum",
+        "contacts/impulse_world",
+        body,
+        "N s more than impulses, gravity and effects say",
+        excess,
+        allowed,
+        wrong,
+    )
+
+
+def _worst(
+    what: str,
+    array: str,
+    body: _Body,
+    than: str,
+    excess: np.ndarray,
+    allowed: np.ndarray,
+    wrong: np.ndarray,
+) -> Iterator[Fault]:
+    """Yield the worst of the intervals (T - 1,) that are wrong, if any: by `than` much more did `what` change there."""
+    if not wrong.any():
+        return
+    worst = int(np.where(wrong, excess / allowed, 0).argmax())
+    yield Fault(
+        what,
+        f"{array}: body '{body.name}', frame {worst + 1}: {what} changed by {excess[worst]:.3g} {than}; "
+        f"{allowed[worst]:.2g} is allowed. So in {int(wrong.sum())} frames.",
+        frame=worst + 1,
+        body=body.name,
+        value=float(excess[worst]),
+        limit=float(allowed[worst]),
+    )
 
 
 def _bent(values: np.ndarray, touching: np.ndarray) -> np.ndarray:
@@ -247,18 +268,9 @@ def _check_spin(
     allowed = IMPULSE_TOLERANCE * scale + bent + pushed[1:] * 2 * fastest * step
     touching = pushed[1:] > 0
     wrong = ~(excess <= allowed) & ~(touching & turned)
-    if wrong.any():
-        worst = int(np.where(wrong, excess / allowed, 0).argmax())
-        yield Fault(
-            "angular momentum",
-            f"bodies/omega_body: body '{body.name}', frame {worst + 1}: angular momentum changed by "
-            f"{excess[worst]:.3g} N m s more than the contacts turn it; {allowed[worst]:.2g} is allowed. "
-            f"So in {int(wrong.sum())} frames.",
-            frame=worst + 1,
-            body=body.name,
-            value=float(excess[worst]),
-            limit=float(allowed[worst]),
-        )
+    yield from _worst(
+        "angular momentum", "bodies/omega_body", body, "N m s more than the contacts turn it", excess, allowed, wrong
+    )
     shares = excess[touching] / np.maximum(reach[1:][touching], 1e-30)
     if turned or not len(shares):
         return

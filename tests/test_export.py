@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 from cgwm.cli import main
-from cgwm.cli.export import _option
+from cgwm.cli.usage import option_name
 from cgwm.datasets.atomic import sha256
 from cgwm.datasets.cameras import Camera, camera_of, to_intrinsics
 from cgwm.datasets.colmap_model import read_colmap_model, rotation_from_quat_wxyz
@@ -627,4 +627,4 @@ def test_the_command_tells_what_was_measured(model: Path, tmp_path: Path, capfd:
 def test_every_format_has_its_options() -> None:
     assert set(OPTIONS) == {*DATASET_FORMATS, *MODEL_FORMATS}
     assert {name for names in OPTIONS.values() for name in names} == set(ExportOptions.__dataclass_fields__)
-    assert _option("duration_s") == "--duration" and _option("sh_degree") == "--sh-degree"
+    assert option_name("duration_s") == "--duration" and option_name("sh_degree") == "--sh-degree"

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
 from ...datasets.loader import RolloutReader
 from ...datasets.models import Model
+from ...datasets.rollouts import ContactTable
 from ...schemas import SamplingPlan, SynthesizeConfig
-from ..physics.checks import require_apart, require_finite
-from ..physics.dispatch import rollout as roll_out
-from ..physics.records import ContactRecord
-from ..physics.world import State, World
-from ..posterior import draw_parameters
-from ..sampling import draw_start, resolve_plan
+from ..draws import draw_rollout
+from ..rollout_batches import Diverged, Simulator
+from ..sampling import resolve_plan
 
 Array = NDArray[np.float64]
 Contacts = Mapping[str, NDArray[np.generic]]
@@ -93,31 +91,19 @@ def own_motion(model: Model, number: int) -> Motion:
     Raises:
         NotConvergedError: If the simulation diverges.
     """
-    config = SynthesizeConfig()
-    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(number,)))
-    file, _ = draw_parameters(model.file, 0.0, rng)  # draws the numbers that the start's follow
-    model = replace(model, file=file)
+    config = SynthesizeConfig(plan=resolve_plan(model, SamplingPlan(parameter_spread=0.0)))
     times_s = np.arange(round(config.duration_s * config.frame_rate_hz) + 1) / config.frame_rate_hz
-    start = draw_start(model, resolve_plan(model, SamplingPlan()), float(times_s[-1]), rng)
-    world = World.from_model(model)
-    values = (start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s)
-    state = State(*(torch.as_tensor(value, dtype=torch.float64)[None] for value in values))
-    require_apart(world, state)
-    with torch.no_grad():
-        rollout = roll_out(world, state, torch.as_tensor(times_s), start.driven, record_contacts=True)
-    require_finite(rollout, world, state, [f"rollout {number}"])
-    assert rollout.contacts is not None  # asked for above
-    return Motion(times_s, rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy(), _rows(rollout.contacts))
+    drawn = draw_rollout(model, config.plan, config, {}, float(times_s[-1]), number)
+    (found,) = Simulator(model, times_s, "cpu").run([drawn], config.seed)
+    if isinstance(found, Diverged):
+        raise found.error
+    return Motion(times_s, found.position_m, found.quat_wxyz, _by_frame(found.contacts))
 
 
-def _rows(record: ContactRecord) -> tuple[Contacts, ...]:
-    """Return the contacts that touch at a frame, or passed on an impulse since the frame before, by frame."""
-    position, impulse = record.position_m[0].numpy(), record.impulse_n_s[0].numpy()
-    active = (np.abs(impulse).max(-1) > 0) | (record.distance_m[0].numpy() <= 0)
-    sliding = record.sliding[0].numpy().astype(np.uint8)
+def _by_frame(table: ContactTable) -> tuple[Contacts, ...]:
+    columns = {"pos_world": table.position_m, "impulse_world": table.impulse_n_s, "mode": table.sliding}
     return tuple(
-        {"pos_world": place[here], "impulse_world": push[here], "mode": mode[here]}
-        for place, push, mode, here in zip(position, impulse, sliding, active, strict=True)
+        {name: values[first:last] for name, values in columns.items()} for first, last in pairwise(table.offsets)
     )
 
 
