@@ -1,15 +1,15 @@
 """Does `cgwm diagnose` name what is hidden, and nothing where nothing is? Captures whose truth is another engine.
 
     python benchmarks/diagnose.py --stage development --workers 2 [--nulls 20] [--only cube/com_offset] [--list rough]
-    python benchmarks/diagnose.py --stage report2 --table
+    python benchmarks/diagnose.py --stage report3 --table
     python benchmarks/diagnose.py --list video             # six captures with videos only
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
 
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
 --effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
-by report and report2, whose seeds are others (report2: since what report said was seen). Results are stored case by
-case and taken up again.
+by report, report2 and report3, whose seeds are others (each later one: since what the one before said was seen).
+Results are stored case by case and taken up again.
 """
 
 from __future__ import annotations
@@ -291,6 +291,7 @@ def main() -> int:
     parser.add_argument("--stage", choices=STAGES, default="development")
     parser.add_argument("--list", choices=("all", "rough", "drake", "video"), default="all", help="which cases")
     parser.add_argument("--nulls", type=int, default=200)
+    parser.add_argument("--repeats", type=int, default=1, help="seeds of each effect, pair and unknown")
     parser.add_argument("--only", default="", help="cases whose names contain this")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after this time")
@@ -306,7 +307,7 @@ def main() -> int:
         return 0
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     if given.list == "all":
-        chosen = cases(given.stage, nulls=given.nulls)
+        chosen = cases(given.stage, given.repeats, given.nulls)
     elif given.list == "drake":
         chosen = drake_cases(given.stage, nulls=given.nulls)
     else:

@@ -5,14 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnosis.candidates import Candidate
+from cgwm.pipeline.diagnosis.cuts import Segment
+from cgwm.pipeline.diagnosis.glide_fits import soft_world, without_loads
 from cgwm.pipeline.diagnosis.glide_stage import glide_evidence, with_effect
 from cgwm.pipeline.diagnosis.glides import glides_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
+from cgwm.pipeline.diagnosis.segments import Segments
 from cgwm.pipeline.diagnosis.verdict import GLIDE_SCORE, find
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact import ContactLaw
 from cgwm.pipeline.physics.effects import load_effect
+from cgwm.pipeline.physics.parameters import FRICTION
+from cgwm.pipeline.physics.rotation import quat_to_matrix
 from diagnosis_data import Effects, tosses, world_with
 
 LIBRARY = [
@@ -52,7 +58,7 @@ def test_a_glide_ends_at_an_impact() -> None:
 def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None:
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22})
-    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE)
+    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE, prepared.flight)
     assert found[0].evidence.name == name
     assert found[0].score > GLIDE_SCORE
     assert found[0].score > 3 * found[1].score
@@ -67,7 +73,7 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
 
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
-    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE)
+    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE, prepared.flight)
     assert not found or found[0].score < GLIDE_SCORE
 
 
@@ -79,3 +85,40 @@ def test_what_glides_tell_is_the_verdict() -> None:
     assert found.chosen[0].where == "contact"
     before, after = found.errors["rolling_resistance"]
     assert np.isfinite([before, after]).all()
+
+
+def test_a_box_that_turns_over_an_edge_does_not_glide() -> None:
+    world, times = world_with("cube"), np.linspace(0, 1, 101)
+    angle = np.interp(times, (0.3, 0.6), (0.0, np.pi / 2))
+    height = 0.05 * (np.abs(np.cos(angle)) + np.abs(np.sin(angle)))  # its lowest edge stays on the ground
+    rng, zero = np.random.default_rng(0), np.zeros(101)
+    position = np.stack([0.1 * times, zero, height], 1) + 2e-4 * rng.standard_normal((101, 3))
+    found = {}
+    for name, tilt in (("flat", 0 * angle), ("over", angle)):
+        quat = np.stack([np.cos(tilt / 2), zero, np.sin(tilt / 2), zero], 1) + 5e-4 * rng.standard_normal((101, 4))
+        level = position.copy()
+        level[:, 2] += 0.05 * (np.abs(np.cos(tilt)) + np.abs(np.sin(tilt))) - height
+        track = Track(times, level, quat / np.linalg.norm(quat, axis=1, keepdims=True))
+        prepared = prepare(world, [(name, {world.bodies[0].name: track})])
+        glides = glides_of(world, prepared.whole, prepared.clear, prepared.noise)
+        found[name] = sum(item.last - item.first for item in glides)
+        assert all(name == "flat" or item.last <= 32 or item.first >= 58 for item in glides)
+    assert found["flat"] > 90 and 40 < found["over"] < 70
+
+
+def test_what_unknown_loads_turn_is_no_evidence() -> None:
+    world = world_with("cube")
+    episodes = tosses(world, 2, count=2, duration_s=0.5, height_m=(0.05, 0.05), lift_m_s=(0.0, 0.0))
+    prepared = prepare(world, episodes)
+    soft = soft_world(world)
+    frames = [Segment(k, 0, 50) for k in range(2)]
+    glides = Segments.of("contact", soft, prepared.whole, frames, prepared.noise)
+    rows = glides.residuals([FRICTION], torch.zeros(2, 1, dtype=torch.float64), jacobian=False)[0]
+    weak, full = without_loads(glides, rows), rows
+    up = quat_to_matrix(glides.observations.quat_wxyz[:, :, 0]).transpose(-1, -2) @ soft.ground_normal
+    squared = glides.observations.times_s[..., None].square()
+    constant = torch.cat((torch.zeros_like(up), squared * up), -1)  # a turn at constant angular acceleration
+    for given, least, most in ((constant, 0.0, 0.05), (rows.roll(1, -1), 0.5, 1.0)):
+        share = without_loads(glides, given).norm() / given.norm()
+        assert least <= share <= most
+    assert weak.norm() <= full.norm()

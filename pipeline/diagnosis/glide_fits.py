@@ -31,6 +31,9 @@ STATE_STEPS = (1e-4, 1e-3, 1e-3, 1e-2)
 PARAMETER_STEP = 0.02
 """Differences by parameters, in widths of their priors."""
 ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE = 8, 1e5, 0.2, 2e-3
+LOADS_UNKNOWN = 0.02
+"""How a weight is shared by more than three points, nobody knows better than to this share: a body is never quite flat,
+and engines differ by as much. What it turns a sliding body about the normal is no evidence for anything."""
 DAMPINGS = (0.1, 1.0, 10.0, 300.0)
 """Of each step so many are tried, in units of the damping that was best before: through the end of a slide the linear
 picture holds for small steps only."""
@@ -72,6 +75,7 @@ def fit_groups(
     free: Tensor,
     group: Tensor,
     iterations: int = ITERATIONS,
+    centre: Tensor | None = None,
 ) -> GlideFit:
     """Fit the parameters of each group and the starts of its glides.
 
@@ -82,6 +86,7 @@ def fit_groups(
         free: Places of the numbers that each group fits (G, S); -1 for none.
         group: Of each glide (B,).
         iterations: Most steps.
+        centre: Of the priors (G, P); where the fit starts by default.
     """
     width = torch.tensor([p.prior[1] for p in parameters]).to(values)
     limits = torch.tensor([p.limits for p in parameters]).to(values)
@@ -94,9 +99,10 @@ def fit_groups(
         return values.scatter_add(1, place, torch.where(fitted, own - start, torch.zeros_like(own)))
 
     def cost_of(chi2: Tensor, own: Tensor) -> Tensor:
-        return _added(chi2, group, count) + (prior * fitted * (own - start) ** 2).sum(1)
+        return _added(chi2, group, count) + (prior * fitted * (own - middle) ** 2).sum(1)
 
     start = values.gather(1, place)
+    middle = start if centre is None else centre.gather(1, place)
     now, cost = start, cost_of(chi2, start)
     damping, active = torch.full_like(cost, 1e-2), torch.ones(count, dtype=torch.bool)
     information = torch.zeros(count, size, size).to(values)
@@ -108,7 +114,7 @@ def fit_groups(
         def step(damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             """Return values (G, S), changes of states along the basis (n, K) and information of a damped step."""
             m, g, by_slope, by_value = _projected(rows, jacobian, size, own, damping)  # noqa: B023 used at once
-            m, g = m + torch.diag_embed(prior), g - prior * (now - start)  # noqa: B023
+            m, g = m + torch.diag_embed(prior), g - prior * (now - middle)  # noqa: B023
             blocked = ((now <= low) & (g < 0)) | ((now >= high) & (g > 0))  # noqa: B023
             moving = (fitted & ~blocked & active[:, None]).to(values)  # noqa: B023
             diagonal = damping[:, None] * m.diagonal(dim1=1, dim2=2) * moving + (1 - moving)
@@ -183,8 +189,35 @@ def _added(values: Tensor, group: Tensor, count: int) -> Tensor:
 
 
 def _chi2(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
-    rows = segments.residuals(parameters, values, jacobian=False)[0]
+    rows = without_loads(segments, segments.residuals(parameters, values, jacobian=False)[0])
     return torch.nan_to_num(rows.square().sum((1, 2)), nan=1e12, posinf=1e12)
+
+
+def without_loads(segments: Segments, rows: Tensor) -> Tensor:
+    """Return residuals (B, T, 6) in sigmas without what unknown loads may have turned the body about the normal.
+
+    Derived. With the columns of U the residuals of turns about the normal by angular accelerations that are constant
+    and that grow with time, whose standard deviation is s, the covariance of the residuals is 1 + s^2 U U^T; they are
+    multiplied by its inverse root.
+    """
+    seen, world = segments.observations, segments.world
+    body = world.bodies[seen.free[0]]
+    if is_round(body):
+        return rows
+    assert world.ground_normal is not None and isinstance(world.contact, ContactLaw)
+    turned = seen.turned[:, :, 0, None] / segments.noise[1]
+    times = (seen.times_s - seen.times_s[:, :1])[..., None]
+    share = times / times.amax(1, keepdim=True).clamp_min(1e-9)
+    axis = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ world.ground_normal
+    turn = 0.5 * times.square() * axis * turned
+    turns = torch.stack([torch.cat((torch.zeros_like(axis), one), -1) for one in (turn, share / 3 * turn)], -1)
+    reach = body.centers[0].norm(dim=-1).max()
+    torque = world.contact.friction[0] * world.gravity[0].norm() * body.mass[0] * reach
+    spread = LOADS_UNKNOWN * torque / body.inertia[0].diagonal().mean()
+    directions, sizes, _ = torch.linalg.svd(turns.flatten(1, 2), full_matrices=False)
+    known = 1 - (1 + (spread * sizes).square()).rsqrt()
+    along = directions.mT @ rows.flatten(1)[..., None]
+    return rows - (directions @ (known[..., None] * along)).view_as(rows)
 
 
 def _basis(segments: Segments) -> Tensor:
@@ -224,7 +257,8 @@ def _linear(
     changes += [sign * basis[..., j] for j in range(k) for sign in (1.0, -1.0)]
     moves += [values] * (2 * k)
     every = segments.select(list(range(n)) * len(changes)).moved(torch.cat(changes))
-    rows = every.residuals(parameters, torch.cat(moves), jacobian=False)[0].flatten(1).unflatten(0, (len(changes), n))
+    rows = every.residuals(parameters, torch.cat(moves), jacobian=False)[0]
+    rows = without_loads(every, rows).flatten(1).unflatten(0, (len(changes), n))
     rows = torch.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
     by_value = (rows[1 : 1 + size] - rows[0]).movedim(0, -1) / steps[free.clamp_min(0)][:, None]
     by_state = 0.5 * (rows[1 + size :: 2] - rows[2 + size :: 2]).movedim(0, -1)

@@ -19,11 +19,11 @@ from ..physics.contact import ContactLaw
 from ..physics.effects.effect import ActiveEffect
 from ..physics.parameters import FRICTION, GROUND_SHIFT, Parameter, effect_parameters
 from ..physics.world import State, World
-from .candidates import Candidate, Variant, admissible, base_values, variants_of, with_variants
+from .candidates import Candidate, Variant, admissible, base_parameters, base_values, variants_of, with_variants
 from .glide_fits import ITERATIONS, GlideFit, fit_groups, soft_world
 from .glides import glides_of, settled
 from .prepared import Prepared
-from .score import ScoreTest
+from .score import ScoreTest, picture, sums
 from .segments import Segments, line_state, world_for
 from .slots import Evidence
 
@@ -57,15 +57,19 @@ class GlideEvidence:
 
 
 def glide_evidence(
-    prepared: Prepared, world: World, candidates: Sequence[Candidate], least: float
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], least: float, flight: Segments | None
 ) -> list[GlideEvidence]:
     """Return the evidence of the candidates that act in contact, the best first; none where none can reach a score.
+
+    What acts in flight acts in glides, too, and is known no better than flights tell it: an error of half a thousandth
+    of a radian in a tilt is a millimetre in a slide of half a second. It is fitted along, from there.
 
     Args:
         prepared: The episodes.
         world: The model's world.
         candidates: All of them.
         least: The score that matters.
+        flight: Flights with fitted states; None where there are none.
     """
     if not isinstance(world.contact, ContactLaw) or not prepared.turned:
         return []
@@ -77,7 +81,8 @@ def glide_evidence(
     soft = soft_world(world)
     glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
     glides, friction = _started(glides, float(world.contact.friction[0]))
-    base = _fitted(soft, [], [(glides, friction)])[0]
+    told = _told_by_flight(flight, soft, prepared.groups)
+    base = _fitted(soft, [], [(glides, friction)], told)[0]
     degrees = float(glides.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
         return []
@@ -85,7 +90,7 @@ def glide_evidence(
     few = [v for v in variants if len(v.parameters) <= MANY]
     found: dict[int, tuple[Variant, GlideFit]] = {}
     for part in (few, [v for v in variants if v not in few]):
-        tried = _fitted(soft, part, [start] * len(part), FIRST_ITERATIONS) if part else []
+        tried = _fitted(soft, part, [start] * len(part), told, FIRST_ITERATIONS) if part else []
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
     # what is far behind after some steps is not worth the others
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
@@ -93,12 +98,12 @@ def glide_evidence(
     for part in ([k for k in close if found[k][0] in few], [k for k in close if found[k][0] not in few]):
         if part:
             chosen = [found[k] for k in part]
-            again = _fitted(soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen])
+            again = _fitted(soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen], told)
             found |= {k: (found[k][0], fit) for k, fit in zip(part, again, strict=True)}
     # the model alone once more from where the best one ended: what both gain by that is no sign of an effect
     _, best = min(found.values(), key=lambda one: one[1].cost)
     own = best.values[0, : base.values.shape[1]]
-    least_cost = min(base.cost, _fitted(soft, [], [(best.segments, own)])[0].cost)
+    least_cost = min(base.cost, _fitted(soft, [], [(best.segments, own)], told)[0].cost)
     return _ranked(list(found.values()), kept, least_cost, degrees)
 
 
@@ -133,6 +138,7 @@ def _fitted(
     world: World,
     variants: Sequence[Variant],
     starts: Sequence[tuple[Segments, Tensor]],
+    told: Sequence[Parameter],
     iterations: int = ITERATIONS,
 ) -> list[GlideFit]:
     """Return the fit of each variant beside a friction; of the friction alone without variants.
@@ -142,10 +148,11 @@ def _fitted(
         variants: To fit, all in one batch.
         starts: Of each, glides with states, and the values of a fit without it or with it to start from, or as many of
             the first as are known.
+        told: What flights tell, with their standard errors as priors.
         iterations: Most steps.
     """
     beside, own = with_variants(world, variants, "contact")
-    known = _own_numbers(world)
+    known = [*_own_numbers(world), *told]
     parameters: list[Parameter] = [FRICTION, GROUND_SHIFT, *known, *own]
     place = {p.name: k for k, p in enumerate(parameters)}
     shared = list(range(2 + len(known)))
@@ -153,14 +160,17 @@ def _fitted(
     size, count = max(map(len, rows)), len(starts[0][0].items)
     free = torch.tensor([row + [-1] * (size - len(row)) for row in rows])
     values = base_values(beside, parameters).repeat(len(rows), 1)
+    middle = values.clone()
     for k, (row, (_, value)) in enumerate(zip(rows, starts, strict=True)):
         given = value.reshape(-1)
         values[k, row[: len(given)]] = given
+    free_start = [k for k, p in enumerate(parameters) if p not in told]
+    middle[:, free_start] = values[:, free_start]
     glides = starts[0][0]
     every = replace(glides, world=world_for("contact", beside)).select(list(range(count)) * len(rows))
     every = every.with_state(State.joined(*(segments.observations.state for segments, _ in starts)))
     group = torch.arange(len(rows)).repeat_interleave(count)
-    found = fit_groups(every, parameters, values, free, group, iterations)
+    found = fit_groups(every, parameters, values, free, group, iterations, middle)
     fits = []
     for k, row in enumerate(rows):
         chosen = slice(k * count, (k + 1) * count)
@@ -174,6 +184,17 @@ def _own_numbers(world: World) -> list[Parameter]:
     """Return the parameters of what the model already has in contact, which are fitted along."""
     own = {a.effect.name for a in world.effects if a.effect.phase == "contact"}
     return [p for p in effect_parameters(world) if p.name.partition(".")[0] in own]
+
+
+def _told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> list[Parameter]:
+    """Return the parameters of what acts in flight, with the standard errors that flights leave them as priors."""
+    parameters = base_parameters(world, "flight")
+    if flight is None or not parameters:
+        return []
+    seen = picture(flight, world, (), groups, robust=False)
+    information, _ = sums(seen, range(seen.base))
+    deviations = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+    return [replace(p, prior=(p.prior[0], float(s))) for p, s in zip(parameters, deviations, strict=True)]
 
 
 def _ranked(

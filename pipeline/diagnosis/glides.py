@@ -30,6 +30,8 @@ NEAR_M, NEAR_SIGMAS = 0.0015, 3.0
 """On the ground: the lowest point lies below this height, and so many standard deviations of the noise."""
 SIDE_S, SIDE_FRAMES = 0.04, 3
 """An impact is a jump of the velocity along the normal, or of tilting, between so much before and after it."""
+TILTING_RAD_S = 0.3
+"""A body that is not round and tilts faster than this, or so many standard deviations (below), turns over an edge."""
 JUMP_M_S, JUMP_SIGMAS = 0.12, 4.0
 """A jump of any point of the body by this speed, or so many standard deviations where those are more, is an impact."""
 
@@ -53,6 +55,8 @@ def glides_of(world: World, whole: Observations, clear: Tensor, noise: tuple[flo
     for episode, times in enumerate(whole.times_s):
         count = int((whole.seen[episode].amax(-1) > 0).sum())
         steady = on[episode, :count].numpy() & ~_impacts(world, whole, episode, count, noise)
+        if not is_round(body):
+            steady &= ~_tilting(world, whole, episode, count, noise[1])
         found += _parts(episode, times[:count].numpy(), steady)
     return without_rest(whole, found, noise)
 
@@ -110,6 +114,26 @@ def _impacts(
     wide[1:] |= jumps[:-1]
     wide[:-1] |= jumps[1:]
     return wide
+
+
+def _tilting(world: World, whole: Observations, episode: int, count: int, noise_rad: float) -> NDArray[np.bool_]:
+    """Return the frames (T,) about which the body does not stay on one of its sides."""
+    assert world.ground_normal is not None
+    times = whole.times_s[episode, :count].numpy()
+    turned = whole.turned[episode, :count, 0].numpy() > 0
+    up = (quat_to_matrix(whole.quat_wxyz[episode, :count, 0]).transpose(-1, -2) @ world.ground_normal).numpy()
+    step = float(np.median(np.diff(times))) if count > 1 else 1.0
+    side = max(SIDE_FRAMES, round(SIDE_S / step))
+    tilts = np.zeros(count, np.bool_)
+    for k in range(count):
+        frames = np.arange(max(0, k - side), min(count, k + side + 1))
+        frames = frames[turned[frames]]
+        if len(frames) < 3:
+            continue
+        slope = np.linalg.pinv(np.stack([np.ones(len(frames)), times[frames] - times[k]], 1))[1]
+        spread = float(np.linalg.norm(slope))
+        tilts[k] = np.linalg.norm(slope @ up[frames]) > max(TILTING_RAD_S, JUMP_SIGMAS * noise_rad * spread)
+    return tilts
 
 
 def _parts(episode: int, times: Array, steady: NDArray[np.bool_]) -> list[Segment]:

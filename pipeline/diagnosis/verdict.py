@@ -99,7 +99,7 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     scatter = max(prepared.slow, dispersion(*pieces[-1])) if pieces else 1.0
     before = _worst_omnibus(pieces, scatter)
     slots, after_flight, flight = _flight_search(prepared, world, candidates, scatter)
-    chosen, contact, final, chi2, fitted = _with_contact(prepared, world, after_flight, slots, candidates)
+    chosen, contact, final, chi2, fitted = _with_contact(prepared, world, after_flight, slots, candidates, flight)
     after = _worst_omnibus(_pieces(prepared, final), scatter) if chosen else before
     in_flight = [slot.best.name for slot in slots if slot.flagged]
     alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
@@ -215,7 +215,12 @@ def _bundled(
 
 
 def _with_contact(
-    prepared: Prepared, world: World, after_flight: World, slots: Sequence[Slot], candidates: Sequence[Candidate]
+    prepared: Prepared,
+    world: World,
+    after_flight: World,
+    slots: Sequence[Slot],
+    candidates: Sequence[Candidate],
+    flight: Segments | None,
 ) -> tuple[list[Chosen], list[ContactEvidence], World, float | None, Segments | None]:
     """Return the selected effects, the evidence of contact, the world with them, chi2 / dof and segments of contact."""
     filled = [slot for slot in slots if slot.flagged]
@@ -243,7 +248,7 @@ def _with_contact(
         base, contact = again
     rows = contact.residuals([], contact.observations.times_s.new_zeros(0), jacobian=False)[0]
     chi2 = float(rows.square().sum() / contact.dof.sum())
-    glides = glide_evidence(prepared, base.world, candidates, GLIDE_SCORE)
+    glides = glide_evidence(prepared, base.world, candidates, GLIDE_SCORE, flight)
     alike = _equal_in_glides(glides)
     if alike:
         first = tuple(one.evidence for one in alike)
