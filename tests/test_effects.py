@@ -353,7 +353,7 @@ def test_anisotropic_friction_brakes_by_direction() -> None:
     for axis, velocity, effect, expected in (
         (0, (1.0, 0.0, 0.0), active("anisotropic_friction", a=0.1), MU + 0.1),
         (1, (0.0, 1.0, 0.0), active("anisotropic_friction", a=0.1), MU - 0.1),
-        (1, (0.0, 1.0, 0.0), active("anisotropic_friction", a=0.5), 0.0),
+        (1, (0.0, 1.0, 0.0), active("anisotropic_friction", a=0.5), 0.1 * (MU + 0.5)),
         (0, (0.7, 0.7, 0.0), active("anisotropic_friction", b=0.1), (MU + 0.1) / math.sqrt(2)),
         (0, (0.7, -0.7, 0.0), active("anisotropic_friction", b=0.1), (MU - 0.1) / math.sqrt(2)),
     ):
@@ -537,7 +537,8 @@ def test_the_published_law_takes_effects_on_friction_alone() -> None:
         for d in (0.0, 0.3)
     ]
     assert speeds[1] < speeds[0] - 0.01
-    for name, value in (("rolling_resistance", "c_r"), ("viscous_friction", "c_v"), ("velocity_restitution", "r")):
+    others = {"rolling_resistance": "c_r", "viscous_friction": "c_v", "velocity_restitution": "r"}
+    for name, value in (others | {"anisotropic_friction": "a"}).items():
         with pytest.raises(UsageError, match=f"the effect '{name}' changes what the published contact law does not"):
             rolled(world, start, 0.05, active(name, **{value: 0.1}))
 

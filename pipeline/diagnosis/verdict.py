@@ -43,8 +43,9 @@ CONTACT_T = 1.0
 GLIDE_SCORE = 220.0
 """An effect in glides is named above this score ... On development seeds the largest of 13 captures without one was 170
 (friction against spinning, of a cube); those that were named rightly had 278 to 91813."""
-FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 4, 400.0
-"""... one of more numbers than these above that: a map of friction fits what a box leaves without any (score 190)."""
+FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 1, 400.0
+"""... one of more numbers than this above that: a map of friction (score 270) and friction by direction (240) fit what
+a box leaves without any. The lowest score of a direction that was there is 1104."""
 GLIDE_EXPLAINED = 0.5
 """And where it explains at least this share of what the noise does not: of less, it stands in for a stranger."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1

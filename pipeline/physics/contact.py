@@ -43,7 +43,8 @@ class Touch:
 
     The numbers have shape (n, 1) or (n, C): friction [1]; contact_time_s [s]; damping_ratio [1]; viscous_n_s_m
     [N s/m]: force against the slip, shared among the points that touch; rolling_m, torsion_m [m]: largest torque
-    against rolling, and against spinning about the normal, in units of the normal force.
+    against rolling, and against spinning about the normal, in units of the normal force. anisotropy (n, 1 or C, 2) [1]:
+    a and b of the friction by direction along `tangent_axes` of the normal, see `ellipse.py`.
     """
 
     ground: bool
@@ -59,6 +60,7 @@ class Touch:
     viscous_n_s_m: Tensor | None = None
     rolling_m: Tensor | None = None
     torsion_m: Tensor | None = None
+    anisotropy: Tensor | None = None
 
     @property
     def approach_m_s(self) -> Tensor:

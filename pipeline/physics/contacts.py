@@ -22,6 +22,7 @@ from .detection import (
     pairs_of,
     slot_count,
 )
+from .ellipse import Ellipse
 from .motion import Inertia, Motion
 from .published import PublishedLaw, published_impulses
 from .rotation import cross
@@ -36,7 +37,7 @@ class PairImpulses:
     pair: number in the world's list of pairs; a, b: bodies, b = -1 the ground; free: which of the two move; items
     (n,): which items of the batch, all for None; points: where; impulse_n_s (n, C, 3): on a, world frame;
     along_axes_n_s (n, C, 3): the same along the contacts' axes; angular_n_m_s (n, 3): on a beyond the moments of the
-    impulses, None where nothing resists turning; friction: of the contacts.
+    impulses, None where nothing resists turning; friction: of the contacts, along their impulses.
     """
 
     pair: int
@@ -126,8 +127,11 @@ class Contacts:
             free = (True, b != GROUND and self.world.bodies[b].free)
             world_impulse = (impulse.linear[..., None, :] @ axes).squeeze(-2)
             angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
+            friction = touch.friction
+            if touch.anisotropy is not None:
+                friction = Ellipse.of(friction, touch.anisotropy).along(impulse.linear[..., 1:])
             results.append(
-                PairImpulses(number, a, b, free, items, points, world_impulse, impulse.linear, angular, touch.friction)
+                PairImpulses(number, a, b, free, items, points, world_impulse, impulse.linear, angular, friction)
             )
         return results
 

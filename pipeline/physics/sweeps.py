@@ -18,12 +18,11 @@ import torch
 from torch import Tensor
 
 from .contact import Touch, coefficients
+from .ellipse import TINY, Ellipse
 from .rotation import cross
 
 CONTACT_ONSET_M = 2e-4
 """A contact counts fully in the sharing of a body's mass from this depth on [m]; it only smooths the onset."""
-TINY = 1e-24
-"""Added to squared lengths, so that the derivative of a contact without impulses stays finite."""
 FAR_M_S = 1e30
 """An open contact asks for a gap speed below any [m/s]; finite, as the reverse derivative of infinity is no number."""
 
@@ -87,7 +86,8 @@ class ContactGroup:
     sides: the rows of the bodies that can move; target (n, C): the gap speed that each closed contact asks for;
     stop_n, stop_t (n, C) [kg]: what one contact may move at once; steady (n, C, 3) [N s]: impulses that stay as they
     are; where turning is resisted, spin (n, 3) [rad/s]: free angular velocity of a against b, stop_w (n, C, 2) [kg m2]:
-    what one contact may stop of it about the normal and across it, torsion_m and rolling_m (n, C).
+    what one contact may stop of it about the normal and across it, torsion_m and rolling_m (n, C). ellipse: in place of
+    the friction, where that depends on the direction.
     """
 
     axes: Tensor
@@ -102,6 +102,7 @@ class ContactGroup:
     stop_w: Tensor | None = None
     torsion_m: Tensor | None = None
     rolling_m: Tensor | None = None
+    ellipse: Ellipse | None = None
 
     @staticmethod
     def of(touch: Touch, axes: Tensor, sides: tuple[Rows, ...]) -> ContactGroup:
@@ -126,6 +127,8 @@ class ContactGroup:
         # the sum of the two tangential mobilities bounds the larger one
         stop_t = share / (mobility[..., 1] + mobility[..., 2])
         group = ContactGroup(axes, relative, sides, target, share * mass, stop_t, touch.friction)
+        if touch.anisotropy is not None:
+            group = replace(group, ellipse=Ellipse.of(touch.friction, touch.anisotropy))
         if touch.viscous_n_s_m is not None:
             # implicit in the slip of the point itself, so that no viscosity turns it round
             drag = h * touch.viscous_n_s_m * _shares(ahead, gap)
@@ -229,7 +232,10 @@ def _sweep(group: ContactGroup, before: Impulses, relative: Tensor, omega: Tenso
     along = linear[..., 0] + group.stop_n * (group.target - relative[..., 0])
     wanted = linear[..., 1:] - group.stop_t[..., None] * relative[..., 1:]
     along = along.clamp_min(0.0)
-    across = in_disc(wanted, group.friction * along)
+    if group.ellipse is None:
+        across = in_disc(wanted, group.friction * along)
+    else:
+        across = group.ellipse.nearest(wanted, along)
     linear = torch.cat((along[..., None], across), -1)
     if steady is not None:
         linear = linear + steady

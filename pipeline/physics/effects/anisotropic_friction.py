@@ -5,34 +5,30 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..contact import Touch
-from ..sweeps import tangent_axes
-from .effect import Effect, EffectParameter, Values
-
-SLOW_M_S = 1e-3
-"""Below this slip [m/s] the direction fades, as it means nothing at rest."""
+from .effect import Effect, EffectParameter, Values, vector
 
 
 class AnisotropicFriction(Effect):
-    """mu + t^T [[a, b], [b, -a]] t for a slip along the unit vector t, on the ground."""
+    """Friction -N M^2 v / |M v| on the ground, M = mu I + [[a, b], [b, -a]]."""
 
     name = "anisotropic_friction"
-    summary = "A ground with a grain: friction that depends on the direction of the slip."
-    formula = "mu(t) = mu + a (t_x^2 - t_y^2) + 2 b t_x t_y, at least 0; t the slip's direction in the ground's axes"
+    summary = "A ground with a grain: friction that depends on the direction of the slip, and pushes across it."
+    formula = (
+        "force = -N M^2 v / |M v|, M = mu I + [[a, b], [b, -a]], v the slip in the ground's axes; at rest any force f "
+        "with |M^-1 f| <= N; the lower principal friction mu - |(a, b)| at least a tenth of the higher one"
+    )
     parameters = (
         EffectParameter("a", "1", scale=0.05, limit=1.0),
         EffectParameter("b", "1", scale=0.05, limit=1.0),
     )
     phase = "contact"
     needs = ("ground", "contact")
-    reveals = "slides from the same speed along at least three directions"
-    source = "second harmonic of the friction in the direction; the force stays opposite to the slip (derived)"
+    reveals = "slides from the same speed along at least three directions; oblique ones are curved"
+    source = "elliptic cone with maximum dissipation (Moreau; Goyal, Ruina & Papadopoulos 1991)"
 
     def contact(self, values: Values, touch: Touch) -> Touch:
-        """Return the contact with the friction of the slip's direction."""
+        """Return the contact with the ellipse of the ground's friction."""
         if not touch.ground:
             return touch
-        slip = (tangent_axes(touch.normal)[..., 1:, :] @ touch.slip_m_s[..., None]).squeeze(-1)
-        x, y = slip.unbind(-1)
-        even, mixed = x.square() - y.square(), 2 * x * y
-        change = values["a"][:, None] * even + values["b"][:, None] * mixed
-        return replace(touch, friction=touch.friction + change / (x.square() + y.square() + SLOW_M_S**2))
+        own = vector(values, "a", "b")[:, None]
+        return replace(touch, anisotropy=own if touch.anisotropy is None else touch.anisotropy + own)

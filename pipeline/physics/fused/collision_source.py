@@ -101,7 +101,11 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
     tally.weighted[1] += along * plain(point.y);
     tally.weighted[2] += along * plain(point.z);
     tally.weight += along;
+#if ELLIPTIC
+    if (size_in(c.ellipse, x, y) > Number(0.99) * along) tally.sliding += along;
+#else
     if (across > Number(0.99) * plain(friction_of(law, c)) * along) tally.sliding += along;
+#endif
 }
 #endif
 

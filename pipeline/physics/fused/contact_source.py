@@ -25,6 +25,9 @@ struct Contact {  // world frame, impulse on body a
 #if SURFACE
     Real friction, steady_x, steady_y;  // impulses that stay as they are
     Vec turning;                        // angular impulse beyond the moment of the other
+#if ELLIPTIC
+    Ellipse ellipse;  // in the place of the friction
+#endif
 #endif
 #if PAIRED
     Vec normal, arm_b;
@@ -93,9 +96,15 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
     x -= c.steady_x;
     y -= c.steady_y;
 #endif
+#if !ELLIPTIC
     Real wanted2 = x * x + y * y;
 #endif
+#endif
     Real along = at_least(before + c.stop_n * (c.target - speed), Number(0));
+#if ELLIPTIC
+    put_in(c.ellipse, along, x, y);
+    return vec(x + c.steady_x, y + c.steady_y, along);
+#else
     // the tiny number keeps the derivative of a contact without impulses finite
     Real scale = friction_of(law, c) * along * inverse_root(wanted2 + Real(Number(1e-24)));
     scale = at_most(scale, Number(1));
@@ -105,6 +114,7 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
     return vec(scale * x + c.steady_x, scale * y + c.steady_y, along);
 #else
     return vec(scale * x, scale * y, along);
+#endif
 #endif
 }
 
@@ -152,6 +162,9 @@ INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real w
     Real u = a.velocity.x + a.omega.y * c.arm.z - a.omega.z * c.arm.y;
     Real v = a.velocity.y + a.omega.z * c.arm.x - a.omega.x * c.arm.z;
     c.friction = friction_at(s, law.friction, com.x + c.arm.x, com.y + c.arm.y, u, v);
+#if ELLIPTIC
+    c.ellipse = ellipse_of(s, c.friction);
+#endif
     Real drag = law.step_s * s.viscous * weight * reciprocal(at_least(total, Number(0.02)));
     drag = -(drag * reciprocal(Real(Number(1)) + drag * reciprocal(c.stop_t)));
     c.steady_x = drag * u;

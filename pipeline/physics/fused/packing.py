@@ -101,6 +101,7 @@ def pack(
         tuple(body.free for body in world.bodies),
         tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
         tuple(body.radii.shape[-1] for body in world.bodies), pairs, surface=wrenches.has_surface(world),
+        elliptic=wrenches.has_ellipse(world),
     )  # fmt: skip
     return Packed(
         structure,

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ..detection import PAIR_SMOOTHING_M
+from ..ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..sweeps import CONTACT_ONSET_M
 from .arithmetic_source import ARITHMETIC
 from .collision_source import COLLISION
@@ -54,7 +55,7 @@ class Structure:
     ground's pull; turned: whether the frame of bodies that touch each other is not the world's; free (bodies,); drives
     (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
     ground, each with its number of contacts; carried: whether each launch goes on where the one before ended; surface:
-    effects of the contact of one body with the ground.
+    effects of the contact of one body with the ground; elliptic: one of them is friction that depends on the direction.
     """
 
     single: bool
@@ -70,6 +71,7 @@ class Structure:
     pairs: tuple[tuple[int, int, int], ...]
     carried: bool = False
     surface: bool = False
+    elliptic: bool = False
 
     @property
     def contacts(self) -> int:
@@ -102,7 +104,7 @@ class Structure:
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "SURFACE": self.surface,
-            "TURNED": self.turned,
+            "ELLIPTIC": self.elliptic, "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
@@ -110,6 +112,8 @@ class Structure:
         }  # fmt: skip
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
         lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define ONSET_M {CONTACT_ONSET_M!r}"]
+        lines += [f"#define NEWTON_STEPS {NEWTON_STEPS}", f"#define FLATTEST {FLATTEST!r}"]
+        lines += [f"#define LEAST_FRICTION {LEAST!r}", f"#define CLOSE {CLOSE!r}"]
         lists = {
             "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],

@@ -6,7 +6,7 @@ SURFACE = r"""
 #if SURFACE
 struct Surface {
     Real stribeck, slow_speed;       // friction at slow slip, and how slow
-    Real even, mixed;                // friction by the direction of the slip
+    Real even, mixed;                // friction by the direction
     Real spots[9], spot_m;           // friction by the place: weights of B-splines, and their spacing
     Real viscous, rolling, torsion;  // N s/m; m; m
     Real restitution, time, ratio;   // how the damping ratio grows with the speed; of the contact
@@ -23,10 +23,8 @@ INLINE Real spline(Real x) {
 
 // Friction of a contact at a place (x, y) with a slip (u, v), both along the axes of an upright ground.
 INLINE Real friction_at(const Surface& s, Real friction, Real x, Real y, Real u, Real v) {
-    Real square = u * u + v * v, speed = root(square + Real(Number(1e-24)));
+    Real speed = root(u * u + v * v + Real(Number(1e-24)));
     Real sum = friction + s.stribeck * exponential(-(speed * reciprocal(s.slow_speed)));
-    Real turned = s.even * (u * u - v * v) + s.mixed * (Number(2) * u * v);
-    sum += turned * reciprocal(square + Real(Number(1e-6)));
     Real each = reciprocal(s.spot_m);
     for (int i = 0; i < 3; i++) {
         Real along = spline(each * x - Real(Number(i - 1)));
@@ -54,6 +52,68 @@ INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness,
     stiffness = Real(Number(1)) + determinant - trace;
     damping = Number(0.5) * (Real(Number(3)) - trace - determinant) - stiffness;
 }
+
+#if ELLIPTIC
+// The friction's matrix mean I + [[even, mixed], [mixed, -even]], as in `physics/ellipse.py`.
+struct Ellipse {
+    Real mean, even, mixed;
+};
+
+INLINE Ellipse ellipse_of(const Surface& s, Real friction) {
+    Real radius = root(s.even * s.even + s.mixed * s.mixed + Real(Number(1e-24)));
+    Real high = at_least(friction + radius, Number(LEAST_FRICTION));
+    Ellipse e = {friction, s.even, s.mixed};
+    if (plain(friction - radius) < Number(FLATTEST) * plain(high)) {
+        Real scale = Number(0.5 * (1 - FLATTEST)) * high * reciprocal(radius);
+        e.mean = Number(0.5 * (1 + FLATTEST)) * high;
+        e.even = scale * s.even;
+        e.mixed = scale * s.mixed;
+    }
+    return e;
+}
+
+INLINE Real share_of(Real size, Real limit) {
+    return size * reciprocal(plain(limit) >= Number(1e-9) * plain(size) ? limit : Number(1e-9) * size);
+}
+
+// Moves an impulse to the nearest one with |M^-1 j| <= limit.
+INLINE void put_in(const Ellipse& e, Real limit, Real& x, Real& y) {
+    const Real tiny = Real(Number(1e-24));
+    Real square = e.even * e.even + e.mixed * e.mixed, twice = Number(2) * e.mean;
+    Real half_trace = e.mean * e.mean + square, root_det = e.mean * e.mean - square;
+    Real turned_x = e.even * x + e.mixed * y, turned_y = e.mixed * x - e.even * y;
+    Real one_x = e.mean * x + turned_x, one_y = e.mean * y + turned_y;
+    Real two_x = e.mean * turned_x + square * x, two_y = e.mean * turned_y + square * y;
+    Real high = e.mean + root(square + tiny), u, v;
+    Real t = at_least(share_of(root(one_x * one_x + one_y * one_y + tiny), limit) - high * high, Number(0));
+    bool close = false;  // its last step was so small that the next one changes nothing but rounding
+    for (int round = 0;; round++) {
+        Real inverse = reciprocal(t * t + Number(2) * half_trace * t + root_det * root_det), first = half_trace + t;
+        u = inverse * (first * one_x - twice * two_x);
+        v = inverse * (first * one_y - twice * two_y);
+        Real size2 = u * u + v * v + tiny;
+        if (close || round == NEWTON_STEPS) {
+            Real scale = at_most(limit * inverse_root(size2), Number(1));
+            x = scale * (e.mean * u + e.even * u + e.mixed * v);
+            y = scale * (e.mean * v + e.mixed * u - e.even * v);
+            return;
+        }
+        Real bent = e.even * (u * u - v * v) + Number(2) * e.mixed * u * v;
+        bent = inverse * (first * size2 - twice * bent);
+        Real beyond = share_of(root(size2), limit) - Real(Number(1));
+        if (plain(t) == Number(0) && plain(beyond) <= Number(0)) return;  // it lies in the ellipse
+        close = plain(beyond) < Number(CLOSE) && plain(beyond) > Number(-CLOSE);
+        t = at_least(t + size2 * reciprocal(bent) * beyond, Number(0));
+    }
+}
+
+// Length of M^-1 j.
+INLINE Number size_in(const Ellipse& e, Number x, Number y) {
+    Number m = plain(e.mean), a = plain(e.even), b = plain(e.mixed);
+    Number u = m * x - a * x - b * y, v = m * y - b * x + a * y;
+    return root(u * u + v * v) / (m * m - a * a - b * b);
+}
+#endif
 
 // A vector's factor that keeps its squared length below that of a limit.
 INLINE Real shortened(Real square, Real limit) {

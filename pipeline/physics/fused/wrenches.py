@@ -76,6 +76,11 @@ def has_surface(world: World) -> bool:
     return world.touching and any(isinstance(active.effect, _SURFACE) for active in world.effects)
 
 
+def has_ellipse(world: World) -> bool:
+    """Whether the friction depends on the direction."""
+    return world.touching and any(isinstance(active.effect, AnisotropicFriction) for active in world.effects)
+
+
 def coefficients(world: World) -> list[Tensor]:
     """Return the coefficients (1 or B, k) of the effects, world frame; none where no effect acts.
 
