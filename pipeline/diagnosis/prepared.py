@@ -104,19 +104,23 @@ def prepare(
     if outliers or bool(touched.any()):
         flight, contact, clear = cut_episodes(world, whole, noise, touched)
         noise = _agreed(given, flight_noise(whole, flight), noise, [])
-    if outliers:
-        warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
     flight, contact, clear = cut_episodes(world, whole, noise, touched)
     if not turned and not all(is_round(world.bodies[k]) for k in world.free):
         contact = []
         warnings.append("no orientation was measured and the body is no ball: contacts cannot be looked at.")
     fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
-    held = held_starts(fitted, whole) if fitted is not None else {}
-    if held:
+    held: dict[int, int] = {}
+    while fitted is not None and (found := held_starts(fitted, whole)):
+        # the noise was measured with the hand in it, and hid other wrong frames
+        held |= found
         whole = without_held(whole, held)
         noise = _agreed(given, flight_noise(whole, cut_episodes(world, whole, noise, touched)[0]), noise, [])
+        whole, more, again = without_outliers(whole, cut_episodes(world, whole, noise, touched)[0], noise)
+        outliers, touched = outliers + more, touched | again
         flight, contact, clear = cut_episodes(world, whole, noise, touched)
         fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
+    if outliers:
+        warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
     released = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
     warnings += told(released, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
     return Prepared(

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from ..physics.world import World
 
 HELD_CHI2 = 3.0
-"""Of rotation, reduced, and in units of that of most flights: a flight that fits worse may have begun in a hand."""
+"""Of rotation, reduced, and in units of that of most flights: a flight that fits worse may have begun in a hand. Of
+349 measured tosses of a cube 12 fit 20 times as well without the first third of their flight, none without the last."""
 FREE_CHI2 = 2.0
 """The same of what is left without the first frames: free."""
 SKEW = 3.0
@@ -111,8 +112,8 @@ def told(released_s: Mapping[str, float], starts_s: Mapping[str, float]) -> list
     """Return a warning for each episode that begins in a hand: released_s, starts_s: times [s] by name."""
     return [
         f"episode '{name}' begins in a hand: for the first {1e3 * (at - starts_s[name]):.0f} ms of its flight it turns "
-        "otherwise than after them, as if something still touched it. These frames are left out; begin the recording "
-        f"later ([episodes] start_s in capture.toml, {at:.3f} s on the track's clock)."
+        "otherwise than after them, as if something still touched it or the tracker had yet to find it. These frames "
+        f"are left out; begin the recording there ([episodes] start_s in capture.toml: {at:.3f} on the track's clock)."
         for name, at in released_s.items()
     ]
 
