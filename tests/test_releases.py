@@ -12,6 +12,7 @@ from cgwm.pipeline import fit_effects
 from cgwm.pipeline.diagnosis.cuts import cut_episodes, whole_episodes
 from cgwm.pipeline.diagnosis.prepared import prepare
 from cgwm.pipeline.diagnosis.releases import after_release, find_releases
+from cgwm.pipeline.phys_geo import PhysicsFit
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
 from diagnosis_data import tosses, world_with
@@ -71,7 +72,7 @@ def test_a_fit_leaves_the_hand_out_and_says_so(monkeypatch: pytest.MonkeyPatch) 
 
     def physics(_: World, episodes: list[tuple[str, dict[str, Track]]], *__: Any) -> Any:
         given.update(episodes)
-        return fit_effects.PhysicsFit(None, (), None, NOISE, {}, ("its own",))  # pyright: ignore[reportArgumentType]
+        return PhysicsFit(None, (), None, NOISE, {}, ("its own",))  # pyright: ignore[reportArgumentType]
 
     monkeypatch.setattr(fit_effects, "fit_physics", physics)
     episodes = thrown(world)
