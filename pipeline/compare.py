@@ -14,6 +14,7 @@ from ..datasets.progress import note, progress
 from ..schemas import CompareResult, InputDataError, PairedDifference, UsageError
 from .compared import ComparedModel
 from .diagnosis.prepared import prepare
+from .diagnosis.releases import after_release
 from .eval import check_bodies, evaluate_model
 from .own_worlds import with_fitted_numbers
 from .paired import paired_difference
@@ -111,7 +112,8 @@ def compare_models(
         for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
             # of an episode's own numbers a short prediction knows as much as of its state
             world = World.from_model(model)
-            world = with_fitted_numbers(world, episodes, model.file, capture.groups, prepared.noise)
+            flown = after_release(episodes, prepared.released_s)
+            world = with_fitted_numbers(world, flown, model.file, capture.groups, prepared.noise)
             fit = short_errors(world, episodes, prepared, bodies)
             points, organisers = wrench_points(world, fit, prepared)
             compared.append(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..datasets.tracks import Track
 from ..schemas import EffectModel, InputDataError, PhysConfig, UsageError
 from ..schemas import Parameter as FittedParameter
+from .diagnosis.releases import after_release, find_releases
 from .phys_geo import PhysicsFit, fit_physics
 from .physics.effects import load_effect
 from .physics.effects.registry import split_units
@@ -87,14 +89,16 @@ def fit_with_effects(
     begun: bool = False,
     groups: Mapping[str, str] | None = None,
 ) -> PhysicsFit:
-    """Fit the world, see `fit_physics`, where its effects have what they need.
+    """Fit the world, see `fit_physics`, where its effects have what they need; throws count from their release on.
 
     Raises:
         InputDataError: If an effect needs what the world or the episodes do not have.
         NotConvergedError: If every rollout diverges.
     """
     _require_needs(world, episodes)
-    return fit_physics(world, episodes, config, noise, begun, groups)
+    released_s, warnings = find_releases(world, episodes, noise)
+    found = fit_physics(world, after_release(episodes, released_s), config, noise, begun, groups)
+    return replace(found, warnings=(*found.warnings, *warnings))
 
 
 def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> None:

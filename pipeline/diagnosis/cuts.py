@@ -73,8 +73,10 @@ def cut_episodes(
     flight: list[Segment] = []
     contact: list[Segment] = []
     for episode, times in enumerate(whole.times_s):
-        count = int((whole.seen[episode].amax(-1) > 0).sum())
-        for first, last in _stretches(times[:count]):
+        seen = torch.nonzero(whole.seen[episode].amax(-1) > 0)[:, 0]
+        begin, end = (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, 0)
+        for start, stop in _stretches(times[begin:end]):
+            first, last = begin + start, begin + stop
             step = float(times[first : last + 1].diff().median()) if last > first else 1.0
             runs = _runs(clear[episode, first : last + 1].tolist())
             flies = [

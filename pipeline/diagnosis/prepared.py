@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,6 +17,7 @@ from .carried import carried_frames
 from .cuts import Segment, cut_episodes, whole_episodes
 from .noise import flight_noise, slow_noise, without_outliers
 from .phases import is_round
+from .releases import held_starts, told, without_held
 from .segment_states import fit_states
 from .segments import Segments
 
@@ -35,7 +36,8 @@ class Prepared:
     carried (E, T): frames above the ground in which nothing falls; noise:
     position [m], rotation [rad]; slow: by what factor the variance of slow errors of a centroid exceeds that of all;
     flight: segments with fitted states, None where there are none; contact_items: the contact segments; outliers:
-    frames left out; turned: whether orientations were measured; warnings.
+    frames left out; turned: whether orientations were measured; warnings; released_s: of episodes that begin in a hand,
+    by name, the time [s] from which they fly freely: what comes before counts as not measured.
     """
 
     names: tuple[str, ...]
@@ -50,6 +52,7 @@ class Prepared:
     outliers: int
     turned: bool
     warnings: tuple[str, ...]
+    released_s: Mapping[str, float] = field(default_factory=dict)
 
     def contact(self, world: World) -> Segments | None:
         """Return the contact segments with states fitted by a world; None where there are none."""
@@ -101,13 +104,25 @@ def prepare(
     if outliers or bool(touched.any()):
         flight, contact, clear = cut_episodes(world, whole, noise, touched)
         noise = _agreed(given, flight_noise(whole, flight), noise, [])
-    if outliers:
-        warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
     flight, contact, clear = cut_episodes(world, whole, noise, touched)
     if not turned and not all(is_round(world.bodies[k]) for k in world.free):
         contact = []
         warnings.append("no orientation was measured and the body is no ball: contacts cannot be looked at.")
     fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
+    held: dict[int, int] = {}
+    while fitted is not None and (found := held_starts(fitted, whole)):
+        # the noise was measured with the hand in it, and hid other wrong frames
+        held |= found
+        whole = without_held(whole, held)
+        noise = _agreed(given, flight_noise(whole, cut_episodes(world, whole, noise, touched)[0]), noise, [])
+        whole, more, again = without_outliers(whole, cut_episodes(world, whole, noise, touched)[0], noise)
+        outliers, touched = outliers + more, touched | again
+        flight, contact, clear = cut_episodes(world, whole, noise, touched)
+        fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
+    if outliers:
+        warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
+    released = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
+    warnings += told(released, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
     return Prepared(
         tuple(name for name, _ in episodes),
         tuple(groups or [0] * len(episodes)),
@@ -121,6 +136,7 @@ def prepare(
         outliers,
         turned,
         tuple(warnings),
+        released,
     )
 
 

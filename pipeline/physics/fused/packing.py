@@ -14,7 +14,7 @@ from ..detection import GROUND, pairs_of, slot_count
 from ..driven import Drive
 from ..motion import start
 from ..rotation import quat_multiply, quat_normalize, quat_rotate
-from ..world import State, World
+from ..world import Body, State, World
 from . import wrenches
 from .structure import Structure
 
@@ -84,7 +84,7 @@ def pack(
     effects = wrenches.coefficients(world)
     turned = turn is not None and len(world.bodies) > 1
     columns = _columns(world, state, turn, turned, effects)
-    spheres = [torch.cat((body.centers, body.radii[..., None]), -1) for body in world.bodies]
+    spheres = [_spheres(body) for body in world.bodies]
     law, substeps = world.contact, world.substeps(times)
     assert isinstance(law, ContactLaw)  # see reason_against
     numbers = torch.tensor(substeps, dtype=torch.int32, device=times.device)
@@ -166,6 +166,12 @@ def _drive_starts(rows: Mapping[int, tuple[Tensor, Tensor]], like: Tensor) -> Te
     lengths = [row.shape[1] for row, _ in rows.values()]
     starts = [sum(lengths[:index]) for index in range(len(lengths))]
     return torch.tensor(starts, dtype=torch.int32, device=like.device)
+
+
+def _spheres(body: Body) -> Tensor:
+    """Return centres and radii (1 or B, N, 4); an effect may give centres of each item's own, and leave the radii."""
+    batch = max(body.centers.shape[0], body.radii.shape[0])
+    return torch.cat((body.centers.expand(batch, -1, -1), body.radii.expand(batch, -1)[..., None]), -1)
 
 
 def _contact_spheres(world: World, starts: list[int]) -> Tensor:
