@@ -145,7 +145,7 @@ def _fitted(
         iterations: Most steps.
     """
     beside, own = with_variants(world, variants, "contact")
-    known = _own_numbers(world)
+    known = own_numbers(world)
     parameters: list[Parameter] = [FRICTION, GROUND_SHIFT, *known, *own]
     place = {p.name: k for k, p in enumerate(parameters)}
     shared = list(range(2 + len(known)))
@@ -170,7 +170,7 @@ def _fitted(
     return fits
 
 
-def _own_numbers(world: World) -> list[Parameter]:
+def own_numbers(world: World) -> list[Parameter]:
     """Return the parameters of what the model already has in contact, which are fitted along."""
     own = {a.effect.name for a in world.effects if a.effect.phase == "contact"}
     return [p for p in effect_parameters(world) if p.name.partition(".")[0] in own]
