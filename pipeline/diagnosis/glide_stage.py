@@ -76,8 +76,8 @@ def glide_evidence(
         return []
     soft = soft_world(world)
     glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
-    glides, friction = _started(glides, float(world.contact.friction[0]))
-    base = _fitted(soft, [], [(glides, friction)])[0]
+    glides, friction = started_glides(glides, float(world.contact.friction[0]))
+    base = fitted_glides(soft, [], [(glides, friction)])[0]
     degrees = float(glides.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
         return []
@@ -85,7 +85,7 @@ def glide_evidence(
     few = [v for v in variants if len(v.parameters) <= MANY]
     found: dict[int, tuple[Variant, GlideFit]] = {}
     for part in (few, [v for v in variants if v not in few]):
-        tried = _fitted(soft, part, [start] * len(part), FIRST_ITERATIONS) if part else []
+        tried = fitted_glides(soft, part, [start] * len(part), FIRST_ITERATIONS) if part else []
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
     # what is far behind after some steps is not worth the others
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
@@ -93,12 +93,12 @@ def glide_evidence(
     for part in ([k for k in close if found[k][0] in few], [k for k in close if found[k][0] not in few]):
         if part:
             chosen = [found[k] for k in part]
-            again = _fitted(soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen])
+            again = fitted_glides(soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen])
             found |= {k: (found[k][0], fit) for k, fit in zip(part, again, strict=True)}
     # the model alone once more from where the best one ended: what both gain by that is no sign of an effect
     _, best = min(found.values(), key=lambda one: one[1].cost)
     own = best.values[0, : base.values.shape[1]]
-    least_cost = min(base.cost, _fitted(soft, [], [(best.segments, own)])[0].cost)
+    least_cost = min(base.cost, fitted_glides(soft, [], [(best.segments, own)])[0].cost)
     return _ranked(list(found.values()), kept, least_cost, degrees)
 
 
@@ -112,7 +112,7 @@ def with_effect(world: World, found: GlideEvidence) -> World:
     return replace(world, contact=contact, effects=(*world.effects, active))
 
 
-def _started(glides: Segments, known: float) -> tuple[Segments, Tensor]:
+def started_glides(glides: Segments, known: float) -> tuple[Segments, Tensor]:
     """Return glides each fitted with a friction of its own, and the logarithm of the friction that most tell."""
     count = len(glides.items)
     states = [settled(glides, line_state(glides, frames)) for frames in START_FRAMES]
@@ -129,7 +129,7 @@ def _started(glides: Segments, known: float) -> tuple[Segments, Tensor]:
     return glides.with_state(found.segments.observations.state.at(best)), friction
 
 
-def _fitted(
+def fitted_glides(
     world: World,
     variants: Sequence[Variant],
     starts: Sequence[tuple[Segments, Tensor]],

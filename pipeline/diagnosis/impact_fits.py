@@ -20,7 +20,7 @@ from .impacts import Impacts
 Array = NDArray[np.float64]
 
 REBOUND_SHARE = 0.03
-"""Of its rebound an impact scatters by this share about any law (on development seeds, where nothing is hidden, 0.8 to
+"""Of its rebound an impact scatters by this share about any law (on development seeds, where nothing is hidden, 0.7 to
 5 %): without it the few impacts of a capture could pass for exact."""
 FRICTION_SHARE, IMPULSE_SHARE, SPIN_SHARE = 0.04, 0.002, 0.06
 """And its impulse along the ground by these shares of itself and of that along the normal, for a slip that ends leaves
