@@ -43,8 +43,8 @@ SPREAD = 0.13
 """Frictions of glides and of impacts differ by this share (root mean square of the logarithm; at most 0.33 of 14) on
 development seeds where nothing is missing: no law of contact is exact in an impact."""
 SCORE, RESOLVED = 8.0, 0.75
-"""An effect is named above this score, and where it takes away this share of what lies between the frictions. Nothing is
-fitted where those alone differ by less [chi2]: on development seeds at most 6 without an effect, 27 with adhesion."""
+"""An effect is named above this score, and where it takes away this share of what lies between the frictions. Nothing
+is fitted where those alone differ by less [chi2]: on development seeds at most 6 without an effect, 27 with one."""
 LEAD = 6.0
 """Another one within this score of it leaves the two unseparated."""
 FEWEST = 6
