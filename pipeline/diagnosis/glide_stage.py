@@ -80,9 +80,9 @@ def glide_evidence(
         return []
     soft = soft_world(world)
     glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
-    glides, friction = _started(glides, float(world.contact.friction[0]))
-    told = _told_by_flight(flight, soft, prepared.groups)
-    base = _fitted(soft, [], [(glides, friction)], told)[0]
+    glides, friction = started_glides(glides, float(world.contact.friction[0]))
+    told = told_by_flight(flight, soft, prepared.groups)
+    base = fitted_glides(soft, [], [(glides, friction)], told)[0]
     degrees = float(glides.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
         return []
@@ -90,7 +90,7 @@ def glide_evidence(
     few = [v for v in variants if len(v.parameters) <= MANY]
     found: dict[int, tuple[Variant, GlideFit]] = {}
     for part in (few, [v for v in variants if v not in few]):
-        tried = _fitted(soft, part, [start] * len(part), told, FIRST_ITERATIONS) if part else []
+        tried = fitted_glides(soft, part, [start] * len(part), told, FIRST_ITERATIONS) if part else []
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
     # what is far behind after some steps is not worth the others
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
@@ -98,12 +98,14 @@ def glide_evidence(
     for part in ([k for k in close if found[k][0] in few], [k for k in close if found[k][0] not in few]):
         if part:
             chosen = [found[k] for k in part]
-            again = _fitted(soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen], told)
+            again = fitted_glides(
+                soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen], told
+            )
             found |= {k: (found[k][0], fit) for k, fit in zip(part, again, strict=True)}
     # the model alone once more from where the best one ended: what both gain by that is no sign of an effect
     _, best = min(found.values(), key=lambda one: one[1].cost)
     own = best.values[0, : base.values.shape[1]]
-    least_cost = min(base.cost, _fitted(soft, [], [(best.segments, own)], told)[0].cost)
+    least_cost = min(base.cost, fitted_glides(soft, [], [(best.segments, own)], told)[0].cost)
     return _ranked(list(found.values()), kept, least_cost, degrees)
 
 
@@ -117,7 +119,7 @@ def with_effect(world: World, found: GlideEvidence) -> World:
     return replace(world, contact=contact, effects=(*world.effects, active))
 
 
-def _started(glides: Segments, known: float) -> tuple[Segments, Tensor]:
+def started_glides(glides: Segments, known: float) -> tuple[Segments, Tensor]:
     """Return glides each fitted with a friction of its own, and the logarithm of the friction that most tell."""
     count = len(glides.items)
     states = [settled(glides, line_state(glides, frames)) for frames in START_FRAMES]
@@ -134,7 +136,7 @@ def _started(glides: Segments, known: float) -> tuple[Segments, Tensor]:
     return glides.with_state(found.segments.observations.state.at(best)), friction
 
 
-def _fitted(
+def fitted_glides(
     world: World,
     variants: Sequence[Variant],
     starts: Sequence[tuple[Segments, Tensor]],
@@ -152,7 +154,7 @@ def _fitted(
         iterations: Most steps.
     """
     beside, own = with_variants(world, variants, "contact")
-    known = [*_own_numbers(world), *told]
+    known = [*own_numbers(world), *told]
     parameters: list[Parameter] = [FRICTION, GROUND_SHIFT, *known, *own]
     place = {p.name: k for k, p in enumerate(parameters)}
     shared = list(range(2 + len(known)))
@@ -180,13 +182,13 @@ def _fitted(
     return fits
 
 
-def _own_numbers(world: World) -> list[Parameter]:
+def own_numbers(world: World) -> list[Parameter]:
     """Return the parameters of what the model already has in contact, which are fitted along."""
     own = {a.effect.name for a in world.effects if a.effect.phase == "contact"}
     return [p for p in effect_parameters(world) if p.name.partition(".")[0] in own]
 
 
-def _told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> list[Parameter]:
+def told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> list[Parameter]:
     """Return the parameters of what acts in flight, with the standard errors that flights leave them as priors."""
     parameters = base_parameters(world, "flight")
     if flight is None or not parameters:

@@ -16,6 +16,8 @@ from .consistency import consistency
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
 from .forecast import held_out_errors
 from .glide_stage import GlideEvidence, glide_evidence, with_effect
+from .grip_stage import grip_evidence, named_by_grip
+from .impact_stage import impact_evidence, named_by_impacts, with_impact_effect
 from .prepared import Prepared
 from .refit import refit
 from .segment_states import fit_states
@@ -255,6 +257,18 @@ def _with_contact(
         first = tuple(one.evidence for one in alike)
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in glides]
         return [*chosen, Chosen(first[0], first, "contact")], told, with_effect(base.world, alike[0]), chi2, contact
+    impacts = impact_evidence(prepared, base.world, candidates)
+    struck = named_by_impacts(impacts)
+    if struck:
+        first = tuple(one.evidence for one in struck)
+        told = [ContactEvidence(one.evidence, one.score, one.gain, one.t) for one in impacts]
+        found = with_impact_effect(base.world, struck[0])
+        return [*chosen, Chosen(first[0], first, "contact")], told, found, chi2, contact
+    gripped = named_by_grip(grip_evidence(prepared, base.world, contact, candidates, flight))
+    if gripped:
+        first = tuple(one.evidence for one in gripped)
+        told = [ContactEvidence(one.evidence, one.score, None, None) for one in gripped]
+        return [*chosen, Chosen(first[0], first, "contact")], told, with_effect(base.world, gripped[0]), chi2, contact
     evidence = contact_evidence(contact, base.world, candidates, prepared.groups, prepared.turned)
     named = _named(evidence)
     if named:

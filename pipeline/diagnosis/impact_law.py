@@ -1,0 +1,228 @@
+"""How a rigid body leaves the ground after one impact in one point: Routh's method, with what effects change.
+
+The normal impulse P grows from 0 to what was measured, the velocity u of the point that touches follows by
+du = K dp with K = 1/m - [r]x I^-1 [r]x, and the friction's part of dp lies against the slip, mu dP at most, or is what
+stops it where less does (Routh 1905, ch. 5; Stronge 2000, ch. 4). The rebound comes from a spring and damper, whose
+damping ratio gives the restitution (`contact.restitution`), followed in time where an effect changes them with the
+speed, so that an effect needs no formula of its own here: it is asked for the contact as a rollout would ask it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..physics.contact import ContactLaw, Touch
+from ..physics.effects.effect import ActiveEffect, BodyMotion
+from ..physics.sweeps import tangent_axes
+from ..physics.world import Body
+
+SLICES = 24
+"""Of the normal impulse."""
+STEPS, STEP = 64, 0.055
+"""Of the spring and damper, in natural times: 3.5 of them hold every impact that ends."""
+REACH_M, REACH_STEPS = 0.01, 24
+"""Below this height an effect of contact may pull on a body that has left, or not yet reached, the ground."""
+
+
+@dataclass(frozen=True)
+class Impact:
+    """Impacts (n) of a body on the ground, world frame.
+
+    before (n, 6): velocity of the centre of mass [m/s] and angular velocity [rad/s]; impulse (n,) [N s] along the
+    normal; place (n, 3) [m] of the point; rotation (n, 3, 3), body to world; arm (n, 3) [m] from the centre of mass;
+    inertia (n, 3, 3) [kg m2] about it; mass (n,) [kg]; normal (3,); weight (n,) [m/s2] along it; body.
+    """
+
+    before: Tensor
+    impulse: Tensor
+    place: Tensor
+    rotation: Tensor
+    arm: Tensor
+    inertia: Tensor
+    mass: Tensor
+    normal: Tensor
+    weight: Tensor
+    body: Body
+
+    @property
+    def compliance(self) -> Tensor:
+        """K (n, 3, 3) [1/kg]: change of the point's velocity by an impulse there."""
+        eye = torch.eye(3).to(self.arm)
+        turns = torch.linalg.cross(self.arm[:, None].expand(-1, 3, -1), eye.expand(len(self.arm), 3, 3))  # r x e_k
+        return eye / self.mass[:, None, None] + turns @ torch.linalg.solve(self.inertia, turns.mT)
+
+
+def point_velocity(twist: Tensor, arm: Tensor) -> Tensor:
+    """Return the velocity (n, 3) of the point at an arm (n, 3) from the centre of mass, of twists (n, 6)."""
+    return twist[:, :3] + torch.linalg.cross(twist[:, 3:], arm)
+
+
+def rebound_speed(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect]) -> Tensor:
+    """Return the speed (n,) [m/s] along the normal at which the point leaves the ground.
+
+    x'' = -x / tau^2 - 2 zeta x' / tau - g - F / m until the ground would have to pull, with the numbers and the pull F
+    that effects make of them; on the way through the effects' reach their pull adds F dh / m to the square of the
+    speed before, and takes it after.
+    """
+    speed = -(point_velocity(impact.before, impact.arm) @ impact.normal)
+    mass = 1 / torch.einsum("i,nij,j->n", impact.normal, impact.compliance, impact.normal)
+    heights = REACH_M * (torch.arange(REACH_STEPS) + 0.5) / REACH_STEPS
+    pulls = [_pull(impact, effects, float(height)) for height in heights] if _pulling(effects) else []
+    work = torch.stack(pulls).sum(0) * REACH_M / REACH_STEPS / mass if pulls else torch.zeros_like(speed)
+    down = impact.weight + (_pull(impact, effects, 0.0) / mass if pulls else 0.0)
+    u = -(speed.clamp_min(1e-6).square() + 2 * work).sqrt()
+    x, out, done = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    step = STEP * law.contact_time_s.expand_as(u)
+
+    slip = point_velocity(impact.before, impact.arm)
+    slip = slip - (slip @ impact.normal)[:, None] * impact.normal
+    probe = _touched(impact, law, effects, slip, None)
+    springs = [active for active in effects if active.effect.has("contact")] if _changes_spring(probe, law) else []
+
+    def push(x: Tensor, u: Tensor) -> Tensor:
+        tau, zeta = law.contact_time_s, law.damping_ratio
+        if springs:
+            touch = _touched(impact, law, springs, slip + u[:, None] * impact.normal, None, x)
+            tau, zeta = touch.contact_time_s[:, 0], touch.damping_ratio[:, 0]
+        return -x / tau.square() - 2 * zeta * u / tau
+
+    before = push(x, u)
+    for _ in range(STEPS):
+        rate = before - down
+        xm, um = x + 0.5 * step * u, u + 0.5 * step * rate
+        x, new = x + step * um, u + step * (push(xm, um) - down)
+        after = push(x, new)
+        share = (before / (before - after).clamp_min(1e-30)).clamp(0.0, 1.0)
+        ends = ~done & (after <= 0)
+        out = torch.where(ends, u + share * (new - u), out)
+        done |= ends
+        u, before = new, after
+    out = torch.where(done, out, u).clamp_min(0.0)
+    return (out.square() - 2 * work).clamp_min(0.0).sqrt()
+
+
+def after_impact(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect]) -> Tensor:
+    """Return the twists (n, 6) after the impacts, the impulse along the normal as given."""
+    k, normal = impact.compliance, impact.normal
+    across = tangent_axes(normal)[1:]  # (2, 3)
+    twist = impact.before
+    slice_ = impact.impulse / SLICES
+    flat = across @ k @ across.T
+    for _ in range(SLICES):
+        u = point_velocity(twist, impact.arm)
+        touch = _touched(impact, law, effects, u, twist[:, 3:])
+        # the impulse that would end the slip, less what the normal one does to it
+        slip = u @ across.T + slice_[:, None] * (k @ normal) @ across.T
+        wanted = -torch.linalg.solve(flat, slip[..., None])[..., 0]
+        friction = within_cone(wanted, slip, _cone(touch), slice_)
+        push = slice_[:, None] * normal + friction @ across
+        turn = torch.linalg.cross(impact.arm, push)
+        twist = twist + torch.cat(
+            [push / impact.mass[:, None], torch.linalg.solve(impact.inertia, turn[..., None])[..., 0]], -1
+        )
+        twist = _braked(impact, touch, slice_, twist)
+    return twist
+
+
+def within_cone(wanted: Tensor, slip: Tensor, cone: Tensor, slice_: Tensor) -> Tensor:
+    """Return the friction impulse (n, 2) that stops the slip, or -P M^2 s / |M s| where that lies outside the cone.
+
+    The cone (n, 2, 2) is the symmetric matrix M of an ellipse; with M = mu it is Coulomb's disc.
+    """
+    inverse = torch.linalg.inv(cone + 1e-9 * torch.eye(2).to(cone))
+    inside = (inverse @ wanted[..., None])[..., 0].norm(dim=-1) <= slice_
+    along = (cone @ slip[..., None])[..., 0]
+    most = -(cone @ along[..., None])[..., 0] / along.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    return torch.where(inside[:, None], wanted, slice_[:, None] * most)
+
+
+def _cone(touch: Touch) -> Tensor:
+    """Return M (n, 2, 2) of the friction: mu I, and what an effect gives it of a grain, [[a, b], [b, -a]]."""
+    friction = touch.friction.clamp_min(0.0)  # no sum of effects pushes a slider on
+    cone = friction[..., None] * torch.eye(2).to(friction)
+    grain: Tensor | None = getattr(touch, "anisotropy", None)
+    if grain is None:
+        return cone
+    a, b = grain[:, 0].unbind(-1)
+    return cone + torch.stack([torch.stack([a, b], -1), torch.stack([b, -a], -1)], -2)
+
+
+def _braked(impact: Impact, touch: Touch, slice_: Tensor, twist: Tensor) -> Tensor:
+    """Return the twists after a slice's torque against rolling and against spinning, which reverse neither."""
+    normal, omega = impact.normal, twist[:, 3:]
+    spin = (omega @ normal)[:, None] * normal
+    for size, part in ((touch.rolling_m, omega - spin), (touch.torsion_m, spin)):
+        if size is None:
+            continue
+        speed = part.norm(dim=-1, keepdim=True)
+        way = part / speed.clamp_min(1e-12)
+        change = torch.linalg.solve(impact.inertia, way[..., None])[..., 0]
+        most = speed[:, 0] / (change * way).sum(-1).clamp_min(1e-12)
+        omega = omega - torch.minimum(size.reshape(-1) * slice_, most)[:, None] * change
+    return torch.cat([twist[:, :3], omega], -1)
+
+
+def _touched(
+    impact: Impact,
+    law: ContactLaw,
+    effects: Sequence[ActiveEffect],
+    u: Tensor,
+    omega: Tensor | None,
+    gap: Tensor | None = None,
+) -> Touch:
+    """Return the contact (n, one point) as effects change it for a velocity (n, 3) of the point."""
+    count = len(u)
+    numbers = [x.expand(count)[:, None] for x in (law.friction, law.contact_time_s, law.damping_ratio)]
+    touch = Touch(
+        True,
+        impact.place[:, None],
+        impact.normal.expand(count, 1, 3),
+        torch.zeros(count, 1).to(u) if gap is None else gap[:, None],
+        u[:, None],
+        impact.before[:, 3:] if omega is None else omega,
+        STEP * numbers[1],
+        *numbers,
+    )
+    for active in effects:
+        if active.effect.has("contact"):
+            touch = active.effect.contact(active.values, touch)
+    return touch
+
+
+def _changes_spring(touch: Touch, law: ContactLaw) -> bool:
+    """Whether effects made other numbers of the spring and damper; what they leave alone stays the law's memory."""
+    same = (touch.contact_time_s, law.contact_time_s), (touch.damping_ratio, law.damping_ratio)
+    return any(own.data_ptr() != given.data_ptr() for own, given in same)
+
+
+def _pulling(effects: Sequence[ActiveEffect]) -> bool:
+    return any(active.effect.phase == "contact" and active.effect.has("wrench") for active in effects)
+
+
+def _pull(impact: Impact, effects: Sequence[ActiveEffect], height: float) -> Tensor:
+    """Return the force (n,) [N] of effects of contact towards the ground, the body at a height [m] above it."""
+    com = impact.place - impact.arm + height * impact.normal
+    motion = BodyMotion(
+        impact.body,
+        impact.mass,
+        impact.inertia,
+        com,
+        impact.rotation,
+        impact.before[:, :3],
+        impact.before[:, 3:],
+        impact.normal[None],
+        impact.normal[None],
+        (impact.place @ impact.normal),
+    )
+    pull = torch.zeros_like(impact.mass)
+    for active in effects:
+        force = None
+        if active.effect.phase == "contact" and active.effect.has("wrench"):
+            force = active.effect.wrench(active.values, motion).force
+        if force is not None:
+            pull = pull - force @ impact.normal
+    return pull
