@@ -45,7 +45,7 @@ SPREAD = 0.13
 development seeds where nothing is missing: no law of contact is exact in an impact."""
 SCORE, RESOLVED = 8.0, 0.75
 """An effect is named above this score, and where it takes away this share of what lies between the frictions. Nothing
-is fitted where those alone differ by less [chi2]: on development seeds at most 6 without an effect, 27 with one."""
+is fitted where those alone differ by less [chi2]: on development seeds 6 without one at most, 13 to 29 with one."""
 LEAD = 6.0
 """Another one within this score of it leaves the two unseparated."""
 FEWEST = 6
