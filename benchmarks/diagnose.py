@@ -59,8 +59,8 @@ FAMILIES: tuple[set[str], ...] = (
     {"rolling_resistance", "torsional_friction", "spin_damping"},
 )
 """Effects that do much the same: to name one for another is a smaller fault."""
-RIGHT = ("exact", "class", "exact, and more")
-COLUMNS = ("exact", "class", "exact, and more", "family", "wrong", "unexplained", "silent", "refused")
+RIGHT = ("exact", "class", "exact, and more", "class, and more")
+COLUMNS = (*RIGHT, "family", "wrong", "unexplained", "silent", "refused")
 
 
 def judged(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
@@ -87,10 +87,10 @@ def _named(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
     along = {name for effect in truth["effects"] for name in effect["comes_with"]}
     along |= set(truth["engine"].get("comes_with", ()))
     marks = {_mark(name, groups) for name in case.effects}
-    if marks == {"exact"}:
-        return "exact, and more" if set(selected) - {*case.effects, *along} else "exact"
+    # what was selected beside the truth, and is no member of its class
+    beside = {name for name in selected if not groups[name] & {*case.effects, *along}}
     if marks <= {"exact", "class"}:
-        return "class"
+        return ("exact" if marks == {"exact"} else "class") + (", and more" if beside else "")
     return "family" if marks & {"exact", "class", "family"} else "wrong"
 
 

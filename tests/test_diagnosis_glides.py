@@ -7,13 +7,14 @@ import pytest
 import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnosis.candidates import Candidate
+from cgwm.pipeline.diagnosis.contact_search import GLIDE_SCORE
 from cgwm.pipeline.diagnosis.cuts import Segment
 from cgwm.pipeline.diagnosis.glide_fits import soft_world, without_loads
 from cgwm.pipeline.diagnosis.glide_stage import glide_evidence, with_effect
 from cgwm.pipeline.diagnosis.glides import glides_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
 from cgwm.pipeline.diagnosis.segments import Segments
-from cgwm.pipeline.diagnosis.verdict import GLIDE_SCORE, find
+from cgwm.pipeline.diagnosis.verdict import find
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact import ContactLaw
 from cgwm.pipeline.physics.effects import load_effect

@@ -13,6 +13,7 @@ from cgwm.datasets.models import read_model
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.diagnosis.candidates import Candidate
+from cgwm.pipeline.diagnosis.contact_search import Chosen
 from cgwm.pipeline.diagnosis.law_file import law_source, save_law
 from cgwm.pipeline.diagnosis.next_throw import RankedThrow, Rivals, next_experiment, ranked_throws, rivals_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
@@ -20,7 +21,7 @@ from cgwm.pipeline.diagnosis.refit import refit
 from cgwm.pipeline.diagnosis.score import ScoreTest
 from cgwm.pipeline.diagnosis.slots import Evidence
 from cgwm.pipeline.diagnosis.throws import DEFAULT, Throw, read_throws, states_of, throws_of
-from cgwm.pipeline.diagnosis.verdict import Chosen, Findings
+from cgwm.pipeline.diagnosis.verdict import Findings
 from cgwm.pipeline.effects import new_effect
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect

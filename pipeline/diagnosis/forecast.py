@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..physics.parameters import Parameter, effect_parameters
 from ..physics.world import World
-from .candidates import base_values, without_effect
+from .candidates import base_parameters, base_values, without_effect
 from .linear import linearised
 from .segment_states import fit_states
 from .segments import Segments, world_for
@@ -40,6 +40,27 @@ def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[floa
     return _error(before, [], values.new_zeros(0)), _error(with_it, parameters, values)
 
 
+def held_out_loss(segments: Segments, world: World) -> float:
+    """Return the mean error of predictions by a world, in standard deviations of the noise, positions plus rotations.
+
+    The numbers of all its effects that predict an episode come from the other episodes, as of `held_out_errors`.
+
+    Args:
+        segments: With states fitted by the world.
+        world: The world with its effects at their estimates.
+    """
+    parameters = base_parameters(world, segments.kind)
+    at = replace(segments, world=world_for(segments.kind, world))
+    values = _by_others(at, parameters, base_values(world, parameters))
+    fitted, late = _continued(at, parameters, values)
+    away = fitted.residuals(parameters, values, jacobian=False)[0].unflatten(1, (late.shape[1], -1))
+    loss = 0.0
+    for measured, columns in ((segments.observations.seen, slice(0, 3)), (segments.observations.turned, slice(3, 6))):
+        weight = measured * late
+        loss += float((away[..., columns].norm(dim=-1) * weight).sum() / weight.sum().clamp_min(1.0))
+    return loss
+
+
 def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
     """Return the parameters (B, P) of each segment as the other episodes tell them."""
     linear = linearised(segments, parameters, values)
@@ -55,11 +76,17 @@ def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tens
 
 
 def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> float:
+    fitted, late = _continued(segments, parameters, values)
+    away = (fitted.positions(parameters, values) - segments.observations.position_m).norm(dim=-1)
+    late = segments.observations.seen * late
+    return float((away * late).sum() / late.sum().clamp_min(1.0))
+
+
+def _continued(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> tuple[Segments, Tensor]:
+    """Return the segments with states fitted to their first frames, and which frames (B, T, 1) are the others."""
     seen = segments.observations
     known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])
     early = (torch.arange(seen.times_s.shape[1]) < known[:, None])[..., None].to(seen.seen)
     start = replace(segments, observations=replace(seen, seen=seen.seen * early, turned=seen.turned * early))
     fitted = fit_states(start, parameters, values, ITERATIONS, search=False)
-    away = (fitted.positions(parameters, values) - seen.position_m).norm(dim=-1)
-    late = seen.seen * (1 - early)
-    return float((away * late).sum() / late.sum().clamp_min(1.0))
+    return replace(fitted, observations=replace(seen, state=fitted.observations.state)), 1 - early
