@@ -102,6 +102,7 @@ def report(
     clear = prepared.clear & (prepared.whole.seen.amax(-1) > 0)
     seen = int((prepared.whole.seen.amax(-1) > 0).sum())
     warnings = [*prepared.warnings, *_one_phase(prepared)]
+    warnings += [f"{law.effect}: these flights fit {law.formula} as well as its own law." for law in findings.as_good]
     law = _law(prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []

@@ -29,7 +29,7 @@ FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 1, 400.0
 """... one of more numbers above that, as it fits more by chance ..."""
 GLIDE_SURE, GLIDE_SHARE_SURE = 80.0, 0.78
 """... or above this, if it leaves next to nothing: what stands in for something else explains a part. On development
-seeds (2026-11-22) effects that were not there reached a score of 165 at a share of 0.69, and any share up to a score of 50."""
+seeds what was not there reached a score of 165 at a share of 0.69, and any share up to a score of 50."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
 """Another one within this score of it, or this share of it, leaves the two unseparated."""
 CONTACT_SCORE, CONTACT_T = 22.0, 1.0

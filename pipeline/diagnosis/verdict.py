@@ -13,6 +13,7 @@ from .contact_search import Chosen, with_contact
 from .contact_stage import ContactEvidence
 from .flight_search import flight_search
 from .forecast import held_out_errors
+from .other_laws import OtherLaw, other_laws
 from .prepared import Prepared
 from .segments import Segments
 from .slots import Evidence, Slot
@@ -35,7 +36,8 @@ class Findings:
 
     before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
     candidates, the best first; contact: all contact evidence; world: with the selected effects; base: without them;
-    errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect.
+    errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect; as_good:
+    other laws that explain the flights as well as those of effects found.
     """
 
     verdict: VerdictName
@@ -49,6 +51,7 @@ class Findings:
     contact_chi2: float | None
     base: World
     errors: dict[str, tuple[float, float]]
+    as_good: tuple[OtherLaw, ...] = ()
 
     @property
     def judged_in_contact(self) -> set[str]:
@@ -68,7 +71,8 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     after = _worst_omnibus(_pieces(prepared, final), scatter) if chosen else before
     in_flight = [slot.best.name for slot in slots if slot.flagged]
     alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
-    doubtful = alike is not None and alike.doubtful
+    others = [] if flight is None else other_laws(flight, after_flight, in_flight, scatter)
+    doubtful = (alike is not None and alike.doubtful) or any(one.better for one in others)
     left = after is not None and after.statistic > OMNIBUS_LIMIT and after.p_value < OMNIBUS_P
     remaining = left or doubtful
     verdict: VerdictName = "none_missing"
@@ -96,6 +100,7 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
         chi2,
         world,
         errors,
+        tuple(one for one in others if one.as_good),
     )
 
 
