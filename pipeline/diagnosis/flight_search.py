@@ -30,6 +30,7 @@ def flight_search(
     flight, slots, current = prepared.flight, [], world
     if flight is None:
         return [], world, None
+    losses: list[float] = []
     while len(slots) < MOST_EFFECTS:
         slot = fill(flight, current, candidates, prepared.groups, prepared.turned, scatter)
         if not slot.flagged:
@@ -37,14 +38,16 @@ def flight_search(
             break
         refitted = slot.best.refitted
         assert refitted is not None
-        if slots and not held_out_loss(refitted.segments[0], refitted.world) < held_out_loss(flight, current):
-            break
+        if slots:
+            losses.append(held_out_loss(flight, current))
+            if not held_out_loss(refitted.segments[0], refitted.world) < losses[-1]:
+                break
         slots.append(slot)
         current, flight = refitted.world, refitted.segments[0]
     filled = [slot for slot in slots if slot.flagged]
     if len(filled) > 1:
         bundled = _bundled(prepared, world, filled, candidates, scatter)
-        if bundled is not None:
+        if bundled is not None and held_out_loss(bundled[2], bundled[1]) < losses[0]:
             return bundled
         for place in range(len(filled) - 1):  # the first were chosen before the others were known
             without = without_effect(current, filled[place].best.name)

@@ -31,7 +31,7 @@ STATE_STEPS = (1e-4, 1e-3, 1e-3, 1e-2)
 PARAMETER_STEP = 0.02
 """Differences by parameters, in widths of their priors."""
 ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE = 8, 1e5, 0.2, 2e-3
-LOADS_UNKNOWN = 0.02
+LOADS_UNKNOWN = 0.01
 """How a weight is shared by more than three points, nobody knows better than to this share: a body is never quite flat,
 and engines differ by as much. What it turns a sliding body about the normal is no evidence for anything."""
 DAMPINGS = (0.1, 1.0, 10.0, 300.0)

@@ -82,31 +82,51 @@ def glide_evidence(
     glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
     glides, friction = started_glides(glides, float(world.contact.friction[0]))
     told = told_by_flight(flight, soft, prepared.groups)
-    base = fitted_glides(soft, [], [(glides, friction)], told)[0]
+    # a single glide may mislead the start, and a wrong friction is a valley of its own
+    begun = [friction, world.contact.friction[0].log().to(friction)]
+    base = min((fitted_glides(soft, [], [(glides, one)], told)[0] for one in begun), key=lambda fit: fit.cost)
     degrees = float(glides.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
         return []
     start = (base.segments, base.values[0])
-    few = [v for v in variants if len(v.parameters) <= MANY]
     found: dict[int, tuple[Variant, GlideFit]] = {}
-    for part in (few, [v for v in variants if v not in few]):
-        tried = fitted_glides(soft, part, [start] * len(part), told, FIRST_ITERATIONS) if part else []
+    for part in batches(variants):
+        tried = fitted_glides(soft, part, [start] * len(part), told, FIRST_ITERATIONS)
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
     # what is far behind after some steps is not worth the others
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
     close = [k for k, gain in gains.items() if gain > least and gain > CLOSE_SHARE * max(gains.values())]
-    for part in ([k for k in close if found[k][0] in few], [k for k in close if found[k][0] not in few]):
-        if part:
-            chosen = [found[k] for k in part]
-            again = fitted_glides(
-                soft, [v for v, _ in chosen], [(fit.segments, fit.values[0]) for _, fit in chosen], told
-            )
-            found |= {k: (found[k][0], fit) for k, fit in zip(part, again, strict=True)}
+    for part in batches([found[k][0] for k in close]):
+        mine = [(k, found[k]) for k in close if found[k][0] in part]
+        again = fitted_glides(soft, part, [(fit.segments, fit.values[0]) for _, (_, fit) in mine], told)
+        found |= {k: (variant, fit) for (k, (variant, _)), fit in zip(mine, again, strict=True)}
     # the model alone once more from where the best one ended: what both gain by that is no sign of an effect
     _, best = min(found.values(), key=lambda one: one[1].cost)
     own = best.values[0, : base.values.shape[1]]
     least_cost = min(base.cost, fitted_glides(soft, [], [(best.segments, own)], told)[0].cost)
     return _ranked(list(found.values()), kept, least_cost, degrees)
+
+
+def batches(variants: Sequence[Variant]) -> list[list[Variant]]:
+    """Return candidates in parts to be fitted at once, in order.
+
+    The fused kernel takes one effect of a kind; all of a batch pay for those of many numbers, which are kept apart.
+    """
+    parts: list[list[Variant]] = []
+    for variant in variants:
+        many = len(variant.parameters) > MANY
+        fits = (
+            part
+            for part in parts
+            if many == (len(part[0].parameters) > MANY)
+            and all(type(other.active.effect) is not type(variant.active.effect) for other in part)
+        )
+        part = next(fits, None)
+        if part is None:
+            parts.append([variant])
+        else:
+            part.append(variant)
+    return parts
 
 
 def with_effect(world: World, found: GlideEvidence) -> World:

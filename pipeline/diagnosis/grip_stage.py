@@ -25,9 +25,9 @@ from .cuts import Segment
 from .glide_fits import GlideFit, soft_world
 from .glide_stage import (
     FIRST_ITERATIONS,
-    MANY,
     SURPLUS_SIGMAS,
     GlideEvidence,
+    batches,
     fitted_glides,
     started_glides,
     told_by_flight,
@@ -129,10 +129,9 @@ def _fits(
     """Return the fits of the variants, those that are far behind after some steps only to there."""
     own = alone.values[0]
     pulls = [v for v in variants if len(v.parameters) == 1 and v.active.effect.has("wrench")]
-    few = [v for v in variants if v not in pulls and len(v.parameters) <= MANY]
     found: list[tuple[Variant, GlideFit]] = []
-    for part in (few, [v for v in variants if v not in pulls and v not in few]):
-        tried = fitted_glides(soft, part, [(alone.segments, own)] * len(part), known, FIRST_ITERATIONS) if part else []
+    for part in batches([v for v in variants if v not in pulls]):
+        tried = fitted_glides(soft, part, [(alone.segments, own)] * len(part), known, FIRST_ITERATIONS)
         costs = [struck.joint(fit) for fit in tried]
         for variant, fit, cost in zip(part, tried, costs, strict=True):
             close = cost == min(costs)

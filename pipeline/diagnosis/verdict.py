@@ -36,8 +36,8 @@ class Findings:
 
     before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
     candidates, the best first; contact: all contact evidence; world: with the selected effects; base: without them;
-    errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect; as_good:
-    other laws that explain the flights as well as those of effects found.
+    errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect;
+    as_good: other laws that explain the flights as well as those of effects found.
     """
 
     verdict: VerdictName
@@ -67,13 +67,16 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     scatter = max(prepared.slow, dispersion(*pieces[-1])) if pieces else 1.0
     before = _worst_omnibus(pieces, scatter)
     slots, after_flight, flight = flight_search(prepared, world, candidates, scatter)
-    chosen, contact, final, chi2, fitted = with_contact(prepared, world, after_flight, slots, candidates, flight)
+    flown = _worst_omnibus(_pieces(prepared, after_flight), scatter)
+    chosen, contact, final, chi2, fitted = with_contact(
+        prepared, world, after_flight, slots, candidates, flight, explained=not _is_left(flown)
+    )
     after = _worst_omnibus(_pieces(prepared, final), scatter) if chosen else before
     in_flight = [slot.best.name for slot in slots if slot.flagged]
     alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
     others = [] if flight is None else other_laws(flight, after_flight, in_flight, scatter)
     doubtful = (alike is not None and alike.doubtful) or any(one.better for one in others)
-    left = after is not None and after.statistic > OMNIBUS_LIMIT and after.p_value < OMNIBUS_P
+    left = _is_left(after)
     remaining = left or doubtful
     verdict: VerdictName = "none_missing"
     if doubtful or (left and _explained(before, after) < ENOUGH_SHARE):
@@ -114,6 +117,10 @@ def _worst_omnibus(pieces: Sequence[tuple[Segments, ResidualWrenches]], scatter:
     """Return the omnibus statistic of flight over all lengths of pieces, the one with the smallest p-value."""
     found = [omnibus(wrenches, scatter) for _, wrenches in pieces]
     return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
+
+
+def _is_left(found: Omnibus | None) -> bool:
+    return found is not None and found.statistic > OMNIBUS_LIMIT and found.p_value < OMNIBUS_P
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
