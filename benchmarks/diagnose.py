@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Literal
@@ -177,9 +177,9 @@ def _added(capture: Path, base: Path, child: Path, effects: Sequence[str], physi
     return {"errors": errors, "estimates": own, "child_cpu_s": round(time.process_time() - began, 1)}
 
 
-def timing(device: Literal["auto", "cpu", "cuda"]) -> str:
-    """Return how long a diagnosis of ten tosses of 1 s takes: in a fresh process, and once more."""
-    lines = ["| body | hidden | fit | diagnosis | again | verdict |", "|---|---|---|---|---|---|"]
+def timing(device: Literal["auto", "cpu", "cuda"]) -> Iterator[str]:
+    """Yield the lines of a table of how long a diagnosis of ten tosses of 1 s takes: in a fresh process, and again."""
+    yield from ("| body | hidden | fit | diagnosis | again | verdict |", "|---|---|---|---|---|---|")
     things: tuple[Literal["cube", "ball"], ...] = ("cube", "ball")
     for thing, effects in itertools.product(things, (("quadratic_drag",), ())):
         case = Case(f"timing/{thing}", thing, effects, seed=4, train=10)
@@ -194,8 +194,7 @@ def timing(device: Literal["auto", "cpu", "cuda"]) -> str:
                 marks.append(time.perf_counter())
         seconds = " | ".join(f"{after - before:.1f} s" for before, after in itertools.pairwise(marks))
         named = ", ".join(found.selected)
-        lines.append(f"| {thing} | {', '.join(effects) or 'nothing'} | {seconds} | {found.verdict} {named} |")
-    return "\n".join(lines)
+        yield f"| {thing} | {', '.join(effects) or 'nothing'} | {seconds} | {found.verdict} {named} |"
 
 
 def run(todo: Sequence[Case], store: Store, workers: int, refit: bool, deadline: float) -> None:
@@ -303,7 +302,8 @@ def main() -> int:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of --time")
     given = parser.parse_args()
     if given.time:
-        print(timing(given.device))
+        for line in timing(given.device):
+            print(line, flush=True)
         return 0
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     if given.list == "all":

@@ -225,7 +225,7 @@ def red(page: Page) -> np.ndarray:
 
 def eventually(page: Page, right: Callable[[np.ndarray], bool]) -> np.ndarray:
     """Return the red pixels once they are right; software WebGL shows what it was told only after a while."""
-    for _ in range(60):
+    for _ in range(240):
         found = red(page)
         if right(found):
             return found
