@@ -17,7 +17,7 @@ from .candidates import Candidate, base_parameters, base_values, without_effect
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
 from .glide_stage import GlideEvidence, glide_evidence, with_effect
 from .grip_stage import grip_evidence, named_by_grip
-from .impact_stage import impact_evidence, named_by_impacts, with_impact_effect
+from .impact_stage import ImpactEvidence, impact_evidence, named_by_impacts, with_impact_effect
 from .prepared import Prepared
 from .refit import refit
 from .segments import Segments
@@ -50,7 +50,7 @@ CONFIRMED = 2.0
 
 @dataclass(frozen=True)
 class Chosen:
-    """An effect that was selected, and its equals (itself the first); acts_in: where its evidence is from."""
+    """An effect that was selected, and its equals (itself the first); where: which motion its evidence is from."""
 
     evidence: Evidence
     equals: tuple[Evidence, ...]
@@ -95,30 +95,31 @@ def with_contact(
     glides = glide_evidence(prepared, base.world, candidates, GLIDE_SURE, flight)
     alike = _equal_in_glides(glides, explained, bool(chosen))
     if alike:
-        first = tuple(one.evidence for one in alike)
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in glides]
-        return [*chosen, Chosen(first[0], first, "contact")], told, with_effect(base.world, alike[0]), chi2, contact
+        return [*chosen, _chosen(alike)], told, with_effect(base.world, alike[0]), chi2, contact
     impacts = impact_evidence(prepared, base.world, candidates)
     struck = named_by_impacts(impacts)
     if struck:
-        first = tuple(one.evidence for one in struck)
         told = [ContactEvidence(one.evidence, one.score, one.gain, one.t) for one in impacts]
-        found = with_impact_effect(base.world, struck[0])
-        return [*chosen, Chosen(first[0], first, "contact")], told, found, chi2, contact
+        return [*chosen, _chosen(struck)], told, with_impact_effect(base.world, struck[0]), chi2, contact
     gripped = named_by_grip(grip_evidence(prepared, base.world, contact, candidates, flight))
     if gripped:
-        first = tuple(one.evidence for one in gripped)
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in gripped]
-        return [*chosen, Chosen(first[0], first, "contact")], told, with_effect(base.world, gripped[0]), chi2, contact
+        return [*chosen, _chosen(gripped)], told, with_effect(base.world, gripped[0]), chi2, contact
     evidence = contact_evidence(contact, base.world, candidates, prepared.groups, prepared.turned)
     named = _named(evidence, glides)
     if named:
         found, numbers = _added(base.world, contact, named[0].evidence)
         if any(abs(value) > CONFIRMED * error for value, error in numbers.values()):
-            first = replace(named[0].evidence, numbers=numbers)
-            equals = (first, *(one.evidence for one in named[1:]))
-            return [*chosen, Chosen(first, equals, "contact")], evidence, found, chi2, contact
+            first = replace(named[0], evidence=replace(named[0].evidence, numbers=numbers))
+            return [*chosen, _chosen([first, *named[1:]])], evidence, found, chi2, contact
     return chosen, evidence, replace(final, contact=base.world.contact), chi2, contact
+
+
+def _chosen(equals: Sequence[GlideEvidence | ImpactEvidence | ContactEvidence]) -> Chosen:
+    """Return the first of what a stage names, with its equals."""
+    every = tuple(one.evidence for one in equals)
+    return Chosen(every[0], every, "contact")
 
 
 def _equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: bool) -> list[GlideEvidence]:

@@ -39,8 +39,9 @@ def flight_search(
         refitted = slot.best.refitted
         assert refitted is not None
         if slots:
-            losses.append(held_out_loss(flight, current))
-            if not held_out_loss(refitted.segments[0], refitted.world) < losses[-1]:
+            losses = losses or [held_out_loss(flight, current)]
+            losses.append(held_out_loss(refitted.segments[0], refitted.world))
+            if not losses[-1] < losses[-2]:
                 break
         slots.append(slot)
         current, flight = refitted.world, refitted.segments[0]

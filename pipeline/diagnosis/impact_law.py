@@ -144,7 +144,7 @@ def _cone(touch: Touch) -> Tensor:
     """Return M (n, 2, 2) of the friction: mu I, and what an effect gives it of a grain, [[a, b], [b, -a]]."""
     friction = touch.friction.clamp_min(0.0)  # no sum of effects pushes a slider on
     cone = friction[..., None] * torch.eye(2).to(friction)
-    grain: Tensor | None = getattr(touch, "anisotropy", None)
+    grain = touch.anisotropy
     if grain is None:
         return cone
     a, b = grain[:, 0].unbind(-1)
