@@ -1,14 +1,14 @@
 """Does `cgwm diagnose` name what is hidden, and nothing where nothing is? Captures whose truth is another engine.
 
     python benchmarks/diagnose.py --stage development --workers 2 [--nulls 20] [--only cube/com_offset] [--list rough]
-    python benchmarks/diagnose.py --stage report3 --table
+    python benchmarks/diagnose.py --stage report4 --table
     python benchmarks/diagnose.py --list video             # six captures with videos only
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
 
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
 --effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
-by report, report2 and report3, whose seeds are others (each later one: since what the one before said was seen).
+by report to report4, whose seeds are others (each later one: since what the one before said was seen).
 Results are stored case by case and taken up again.
 """
 
@@ -60,7 +60,8 @@ FAMILIES: tuple[set[str], ...] = (
 )
 """Effects that do much the same: to name one for another is a smaller fault."""
 RIGHT = ("exact", "class", "exact, and more", "class, and more")
-COLUMNS = (*RIGHT, "family", "wrong", "unexplained", "silent", "refused")
+COLUMNS = (*RIGHT, "among", "family", "wrong", "unexplained", "silent", "refused")
+"""among: said to be not separable from others of contact, which is honest, and not right; family: one of them alone."""
 
 
 def judged(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
@@ -91,7 +92,9 @@ def _named(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
     beside = {name for name in selected if not groups[name] & {*case.effects, *along}}
     if marks <= {"exact", "class"}:
         return ("exact" if marks == {"exact"} else "class") + (", and more" if beside else "")
-    return "family" if marks & {"exact", "class", "family"} else "wrong"
+    if marks <= {"exact", "class", "among"} and not beside:
+        return "among"
+    return "family" if marks & {"exact", "class", "among", "family"} else "wrong"
 
 
 def _mark(name: str, groups: dict[str, set[str]]) -> str:
@@ -101,6 +104,8 @@ def _mark(name: str, groups: dict[str, set[str]]) -> str:
     for group in groups.values():
         if name in group and any(group <= set(aliases) for aliases in FLIGHT_ALIASES):
             return "class"
+    if EFFECTS[name].acts == "contact" and any(name in group for group in groups.values()):
+        return "among"
     near = {other for family in FAMILIES if name in family for other in family}
     return "family" if any(name in group or near & group for group in groups.values()) else "wrong"
 

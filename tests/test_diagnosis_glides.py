@@ -7,13 +7,15 @@ import pytest
 import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.contact_search import GLIDE_SCORE
+from cgwm.pipeline.diagnosis.contact_search import GLIDE_SCORE, equal_in_glides
 from cgwm.pipeline.diagnosis.cuts import Segment
 from cgwm.pipeline.diagnosis.glide_fits import soft_world, without_loads
-from cgwm.pipeline.diagnosis.glide_stage import glide_evidence, with_effect
+from cgwm.pipeline.diagnosis.glide_stage import GlideEvidence, StartedGlides, glide_evidence, with_effect
 from cgwm.pipeline.diagnosis.glides import glides_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
+from cgwm.pipeline.diagnosis.score import ScoreTest
 from cgwm.pipeline.diagnosis.segments import Segments
+from cgwm.pipeline.diagnosis.slots import Evidence
 from cgwm.pipeline.diagnosis.verdict import find
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact import ContactLaw
@@ -55,6 +57,57 @@ def test_a_glide_ends_at_an_impact() -> None:
         assert float(height[item.episode, item.first : item.last + 1].max()) < 0.01
 
 
+def test_hidden_frames_shorten_no_glide() -> None:
+    world = world_with("ball")
+    episodes = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
+    seen = prepare(world, episodes)
+    whole = seen.whole
+    hidden = {name: getattr(whole, name).clone() for name in ("seen", "turned")}
+    for mask in hidden.values():
+        mask[:, :6] = 0  # in a hand
+        mask[0, 20] = 0  # lost once
+    parts = [(item.episode, item.first, item.last) for item in glides_of(world, whole, seen.clear, seen.noise)]
+    later = glides_of(world, replace(whole, **hidden), seen.clear, seen.noise)
+    assert max(last for _, _, last in parts) == max(item.last for item in later) == len(whole.times_s[0]) - 1
+    assert min(item.first for item in later) == 6
+    covered = sum(item.last - item.first for item in later)
+    assert covered >= sum(last - first for _, first, last in parts) - 2 * 7
+
+
+def evidence(name: str, score: float, share: float, size: float = 1.0) -> GlideEvidence:
+    """An effect in glides, each of its numbers so many times what is usual."""
+    effect = load_effect(name)
+    values = np.array([size * p.scale for p in effect.parameters])
+    test = ScoreTest(score, len(values), 0.0, values, np.eye(len(values)), True)
+    numbers = {p.name: (float(v), 0.0) for p, v in zip(effect.parameters, values, strict=True)}
+    return GlideEvidence(Evidence(Candidate(name, effect), {}, test, 0.0, numbers=numbers), score, 0.3, 1.0, share)
+
+
+@pytest.mark.parametrize(
+    ("found", "flown", "named"),
+    [
+        ([("viscous_friction", 250, 0.7), ("rolling_resistance", 50, 0.1)], False, ["viscous_friction"]),
+        ([("viscous_friction", 200, 0.7)], False, []),  # wrong ones reach as much
+        ([("viscous_friction", 100, 0.9)], False, ["viscous_friction"]),  # it leaves next to nothing
+        ([("friction_patch", 300, 0.9)], False, []),  # a map fits about anything
+        ([("friction_patch", 500, 0.9)], False, ["friction_patch"]),
+        ([("viscous_friction", 250, 0.7)], True, []),  # the law of what was found in flight is never quite the true one
+        ([("viscous_friction", 500, 0.7)], True, ["viscous_friction"]),
+        ([("anisotropic_friction", 500, 0.9, 0.2)], False, []),  # a hundredth by direction
+        # a rival that is behind by less than wrong ones gain, and explains about as much
+        (
+            [("stribeck_friction", 250, 0.7), ("friction_patch", 150, 0.6), ("adhesion", 140, 0.2)],
+            False,
+            ["stribeck_friction", "friction_patch"],
+        ),
+        ([("stribeck_friction", 900, 0.7), ("friction_patch", 600, 0.6)], False, ["stribeck_friction"]),
+    ],
+)
+def test_what_glides_name(found: list[tuple[str, float, float]], flown: bool, named: list[str]) -> None:
+    given = [evidence(*one) for one in found]
+    assert [one.evidence.name for one in equal_in_glides(given, explained=True, flown=flown)] == named
+
+
 @pytest.mark.parametrize(
     ("name", "values"),
     [
@@ -67,7 +120,7 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22})
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
-    found = glide_evidence(prepared, world, library, GLIDE_SCORE, prepared.flight)
+    found = glide_evidence(prepared, world, library, GLIDE_SCORE, StartedGlides.of(prepared, world, prepared.flight))
     assert found[0].evidence.name == name
     assert found[0].score > GLIDE_SCORE
     assert found[0].score > 3 * found[1].score
@@ -82,7 +135,7 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
 
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
-    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE, prepared.flight)
+    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE, StartedGlides.of(prepared, world, prepared.flight))
     assert not found or found[0].score < GLIDE_SCORE
 
 

@@ -6,7 +6,7 @@ import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnosis.candidates import Candidate
 from cgwm.pipeline.diagnosis.contact_stage import fitted_contact
-from cgwm.pipeline.diagnosis.glide_stage import GlideEvidence
+from cgwm.pipeline.diagnosis.glide_stage import GlideEvidence, StartedGlides
 from cgwm.pipeline.diagnosis.grip_stage import grip_evidence, named_by_grip
 from cgwm.pipeline.diagnosis.prepared import prepare
 from cgwm.pipeline.physics import State
@@ -39,7 +39,9 @@ def told(body: str, effects: Effects | None = None) -> list[GlideEvidence]:
     prepared = prepare(world, [*slides, *tosses(truth, 2, count=count, lift_m_s=(-0.5, 0.0))])
     found = fitted_contact(prepared, world)
     assert found is not None
-    return grip_evidence(prepared, found[0].world, found[1], LIBRARY, prepared.flight)
+    return grip_evidence(
+        prepared, found[0].world, found[1], LIBRARY, StartedGlides.of(prepared, found[0].world, prepared.flight)
+    )
 
 
 def test_adhesion_shows_where_glides_have_more_friction_than_impacts() -> None:

@@ -15,7 +15,7 @@ from ..physics.effects.registry import CONTACT_ALIASES
 from ..physics.world import World
 from .candidates import Candidate, base_parameters, base_values, without_effect
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
-from .glide_stage import GlideEvidence, glide_evidence, with_effect
+from .glide_stage import GlideEvidence, StartedGlides, glide_evidence, with_effect
 from .grip_stage import grip_evidence, named_by_grip
 from .impact_stage import ImpactEvidence, impact_evidence, named_by_impacts, with_impact_effect
 from .prepared import Prepared
@@ -26,13 +26,20 @@ from .slots import Evidence, Slot
 GLIDE_SCORE, GLIDE_EXPLAINED = 220.0, 0.5
 """An effect in glides is named above this score, if it explains at least this share of what the noise does not ..."""
 FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 1, 400.0
-"""... one of more numbers above that, as it fits more by chance ..."""
+"""... one of more numbers, or beside an effect of flight, above that, as it fits more by chance ..."""
 GLIDE_SURE, GLIDE_SHARE_SURE = 80.0, 0.78
 """... or above this, if it leaves next to nothing: what stands in for something else explains a part. On development
 seeds what was not there reached a score of 165 at a share of 0.69, and any share up to a score of 50; friction by
 direction 179 at 0.94 beside a drag in wind, so that beside effects of flight this does not count for more numbers."""
+MANY_NUMBERS = 4
+"""That holds for none of more numbers than this: a map fits about anything."""
+GLIDE_LEAST = 0.3
+"""No effect is named whose numbers all are below this share of their usual sizes: engines differ by as much."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
-"""Another one within this score of it, or this share of it, leaves the two unseparated."""
+"""Another one within this score of it, or this share of it, leaves the two unseparated ..."""
+MISLED, RIVAL_SHARE = 165.0, 0.5
+"""... and so does one behind by less than what a wrong one has reached, if it explains this share of what the best one
+does: how friction falls with the speed, how it grows and where it changes are much the same along a single slide."""
 CONTACT_SCORE, CONTACT_T = 22.0, 1.0
 """Under the law of contact an effect is named above this score, where the mean gain of held-out episodes is above so
 many of its standard errors ..."""
@@ -92,8 +99,9 @@ def with_contact(
         base, contact = again
     rows = contact.residuals([], contact.observations.times_s.new_zeros(0), jacobian=False)[0]
     chi2 = float(rows.square().sum() / contact.dof.sum())
-    glides = glide_evidence(prepared, base.world, candidates, GLIDE_SURE, flight)
-    alike = _equal_in_glides(glides, explained, bool(chosen))
+    started = StartedGlides.of(prepared, base.world, flight)
+    glides = glide_evidence(prepared, base.world, candidates, GLIDE_SURE, started)
+    alike = equal_in_glides(glides, explained, bool(chosen))
     if alike:
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in glides]
         return [*chosen, _chosen(alike)], told, with_effect(base.world, alike[0]), chi2, contact
@@ -102,7 +110,7 @@ def with_contact(
     if struck:
         told = [ContactEvidence(one.evidence, one.score, one.gain, one.t) for one in impacts]
         return [*chosen, _chosen(struck)], told, with_impact_effect(base.world, struck[0]), chi2, contact
-    gripped = named_by_grip(grip_evidence(prepared, base.world, contact, candidates, flight))
+    gripped = named_by_grip(grip_evidence(prepared, base.world, contact, candidates, started))
     if gripped:
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in gripped]
         return [*chosen, _chosen(gripped)], told, with_effect(base.world, gripped[0]), chi2, contact
@@ -122,7 +130,7 @@ def _chosen(equals: Sequence[GlideEvidence | ImpactEvidence | ContactEvidence]) 
     return Chosen(every[0], every, "contact")
 
 
-def _equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: bool) -> list[GlideEvidence]:
+def equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: bool) -> list[GlideEvidence]:
     """Return the effect that glides name and its equals; none where they name none.
 
     Args:
@@ -135,14 +143,25 @@ def _equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: 
         return []
     if not explained and fit[0].share < GLIDE_SHARE_SURE:
         return []  # what flights leave unexplained acts here, too
-    lead = max(GLIDE_LEAD, GLIDE_SHARE * fit[0].score)
-    return [one for one in fit if one.score > fit[0].score - lead]
+    first = fit[0]
+    lead = max(GLIDE_LEAD, GLIDE_SHARE * first.score)
+
+    def rivals(one: GlideEvidence) -> bool:
+        behind = first.score - one.score
+        return behind < lead or (behind < MISLED and one.share > RIVAL_SHARE * first.share)
+
+    return [one for one in fit if rivals(one)]
 
 
 def _told_by_glides(one: GlideEvidence, flown: bool) -> bool:
-    flexible = len(one.evidence.candidate.effect.parameters) > FEW_NUMBERS
-    enough = one.score > (GLIDE_SCORE_FLEXIBLE if flexible else GLIDE_SCORE) and one.share > GLIDE_EXPLAINED
-    sure = one.score > GLIDE_SURE and one.share > GLIDE_SHARE_SURE
+    parameters, numbers = one.evidence.candidate.effect.parameters, one.evidence.numbers
+    assert numbers is not None
+    if all(abs(numbers[p.name][0]) < GLIDE_LEAST * p.scale for p in parameters):
+        return False
+    flexible = len(parameters) > FEW_NUMBERS
+    least = GLIDE_SCORE_FLEXIBLE if flexible or flown else GLIDE_SCORE
+    enough = one.score > least and one.share > GLIDE_EXPLAINED
+    sure = one.score > GLIDE_SURE and one.share > GLIDE_SHARE_SURE and len(parameters) <= MANY_NUMBERS
     return enough or (sure and not (flexible and flown))
 
 

@@ -56,32 +56,59 @@ class GlideEvidence:
     share: float
 
 
+@dataclass(frozen=True)
+class StartedGlides:
+    """Glides, each with a start fitted with a friction of its own, before any effect is looked for.
+
+    segments: in the world with the soft contact; friction (1,): logarithm of the one that most tell; told: parameters
+    of what acts in flight, with the standard errors that flights leave them as priors. It acts in glides, too, and is
+    known no better there: an error of half a thousandth of a radian in a tilt is a millimetre in a slide of half a
+    second.
+    """
+
+    segments: Segments
+    friction: Tensor
+    told: tuple[Parameter, ...]
+
+    @staticmethod
+    def of(prepared: Prepared, world: World, flight: Segments | None) -> StartedGlides | None:
+        """Find and start the glides of all episodes; None where there are none.
+
+        Args:
+            prepared: The episodes.
+            world: The model's world.
+            flight: Flights with fitted states; None where there are none.
+        """
+        if not isinstance(world.contact, ContactLaw) or not prepared.turned:
+            return None
+        items = glides_of(world, prepared.whole, prepared.clear, prepared.noise)
+        if not items:
+            return None
+        soft = soft_world(world)
+        glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
+        glides, friction = _started(glides, float(world.contact.friction[0]))
+        return StartedGlides(glides, friction, tuple(_told_by_flight(flight, soft, prepared.groups)))
+
+
 def glide_evidence(
-    prepared: Prepared, world: World, candidates: Sequence[Candidate], least: float, flight: Segments | None
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], least: float, started: StartedGlides | None
 ) -> list[GlideEvidence]:
     """Return the evidence of the candidates that act in contact, the best first; none where none can reach a score.
-
-    What acts in flight acts in glides, too, and is known no better than flights tell it: an error of half a thousandth
-    of a radian in a tilt is a millimetre in a slide of half a second. It is fitted along, from there.
 
     Args:
         prepared: The episodes.
         world: The model's world.
         candidates: All of them.
         least: The score that matters.
-        flight: Flights with fitted states; None where there are none.
+        started: Its glides.
     """
-    if not isinstance(world.contact, ContactLaw) or not prepared.turned:
-        return []
-    items = glides_of(world, prepared.whole, prepared.clear, prepared.noise)
     kept, _ = admissible(world, candidates, prepared.turned)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
-    if not items or not variants:
+    if started is None or not variants:
         return []
-    soft = soft_world(world)
-    glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
-    glides, friction = started_glides(glides, float(world.contact.friction[0]))
-    told = told_by_flight(flight, soft, prepared.groups)
+    assert isinstance(world.contact, ContactLaw)  # see StartedGlides.of
+    glides, friction, told = started.segments, started.friction, started.told
+    soft = glides.world
     # a single glide may mislead the start, and a wrong friction is a valley of its own
     begun = [friction, world.contact.friction[0].log().to(friction)]
     base = min((fitted_glides(soft, [], [(glides, one)], told)[0] for one in begun), key=lambda fit: fit.cost)
@@ -139,7 +166,7 @@ def with_effect(world: World, found: GlideEvidence) -> World:
     return replace(world, contact=contact, effects=(*world.effects, active))
 
 
-def started_glides(glides: Segments, known: float) -> tuple[Segments, Tensor]:
+def _started(glides: Segments, known: float) -> tuple[Segments, Tensor]:
     """Return glides each fitted with a friction of its own, and the logarithm of the friction that most tell."""
     count = len(glides.items)
     states = [settled(glides, line_state(glides, frames)) for frames in START_FRAMES]
@@ -208,7 +235,7 @@ def own_numbers(world: World) -> list[Parameter]:
     return [p for p in effect_parameters(world) if p.name.partition(".")[0] in own]
 
 
-def told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> list[Parameter]:
+def _told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> list[Parameter]:
     """Return the parameters of what acts in flight, with the standard errors that flights leave them as priors."""
     parameters = base_parameters(world, "flight")
     if flight is None or not parameters:

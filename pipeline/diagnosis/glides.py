@@ -8,6 +8,7 @@ long, where other contacts are cut short.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -53,11 +54,14 @@ def glides_of(world: World, whole: Observations, clear: Tensor, noise: tuple[flo
     on = (lowest < margin) & ~clear & (whole.seen[:, :, 0] > 0)
     found = []
     for episode, times in enumerate(whole.times_s):
-        count = int((whole.seen[episode].amax(-1) > 0).sum())
-        steady = on[episode, :count].numpy() & ~_impacts(world, whole, episode, count, noise)
+        seen = (whole.seen[episode].amax(-1) > 0).nonzero()[:, 0]  # the first may be hidden, and any of the others
+        if len(seen) < 2:
+            continue
+        steady = on[episode, seen].numpy() & ~_impacts(world, whole, episode, seen, noise)
         if not is_round(body):
-            steady &= ~_tilting(world, whole, episode, count, noise[1])
-        found += _parts(episode, times[:count].numpy(), steady)
+            steady &= ~_tilting(world, whole, episode, seen, noise[1])
+        parts = _parts(times[seen].numpy(), steady)
+        found += [Segment(episode, int(seen[first]), int(seen[last])) for first, last in parts]
     return without_rest(whole, found, noise)
 
 
@@ -85,21 +89,16 @@ def settled(segments: Segments, state: State) -> State:
 
 
 def _impacts(
-    world: World, whole: Observations, episode: int, count: int, noise: tuple[float, float]
+    world: World, whole: Observations, episode: int, seen: Tensor, noise: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """Return the frames (T,) within one frame of which the speed along the normal, or the rate of tilting, jumps."""
+    """Return which of the seen frames are within one of a jump of the speed along the normal, or of the tilting."""
     assert world.ground_normal is not None
     body = world.bodies[whole.free[0]]
-    times = whole.times_s[episode, :count].numpy()
-    height = (whole.position_m[episode, :count, 0] @ world.ground_normal)[:, None].numpy()
-    quat, turned = whole.quat_wxyz[episode, :count, 0], whole.turned[episode, :count, 0].numpy() > 0
+    height = (whole.position_m[episode, seen, 0] @ world.ground_normal)[:, None].numpy()
+    quat, turned = whole.quat_wxyz[episode, seen, 0], whole.turned[episode, seen, 0].numpy() > 0
     level = tangent_axes(world.ground_normal)[1:]
-    step = float(np.median(np.diff(times))) if count > 1 else 1.0
-    side = max(SIDE_FRAMES, round(SIDE_S / step))
-    jumps = np.zeros(count, np.bool_)
-    for k in range(count):
-        frames = slice(max(0, k - side), min(count, k + side + 1))
-        t = times[frames] - times[k]
+    jumps = np.zeros(len(seen), np.bool_)
+    for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
         if (t < 0).sum() < 2 or (t > 0).sum() < 2:
             continue
         inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], 1))[3]
@@ -116,29 +115,35 @@ def _impacts(
     return wide
 
 
-def _tilting(world: World, whole: Observations, episode: int, count: int, noise_rad: float) -> NDArray[np.bool_]:
-    """Return the frames (T,) about which the body does not stay on one of its sides."""
+def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float) -> NDArray[np.bool_]:
+    """Return about which of the seen frames the body does not stay on one of its sides."""
     assert world.ground_normal is not None
-    times = whole.times_s[episode, :count].numpy()
-    turned = whole.turned[episode, :count, 0].numpy() > 0
-    up = (quat_to_matrix(whole.quat_wxyz[episode, :count, 0]).transpose(-1, -2) @ world.ground_normal).numpy()
-    step = float(np.median(np.diff(times))) if count > 1 else 1.0
-    side = max(SIDE_FRAMES, round(SIDE_S / step))
-    tilts = np.zeros(count, np.bool_)
-    for k in range(count):
-        frames = np.arange(max(0, k - side), min(count, k + side + 1))
-        frames = frames[turned[frames]]
-        if len(frames) < 3:
+    turned = whole.turned[episode, seen, 0].numpy() > 0
+    up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ world.ground_normal).numpy()
+    tilts = np.zeros(len(seen), np.bool_)
+    for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
+        known = turned[frames]
+        if known.sum() < 3:
             continue
-        slope = np.linalg.pinv(np.stack([np.ones(len(frames)), times[frames] - times[k]], 1))[1]
+        slope = np.linalg.pinv(np.stack([np.ones(int(known.sum())), t[known]], 1))[1]
         spread = float(np.linalg.norm(slope))
-        tilts[k] = np.linalg.norm(slope @ up[frames]) > max(TILTING_RAD_S, JUMP_SIGMAS * noise_rad * spread)
+        tilts[k] = np.linalg.norm(slope @ up[frames][known]) > max(TILTING_RAD_S, JUMP_SIGMAS * noise_rad * spread)
     return tilts
 
 
-def _parts(episode: int, times: Array, steady: NDArray[np.bool_]) -> list[Segment]:
-    """Return the stretches of steady frames that are long enough, cut into equal parts."""
-    found: list[Segment] = []
+def _windows(times: Array) -> Iterator[tuple[int, slice, Array]]:
+    """Yield each frame with the frames about it, which lie no further than some steps, and their times from it."""
+    step = float(np.median(np.diff(times)))
+    side = max(SIDE_FRAMES, round(SIDE_S / step))
+    for k, now in enumerate(times):
+        reach = (side + 0.5) * step
+        first, end = np.searchsorted(times, [now - reach, now + reach])
+        yield k, slice(first, end), times[first:end] - now
+
+
+def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last frames of the steady stretches that are long enough, cut into equal parts."""
+    found: list[tuple[int, int]] = []
     steps = np.diff(times)
     breaks = np.append(False, steps > GAP * np.median(steps)) if len(steps) else np.zeros(len(times), bool)
     edges = np.flatnonzero(np.append(True, (steady[1:] != steady[:-1]) | breaks[1:]))
@@ -148,5 +153,5 @@ def _parts(episode: int, times: Array, steady: NDArray[np.bool_]) -> list[Segmen
             continue
         number = int(np.ceil(length / LONGEST_S - 1e-9))
         cuts = [first + round(k * (end - 1 - first) / number) for k in range(number + 1)]
-        found += [Segment(episode, a, b) for a, b in itertools.pairwise(cuts)]
+        found += itertools.pairwise(cuts)
     return found

@@ -17,22 +17,19 @@ import torch
 from scipy.stats import chi2 as chi2_law
 from torch import Tensor
 
-from ..physics.contact import ContactLaw
 from ..physics.parameters import CONTACT_PARAMETERS, Parameter
 from ..physics.world import World
 from .candidates import Candidate, Variant, admissible, variants_of
 from .cuts import Segment
-from .glide_fits import GlideFit, soft_world
+from .glide_fits import GlideFit
 from .glide_stage import (
     FIRST_ITERATIONS,
     SURPLUS_SIGMAS,
     GlideEvidence,
+    StartedGlides,
     batches,
     fitted_glides,
-    started_glides,
-    told_by_flight,
 )
-from .glides import glides_of
 from .phases import is_round
 from .prepared import Prepared
 from .refit import refit
@@ -79,7 +76,11 @@ class _Struck:
 
 
 def grip_evidence(
-    prepared: Prepared, world: World, contact: Segments, candidates: Sequence[Candidate], flight: Segments | None
+    prepared: Prepared,
+    world: World,
+    contact: Segments,
+    candidates: Sequence[Candidate],
+    started: StartedGlides | None,
 ) -> list[GlideEvidence]:
     """Return the evidence of candidates that glides and impacts together tell, the best first; mostly none.
 
@@ -88,22 +89,19 @@ def grip_evidence(
         world: The model's world.
         contact: Its contact segments with fitted states.
         candidates: All of them.
-        flight: Flights with fitted states; None where there are none.
+        started: Its glides.
     """
-    if not isinstance(world.contact, ContactLaw) or not prepared.turned or is_round(world.bodies[world.free[0]]):
+    if started is None or is_round(world.bodies[world.free[0]]):
         return []
-    items = glides_of(world, prepared.whole, prepared.clear, prepared.noise)
-    hits = [k for k, item in enumerate(contact.items) if not _within(item, items)]
-    if not items or len(hits) < FEWEST:
+    glides, own, known = started.segments, started.friction, started.told
+    hits = [k for k, item in enumerate(contact.items) if not _within(item, glides.items)]
+    if len(hits) < FEWEST:
         return []
-    soft = soft_world(world)
-    glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
-    glides, own = started_glides(glides, float(world.contact.friction[0]))
+    soft = glides.world
     told, error = refit([contact.select(hits)], world, CONTACT_PARAMETERS).number("friction")
     struck = _Struck(told, math.hypot(SPREAD, error / told), 1.0)
     if (struck.apart(own) / struck.width) ** 2 < SCORE:
         return []
-    known = told_by_flight(flight, soft, prepared.groups)
     alone = fitted_glides(soft, [], [(glides, own[None])], known)[0]
     degrees = float(glides.dof.sum())
     struck = replace(struck, spread=max(1.0, alone.cost / degrees))

@@ -12,10 +12,11 @@ from .case import Case
 from .registry import EFFECTS, Size
 from .things import Kind
 
-Stage = Literal["development", "report", "report2", "report3"]
-STAGES: tuple[Stage, ...] = ("development", "report", "report2", "report3")
+Stage = Literal["development", "report", "report2", "report3", "report4"]
+STAGES: tuple[Stage, ...] = ("development", "report", "report2", "report3", "report4")
 """Thresholds may be chosen by the first alone. The summary of `report` was seen when glides were added to `diagnose`,
-that of `report2` when impacts were (2026-11-22), so that what came after is to be judged by `report3`."""
+that of `report2` when impacts were, and that of `report3` when rivals in glides were (2026-11-22), so that what came
+after is to be judged by `report4`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
