@@ -54,7 +54,10 @@ def test_nothing_is_written_by_a_short_fit(tmp_path, capture):
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
 
 
-@pytest.mark.parametrize("settings", [{}, {"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1}])
+ADAPTIVE = {"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1}
+
+
+@pytest.mark.parametrize("settings", [{}, pytest.param(ADAPTIVE, marks=pytest.mark.evidence)])
 def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monkeypatch):
     config = CONFIG.model_copy(update={"iterations": 12, "joint": False, **settings})
     monkeypatch.setattr(adaptive, "REFINED_EVERY", 10)

@@ -106,7 +106,7 @@ def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, ju
     assert set(judge.parameter_errors(fitted.record["parameters"])) >= {"friction"}
 
 
-@pytest.mark.parametrize("which", ["mujoco", "pinwm", "paper"])
+@pytest.mark.parametrize("which", [pytest.param("mujoco", marks=pytest.mark.evidence), "pinwm", "paper"])
 def test_rivals_learn_from_images_alone(bench, blind, judge, frozen, poses, monkeypatch, which):
     for module in (bench.cem_mujoco, bench.pinwm, bench.paper):
         monkeypatch.setattr(module, "find_poses", lambda *_: poses)

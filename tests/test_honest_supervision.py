@@ -56,7 +56,7 @@ def _timeless(value: Any) -> Any:
     return {key: _timeless(part) for key, part in value.items() if not key.startswith("seconds")}
 
 
-@pytest.mark.parametrize("masks", [True, False])
+@pytest.mark.parametrize("masks", [True, pytest.param(False, marks=pytest.mark.evidence)])
 def test_what_is_not_in_the_images_is_not_looked_at(tmp_path: Path, masks: bool) -> None:
     root = told(tmp_path, masks)
     fit(root, tmp_path / "a", "phys-geo", model_of(root), phys_config=CONFIG)

@@ -187,7 +187,7 @@ def test_window_and_constant_give_the_loss_of_the_whole_picture(scene: tuple[Mod
     assert loss.gains["right"] == pytest.approx(GAIN["right"], abs=0.02)
 
 
-@pytest.mark.parametrize("masks", [True, False])
+@pytest.mark.parametrize("masks", [True, pytest.param(False, marks=pytest.mark.evidence)])
 def test_poses_are_found_again(scene: tuple[Model, World, Rollout], masks: bool) -> None:
     model, _, rollout = scene
     footage = film(model, rollout, masks)

@@ -66,7 +66,7 @@ def test_values_and_gradients_equal_the_torch_renderer(kernels, min_alpha):
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+@pytest.mark.parametrize("min_alpha", [pytest.param(0.0, marks=pytest.mark.evidence), 1 / 255])
 def test_strong_distortion_equals_the_torch_renderer(kernels, min_alpha):
     """What lies far outside of a barrel's picture, the distortion would fold back into it."""
     size = (37, 20)  # six tiles, of which four are cut

@@ -37,7 +37,7 @@ def test_the_batch_changes_no_byte(tmp_path: Path) -> None:
 
 
 @NEEDS_COMPILER
-@pytest.mark.parametrize("driven", [False, True])
+@pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.evidence)])
 def test_the_batch_changes_no_byte_in_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: bool) -> None:
     """The fused kernel, built for the CPU, takes many rollouts with numbers of their own; none sees the others."""
     calls: list[int] = []

@@ -91,7 +91,7 @@ def test_truth_slides_by_coulombs_law_in_an_oblique_impact(along_m_s: float) -> 
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 3, *(pytest.param(seed, marks=pytest.mark.evidence) for seed in (1, 2, *range(4, len(FAMILIES))))]
+    "seed", [2, *(pytest.param(seed, marks=pytest.mark.evidence) for seed in range(len(FAMILIES)) if seed != 2)]
 )
 def test_truth_flies_as_gravity_says_before_contact(seed: int) -> None:
     plan = planned("fall", seed)

@@ -122,11 +122,13 @@ def _built(source: str) -> ctypes.CDLL:
     kept = _folder()
     if kept is not None and (kept / f"{name}.so").exists():
         return ctypes.CDLL(str(kept / f"{name}.so"))
-    with tempfile.TemporaryDirectory(dir=kept, prefix="build-") as work:
+    # an interrupt kills the compiler, which then leaves what it had in its own temporary files: they lie here, too
+    with tempfile.TemporaryDirectory(dir=kept, prefix="build-", ignore_cleanup_errors=True) as work:
         program, library = Path(work) / "rollout.cpp", Path(work) / "rollout.so"
         program.write_text(source, encoding="utf-8")
         steps = [command, *FLAGS, str(program), "-o", str(library)]
-        subprocess.run(steps, check=True, capture_output=True, text=True, timeout=BUILD_S)
+        own = os.environ | {"TMPDIR": work}
+        subprocess.run(steps, check=True, capture_output=True, text=True, timeout=BUILD_S, env=own)
         if kept is None:
             return ctypes.CDLL(str(library))
         # in one step: other processes see all of it or nothing
