@@ -27,6 +27,8 @@ SHORTLIST = 5
 """So many candidates are refitted."""
 SHORTLIST_SHARE = 0.4
 """Those whose score statistic is at least this share of the largest."""
+UNFITTED = 1.5
+"""Where every refit leaves more than this [chi2 / dof], constants are tried that the score test did not choose."""
 ALIAS_CHI2 = 6.0
 """An effect that fits worse by less than this [chi2, at equal numbers] explains the data equally: odds of 20."""
 CONTAINED = 0.995
@@ -126,6 +128,13 @@ def fill(
     short = sorted(short, key=lambda e: (_penalty(e) * _log(seen) - e.test.statistic, e.name))[: SHORTLIST + 2]
     before = refit([flight], world, base_parameters(world, "flight"))
     done = [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in short]
+    expected = float(seen.dof.sum()) * dispersion
+    if all(e.refitted is not None and e.refitted.cost > UNFITTED * expected for e in done):
+        others = [e for one in short for e in _with_other_constants(one, seen, variants, kept, dispersion)]
+        again = [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in others]
+        done = list(
+            {e.name: e for e in sorted([*done, *again], key=lambda e: (-(e.delta_bic or 0.0), e.name))}.values()
+        )
     done = sorted(done, key=lambda e: (e.delta_bic, e.name))
     done = [e for e in done if e.delta_bic is not None and e.delta_bic < 0]
     if not done:
@@ -133,6 +142,23 @@ def fill(
     names = {e.name: e for e in done}
     ranking = [*done, *(e for e in evidence if e.name not in names)]
     return Slot(tuple(ranking), tuple(_equals(done, seen, kept, variants, dispersion)), True)
+
+
+def _with_other_constants(
+    evidence: Evidence,
+    seen: Picture,
+    variants: Sequence[Variant],
+    candidates: Sequence[Candidate],
+    dispersion: float,
+) -> list[Evidence]:
+    """Return a candidate at each of its constants but those it was tested best with.
+
+    A score test looks at the first step from neutral; of a large effect the constants that are best there need not be
+    the best ones where it ends.
+    """
+    mine = [v for v in variants if candidates[v.place] is evidence.candidate and v.constants != evidence.constants]
+    tests = [score_test(seen, seen.columns(v.parameters), dispersion=dispersion) for v in mine]
+    return [replace(evidence, constants=v.constants, test=test) for v, test in zip(mine, tests, strict=True)]
 
 
 def refitted(
