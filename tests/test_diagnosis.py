@@ -152,6 +152,18 @@ def test_flight_finds_what_is_hidden() -> None:
         assert abs(estimate - true) < 4 * error and error < 0.1 * true
 
 
+def test_the_constants_of_a_large_effect_are_those_of_where_it_ends() -> None:
+    """At the first step from neutral half the range is the better one, and leaves a gap that gravity seems to fill."""
+    library = [Candidate(name, load_effect(name)) for name in ("ground_magnet", "gravity_scale")]
+    prepared, world = ready("ball", {"ground_magnet": {"A": 10.0, "l": 0.1}}, 3, duration_s=0.6)
+    assert prepared.flight is not None
+    slot = fill(prepared.flight, world, library, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
+    assert slot.best.name == "ground_magnet" and slot.best.constants == {"l": 0.1}
+    assert slot.best.numbers is not None
+    estimate, error = slot.best.numbers["A"]
+    assert abs(estimate - 10.0) < 3 * error < 1.5
+
+
 def test_flight_is_silent_where_nothing_is_missing() -> None:
     for seed in (11, 12):
         assert not flight_slot({}, seed).flagged
