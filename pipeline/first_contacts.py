@@ -43,6 +43,8 @@ REACH = 1.96
 MAX_WINDOWS = 100
 """So many give second moments of mass within 2 %."""
 ITERATIONS = 16
+LEAST_INFORMATION, ROUNDING = 1e-30, 1e-10
+"""Less information is none, and so is one of less than this share of the largest, in units of the numbers' own."""
 ENOUGH_EPISODES = 8
 """From so many episodes on their scatter gives the intervals."""
 UNOBSERVABLE_SHARE = 0.8
@@ -112,7 +114,7 @@ def fit_first_contacts(
         rows, _ = residuals(solution.shared, solution.states, False)
         errors = WindowErrors.of(rows, solution, observations, np.zeros(len(observations.names), bool))
         factor, dof = errors.factor(len(names))
-        missed = factor * (student.ppf(0.975, dof) / REACH) ** 2 * _pinv(solution.information.numpy())
+        missed = factor * (student.ppf(0.975, dof) / REACH) ** 2 * _inverse(solution.information.numpy())
         covariance = _wider(covariance, missed)
     std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
@@ -139,7 +141,7 @@ def few_covariance(information: Array, scores: Array) -> Array:
     and then the curvature is far too narrow: the scatter counts, with what few samples ask for (n / (n - 1), and
     Student's t in the normal law's place).
     """
-    inverse = _pinv(information)
+    inverse = _inverse(information)
     count = len(scores)
     scatter = inverse @ (scores.T @ scores) @ inverse
     if count >= ENOUGH_EPISODES:
@@ -155,9 +157,15 @@ def _wider(covariance: Array, other: Array) -> Array:
     return covariance * np.outer(width, width)
 
 
-def _pinv(information: Array) -> Array:
-    scale = np.sqrt(np.diag(information).clip(1e-300))
-    return np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+def _inverse(information: Array) -> Array:
+    """Return the inverse of an information (P, P); of what carries none the variance is huge, and never negative.
+
+    What states fitted along take away may leave a direction with less than nothing, by rounding.
+    """
+    scale = np.sqrt(np.diag(information).clip(LEAST_INFORMATION))
+    sizes, directions = np.linalg.eigh(information / np.outer(scale, scale))
+    sizes = sizes.clip(ROUNDING * max(float(sizes[-1]), 1.0))
+    return (directions / sizes) @ directions.T / np.outer(scale, scale)
 
 
 def windows_of(

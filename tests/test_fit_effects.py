@@ -249,6 +249,17 @@ def test_flights_that_do_not_show_an_effect_give_nothing() -> None:
     assert fit_effect_flights(world, episodes, wanted, (5e-4, 1e-3)) is None
 
 
+def test_what_carries_no_information_has_a_wide_interval() -> None:
+    """Neither nan nor nothing, where rounding leaves less than no information, or where there is none at all."""
+    one, other = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
+    turned = 4.0 * np.outer(one, one) - 1e-13 * np.outer(other, other)
+    for information, known in ((turned, one), (np.diag([4.0, 0.0]), np.array([1.0, 0.0]))):
+        covariance = first_contacts.few_covariance(information, np.zeros((3, 2)))
+        assert np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()
+        assert known @ covariance @ known == pytest.approx(0.25, rel=1e-3)
+        assert np.sqrt(np.diag(covariance).max()) > 1e4
+
+
 def test_few_episodes_make_intervals_wider_where_they_scatter_and_never_narrower() -> None:
     information = np.diag([100.0, 4.0])
     alike, apart = np.zeros((3, 2)), np.array([[30.0, 0.0], [-30.0, 0.0], [0.0, 0.0]])
