@@ -103,7 +103,7 @@ def evidence(name: str, score: float, share: float, size: float = 1.0) -> GlideE
         ([("stribeck_friction", 900, 0.7), ("friction_patch", 600, 0.6)], False, ["stribeck_friction"]),
     ],
 )
-def test_what_glides_name(found: list[tuple[str, float, float]], flown: bool, named: list[str]) -> None:
+def test_what_glides_name(found: list[tuple], flown: bool, named: list[str]) -> None:
     given = [evidence(*one) for one in found]
     assert [one.evidence.name for one in equal_in_glides(given, explained=True, flown=flown)] == named
 

@@ -143,14 +143,9 @@ def equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: b
         return []
     if not explained and fit[0].share < GLIDE_SHARE_SURE:
         return []  # what flights leave unexplained acts here, too
-    first = fit[0]
-    lead = max(GLIDE_LEAD, GLIDE_SHARE * first.score)
-
-    def rivals(one: GlideEvidence) -> bool:
-        behind = first.score - one.score
-        return behind < lead or (behind < MISLED and one.share > RIVAL_SHARE * first.share)
-
-    return [one for one in fit if rivals(one)]
+    alike = fit[0].score - max(GLIDE_LEAD, GLIDE_SHARE * fit[0].score)
+    rival, share = fit[0].score - MISLED, RIVAL_SHARE * fit[0].share
+    return [one for one in fit if one.score > alike or (one.score > rival and one.share > share)]
 
 
 def _told_by_glides(one: GlideEvidence, flown: bool) -> bool:

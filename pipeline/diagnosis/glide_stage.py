@@ -87,7 +87,7 @@ class StartedGlides:
         soft = soft_world(world)
         glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
         glides, friction = _started(glides, float(world.contact.friction[0]))
-        return StartedGlides(glides, friction, tuple(_told_by_flight(flight, soft, prepared.groups)))
+        return StartedGlides(glides, friction, _told_by_flight(flight, soft, prepared.groups))
 
 
 def glide_evidence(
@@ -235,15 +235,15 @@ def own_numbers(world: World) -> list[Parameter]:
     return [p for p in effect_parameters(world) if p.name.partition(".")[0] in own]
 
 
-def _told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> list[Parameter]:
+def _told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]) -> tuple[Parameter, ...]:
     """Return the parameters of what acts in flight, with the standard errors that flights leave them as priors."""
     parameters = base_parameters(world, "flight")
     if flight is None or not parameters:
-        return []
+        return ()
     seen = picture(flight, world, (), groups, robust=False)
     information, _ = sums(seen, range(seen.base))
     deviations = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
-    return [replace(p, prior=(p.prior[0], float(s))) for p, s in zip(parameters, deviations, strict=True)]
+    return tuple(replace(p, prior=(p.prior[0], float(s))) for p, s in zip(parameters, deviations, strict=True))
 
 
 def _ranked(

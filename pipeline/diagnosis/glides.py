@@ -132,20 +132,20 @@ def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, nois
 
 
 def _windows(times: Array) -> Iterator[tuple[int, slice, Array]]:
-    """Yield each frame with the frames about it, which lie no further than some steps, and their times from it."""
+    """Yield the place of each frame (at least two), the frames no further from it than some steps, and how far [s]."""
     step = float(np.median(np.diff(times)))
     side = max(SIDE_FRAMES, round(SIDE_S / step))
-    for k, now in enumerate(times):
-        reach = (side + 0.5) * step
-        first, end = np.searchsorted(times, [now - reach, now + reach])
-        yield k, slice(first, end), times[first:end] - now
+    reach = (side + 0.5) * step
+    firsts, ends = np.searchsorted(times, times - reach), np.searchsorted(times, times + reach)
+    for k, (first, end) in enumerate(zip(firsts, ends, strict=True)):
+        yield k, slice(first, end), times[first:end] - times[k]
 
 
 def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return first and last frames of the steady stretches that are long enough, cut into equal parts."""
     found: list[tuple[int, int]] = []
     steps = np.diff(times)
-    breaks = np.append(False, steps > GAP * np.median(steps)) if len(steps) else np.zeros(len(times), bool)
+    breaks = np.append(False, steps > GAP * np.median(steps))
     edges = np.flatnonzero(np.append(True, (steady[1:] != steady[:-1]) | breaks[1:]))
     for first, end in itertools.pairwise([*edges.tolist(), len(times)]):
         length = times[end - 1] - times[first]

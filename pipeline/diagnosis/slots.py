@@ -128,15 +128,14 @@ def fill(
     short = sorted(short, key=lambda e: (_penalty(e) * _log(seen) - e.test.statistic, e.name))[: SHORTLIST + 2]
     before = refit([flight], world, base_parameters(world, "flight"))
     done = [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in short]
-    expected = float(seen.dof.sum()) * dispersion
-    if all(e.refitted is not None and e.refitted.cost > UNFITTED * expected for e in done):
+    enough = UNFITTED * float(seen.dof.sum()) * dispersion
+    if all(e.refitted is not None and e.refitted.cost > enough for e in done):
         others = [e for one in short for e in _with_other_constants(one, seen, variants, kept, dispersion)]
-        again = [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in others]
-        done = list(
-            {e.name: e for e in sorted([*done, *again], key=lambda e: (-(e.delta_bic or 0.0), e.name))}.values()
-        )
-    done = sorted(done, key=lambda e: (e.delta_bic, e.name))
-    done = [e for e in done if e.delta_bic is not None and e.delta_bic < 0]
+        done += [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in others]
+    best: dict[int, Evidence] = {}  # each candidate at its best constants
+    for e in sorted(done, key=lambda e: (e.delta_bic, e.name)):
+        best.setdefault(id(e.candidate), e)
+    done = [e for e in best.values() if e.delta_bic is not None and e.delta_bic < 0]
     if not done:
         return Slot(tuple(evidence), tuple(evidence[:1]), False)
     names = {e.name: e for e in done}

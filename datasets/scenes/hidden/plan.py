@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, get_args
 from zlib import crc32
 
 import numpy as np
@@ -13,7 +13,7 @@ from .registry import EFFECTS, Size
 from .things import Kind
 
 Stage = Literal["development", "report", "report2", "report3", "report4"]
-STAGES: tuple[Stage, ...] = ("development", "report", "report2", "report3", "report4")
+STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen by the first alone. The summary of `report` was seen when glides were added to `diagnose`,
 that of `report2` when impacts were, and that of `report3` when rivals in glides were (2026-11-22), so that what came
 after is to be judged by `report4`."""
