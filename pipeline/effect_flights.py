@@ -45,12 +45,13 @@ def fit_effect_flights(
     start = torch.tensor([parameter.encode(value) for parameter, value in wanted]).to(world.gravity)
     found = refit([prepared.flight], world_for("flight", world), names, start, ITERATIONS)
     linear = linearised(found.segments[0], names, found.values)
-    information = linear.information.sum(0) + torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start)
+    prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start).numpy()
+    information = linear.information.sum(0).numpy()
     # what a formula misses of the true effect is missed in all frames of an episode alike
     episode = torch.tensor([item.episode for item in prepared.flight.items])
     scores = torch.stack([linear.score[episode == one].sum(0) for one in episode.unique().tolist()])
     excess = max(prepared.slow, float(linear.chi2.sum() / linear.dof.sum().clamp_min(1.0)), 1.0)
-    covariance = few_covariance(information.numpy() / excess, scores.numpy() / excess)
+    covariance = few_covariance(information / excess + prior, scores.numpy() / excess, prior)
     std = np.sqrt(np.diag(covariance))
     if any(s > UNOBSERVABLE_SHARE * p.prior[1] for s, p in zip(std, names, strict=True)):
         return None

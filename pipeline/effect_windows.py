@@ -1,4 +1,4 @@
-"""Effects in a fit: those of flight found in flights, the others about first contacts, constants on their grids."""
+"""Effects in a fit: found in flights, glides, impacts or about first contacts, where they show; constants on grids."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import torch
 
 from ..datasets.tracks import Track
 from .effect_flights import fit_effect_flights
+from .effect_glides import EffectGlides
+from .effect_impacts import EffectImpacts
 from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, fit_first_contacts
 from .own_numbers import fit_own_numbers
 from .physics.effects import ActiveEffect
@@ -26,11 +28,11 @@ def fit_effect_windows(
     noise: tuple[float, float],
     groups: Mapping[str, str] | None = None,
 ) -> FirstContacts:
-    """Fit the world's effects: to flights those that they show, the others to flight and first contacts.
+    """Fit the world's effects: to flights, glides and impacts those that they show, the others about first contacts.
 
-    The open-loop search is for few numbers: with every effect its valley gets narrower; flights and windows show
-    effects well. A constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be searched
-    from there: it is tried at each value of its grid, and the one with the lowest cost is kept.
+    The open-loop search is for few numbers: with every effect its valley gets narrower; these show effects
+    well. A constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be
+    searched from there: it is tried at each value of its grid, and the one with the lowest cost is kept.
 
     Args:
         world: With effects.
@@ -49,20 +51,48 @@ def fit_effect_windows(
     if any(parameter.shared != "all" for parameter in effect_parameters(world)):
         return _with_own_numbers(world, episodes, along, noise, groups or {}, bool(contact))
 
-    def about_contacts(at: World, wanted: Start) -> FirstContacts:
-        return fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)
+    parts, left, at = [], [*others, *contact], world
+    flown = _best(at, others, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise)) if others else None
+    if flown is not None:
+        # what flights show stands: in contact it would be bent by what the contact law misses
+        parts, left, at = [flown], contact, flown.world
+    for kind in (EffectGlides, EffectImpacts):
+        # not those of flight that flights do not show
+        names = [a.effect.name for a in at.effects if a.effect.name in left and kind.may_tell(a.effect)]
+        motion = kind.of(at, episodes, names, noise) if names else None
+        if motion is None:
+            continue
+        told = _best(at, names, lambda at, _, motion=motion, names=names: motion.fit(at, names))
+        assert told is not None  # these always give something
+        shown = {parameter.name.partition(".")[0] for parameter in told.parameters}
+        if shown:
+            kept = {name: value for name, value in told.constants.items() if name.partition(".")[0] in shown}
+            parts, at = [*parts, replace(told, constants=kept)], told.world
+            left = [name for name in left if name not in shown]
+            along = [(p, told.along.get(p.name, value)) for p, value in along]
+    if left:
+        about_contacts = _best(
+            at, left, lambda at, wanted: fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)
+        )
+        assert about_contacts is not None  # windows always give something
+        parts.append(about_contacts)
+    return _joined(parts)
 
-    flown = _best(world, others, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise)) if others else None
-    if flown is not None and not contact:
-        return flown
-    # what flights show stands: in contact it would be bent by what the contact law misses
-    touched = _best(world if flown is None else flown.world, contact if flown else [*others, *contact], about_contacts)
-    assert touched is not None  # windows always give something
-    if flown is None:
-        return touched
-    record = touched.record | {"in_flight": flown.record}
-    parameters, constants = (*flown.parameters, *touched.parameters), flown.constants | touched.constants
-    return FirstContacts(touched.world, parameters, record, (*flown.correlations, *touched.correlations), constants)
+
+def _joined(parts: Sequence[FirstContacts]) -> FirstContacts:
+    """Return what fits found one after the other, each in the world of the one before."""
+    last, records = parts[-1], {"flights": "in_flight", "glides": "in_glides", "impacts": "in_impacts"}
+    record = dict(last.record)
+    for part in parts[:-1]:
+        record[next(name for key, name in records.items() if key in part.record)] = part.record
+    return replace(
+        last,
+        parameters=tuple(parameter for part in parts for parameter in part.parameters),
+        record=record,
+        correlations=tuple(block for part in parts for block in part.correlations),
+        constants={name: value for part in parts for name, value in part.constants.items()},
+        along={name: value for part in parts for name, value in part.along.items()},
+    )
 
 
 def _with_own_numbers(

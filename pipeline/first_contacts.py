@@ -57,7 +57,8 @@ class FirstContacts:
 
     correlations: of the parameters, in blocks; constants: of effects, `effect.constant` by name.
     ground: how far the ground was moved in this world, where ends of episodes showed its height; own: by session or
-    episode, values of `effect.parameter` that are its own; spread: of these from unit to unit.
+    episode, values of `effect.parameter` that are its own; spread: of these from unit to unit; along: numbers of the
+    contact that were found beside, where a search for them may start.
     """
 
     world: World
@@ -68,6 +69,7 @@ class FirstContacts:
     ground: FittedParameter | None = None
     own: dict[str, dict[str, float]] = field(default_factory=dict)
     spread: dict[str, float] = field(default_factory=dict)
+    along: dict[str, float] = field(default_factory=dict)
 
 
 def fit_first_contacts(
@@ -95,7 +97,7 @@ def fit_first_contacts(
     """
     picked, windows, _ = windows_of(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
     observations = Observations.of(world, picked, windows)
-    start = [*wanted, *along]
+    start, count = [*wanted, *along], len(wanted)
     names = [parameter for parameter, _ in start]
     position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
     residuals = TrajectoryResiduals(world, names, observations, position_std, rotation_std)
@@ -107,14 +109,14 @@ def fit_first_contacts(
         robust_scale=ROBUST_SCALE,
         iterations=ITERATIONS,
         prior_information=state_prior(len(observations.free)),
+        shared_prior=_prior(names, count, world.gravity),
     )
-    count = len(wanted)
     covariance = few_covariance(solution.information.numpy(), solution.scores.numpy())
     if len(observations.names) < ENOUGH_EPISODES:
         rows, _ = residuals(solution.shared, solution.states, False)
         errors = WindowErrors.of(rows, solution, observations, np.zeros(len(observations.names), bool))
         factor, dof = errors.factor(len(names))
-        missed = factor * (student.ppf(0.975, dof) / REACH) ** 2 * _inverse(solution.information.numpy())
+        missed = factor * (student.ppf(0.975, dof) / REACH) ** 2 * inverse(solution.information.numpy())
         covariance = _wider(covariance, missed)
     std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
@@ -127,28 +129,42 @@ def fit_first_contacts(
     )
 
 
+def _prior(parameters: Sequence[Parameter], wanted: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return centre and information (P,) of the priors of what is wanted; the rest, which comes after it, has none.
+
+    Without them a number that no window shows wanders to a bound, by what little the contact law misses.
+    """
+    centre = [p.encode(p.prior[0]) for p in parameters]
+    information = [1 / p.prior[1] ** 2 if k < wanted else 0.0 for k, p in enumerate(parameters)]
+    return torch.tensor(centre).to(like), torch.tensor(information).to(like)
+
+
 def correlation_of(names: Sequence[str], covariance: Array) -> Correlation:
     """Return the correlations of fitted coordinates with a covariance (P, P), as `model.json` has them."""
     std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     return Correlation(parameters=tuple(names), matrix=tuple(map(tuple, (covariance / np.outer(std, std)).tolist())))
 
 
-def few_covariance(information: Array, scores: Array) -> Array:
+def few_covariance(information: Array, scores: Array, prior: Array | None = None) -> Array:
     """Return the covariance (P, P) from the information (P, P) and the scatter of the episodes' gradients (E, P).
+
+    prior: the part of the information (P, P) that is a prior's. It pulls in no episode, so that without its own scatter
+    what no episode shows would seem exact.
 
     From `ENOUGH_EPISODES` on the scatter alone (Huber 1967). Of few it may be small by chance, and the curvature, which
     rests on the noise, counts where it is wider. But what a model misses is missed in all frames of an episode alike,
     and then the curvature is far too narrow: the scatter counts, with what few samples ask for (n / (n - 1), and
     Student's t in the normal law's place).
     """
-    inverse = _inverse(information)
+    curvature = inverse(information)
     count = len(scores)
-    scatter = inverse @ (scores.T @ scores) @ inverse
+    spread = scores.T @ scores + (0.0 if prior is None else prior)
+    scatter = curvature @ spread @ curvature
     if count >= ENOUGH_EPISODES:
         return scatter
     if count < 2:
-        return inverse
-    return _wider(inverse, count / (count - 1) * (student.ppf(0.975, count - 1) / REACH) ** 2 * scatter)
+        return curvature
+    return _wider(curvature, count / (count - 1) * (student.ppf(0.975, count - 1) / REACH) ** 2 * scatter)
 
 
 def _wider(covariance: Array, other: Array) -> Array:
@@ -157,7 +173,7 @@ def _wider(covariance: Array, other: Array) -> Array:
     return covariance * np.outer(width, width)
 
 
-def _inverse(information: Array) -> Array:
+def inverse(information: Array) -> Array:
     """Return the inverse of an information (P, P); of what carries none the variance is huge, and never negative.
 
     What states fitted along take away may leave a direction with less than nothing, by rounding.

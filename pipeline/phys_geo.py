@@ -189,6 +189,7 @@ def fit_physics(
             world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma, groups
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
+        start = [(p, effects.along.get(p.name, value)) for p, value in start]
         if effects.ground is not None:  # rest shows it better than where rollouts end
             names = list(CONTACT_PARAMETERS)
             start = [(p, value) for p, value in start if p in names]

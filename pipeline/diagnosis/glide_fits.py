@@ -150,6 +150,14 @@ def fit_groups(
     return GlideFit(segments, chi2, whole(now), information)
 
 
+def told_by_each(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return information (B, P, P) and score (B, P) of each glide on parameters at values (P,), its start free."""
+    count, size = len(segments.items), len(parameters)
+    free = torch.arange(size).expand(count, size)
+    rows, jacobian, _ = _linear(segments, parameters, values.expand(count, size), free)
+    return _projected(rows, jacobian, size, torch.arange(count), torch.zeros(count).to(values))[:2]
+
+
 def _projected(
     rows: Tensor, jacobian: Tensor, size: int, own: Tensor, damping: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -107,11 +107,9 @@ def glide_evidence(
     if started is None or not variants:
         return []
     assert isinstance(world.contact, ContactLaw)  # see StartedGlides.of
-    glides, friction, told = started.segments, started.friction, started.told
+    glides, told = started.segments, started.told
     soft = glides.world
-    # a single glide may mislead the start, and a wrong friction is a valley of its own
-    begun = [friction, world.contact.friction[0].log().to(friction)]
-    base = min((fitted_glides(soft, [], [(glides, one)], told)[0] for one in begun), key=lambda fit: fit.cost)
+    base = fitted_base(started, world.contact)
     degrees = float(glides.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
         return []
@@ -132,6 +130,16 @@ def glide_evidence(
     own = best.values[0, : base.values.shape[1]]
     least_cost = min(base.cost, fitted_glides(soft, [], [(best.segments, own)], told)[0].cost)
     return _ranked(list(found.values()), kept, least_cost, degrees)
+
+
+def fitted_base(started: StartedGlides, law: ContactLaw) -> GlideFit:
+    """Return the fit of what the model has: from the friction that most glides tell, or from that of a law.
+
+    A single glide may mislead the former, and a wrong friction is a valley of its own.
+    """
+    begun = (started.friction, law.friction[0].log().to(started.friction))
+    tried = (fitted_glides(started.segments.world, [], [(started.segments, one)], started.told)[0] for one in begun)
+    return min(tried, key=lambda fit: fit.cost)
 
 
 def batches(variants: Sequence[Variant]) -> list[list[Variant]]:
@@ -201,10 +209,10 @@ def fitted_glides(
         iterations: Most steps.
     """
     beside, own = with_variants(world, variants, "contact")
-    known = [*own_numbers(world), *told]
-    parameters: list[Parameter] = [FRICTION, GROUND_SHIFT, *known, *own]
+    known = fitted_along(world, told)
+    parameters = [*known, *own]
     place = {p.name: k for k, p in enumerate(parameters)}
-    shared = list(range(2 + len(known)))
+    shared = list(range(len(known)))
     rows = [[*shared, *(place[name] for name in v.parameters)] for v in variants] or [shared]
     size, count = max(map(len, rows)), len(starts[0][0].items)
     free = torch.tensor([row + [-1] * (size - len(row)) for row in rows])
@@ -227,6 +235,11 @@ def fitted_glides(
         information = found.information[k : k + 1, : len(row), : len(row)]
         fits.append(GlideFit(glides.with_state(states), found.chi2[chosen], found.values[k : k + 1, row], information))
     return fits
+
+
+def fitted_along(world: World, told: Sequence[Parameter]) -> list[Parameter]:
+    """Return what is fitted in glides beside a candidate: friction, height, the model's effects, what flights tell."""
+    return [FRICTION, GROUND_SHIFT, *own_numbers(world), *told]
 
 
 def own_numbers(world: World) -> list[Parameter]:

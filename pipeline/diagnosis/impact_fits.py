@@ -152,6 +152,15 @@ class ImpactProblem:
         found = (self.whitening @ self.residuals(values)[..., None])[..., 0]
         return torch.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6)
 
+    def linear(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Return residuals (n, 6) in sigmas at a value (P,), and their differences (n, 6, P) by the parameters."""
+        steps = STEP * torch.tensor([p.prior[1] for p in self.parameters]).to(value)
+        high = torch.tensor([p.limits[1] for p in self.parameters]).to(value)
+        # towards the inside, where a step up would leave the bounds
+        steps = torch.where(value + steps > high, -steps, steps)
+        rows = self.rows(torch.cat([value[None], value + torch.diag(steps)]))
+        return rows[0], ((rows[1:] - rows[:1]) / steps[:, None, None]).movedim(0, -1)
+
 
 def fit_impacts(
     problem: ImpactProblem, start: Tensor, weight: Array | None = None, centre: Tensor | None = None
@@ -170,7 +179,6 @@ def fit_impacts(
     centre = start if centre is None else centre
     counts = np.ones(len(problem.impacts)) if weight is None else weight
     counted = torch.as_tensor(counts).to(start)[:, None].expand(-1, 6)
-    steps = STEP * width
 
     def cost_of(rows: Tensor, value: Tensor) -> Tensor:
         return (counted * rows.square()).sum((-1, -2)) + ((value - centre) / width).square().sum(-1)
@@ -178,13 +186,10 @@ def fit_impacts(
     value, cost = start, cost_of(problem.rows(start[None])[0], start)
     information = torch.diag(1 / width.square())
     for _ in range(ITERATIONS):
-        # towards the inside, where a step up would leave the bounds
-        signs = torch.where(value + steps > high, -1.0, 1.0)
-        rows = problem.rows(torch.cat([value[None], value + torch.diag(signs * steps)]))
-        slope = ((rows[1:] - rows[:1]) / (signs * steps)[:, None, None]).flatten(1).T
-        heavy = counted.flatten()[:, None] * slope
+        rows, slope = problem.linear(value)
+        slope, heavy = slope.flatten(0, 1), (counted[..., None] * slope).flatten(0, 1)
         information = slope.T @ heavy + torch.diag(1 / width.square())
-        score = -(heavy.T @ rows[0].flatten()) - (value - centre) / width.square()
+        score = -(heavy.T @ rows.flatten()) - (value - centre) / width.square()
         blocked = ((value <= low) & (score < 0)) | ((value >= high) & (score > 0))
         moving = (~blocked).to(value)
         reduced = information * moving[:, None] * moving + torch.diag(1 - moving)

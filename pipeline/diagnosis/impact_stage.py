@@ -79,7 +79,7 @@ def impact_evidence(prepared: Prepared, world: World, candidates: Sequence[Candi
         return []
     kept, _ = admissible(world, candidates, prepared.turned)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
-    base = _Base.of(world, impacts)
+    base = ImpactBase.of(world, impacts)
     found = []
     for variant in variants:
         problem, start = base.beside(variant)
@@ -115,7 +115,7 @@ def named_by_impacts(evidence: Sequence[ImpactEvidence]) -> list[ImpactEvidence]
 
 
 @dataclass(frozen=True, eq=False)
-class _Base:
+class ImpactBase:
     """The world without a candidate, fitted to the impacts: what every candidate starts from and is compared with."""
 
     problem: ImpactProblem
@@ -124,10 +124,12 @@ class _Base:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
+        """Numbers of the contact and of the effects that the world has."""
         return self.problem.parameters
 
     @staticmethod
-    def of(world: World, impacts: Impacts) -> _Base:
+    def of(world: World, impacts: Impacts) -> ImpactBase:
+        """Fit what a world has to impacts."""
         known = own_numbers(world)
         # not where the model's fit put them: an effect that it lacks has pulled them
         usual = torch.tensor([p.encode(p.prior[0]) for p in BASE]).to(world.gravity)
@@ -137,7 +139,7 @@ class _Base:
             problem = problem.whitened(value)
             fit = fit_impacts(problem, value, centre=centre)
             value = torch.as_tensor(fit.values)
-        return _Base(problem, centre, fit)
+        return ImpactBase(problem, centre, fit)
 
     def beside(self, variant: Variant) -> tuple[ImpactProblem, torch.Tensor]:
         """Return the problem with a candidate, and values to start from."""
@@ -177,7 +179,9 @@ def _told(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
     return float((rows[1:] - rows[:1]).square().sum((1, 2)).max()) > TOLD
 
 
-def _ranked(base: _Base, found: Sequence[tuple[Variant, ImpactFit]], kept: Sequence[Candidate]) -> list[ImpactEvidence]:
+def _ranked(
+    base: ImpactBase, found: Sequence[tuple[Variant, ImpactFit]], kept: Sequence[Candidate]
+) -> list[ImpactEvidence]:
     if not found:
         return []
     tries: dict[int, int] = {}
@@ -216,7 +220,7 @@ def _ranked(base: _Base, found: Sequence[tuple[Variant, ImpactFit]], kept: Seque
 
 
 def _held_out(
-    base: _Base,
+    base: ImpactBase,
     one: ImpactEvidence,
     found: Sequence[tuple[Variant, ImpactFit]],
     kept: Sequence[Candidate],

@@ -1,0 +1,93 @@
+"""Effects of contact fitted to glides: while a body slides, rolls or spins on the ground its weight is the force.
+
+About an impact a law of contact misses more than most effects change, and a fit there bends them until it fits. In a
+glide the normal force is the weight by every law, so that what is left between motion and model is friction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from ..datasets.tracks import Track
+from .diagnosis.glide_fits import GlideFit, told_by_each
+from .diagnosis.glide_stage import StartedGlides, fitted_along, fitted_base, fitted_glides
+from .diagnosis.prepared import prepare
+from .diagnosis.segments import world_for
+from .first_contacts import FirstContacts
+from .physics.contact import ContactLaw
+from .physics.effects import Effect
+from .physics.parameters import FRICTION
+from .physics.world import World
+from .shown_effects import at_nothing, shown_effects, without
+
+
+@dataclass(frozen=True)
+class EffectGlides:
+    """Glides of episodes: started, without the effects that are wanted, and their fit with a friction alone."""
+
+    started: StartedGlides
+    base: GlideFit
+
+    @staticmethod
+    def may_tell(effect: Effect) -> bool:
+        """Whether glides may tell an effect: what presses the body on the ground acts there as more friction does."""
+        return effect.phase == "contact" and not effect.has("wrench")
+
+    @staticmethod
+    def of(
+        world: World, episodes: Sequence[tuple[str, dict[str, Track]]], names: Sequence[str], noise: tuple[float, float]
+    ) -> EffectGlides | None:
+        """Find the glides and fit them without the effects; None where there are none.
+
+        Args:
+            world: With the effects, and others.
+            episodes: Name and tracks by body of each episode.
+            names: Of the effects.
+            noise: Of the tracks (position [m], rotation [rad]).
+        """
+        if not isinstance(world.contact, ContactLaw):
+            return None
+        bare = without(world, names)
+        prepared = prepare(bare, episodes, noise)
+        started = StartedGlides.of(prepared, bare, prepared.flight)
+        return None if started is None else EffectGlides(started, fitted_base(started, world.contact))
+
+    def fit(self, world: World, names: Sequence[str]) -> FirstContacts:
+        """Fit the effects at their constants, with the friction beside them and a start of each glide.
+
+        Args:
+            world: With the effects, and others.
+            names: Of the effects.
+        """
+        told = self.started.told
+        beside = replace(self.base.segments.world, effects=at_nothing(world, names).effects)
+        parameters = fitted_along(beside, told)
+        begun = self.base.values[0, :2]  # friction and height; the effects at nothing
+        found = fitted_glides(beside, [], [(self.base.segments, begun)], told)[0]
+        glides = replace(found.segments, world=world_for("contact", beside))
+        information, score = told_by_each(glides, parameters, found.values[0])
+        # none of the friction: it begins at what glides tell, and a prior there would tell what acts like it
+        prior = torch.tensor([0.0 if p is FRICTION else 1 / p.prior[1] ** 2 for p in parameters]).to(information)
+        excess = max(found.cost / float(glides.dof.sum()), 1.0)
+        friction = float(found.values[0, 0].exp())
+        record = {
+            "glides": len(glides.items),
+            "costs": [self.base.cost, found.cost],
+            "chi2": excess,
+            "friction": friction,
+        }
+        shown = shown_effects(
+            world,
+            names,
+            parameters,
+            found.values[0],
+            information.sum(0),
+            torch.diag(prior),
+            score,
+            excess,
+            record,
+        )
+        return replace(shown, along={FRICTION.name: friction})
