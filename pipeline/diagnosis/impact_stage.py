@@ -51,8 +51,9 @@ class ImpactEvidence:
 
     score: by how much chi2 falls, in units of what the best candidate leaves, less the penalty of BIC; evidence, with
     its numbers and held-out gains; fit: of the base and the effect; size: of the largest of its numbers, in scales that
-    matter; gain, t: of the held-out episodes together, and their mean in its standard errors; share: of the excess of
-    chi2 that it explains, in the part (rebounds, or the rest) that it acts on.
+    matter; gain, t: of the held-out episodes together, and their mean in its standard errors, of the best alone and
+    where it stands out; share: of the excess of chi2 that it explains, in the part (rebounds, or the rest) that it acts
+    on.
     """
 
     evidence: Evidence
@@ -104,14 +105,16 @@ def with_impact_effect(world: World, found: ImpactEvidence) -> World:
 
 def named_by_impacts(evidence: Sequence[ImpactEvidence]) -> list[ImpactEvidence]:
     """Return the effect that impacts name and its equals; none where they name none."""
+    if not evidence or not _stands_out(evidence[0]) or evidence[0].gain <= 0 or evidence[0].t < HELD_OUT_T:
+        return []
+    lead = max(LEAD, LEAD_SHARE * evidence[0].score)
     fit = [one for one in evidence if one.evidence.test.admissible and one.size > SIZE and one.score > 0]
-    if not fit or fit[0] is not evidence[0]:
-        return []
-    first = fit[0]
-    if first.score < SCORE or first.share < EXPLAINED or first.gain <= 0 or first.t < HELD_OUT_T:
-        return []
-    lead = max(LEAD, LEAD_SHARE * first.score)
-    return [one for one in fit if one.score > first.score - lead]
+    return [one for one in fit if one.score > evidence[0].score - lead]
+
+
+def _stands_out(one: ImpactEvidence) -> bool:
+    """Whether the best effect is worth a look at held-out episodes, which takes most of the time."""
+    return one.evidence.test.admissible and one.size > SIZE and one.score >= SCORE and one.share >= EXPLAINED
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +219,7 @@ def _ranked(
         if variant.place not in best or score > best[variant.place].score:
             best[variant.place] = one
     order = sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))
-    return [_held_out(base, order[0], found, kept, spread), *order[1:]]
+    return [_held_out(base, order[0], found, kept, spread), *order[1:]] if _stands_out(order[0]) else order
 
 
 def _held_out(

@@ -254,10 +254,11 @@ def layout(seen: Picture, columns: Sequence[int]) -> tuple[NDArray[np.int64], Ar
     prior: list[float] = []
     for k, column in enumerate(columns):
         parameter = seen.parameters[column]
-        owner = {"all": np.zeros_like(seen.episode), "group": seen.group, "episode": seen.episode}[parameter.shared]
-        numbers = np.unique(owner, return_inverse=True)[1]
-        number = int(numbers.max()) + 1
-        places[:, k] = count + numbers
+        places[:, k], number = count, 1
+        if parameter.shared != "all":
+            owner = seen.group if parameter.shared == "group" else seen.episode
+            places[:, k] += np.unique(owner, return_inverse=True)[1]
+            number = int(places[:, k].max()) - count + 1
         count += number
         # a prior ties the values of sessions to each other, about neutral
         prior += [seen.prior[column] if parameter.shared == "all" else 1 / parameter.prior[1] ** 2] * number
