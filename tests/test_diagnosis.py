@@ -3,12 +3,14 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.diagnosis import flight_search
 from cgwm.pipeline.diagnosis.candidates import Candidate, variants_of
 from cgwm.pipeline.diagnosis.consistency import consistency
 from cgwm.pipeline.diagnosis.contact_stage import fitted_contact, separated
@@ -164,6 +166,28 @@ def test_the_constants_of_a_large_effect_are_those_of_where_it_ends() -> None:
     assert abs(estimate - 10.0) < 3 * error < 1.5
 
 
+@pytest.mark.parametrize(("share", "wanted"), [(0.5, ["quadratic_drag"]), (0.7, ["quadratic_drag", "gravity_tilt"])])
+def test_what_patches_up_the_law_of_another_is_no_second_effect(
+    monkeypatch: pytest.MonkeyPatch, share: float, wanted: list[str]
+) -> None:
+    """It is significant and predicts held-out episodes, and explains a part of the excess that is left."""
+    prepared, world = ready("cube", {"quadratic_drag": {"k": 0.15}}, count=3, duration_s=0.3, ground=False)
+    assert prepared.flight is not None
+    least, excess = float(prepared.flight.dof.sum()), 300.0
+    costs = [least + excess, least + (1 - share) * excess]
+    slots = []
+    for name, cost in zip(("quadratic_drag", "gravity_tilt"), costs, strict=True):
+        refitted = SimpleNamespace(cost=cost, world=world, segments=[prepared.flight])
+        slots.append(Slot((), (SimpleNamespace(name=name, refitted=refitted),), True))  # pyright: ignore
+    last, first = Slot((), (SimpleNamespace(name="wind", refitted=None),), False), iter(slots)  # pyright: ignore
+    monkeypatch.setattr(flight_search, "fill", lambda *_: next(first, last))
+    losses = iter((3.0, 2.0))
+    monkeypatch.setattr(flight_search, "held_out_loss", lambda *_: next(losses))
+    monkeypatch.setattr(flight_search, "_bundled", lambda *_: None)
+    found, _, _ = flight_search.flight_search(prepared, world, LIBRARY, 1.0)  # pyright: ignore[reportArgumentType]
+    assert [slot.best.name for slot in found] == wanted
+
+
 def test_flight_is_silent_where_nothing_is_missing() -> None:
     for seed in (11, 12):
         assert not flight_slot({}, seed).flagged
@@ -236,7 +260,7 @@ def test_the_residual_wrench_tells_what_organises_it_and_which_law() -> None:
     best, low, high = law.exponents["-u"]
     assert low <= 1.0 <= high and best == pytest.approx(1.0, abs=0.5)
     assert law.left_chi2 < 1.6
-    tilted, world = ready("ball", {"gravity_tilt": {"tilt_x": 0.05}}, 8, count=6, duration_s=0.5, ground=False)
+    tilted, world = ready("ball", {"gravity_tilt": {"tilt_x": 0.06}}, 8, count=6, duration_s=0.5, ground=False)
     windows = wrench_windows(world, tilted.whole, tilted.flight.items, tilted.noise)  # pyright: ignore
     assert organisers(windows)[0].coordinate == "constant"  # pyright: ignore[reportArgumentType]
 
