@@ -108,6 +108,22 @@ def test_what_glides_name(found: list[tuple], flown: bool, named: list[str]) -> 
     assert [one.evidence.name for one in equal_in_glides(given, explained=True, flown=flown)] == named
 
 
+def test_what_a_single_episode_says_is_not_named_beside_an_effect_of_flight() -> None:
+    told = evidence("anisotropic_friction", 900, 0.9)
+    alone, twice = replace(told, others=20.0), replace(told, others=200.0)
+    assert equal_in_glides([alone], explained=True, flown=True) == []
+    assert equal_in_glides([twice], explained=True, flown=True) == [twice]
+    assert equal_in_glides([alone], explained=True, flown=False) == [alone]  # no law from flight can be off
+
+
+def test_evidence_tells_what_the_other_episodes_say() -> None:
+    prepared, world = rolls({"rolling_resistance": {"c_r": 1e-3}})
+    started = StartedGlides.of(prepared, world, prepared.flight)
+    (first, *_) = glide_evidence(prepared, world, LIBRARY, 50.0, started)
+    assert first.evidence.name == "rolling_resistance"
+    assert 80 < first.others < 0.6 * first.score  # two balls
+
+
 @pytest.mark.parametrize(
     ("name", "values"),
     [

@@ -46,7 +46,8 @@ class GlideEvidence:
     """A candidate in glides.
 
     score: by how much chi2 falls, in units of what the best candidate leaves, less the penalty of BIC; evidence, with
-    its numbers; friction: beside it; left: chi2 / dof; share: of the excess of chi2 over its mean, that it explains.
+    its numbers; friction: beside it; left: chi2 / dof; share: of the excess of chi2 over its mean, that it explains;
+    others: by how much chi2 falls without the episode in which it falls most, infinite where that was not looked at.
     """
 
     evidence: Evidence
@@ -54,6 +55,7 @@ class GlideEvidence:
     friction: float
     left: float
     share: float
+    others: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def glide_evidence(
     _, best = min(found.values(), key=lambda one: one[1].cost)
     own = best.values[0, : base.values.shape[1]]
     least_cost = min(base.cost, fitted_glides(soft, [], [(best.segments, own)], told)[0].cost)
-    return _ranked(list(found.values()), kept, least_cost, degrees)
+    return _ranked(list(found.values()), kept, base, least_cost, degrees)
 
 
 def fitted_base(started: StartedGlides, law: ContactLaw) -> GlideFit:
@@ -260,12 +262,14 @@ def _told_by_flight(flight: Segments | None, world: World, groups: Sequence[int]
 
 
 def _ranked(
-    found: Sequence[tuple[Variant, GlideFit]], kept: Sequence[Candidate], base: float, degrees: float
+    found: Sequence[tuple[Variant, GlideFit]], kept: Sequence[Candidate], alone: GlideFit, base: float, degrees: float
 ) -> list[GlideEvidence]:
+    """Return the evidence of fits, the best first; alone: the fit without them, base: the least chi2 without them."""
     tries: dict[int, int] = {}
     for variant, _ in found:
         tries[variant.place] = tries.get(variant.place, 0) + 1
     spread = max(1.0, min(fit.cost for _, fit in found) / degrees)
+    episode = np.array([item.episode for item in alone.segments.items])
     best: dict[int, GlideEvidence] = {}
     for variant, fit in found:
         candidate, values = kept[variant.place], fit.values[0, -len(variant.parameters) :].numpy().astype(np.float64)
@@ -280,7 +284,10 @@ def _ranked(
         evidence = Evidence(candidate, variant.constants, test, corrected, numbers=numbers)
         score = gain - number * math.log(max(degrees, 2.0)) - 2 * math.log(tries[variant.place])
         share = (base - fit.cost) / max(base - degrees, 1.0)
-        one = GlideEvidence(evidence, score, float(fit.values[0, 0].exp()), fit.cost / degrees, share)
+        falls = (alone.chi2 - fit.chi2).numpy()
+        by_episode = [float(falls[episode == own].sum()) for own in np.unique(episode)]
+        others = (sum(by_episode) - max(by_episode)) / spread
+        one = GlideEvidence(evidence, score, float(fit.values[0, 0].exp()), fit.cost / degrees, share, others)
         if variant.place not in best or score > best[variant.place].score:
             best[variant.place] = one
     return sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))
