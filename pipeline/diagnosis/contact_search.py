@@ -38,7 +38,7 @@ GLIDE_LEAST = 0.3
 GLIDE_OTHERS = 80.0
 """Beside an effect of flight chi2 falls by this much in other episodes than the one that says most, too: along a single
 slide the law of what was found in flight may be off. Balls in wind had false friction by direction with scores of 823
-and 1044, of which the others say 33 and 18; of true ones 136 to 34,000."""
+and 1044, of which the others say 33 and 18; of true ones 114 to 34,000, but for one that fell silent (26)."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
 """Another one within this score of it, or this share of it, leaves the two unseparated ..."""
 MISLED, RIVAL_SHARE = 165.0, 0.5
