@@ -11,17 +11,16 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..datasets.tracks import Track
 from .diagnosis.glide_fits import GlideFit, told_by_each
 from .diagnosis.glide_stage import StartedGlides, fitted_along, fitted_base, fitted_glides
-from .diagnosis.prepared import prepare
+from .diagnosis.prepared import Prepared
 from .diagnosis.segments import world_for
 from .first_contacts import FirstContacts
 from .physics.contact import ContactLaw
 from .physics.effects import Effect
 from .physics.parameters import FRICTION
 from .physics.world import World
-from .shown_effects import at_nothing, shown_effects, without
+from .shown_effects import at_nothing, shown_effects
 
 
 @dataclass(frozen=True)
@@ -37,23 +36,17 @@ class EffectGlides:
         return effect.phase == "contact" and not effect.has("wrench")
 
     @staticmethod
-    def of(
-        world: World, episodes: Sequence[tuple[str, dict[str, Track]]], names: Sequence[str], noise: tuple[float, float]
-    ) -> EffectGlides | None:
-        """Find the glides and fit them without the effects; None where there are none.
+    def of(prepared: Prepared, bare: World) -> EffectGlides | None:
+        """Find the glides and fit them; None where there are none.
 
         Args:
-            world: With the effects, and others.
-            episodes: Name and tracks by body of each episode.
-            names: Of the effects.
-            noise: Of the tracks (position [m], rotation [rad]).
+            prepared: The episodes.
+            bare: The world without the effects that are wanted.
         """
-        if not isinstance(world.contact, ContactLaw):
-            return None
-        bare = without(world, names)
-        prepared = prepare(bare, episodes, noise)
         started = StartedGlides.of(prepared, bare, prepared.flight)
-        return None if started is None else EffectGlides(started, fitted_base(started, world.contact))
+        if started is None or not isinstance(bare.contact, ContactLaw):
+            return None
+        return EffectGlides(started, fitted_base(started, bare.contact))
 
     def fit(self, world: World, names: Sequence[str]) -> FirstContacts:
         """Fit the effects at their constants, with the friction beside them and a start of each glide.

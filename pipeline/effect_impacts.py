@@ -7,19 +7,18 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..datasets.tracks import Track
 from .diagnosis.candidates import base_values
 from .diagnosis.glide_stage import own_numbers
 from .diagnosis.impact_fits import BASE, fit_impacts
 from .diagnosis.impact_stage import LEAST, ImpactBase
 from .diagnosis.impacts import measured_impacts
-from .diagnosis.prepared import prepare
+from .diagnosis.prepared import Prepared
 from .first_contacts import FirstContacts
 from .physics.contact import ContactLaw
 from .physics.effects import Effect
 from .physics.parameters import DAMPING_RATIO
 from .physics.world import World
-from .shown_effects import at_nothing, shown_effects, without
+from .shown_effects import at_nothing, shown_effects
 
 
 @dataclass(frozen=True)
@@ -34,24 +33,15 @@ class EffectImpacts:
         return effect.phase == "contact"
 
     @staticmethod
-    def of(
-        world: World, episodes: Sequence[tuple[str, dict[str, Track]]], names: Sequence[str], noise: tuple[float, float]
-    ) -> EffectImpacts | None:
-        """Find the impacts and fit them without the effects; None where there are too few, or the body is no ball.
+    def of(prepared: Prepared, bare: World) -> EffectImpacts | None:
+        """Find the impacts and fit them; None where there are too few, or the body is no ball.
 
         Args:
-            world: With the effects, and others.
-            episodes: Name and tracks by body of each episode.
-            names: Of the effects.
-            noise: Of the tracks (position [m], rotation [rad]).
+            prepared: The episodes.
+            bare: The world without the effects that are wanted.
         """
-        if not isinstance(world.contact, ContactLaw):
-            return None
-        bare = without(world, names)
-        impacts = measured_impacts(prepare(bare, episodes, noise), bare)
-        if impacts is None or len(impacts) < LEAST:
-            return None
-        return EffectImpacts(ImpactBase.of(bare, impacts))
+        impacts = measured_impacts(prepared, bare) if isinstance(bare.contact, ContactLaw) else None
+        return None if impacts is None or len(impacts) < LEAST else EffectImpacts(ImpactBase.of(bare, impacts))
 
     def fit(self, world: World, names: Sequence[str]) -> FirstContacts:
         """Fit the effects at their constants, with the contact's numbers beside them.

@@ -33,7 +33,7 @@ from ..schemas import ContactParameters, Correlation, InputDataError, NotConverg
 from ..schemas import Parameter as FittedParameter
 from .diagnosis.segments import world_for
 from .diagnosis.usable import refuse_slow_times
-from .effect_windows import fit_effect_windows
+from .effect_motions import fit_effect_motions
 from .estimation.noise import estimate_noise
 from .estimation.observations import Observations
 from .estimation.search import Prior, SearchResult, episode_covariance, importance_search
@@ -185,7 +185,7 @@ def fit_physics(
         world = mass.world
     if effect_parameters(world):
         # flight needs no contact and no short steps
-        effects = fit_effect_windows(
+        effects = fit_effect_motions(
             world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma, groups
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)

@@ -20,11 +20,6 @@ def at_nothing(world: World, names: Sequence[str]) -> World:
     return replace(world, effects=tuple(_neutral(a) if a.effect.name in names else a for a in world.effects))
 
 
-def without(world: World, names: Sequence[str]) -> World:
-    """Return the world without some of its effects."""
-    return replace(world, effects=tuple(a for a in world.effects if a.effect.name not in names))
-
-
 def shown_effects(
     world: World,
     names: Sequence[str],

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from cgwm.pipeline import first_contacts
+from cgwm.pipeline.diagnosis.prepared import prepare
 from cgwm.pipeline.effect_glides import EffectGlides
 from cgwm.pipeline.effect_impacts import EffectImpacts
-from cgwm.pipeline.effect_windows import fit_effect_windows
+from cgwm.pipeline.effect_motions import fit_effect_motions
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, effect_parameters
@@ -33,7 +34,7 @@ def inside(found: Parameter, truth: float) -> bool:
 def test_glides_give_an_effect_with_the_friction_where_a_search_starts() -> None:
     truth = {"rolling_resistance": {"c_r": 0.001}, "torsional_friction": {"c_t": 5e-4}}
     nothing = world_with("ball", {name: {} for name in truth})
-    found = fit_effect_windows(nothing, rolls(truth), values(nothing), NOISE)
+    found = fit_effect_motions(nothing, rolls(truth), values(nothing), NOISE)
     assert found.record["glides"] >= 3 and "windows" not in found.record
     for parameter in found.parameters:
         name, _, number = parameter.name.partition(".")
@@ -52,7 +53,8 @@ def test_intervals_from_glides_hold_the_truth() -> None:
     nothing = world_with("ball", {name: {} for name in truth})
     held = []
     for seed in range(20):
-        glides = EffectGlides.of(nothing, rolls(truth, seed), list(truth), NOISE)
+        bare = world_with("ball")
+        glides = EffectGlides.of(prepare(bare, rolls(truth, seed), NOISE), bare)
         assert glides is not None
         for parameter in glides.fit(nothing, list(truth)).parameters:
             name, _, number = parameter.name.partition(".")
@@ -70,16 +72,17 @@ def test_episodes_without_glides_or_impacts_are_left_to_windows(monkeypatch: pyt
     monkeypatch.setattr(first_contacts, "ITERATIONS", 1)
     nothing = world_with("cube", {"viscous_friction": {}})
     thrown = tosses(world_with("cube"), 5, count=2, duration_s=0.35)
-    assert EffectGlides.of(nothing, thrown, ["viscous_friction"], NOISE) is None
-    assert EffectImpacts.of(nothing, thrown, ["viscous_friction"], NOISE) is None
-    assert fit_effect_windows(nothing, thrown, values(nothing), NOISE).record["windows"] == 2
+    prepared = prepare(world_with("cube"), thrown, NOISE)
+    assert EffectGlides.of(prepared, world_with("cube")) is None
+    assert EffectImpacts.of(prepared, world_with("cube")) is None
+    assert fit_effect_motions(nothing, thrown, values(nothing), NOISE).record["windows"] == 2
 
 
 def test_impacts_of_a_ball_give_a_restitution_that_falls_with_the_speed() -> None:
     truth = {"velocity_restitution": {"r": 0.3}}
     nothing = world_with("ball", {"velocity_restitution": {}})
     dropped = tosses(world_with("ball", truth), 2, count=6, duration_s=0.8, height_m=(0.1, 1.2), lift_m_s=(-0.5, 0.0))
-    found = fit_effect_windows(nothing, dropped, values(nothing), NOISE)
+    found = fit_effect_motions(nothing, dropped, values(nothing), NOISE)
     assert found.record["impacts"] >= 6 and "windows" not in found.record
     (only,) = found.parameters
     assert only.name == "velocity_restitution.r" and inside(only, 0.3) and only.estimate > 0.1

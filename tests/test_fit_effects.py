@@ -13,7 +13,7 @@ from cgwm.datasets.models import read_model
 from cgwm.datasets.tracks import write_tracks
 from cgwm.pipeline import first_contacts, phys_geo
 from cgwm.pipeline.effect_flights import fit_effect_flights
-from cgwm.pipeline.effect_windows import fit_effect_windows
+from cgwm.pipeline.effect_motions import fit_effect_motions
 from cgwm.pipeline.estimation.search import SearchResult
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.fit_effects import fit_with_effects, fitted_effects, with_effects
@@ -216,7 +216,7 @@ def test_effects_of_flight_are_found_in_flights_from_nothing() -> None:
     hidden = tuple(active(name, **values) for name, values in truth.items())
     episodes = thrown(replace(boxes(), effects=hidden), 4)
     world = replace(boxes(), effects=tuple(active(name) for name in truth))
-    found = fit_effect_windows(world, episodes, [], (5e-4, 1e-3))
+    found = fit_effect_motions(world, episodes, [], (5e-4, 1e-3))
     assert found.record["flights"] >= 4 and "windows" not in found.record
     for parameter in found.parameters:
         name, _, number = parameter.name.partition(".")
@@ -230,7 +230,7 @@ def test_what_flights_show_stands_beside_effects_of_contact(monkeypatch: pytest.
     monkeypatch.setattr(first_contacts, "ITERATIONS", 2)
     episodes = thrown(replace(boxes(), effects=(active("spin_damping", d=1.0),)), 3)
     alone, beside = (
-        fit_effect_windows(replace(boxes(), effects=effects), episodes, [], (5e-4, 1e-3))
+        fit_effect_motions(replace(boxes(), effects=effects), episodes, [], (5e-4, 1e-3))
         for effects in (
             (active("spin_damping"),),
             (active("viscous_friction"), active("spin_damping")),

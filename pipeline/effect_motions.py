@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 
 from ..datasets.tracks import Track
+from .diagnosis.prepared import prepare
 from .effect_flights import fit_effect_flights
 from .effect_glides import EffectGlides
 from .effect_impacts import EffectImpacts
@@ -21,7 +22,7 @@ from .physics.world import World
 Start = list[tuple[Parameter, float]]
 
 
-def fit_effect_windows(
+def fit_effect_motions(
     world: World,
     episodes: Sequence[tuple[str, dict[str, Track]]],
     along: Sequence[tuple[Parameter, float]],
@@ -59,7 +60,8 @@ def fit_effect_windows(
     for kind in (EffectGlides, EffectImpacts):
         # not those of flight that flights do not show
         names = [a.effect.name for a in at.effects if a.effect.name in left and kind.may_tell(a.effect)]
-        motion = kind.of(at, episodes, names, noise) if names else None
+        bare = replace(at, effects=tuple(a for a in at.effects if a.effect.name not in names))
+        motion = kind.of(prepare(bare, episodes, noise), bare) if names else None
         if motion is None:
             continue
         told = _best(at, names, lambda at, _, motion=motion, names=names: motion.fit(at, names))
