@@ -78,7 +78,7 @@ class EffectGlides:
             parameters,
             found.values[0],
             information.sum(0),
-            torch.diag(prior),
+            prior,
             score,
             excess,
             record,

@@ -56,7 +56,7 @@ class EffectImpacts:
         begun = torch.cat([torch.as_tensor(self.base.fit.values[: len(BASE)]), centre[len(BASE) :]])
         problem = replace(self.base.problem, world=beside, parameters=(*BASE, *known))
         found = fit_impacts(problem, begun, centre=centre)
-        prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in problem.parameters])).to(centre)
+        prior = torch.tensor([1 / p.prior[1] ** 2 for p in problem.parameters]).to(centre)
         rows, slopes = problem.linear(torch.as_tensor(found.values))
         impacts = self.base.problem.impacts
         excess = max(float(found.chi2.sum()) / (6 * len(impacts) - len(problem.parameters)), 1.0)
@@ -70,7 +70,7 @@ class EffectImpacts:
             names,
             problem.parameters,
             torch.as_tensor(found.values),
-            torch.as_tensor(found.information) - prior,
+            torch.as_tensor(found.information) - torch.diag(prior),
             prior,
             -(slopes.mT @ rows[..., None])[..., 0],
             excess,

@@ -31,9 +31,9 @@ def fit_effect_motions(
 ) -> FirstContacts:
     """Fit the world's effects: to flights, glides and impacts those that they show, the others about first contacts.
 
-    The open-loop search is for few numbers: with every effect its valley gets narrower; these show effects
-    well. A constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be
-    searched from there: it is tried at each value of its grid, and the one with the lowest cost is kept.
+    The open-loop search is for few numbers: with every effect its valley gets narrower; these show effects well. A
+    constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be searched from there: it
+    is tried at each value of its grid, and the one with the lowest cost is kept.
 
     Args:
         world: With effects.
@@ -52,16 +52,17 @@ def fit_effect_motions(
     if any(parameter.shared != "all" for parameter in effect_parameters(world)):
         return _with_own_numbers(world, episodes, along, noise, groups or {}, bool(contact))
 
-    parts, left, at = [], [*others, *contact], world
+    parts: dict[str, FirstContacts] = {}
+    left, at = [*others, *contact], world
     flown = _best(at, others, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise)) if others else None
     if flown is not None:
         # what flights show stands: in contact it would be bent by what the contact law misses
-        parts, left, at = [flown], contact, flown.world
-    for kind in (EffectGlides, EffectImpacts):
+        parts["in_flight"], left, at = flown, contact, flown.world
+    prepared = prepare(_without(at, contact), episodes, noise) if contact else None
+    for where, kind in (("in_glides", EffectGlides), ("in_impacts", EffectImpacts)):
         # not those of flight that flights do not show
         names = [a.effect.name for a in at.effects if a.effect.name in left and kind.may_tell(a.effect)]
-        bare = replace(at, effects=tuple(a for a in at.effects if a.effect.name not in names))
-        motion = kind.of(prepare(bare, episodes, noise), bare) if names else None
+        motion = kind.of(prepared, _without(at, names)) if prepared is not None and names else None
         if motion is None:
             continue
         told = _best(at, names, lambda at, _, motion=motion, names=names: motion.fit(at, names))
@@ -69,7 +70,7 @@ def fit_effect_motions(
         shown = {parameter.name.partition(".")[0] for parameter in told.parameters}
         if shown:
             kept = {name: value for name, value in told.constants.items() if name.partition(".")[0] in shown}
-            parts, at = [*parts, replace(told, constants=kept)], told.world
+            parts[where], at = replace(told, constants=kept), told.world
             left = [name for name in left if name not in shown]
             along = [(p, told.along.get(p.name, value)) for p, value in along]
     if left:
@@ -77,23 +78,25 @@ def fit_effect_motions(
             at, left, lambda at, wanted: fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)
         )
         assert about_contacts is not None  # windows always give something
-        parts.append(about_contacts)
+        parts["about_contacts"] = about_contacts
     return _joined(parts)
 
 
-def _joined(parts: Sequence[FirstContacts]) -> FirstContacts:
-    """Return what fits found one after the other, each in the world of the one before."""
-    last, records = parts[-1], {"flights": "in_flight", "glides": "in_glides", "impacts": "in_impacts"}
-    record = dict(last.record)
-    for part in parts[:-1]:
-        record[next(name for key, name in records.items() if key in part.record)] = part.record
+def _without(world: World, names: Sequence[str]) -> World:
+    """Return the world without some of its effects."""
+    return replace(world, effects=tuple(a for a in world.effects if a.effect.name not in names))
+
+
+def _joined(parts: Mapping[str, FirstContacts]) -> FirstContacts:
+    """Return what fits found one after the other, each in the world of the one before; by where they looked."""
+    *before, (_, last) = parts.items()
     return replace(
         last,
-        parameters=tuple(parameter for part in parts for parameter in part.parameters),
-        record=record,
-        correlations=tuple(block for part in parts for block in part.correlations),
-        constants={name: value for part in parts for name, value in part.constants.items()},
-        along={name: value for part in parts for name, value in part.along.items()},
+        parameters=tuple(parameter for part in parts.values() for parameter in part.parameters),
+        record=last.record | {where: part.record for where, part in before},
+        correlations=tuple(block for part in parts.values() for block in part.correlations),
+        constants={name: value for part in parts.values() for name, value in part.constants.items()},
+        along={name: value for part in parts.values() for name, value in part.along.items()},
     )
 
 

@@ -41,13 +41,13 @@ def shown_effects(
         parameters: What was fitted (P), theirs and others.
         values: In fitted coordinates (P,).
         information: On the values (P, P), without priors.
-        prior: Information of these (P, P).
+        prior: Information of these (P,).
         score: Of each piece of motion (B, P), with a start of its own: what a formula misses is missed all through it.
         excess: By what factor the variance of residuals exceeds that of the noise.
         record: For `fit.json`.
     """
     whose = [p.name.partition(".")[0] for p in parameters]
-    held = prior.numpy()
+    held = np.diag(prior.numpy())
     covariance = few_covariance(information.numpy() / excess + held, score.numpy() / excess, held)
     std = np.sqrt(np.diag(covariance))
     known = std < UNOBSERVABLE_SHARE * np.array([p.prior[1] for p in parameters])
