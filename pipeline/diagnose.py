@@ -69,22 +69,31 @@ def diagnose(
     if save_law_to is not None:
         require_law_file(save_law_to, overwrite)
     compared = throws_of(DEFAULT) if throws is None else read_throws(throws)
-    loaded = read_model(model)
-    opened = Capture.open(capture, splits=(split,))
-    world = replace(_world(loaded, opened), rolls_on=resolve_device(device).type)
     library = library_of(candidates)
-    found = diagnosed_episodes(loaded, opened, split)
-    world = with_known_numbers(world, loaded.file, [name for name, _ in found.episodes], opened.groups)
-    refuse_strange(world, found.episodes, str(opened.root))
-    groups = _groups(opened, [name for name, _ in found.episodes])
-    prepared = prepare(world, found.episodes, found.noise, groups)
-    prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
-    refuse_blind(world, prepared, str(opened.root))
+    world, prepared = prepared_world(read_model(model), Capture.open(capture, splits=(split,)), split, device)
     result = report(prepared, world, library, compared)
     if save_law_to is None:
         return result
     saved = save_law(result, save_law_to, overwrite)
     return result.model_copy(update={"saved_law": saved})
+
+
+def prepared_world(model: Model, capture: Capture, split: str, device: str = "auto") -> tuple[World, Prepared]:
+    """Return a fitted model's world, and a split's episodes ready for tests of it.
+
+    Raises:
+        InputDataError: If the data cannot carry a verdict: what is lacking, and what to do.
+        UsageError: If there is no such split.
+    """
+    world = replace(_world(model, capture), rolls_on=resolve_device(device).type)
+    found = diagnosed_episodes(model, capture, split)
+    names = [name for name, _ in found.episodes]
+    world = with_known_numbers(world, model.file, names, capture.groups)
+    refuse_strange(world, found.episodes, str(capture.root))
+    prepared = prepare(world, found.episodes, found.noise, _groups(capture, names))
+    prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
+    refuse_blind(world, prepared, str(capture.root))
+    return world, prepared
 
 
 def report(
