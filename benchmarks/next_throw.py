@@ -93,22 +93,21 @@ def measure(case: Case, rival: str) -> dict[str, Any]:
         opened = Capture.open(capture, splits=("train",))
         world, prepared = prepared_world(read_model(base), opened, "train")
         tracks = [(name, opened.tracks(name)) for name in prepared.names]
-    nothing = refit(_parts(prepared, world), world, base_parameters(world, "contact"))
-    discount = max(1.0, _contact_chi2(nothing))
-    fits = [_with(prepared, world, name, discount) for name in pair]
-    rivals = Rivals(tuple(_evidence(name, one[1]) for name, one in zip(pair, fits, strict=True)), world)
+    fits = [_with(prepared, world, name) for name in pair]
+    discount = max(1.0, min(_contact_chi2(one) for one in fits))
+    rivals = Rivals((_evidence(pair[0], fits[0]), _evidence(pair[1], fits[1])), world)
     ranked = ranked_throws(prepared, rivals, throws_of(DEFAULT), discount)
-    before = fits[1][0] - fits[0][0]
+    before = _nats(fits[0], fits[1], discount)
     rows = {}
     for place, one in (("first", ranked[0]), ("last", ranked[-1])):
         more = prepare(world, [*tracks, (place, {case.thing: made(case, one)})], prepared.noise)
-        after = [_with(more, world, name, discount)[0] for name in pair]
+        after = _nats(_with(more, world, pair[0]), _with(more, world, pair[1]), discount)
         (key,) = one.by_pair
         rows[place] = {
             "throw": one.throw.what,
             "promised_nats": round(one.by_pair[key], 2),
             "least_nats": round(one.least[key], 2),
-            "gained_nats": round(after[1] - after[0] - before, 2),
+            "gained_nats": round(after - before, 2),
         }
     return {"case": case.name, "hidden": pair[0], "rival": rival, "before_nats": round(before, 2), **rows}
 
@@ -117,7 +116,7 @@ def made(case: Case, ranked: RankedThrow) -> Track:
     """Return a throw as MuJoCo moves it, measured as the case is."""
     hidden = case.drawn_effects()
     world = build(Mechanics.of(case.drawn_thing(), case.law), hidden)
-    start = Start(*(np.array(ranked.state[key]) for key in Start.__dataclass_fields__))
+    start = Start(**{key: np.array(value) for key, value in ranked.state.items()})
     motion = ENGINES[case.engine].simulate(world, hidden, start, ranked.throw.duration_s)
     timed_case = replace(case, length_s=ranked.throw.duration_s)
     return measured(timed_case, hidden, motion, case.rng(f"noise {ranked.throw.what}"))[0]
@@ -137,14 +136,21 @@ def _contact_chi2(found: Refit) -> float:
     return 1.0
 
 
-def _with(prepared: Prepared, world: World, name: str, discount: float) -> tuple[float, Refit]:
-    """Return half the cost of data with an effect, contact discounted, and the refit."""
+def _with(prepared: Prepared, world: World, name: str) -> Refit:
+    """Return the refit of all segments with an effect beside the model's numbers."""
     added = replace(world, effects=(*world.effects, ActiveEffect.of(load_effect(name))))
     own = [p for p in effect_parameters(added) if p.name.startswith(f"{name}.")]
-    found = refit(_parts(prepared, world), added, [*base_parameters(world, "contact"), *own])
+    return refit(_parts(prepared, world), added, [*base_parameters(world, "contact"), *own])
+
+
+def _nats(hidden: Refit, rival: Refit, discount: float) -> float:
+    """Return the log-likelihood ratio of two refits, contact discounted."""
     shares = {"flight": 1.0, "contact": 1.0 / discount}
-    parts = zip(found.segments, found.by_segment, strict=True)
-    return 0.5 * sum(shares[part.kind] * float(losses.sum()) for part, losses in parts), found
+    costs = [
+        sum(shares[part.kind] * float(losses.sum()) for part, losses in zip(one.segments, one.by_segment, strict=True))
+        for one in (rival, hidden)
+    ]
+    return 0.5 * (costs[0] - costs[1])
 
 
 def _evidence(name: str, found: Refit) -> Evidence:

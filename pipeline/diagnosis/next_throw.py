@@ -4,7 +4,9 @@ Rivals A and B with estimates th. Data with information M let A's effect be seen
 it, S = the model's numbers and B, by NC_A|B(M) = th_A' (M_AA - M_AS M_SS^-1 M_SA) th_A, the noncentrality of the test
 of A against B: twice the expected log-likelihood ratio if A is true. A throw adds its information, and is worth
 1/2 [dNC_A|B + dNC_B|A] (T-optimality: Atkinson & Fedorov 1975), in nats: the sum of what it gives if A is true and
-if B is. One of the two may be a tenth of the other, so the smaller one is said beside it.
+if B is. One of the two may be a tenth of the other, so the smaller one is said beside it. The numbers are not known
+but within their standard errors C, so that NC is its mean over them, th' R th + tr(R C): numbers that came out as
+nothing, because these data hardly show them, would make all throws alike.
 """
 
 from __future__ import annotations
@@ -204,19 +206,25 @@ def _noncentralities(
         inner = information[np.ix_(beside, beside)] + np.diag(layout.prior[beside])
         mixed = information[np.ix_(beside, own)]
         reduced = information[np.ix_(own, own)] - mixed.T @ np.linalg.solve(inner, mixed)
-        value = _estimate(rivals.evidence[a])
-        found.append(float(value @ reduced @ value))
+        value, std_error = _estimate(rivals.evidence[a])
+        found.append(float(value @ reduced @ value + std_error**2 @ np.diag(reduced)))
     return np.array(found)
 
 
-def _estimate(evidence: Evidence) -> Array:
-    """Return an effect's numbers; where each episode has its own, those of a new one are of the size that matters."""
+def _estimate(evidence: Evidence) -> tuple[Array, Array]:
+    """Return an effect's numbers and their standard errors, these at most the size that matters.
+
+    Where each episode has its own numbers, those of a new one are of that size.
+    """
     parameters = evidence.candidate.effect.parameters
+    scales = np.array([p.scale for p in parameters])
     if evidence.numbers is not None:
-        return np.array([evidence.numbers[p.name][0] for p in parameters])
-    if len(evidence.test.estimate) == len(parameters):
-        return evidence.test.estimate
-    return np.array([p.scale for p in parameters])
+        values, errors = np.array([evidence.numbers[p.name] for p in parameters]).T
+    elif len(evidence.test.estimate) == len(parameters):
+        values, errors = evidence.test.estimate, np.sqrt(np.diag(evidence.test.covariance))
+    else:
+        return scales, np.zeros_like(scales)
+    return values, np.minimum(errors, scales)
 
 
 def _variants(rivals: Rivals, world: World) -> list[Variant]:
