@@ -25,7 +25,7 @@ demo: install
 
 # One thread a worker: the tensors of tests are too small to share out, and the workers share the cores.
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: install
 	$(BIN)/ruff check

@@ -19,3 +19,13 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+LONGEST = ("test_hidden_loop.py", "test_fall_push.py", "test_scenes.py", "test_fused.py", "test_sg_gs.py")
+"""Files that take a minute or more of one core, or nearly, the longest first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest: workers take whole files, and none is to be left alone with one."""
+    place = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(LONGEST)))

@@ -121,7 +121,7 @@ def test_the_scenes_are_a_flight_a_contact_and_a_graze() -> None:
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-@pytest.mark.parametrize("at", [0.0, 0.7])
+@pytest.mark.parametrize("at", [pytest.param(0.0, marks=pytest.mark.evidence), 0.7])
 def test_derivatives_agree_in_flight_in_contact_and_grazing(name: str, at: float) -> None:
     effect, there = load_effect(name), scenes(name)
     function = motion_of(name, there)

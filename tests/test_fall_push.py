@@ -94,6 +94,7 @@ def frozen(bench, blind, judge):
     return errors(judge, bench.zeros.Frozen().fit(blind, None))
 
 
+@pytest.mark.evidence
 def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, judge, frozen, monkeypatch):
     monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 2)
     fitted = bench.cgwm_default.Cgwm("cgwm", FEW).fit(blind, None)
@@ -106,7 +107,8 @@ def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, ju
     assert set(judge.parameter_errors(fitted.record["parameters"])) >= {"friction"}
 
 
-@pytest.mark.parametrize("which", [pytest.param("mujoco", marks=pytest.mark.evidence), "pinwm", "paper"])
+@pytest.mark.evidence
+@pytest.mark.parametrize("which", ["mujoco", "pinwm", "paper"])
 def test_rivals_learn_from_images_alone(bench, blind, judge, frozen, poses, monkeypatch, which):
     for module in (bench.cem_mujoco, bench.pinwm, bench.paper):
         monkeypatch.setattr(module, "find_poses", lambda *_: poses)

@@ -1,6 +1,7 @@
 """The loop of commands on captures of another engine: hidden in flight, in contact, in the measurement, or nothing."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 HIDDEN = {
     "ball/quadratic_drag/large": {"quadratic_drag"},
     "ball/rolling_resistance/large": {"rolling_resistance"},
-    "cube/clock_scale/large": {"clock_scale", "length_scale", "gravity_scale", "buoyancy", "constant_force"},
+    "ball/length_scale/large": {"clock_scale", "length_scale", "gravity_scale", "buoyancy", "constant_force"},
 }
 CASES = {case.name: case for case in cases("development", nulls=2)}
 
@@ -26,7 +27,7 @@ def said(*words: object) -> dict:
 @pytest.mark.parametrize("name", HIDDEN)
 def test_what_is_hidden_is_found_added_and_the_error_falls(name: str, tmp_path: Path) -> None:
     capture, first, second = tmp_path / "capture", tmp_path / "m0", tmp_path / "m1"
-    make_capture(capture, CASES[f"development/{name}/0"])
+    make_capture(capture, replace(CASES[f"development/{name}/0"], test=2))
     said("fit", capture, "--out", first)
     found = said("diagnose", first, capture)
     assert found["verdict"] in ("missing_effect", "not_separable")

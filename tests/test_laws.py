@@ -335,6 +335,7 @@ def test_bodies_rest_within_a_tenth_of_a_millimetre(duration_s: float) -> None:
     assert bool((rollout.position_m[:2, -1, 0, 2] + torch.tensor(low[:2]) > -2 * G * 0.005**2).all())
 
 
+@pytest.mark.evidence
 def test_three_cubes_of_spheres_stand_on_each_other() -> None:
     """Spheres make bumpy faces, whose bumps slide into dents at once; then the cubes stay where they are stacked."""
     half, count = 0.03, 3
@@ -352,7 +353,7 @@ def test_three_cubes_of_spheres_stand_on_each_other() -> None:
 # the discretisation
 
 
-@pytest.mark.parametrize("on_plane", [True, False])
+@pytest.mark.parametrize("on_plane", [True, pytest.param(False, marks=pytest.mark.evidence)])
 def test_material_and_friction_do_not_depend_on_the_number_of_spheres(on_plane: bool) -> None:
     """8 to 500 spheres on one cube: rebound within 2 %, slide within 0.5 % of the law's length, the same rest depth."""
     half, mu = 0.05, 0.3

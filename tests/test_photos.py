@@ -75,6 +75,7 @@ def test_gains_that_are_not_learned_stay_1(views, truth):
     assert exposures.even(views[0]) is views[0]
 
 
+@pytest.mark.evidence
 def test_camera_poses_are_refined_without_moving_the_world(views, truth):
     rng = np.random.default_rng(1)
     bare = [replace(view, cover=None) for view in views]  # all of the picture counts
@@ -197,7 +198,7 @@ def test_depth_maps_carve_what_silhouettes_cannot():
     rng = np.random.default_rng(0)
     K = np.array([[150.0, 0, 64], [0, 150, 64], [0, 0, 1]])
     silhouettes = []
-    for _ in range(30):
+    for _ in range(16):
         direction = rng.normal(size=3)
         direction[2] = abs(direction[2]) + 0.8
         eye = 0.5 * direction / np.linalg.norm(direction)

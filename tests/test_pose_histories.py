@@ -52,6 +52,7 @@ def turned_between_frames(found: PoseTrack) -> float:
     return math.degrees(float(geodesic_angle(found.quat_wxyz[1:, 0], found.quat_wxyz[:-1, 0]).max()))
 
 
+@pytest.mark.evidence
 def test_a_body_that_looks_almost_the_same_turned_about_does_not_flip() -> None:
     _, found, rollout = tracked(two_sided(0.06))
     assert bool(found.found.all())

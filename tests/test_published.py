@@ -94,6 +94,7 @@ def test_its_clamp_is_off_by_the_known_offset() -> None:
     assert float(slope[0]) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.evidence
 def test_bodies_meet_at_the_published_distance() -> None:
     """A ball over two coincident ones feels the inflation log(2)/beta, and rests that much higher."""
     beta = 200.0

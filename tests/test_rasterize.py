@@ -60,13 +60,14 @@ def assert_equal(results, pixels_off=0):
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
+@pytest.mark.parametrize("min_alpha", [pytest.param(0.0, marks=pytest.mark.evidence), 1 / 255])
 def test_values_and_gradients_equal_the_torch_renderer(kernels, min_alpha):
     assert_equal(both(scene(24), kernels, min_alpha))
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("min_alpha", [pytest.param(0.0, marks=pytest.mark.evidence), 1 / 255])
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255])
 def test_strong_distortion_equals_the_torch_renderer(kernels, min_alpha):
     """What lies far outside of a barrel's picture, the distortion would fold back into it."""
     size = (37, 20)  # six tiles, of which four are cut
@@ -104,7 +105,9 @@ def test_no_distortion_is_a_pinhole():
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("coefficients", [BARREL, PINCUSHION, SKEWED])
+@pytest.mark.parametrize(
+    "coefficients", [*(pytest.param(lens, marks=pytest.mark.evidence) for lens in (BARREL, PINCUSHION)), SKEWED]
+)
 def test_distortion_loses_no_sphere(coefficients):
     """Small spheres on the rays of some pixels: these see them, and no others do."""
     width, height = 37, 20
@@ -125,13 +128,14 @@ def test_distortion_loses_no_sphere(coefficients):
     assert int(pairs) < 1.2 * count  # the bounds of the tiles are tight
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize("kernels", KERNELS)
 def test_more_cameras_than_are_summed_together(kernels):
     assert_equal(both(scene(6, cameras=18), kernels, size=(7, 5)))
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("channels", [1, 9])
+@pytest.mark.parametrize("channels", [pytest.param(1, marks=pytest.mark.evidence), 9])
 def test_any_number_of_channels(kernels, channels):
     assert_equal(both(scene(12), kernels, channels=channels))
 
@@ -186,8 +190,8 @@ def test_a_capacity_changes_nothing_while_it_suffices(kernels):
 
 @pytest.mark.filterwarnings("ignore:invalid value")  # from the interpreter's numpy
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-@pytest.mark.parametrize("lens", [None, BARREL])
+@pytest.mark.parametrize("value", [math.nan, pytest.param(math.inf, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize("lens", [pytest.param(None, marks=pytest.mark.evidence), BARREL])
 def test_a_sphere_whose_place_is_not_finite_is_not_drawn(kernels, value, lens):
     means, *others = [tensor.float().to(DEVICE) for tensor in scene(12)]
     distortion = None if lens is None else torch.tensor(lens, device=DEVICE)

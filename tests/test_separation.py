@@ -104,6 +104,7 @@ def test_two_bodies_are_told_apart_by_their_boxes(balls):
     assert ious(result.train, true, 2).mean() > 0.7  # it is half hidden, or half out of the photo, in most of 11 photos
 
 
+@pytest.mark.evidence
 def test_a_body_is_found_beside_one_with_masks_whose_labels_stay(balls):
     capture, views, true = balls
     masked = [with_labels(view, np.where(true[view.name] == 1, 1, 0).astype(np.uint8), 2) for view in views]

@@ -134,6 +134,7 @@ def test_the_contact_sheet_shows_photos_renders_and_errors(result):
     assert errors.mean() < 60  # a fit that errs by a quarter of full scale would be bright
 
 
+@pytest.mark.evidence
 def test_geometry_comes_first_on_request_or_where_maps_are(capture, result, tmp_path, quick):
     assert result.record["ball"]["joint"] is True
     assert "geometry_loss" not in result.record["ball"]

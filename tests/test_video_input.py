@@ -89,7 +89,7 @@ def test_video_and_camera_of_different_sizes(root: Path) -> None:
         load_footage(Capture.open(root, check=False), EPISODE, 64)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
+@pytest.mark.parametrize("frames", [pytest.param(1, marks=pytest.mark.evidence), 2])
 def test_fewer_than_three_frames(root: Path, frames: int) -> None:
     end_s = (frames - 0.9) / RATE_HZ
     with_manifest(root, "[video]", f"[episodes]\n{EPISODE} = {{ end_s = {end_s} }}\n[video]")
