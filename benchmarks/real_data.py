@@ -146,7 +146,7 @@ def main() -> int:
     """Measure what is wanted; return 1 if a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=tuple(STEPS))
-    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the errors; made where it is missing")
     given = parser.parse_args()
     data = shared_data()
     if data is None:
@@ -169,6 +169,7 @@ def main() -> int:
                     make(Path(folder) / name)
                     figures, found = walk(kind, Path(folder) / name, Path(folder))
                 if given.pictures is not None:
+                    given.pictures.mkdir(parents=True, exist_ok=True)
                     labels = ["base", *("+ " + ", ".join(map(short, added)) for added in STEPS[kind])]
                     picture(given.pictures / f"{name}.png", name, labels, found)
                 return figures
