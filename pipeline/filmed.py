@@ -20,6 +20,7 @@ from .checkpoint import Slot
 from .imaging.coarse import coarse_model
 from .imaging.footage import Footage, load_footage
 from .imaging.image_loss import ImageLoss
+from .imaging.pose_search import small_silhouette_px
 from .imaging.pose_tracks import PoseTrack, PoseTracker, pose_noise, stored_track, track_state
 from .imaging.silhouette_loss import image_loss
 from .phys_geo import MAX_SPAN_S
@@ -27,8 +28,8 @@ from .physics.driven import Drive
 from .physics.world import World
 from .splats.mesh import Mesh
 
-COARSE_SIZE = 80
-"""Longer side [px] of the pictures for searching poses."""
+COARSE_SIZE, COARSE_BODY_PX = 80, 20.0
+"""Longer side [px] of the pictures for searching poses, more where a body would cover less than so many pixels."""
 MAX_INSTANTS = 90
 """More instants of an episode are thinned evenly: the image loss of each costs a render a camera."""
 RIVAL_NATS = 10.0
@@ -98,12 +99,21 @@ def filmed_episode(
         return Episode(
             name, footage, loss, _tracks_of(world, footage, stored_track(state)) | drives, stored_track(state)
         )
-    small = _within_span(load_footage(capture, name, COARSE_SIZE, device))
+    small = _within_span(load_footage(capture, name, _coarse_size(loss), device))
     coarse = image_loss(coarse_model(model), small, world.free, outlines)
     position, quat = driven_poses(world, drives, footage.times_s)
     found = PoseTracker(coarse, loss, position, quat).run()
     slot.write(track_state(found))
     return Episode(name, footage, loss, _tracks_of(world, footage, found) | drives, found)
+
+
+def _coarse_size(loss: ImageLoss) -> int:
+    """Return the longer side [px] of the pictures for searching: large enough for bodies that are small in them."""
+    side = max(max(video.size) for video in loss.footage.videos)
+    area = small_silhouette_px(loss)
+    if area is None:
+        return COARSE_SIZE
+    return max(COARSE_SIZE, min(side, math.ceil(side * math.sqrt(COARSE_BODY_PX / area))))
 
 
 def _tracks_of(world: World, footage: Footage, found: PoseTrack) -> dict[str, Track]:

@@ -474,7 +474,9 @@ def physics_fit(
         )
         if record.get("kept") == "shooting":
             grown = record["shooting_misfit"]["information_over"]
-            assumed = f"what the contact model misses in them makes their information {grown:.2g} times smaller"
+            assumed = "that the contact model misses nothing in others that it does not miss in these"
+            if grown >= 1.05:
+                assumed = f"what the contact model misses in them makes their information {grown:.2g} times smaller"
         warnings.append(f"with fewer than {ENOUGH_EPISODES} episodes the intervals rest on an assumption: {assumed}")
     return PhysicsFit(
         contact,

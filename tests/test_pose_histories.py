@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.models import Model
 from cgwm.datasets.ply import Splats
+from cgwm.pipeline import filmed
 from cgwm.pipeline.filmed import RIVAL_NATS, Episode, track_warnings
 from cgwm.pipeline.imaging.coarse import coarse_model
 from cgwm.pipeline.imaging.footage import Footage
@@ -140,3 +142,20 @@ def test_the_ground_does_not_eat_the_rim_of_what_stands_on_it() -> None:
         areas.append(float(loss.quality(torch.tensor([0]), *stands).area))
     assert areas[0] == pytest.approx(areas[1], rel=0.01)
     assert areas[1] > 200
+
+
+def test_bodies_that_are_small_in_the_picture_are_looked_for_in_larger_ones() -> None:
+    """Bodies of some pixels are lost in the small pictures; what covers enough of them is searched as before."""
+
+    def filmed_at(area_px: int, side_px: int) -> SimpleNamespace:
+        covers = torch.zeros(3, 1, 240, side_px)
+        covers[:2].view(2, -1)[:, :area_px] = 1.0  # the body is out of sight in the last frame
+        video = SimpleNamespace(covers=covers, size=(side_px, 240))
+        return SimpleNamespace(
+            footage=SimpleNamespace(videos=[video], frame_at=torch.tensor([[0, 1, 2, -1]])), free=[0]
+        )
+
+    assert filmed._coarse_size(filmed_at(64, 320)) == 179  # 20 px of 64 * (179 / 320)^2
+    assert filmed._coarse_size(filmed_at(1000, 320)) == filmed.COARSE_SIZE
+    assert filmed._coarse_size(filmed_at(8, 320)) == 320  # no larger than it was filmed
+    assert filmed._coarse_size(filmed_at(0, 320)) == filmed.COARSE_SIZE

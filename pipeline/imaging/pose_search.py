@@ -160,6 +160,16 @@ def located(loss: ImageLoss, instant: int, index: int) -> Tensor | None:
     return torch.linalg.solve(across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0])
 
 
+def small_silhouette_px(loss: ImageLoss) -> float | None:
+    """Return the area [px] that a tenth of the free bodies' silhouettes stay below; None where none is seen."""
+    areas = []
+    for number, frames in enumerate(loss.footage.frame_at.tolist()):
+        for frame in set(frames) - {-1}:
+            areas += [float(_silhouette(loss, number, frame, index).sum()) for index in loss.free]
+    seen = [area for area in areas if area >= MIN_SILHOUETTE_PX]
+    return float(np.quantile(seen, 0.1)) if seen else None
+
+
 def _silhouette(loss: ImageLoss, number: int, frame: int, index: int) -> Tensor:
     """Return where a body is seen (H, W): its mask, or the largest region that differs from the background."""
     video = loss.footage.videos[number]
