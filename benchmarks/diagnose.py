@@ -1,14 +1,14 @@
 """Does `cgwm diagnose` name what is hidden, and nothing where nothing is? Captures whose truth is another engine.
 
     python benchmarks/diagnose.py --stage development --workers 2 [--nulls 20] [--only cube/com_offset] [--list rough]
-    python benchmarks/diagnose.py --stage report5 --table
+    python benchmarks/diagnose.py --stage report6 --table
     python benchmarks/diagnose.py --list video             # six captures with videos only
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
 
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
 --effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
-by report to report5, whose seeds are others (each later one: since what the one before said was seen).
+by report to report6, whose seeds are others (each later one: since what the one before said was seen).
 Results are stored case by case and taken up again.
 """
 

@@ -20,7 +20,7 @@ from .checkpoint import Slot
 from .imaging.coarse import coarse_model
 from .imaging.footage import Footage, load_footage
 from .imaging.image_loss import ImageLoss
-from .imaging.pose_search import MIN_SILHOUETTE_PX, small_silhouette_px
+from .imaging.pose_search import small_silhouette_px
 from .imaging.pose_tracks import PoseTrack, PoseTracker, pose_noise, stored_track, track_state
 from .imaging.silhouette_loss import image_loss
 from .phys_geo import MAX_SPAN_S
@@ -28,7 +28,7 @@ from .physics.driven import Drive
 from .physics.world import World
 from .splats.mesh import Mesh
 
-COARSE_SIZE, COARSE_BODY_PX = 80, 2 * MIN_SILHOUETTE_PX
+COARSE_SIZE, COARSE_BODY_PX = 80, 20.0
 """Longer side [px] of the pictures for searching poses, more where a body would cover less than so many pixels."""
 MAX_INSTANTS = 90
 """More instants of an episode are thinned evenly: the image loss of each costs a render a camera."""

@@ -155,7 +155,7 @@ def test_bodies_that_are_small_in_the_picture_are_looked_for_in_larger_ones() ->
             footage=SimpleNamespace(videos=[video], frame_at=torch.tensor([[0, 1, 2, -1]])), free=[0]
         )
 
-    assert filmed._coarse_size(filmed_at(64, 320)) == 139  # 12 px of 64 * (139 / 320)^2
+    assert filmed._coarse_size(filmed_at(64, 320)) == 179  # 20 px of 64 * (179 / 320)^2
     assert filmed._coarse_size(filmed_at(1000, 320)) == filmed.COARSE_SIZE
     assert filmed._coarse_size(filmed_at(8, 320)) == 320  # no larger than it was filmed
     assert filmed._coarse_size(filmed_at(0, 320)) == filmed.COARSE_SIZE
