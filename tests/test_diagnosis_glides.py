@@ -101,6 +101,9 @@ def evidence(name: str, score: float, share: float, size: float = 1.0) -> GlideE
             ["stribeck_friction", "friction_patch"],
         ),
         ([("stribeck_friction", 900, 0.7), ("friction_patch", 600, 0.6)], False, ["stribeck_friction"]),
+        # engines brake the spin of a sliding box differently, which a map explains as well
+        ([("torsional_friction", 250, 0.8), ("friction_patch", 190, 0.7)], False, []),
+        ([("torsional_friction", 250, 0.8), ("friction_patch", 20, 0.7)], False, ["torsional_friction"]),
     ],
 )
 def test_what_glides_name(found: list[tuple], flown: bool, named: list[str]) -> None:

@@ -6,13 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.compared import ComparedModel
 from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.diagnosis.cuts import whole_episodes
 from cgwm.pipeline.diagnosis.prepared import prepare
 from cgwm.pipeline.diagnosis.usable import refuse_blind, refuse_strange
+from cgwm.pipeline.estimation.warmup import clearance
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics.rotation import quat_multiply, quat_to_matrix
 from cgwm.pipeline.short_errors import short_errors
 from cgwm.schemas import InputDataError
 from diagnosis_data import NOISE, tosses, world_with, write_capture
@@ -68,6 +72,27 @@ def test_a_body_of_another_shape_is_told() -> None:
     small = shaped(world, 0.3)
     with pytest.raises(InputDataError, match="above the ground and does not fall"):
         refuse_blind(small, prepare(small, episodes), "here")
+
+
+def test_a_tilted_frame_is_no_other_shape() -> None:
+    """Three degrees of tilt put a body a quarter of a metre away 13 mm under the ground: that is for the diagnosis."""
+    world = world_with("cube")
+    episodes = tosses(world, 3, count=4, duration_s=1.0)
+    name = world.bodies[0].name
+    turn = torch.tensor([np.cos(0.026), 0.0, np.sin(0.026), 0.0])
+    matrix = quat_to_matrix(turn).numpy()
+
+    def seen(track: Track, sideways: float, lower: float) -> Track:
+        position = (track.position_m + np.array([sideways, 0, 0])) @ matrix.T - [0, 0, lower]
+        quat = quat_multiply(turn, torch.tensor(track.quat_wxyz)).numpy()
+        return replace(track, position_m=position, quat_wxyz=quat)
+
+    away = [(n, {name: seen(t[name], 0.2 + 0.1 * k, 0.0)}) for k, (n, t) in enumerate(episodes)]
+    assert float(clearance(world, whole_episodes(world, away)).min()) < -0.012
+    refuse_strange(world, away, "here")
+    lower = [(n, {name: seen(t[name], 0.2 + 0.1 * k, 0.03)}) for k, (n, t) in enumerate(episodes)]
+    with pytest.raises(InputDataError, match="under the ground"):
+        refuse_strange(world, lower, "here")
 
 
 def test_a_mass_and_an_inertia_that_no_such_body_has_are_told() -> None:

@@ -41,6 +41,9 @@ slide the law of what was found in flight may be off. Balls in wind had false fr
 and 1044, of which the others say 33 and 18; of true ones 114 to 34,000, but for one that fell silent (26)."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
 """Another one within this score of it, or this share of it, leaves the two unseparated ..."""
+BRAKED_OTHERWISE = ("torsional_friction",)
+"""What a map of friction explains as well is the spin of a sliding body that engines brake otherwise, below the score
+of maps: of four such names on report4 to report6 three were false (101 to 260), the fourth stood beside a drag."""
 MISLED, RIVAL_SHARE = 165.0, 0.5
 """... and so does one behind by less than what a wrong one has reached, if it explains this share of what the best one
 does: how friction falls with the speed, how it grows and where it changes are much the same along a single slide."""
@@ -149,7 +152,11 @@ def equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: b
         return []  # what flights leave unexplained acts here, too
     alike = fit[0].score - max(GLIDE_LEAD, GLIDE_SHARE * fit[0].score)
     rival, share = fit[0].score - MISLED, RIVAL_SHARE * fit[0].share
-    return [one for one in fit if one.score > alike or (one.score > rival and one.share > share)]
+    equals = [one for one in fit if one.score > alike or (one.score > rival and one.share > share)]
+    mapped = any(len(one.evidence.candidate.effect.parameters) > MANY_NUMBERS for one in equals)
+    if mapped and fit[0].evidence.name in BRAKED_OTHERWISE and fit[0].score < GLIDE_SCORE_FLEXIBLE:
+        return []
+    return equals
 
 
 def _told_by_glides(one: GlideEvidence, flown: bool) -> bool:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ...datasets.tracks import Track
 from ...schemas import InputDataError
@@ -25,6 +26,10 @@ LONGEST_STEP_S = 0.2
 MOST_OFF = 0.2
 """A body whose lowest point lies deeper than this share of its size under the ground, or rests higher above it, has
 another shape or ground."""
+MOST_TILT = 0.1
+"""Of the measured frame [rad], for a ground that is level in the manifest: an error of measurement that has a name."""
+ENVELOPE_ITERATIONS, ENVELOPE_WEIGHT = 20, 0.02
+"""Of the plane under all places: an expectile (Newey & Powell 1987), in which what lies above weighs so little."""
 MOST_CARRIED = 0.2
 """Of the frames, above the ground and yet not falling."""
 DENSEST_KG_M3 = 23000.0
@@ -73,14 +78,36 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
     if world.ground_normal is None or not bool(whole.turned.any()):
         return
     size = min(size_of(world.bodies[k]) for k in world.free)
-    gap = clearance(world, whole)[whole.seen.amax(-1) > 0]
+    seen = whole.seen.amax(-1) > 0
+    gap, place = clearance(world, whole)[seen], whole.position_m[:, :, 0][seen]
     deep = float(torch.quantile(gap, 0.05))
-    if deep < -MOST_OFF * size:
+    if deep < -MOST_OFF * size and not _on_a_tilted_plane(gap, place, world.ground_normal, MOST_OFF * size):
         raise InputDataError(
             f"{where}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
             f"size is {1e3 * size:.0f} mm.",
             *_BELONG_TOGETHER,
         )
+
+
+def _on_a_tilted_plane(gap: Tensor, place: Tensor, normal: Tensor, most: float) -> bool:
+    """Return whether gaps to the ground are those to one that is tilted about the origin: that has a name.
+
+    Args:
+        gap: Where the body is under the ground they are negative (n,) [m].
+        place: Where the body is (n, 3) [m], world.
+        normal: Of the ground (3,).
+        most: Depth [m] that may be left, and that may stay at the origin, where a ground at another height differs.
+    """
+    under = gap < 0
+    along = place - (place @ normal)[:, None] * normal  # two numbers in three: the solution of least norm
+    columns = torch.cat((along, torch.ones_like(gap)[:, None]), 1)
+    plane = columns.new_zeros(4)
+    for _ in range(ENVELOPE_ITERATIONS):  # what flies low over the tilted ground lies above it
+        weight = torch.where(gap[under] < columns[under] @ plane, 1.0, ENVELOPE_WEIGHT).sqrt()
+        plane = torch.linalg.lstsq(weight[:, None] * columns[under], weight * gap[under], driver="gelsd").solution
+    left = gap - columns @ plane
+    level = float(plane[:3].norm()) <= MOST_TILT and abs(float(plane[3])) <= most
+    return level and float(torch.quantile(left, 0.05)) >= -most
 
 
 def refuse_slow_times(tracks: Sequence[Track], where: str) -> None:
