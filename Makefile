@@ -34,7 +34,7 @@ lint: install
 
 evidence: install
 	$(BIN)/pytest -m evidence
-	cd benchmarks && for one in calibrate tosses fall coverage known_mesh real_data; do echo "== $$one"; ../$(BIN)/python $$one.py || echo "$$one: a bar was missed"; done
+	cd benchmarks && for one in calibrate tosses fall coverage known_mesh next_throw real_data; do echo "== $$one"; ../$(BIN)/python $$one.py || echo "$$one: a bar was missed"; done
 
 clean:
 	rm -rf $(VENV) build out *.egg-info .pytest_cache .ruff_cache
