@@ -41,12 +41,12 @@ slide the law of what was found in flight may be off. Balls in wind had false fr
 and 1044, of which the others say 33 and 18; of true ones 114 to 34,000, but for one that fell silent (26)."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
 """Another one within this score of it, or this share of it, leaves the two unseparated ..."""
-BRAKED_OTHERWISE = ("torsional_friction",)
-"""What a map of friction explains as well is the spin of a sliding body that engines brake otherwise, below the score
-of maps: of four such names on report4 to report6 three were false (101 to 260), the fourth stood beside a drag."""
 MISLED, RIVAL_SHARE = 165.0, 0.5
 """... and so does one behind by less than what a wrong one has reached, if it explains this share of what the best one
 does: how friction falls with the speed, how it grows and where it changes are much the same along a single slide."""
+BRAKED_OTHERWISE = ("torsional_friction",)
+"""What a map of friction explains as well is the spin of a sliding body that engines brake otherwise, below the score
+of maps: of four such names on report4 to report6 three were false (101 to 260), the fourth stood beside a drag."""
 CONTACT_SCORE, CONTACT_T = 22.0, 1.0
 """Under the law of contact an effect is named above this score, where the mean gain of held-out episodes is above so
 many of its standard errors ..."""
