@@ -25,6 +25,7 @@ from .reporting.comparison import comparison_html
 from .reporting.footage import footage_of
 from .sg_gs import resolve_device
 from .short_errors import short_errors
+from .threads import one_torch_thread
 from .wrench_points import wrench_points
 
 REPORT_HTML = "compare.html"
@@ -108,7 +109,7 @@ def compare_models(
     prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
     bodies = [first.bodies[k].name for k in first.free]
     compared = []
-    with progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
+    with one_torch_thread(), progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
         for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
             # of an episode's own numbers a short prediction knows as much as of its state
             world = World.from_model(model)

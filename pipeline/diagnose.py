@@ -37,8 +37,10 @@ from .own_worlds import with_known_numbers
 from .physics.effects.registry import effect_names, load_effect, split_units
 from .physics.world import World
 from .sg_gs import resolve_device
+from .threads import one_torch_thread
 
 
+@one_torch_thread()
 def diagnose(
     model: Path,
     capture: Path,

@@ -28,6 +28,7 @@ from .memory import enough_memory
 from .own_worlds import own_parameters, with_fitted_numbers, with_known_numbers
 from .physics.world import World
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, Episode, EpisodePrediction, predict
+from .threads import one_torch_thread
 
 Array = NDArray[np.float64]
 
@@ -126,6 +127,7 @@ def evaluate_model(
     return _evaluation(predictions, compare, warnings)
 
 
+@one_torch_thread()
 def _own_worlds(
     world: World,
     model: Model,
@@ -226,6 +228,7 @@ def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> tuple
     return position or estimated[0], rotation or estimated[1]
 
 
+@one_torch_thread()
 def _predict(
     model: Model,
     world: World,

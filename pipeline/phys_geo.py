@@ -56,6 +56,7 @@ from .physics.parameters import (
 )
 from .physics.rotation import geodesic_angle
 from .physics.world import State, World
+from .threads import one_torch_thread
 
 ERRORS_PER_EPISODE = 3.0
 """Independent errors in one episode's open-loop error; `docs/benchmarks.md` has how the intervals cover with it."""
@@ -139,6 +140,7 @@ def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Tr
     return usable
 
 
+@one_torch_thread()
 def fit_physics(
     world: World,
     episodes: Sequence[tuple[str, dict[str, Track]]],

@@ -39,6 +39,7 @@ from .rollout_batches import ENVIRONMENTS, Diverged
 from .rollout_labels import labels_of
 from .stopwatch import Stopwatch
 from .synthesis_job import Job, manifest_of, notes_of, prepared
+from .threads import one_torch_thread
 
 ROLLOUTS_AT_ONCE = {"cuda": ENVIRONMENTS, "cpu": 1}
 """Drawn and simulated together where the settings do not say, one batch ahead of the pictures."""
@@ -87,7 +88,7 @@ def synthesize(
         NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
     """
     began = time.perf_counter()
-    with _one_thread():
+    with one_torch_thread(kernels_too=True):
         job = prepared(model, config)
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
@@ -112,7 +113,8 @@ def _written(
         return _summary(out, job, kept, contact_count(out / kept.file), time.perf_counter() - began, True, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
     contacts, outcome = 0, _Outcome(Counter(), [])
-    with _one_thread(), _quick_turns(), new_dataset(out, manifest, model, config.shard, overwrite) as (path, entries):
+    dataset = new_dataset(out, manifest, model, config.shard, overwrite)
+    with one_torch_thread(kernels_too=True), _quick_turns(), dataset as (path, entries):
         with RolloutWriter(path, config.seed, config_json, f"cgwm {version('cgwm')}", config.compression) as writer:
             with closing(_rollouts(job, indices, outcome, stopwatch)) as found:
                 for draw, labels in progress(found, "rollouts", len(indices), "rollout"):
@@ -200,21 +202,6 @@ def _batch(job: Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch) ->
 
     attempts = job.plan.reject.attempts
     return list(accepted_rollouts(indices, draw, simulate, job.rejection.reason, attempts, outcome.rejected))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch work in one thread on the CPU.
-
-    The tensors are too small to share out: on a machine with other work, threads that wait for each other made it
-    20 times slower. Shards in parallel are the way to use more cores. It also keeps the bytes the same everywhere.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
+from cgwm.pipeline.physics.effects.residual_wrench import AXES, ResidualWrench
 from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
@@ -324,8 +325,14 @@ def every_effect() -> tuple[ActiveEffect, ...]:
         active("spin_damping", d=0.8), active("constant_force", f_x=0.3, f_y=-0.2, f_z=0.5), active("buoyancy", b=0.6),
         active("wind", w_x=1.0, w_y=-2.0), active("ground_magnet", A=4.0, l=0.1), active("gravity_scale", s=0.05),
         active("gravity_tilt", tilt_x=0.05, tilt_y=0.1), active("com_offset", d_x=0.003, d_y=-0.002),
-        active("inertia_shape", s_xx=0.1, s_xy=0.05),
+        active("inertia_shape", s_xx=0.1, s_xy=0.05), active("ground_magnet", A=3.0, l=0.02), residual_wrench(4.0),
     )  # fmt: skip
+
+
+def residual_wrench(size: float | Tensor) -> ActiveEffect:
+    """Return a constant acceleration of that size, and angular ones up to five times as large."""
+    shares = dict(zip(AXES, (0.3, -0.5, 1.0, -2.0, 5.0, 3.0), strict=True))
+    return ActiveEffect.of(ResidualWrench(), {k: torch.as_tensor(v * size, dtype=F64) for k, v in shares.items()})
 
 
 def flight() -> tuple[World, State]:
@@ -349,6 +356,7 @@ def test_effects(fused: Fused, ground: str) -> None:
     if ground == "none":
         world = replace(world, ground_normal=None, ground_offset=None)
         effects = tuple(e for e in effects if e.effect.name != "ground_magnet")
+        assert len(effects) == len(every_effect()) - 2
     acting = replace(world, effects=effects)
     expected = simulate(acting, state, times(0.2), None, True)
     agree(expected, fused(acting, state, times(0.2), None, True), 1e-9)
@@ -378,7 +386,7 @@ def test_derivatives_of_effects(fused: Fused) -> None:
         ("constant_force", "f_x"), ("buoyancy", "b"), ("wind", "w_x"), ("ground_magnet", "A"), ("com_offset", "d_x"),
         ("gravity_tilt", "tilt_x"),
     ]  # fmt: skip
-    inputs = batch([0.4, 0.7, 0.2, 0.8, 0.3, 0.6, 1.0, 4.0, 0.003, 0.05])
+    inputs = batch([0.4, 0.7, 0.2, 0.8, 0.3, 0.6, 1.0, 4.0, 0.003, 0.05, 2.0])
     first = State(*(getattr(state, name)[:1] for name in POSES))
 
     def function(engine: Any) -> Callable[[Tensor, int], Tensor]:
@@ -387,6 +395,7 @@ def test_derivatives_of_effects(fused: Fused) -> None:
                 ActiveEffect.of(load_effect(name), zeros(name, values) | {key: values[:, k]}, values)
                 for k, (name, key) in enumerate(names)
             )
+            effects = (*effects, residual_wrench(values[:, -1]))
             rollout = engine(replace(world, effects=effects), first, times(0.1))
             return torch.cat([getattr(rollout, name)[:, -1].flatten(1) for name in POSES], 1)
 
@@ -520,8 +529,8 @@ def test_what_the_kernel_does_not_have() -> None:
         name = "other"
 
     assert "'other'" in (reason_against(replace(world, effects=(ActiveEffect.of(Other()),))) or "")
-    twice = (active("ground_magnet", A=1.0, l=0.1), active("ground_magnet", A=2.0, l=0.2))
-    assert "several" in (reason_against(replace(world, effects=twice)) or "")
+    flying = replace(world, touching=False, effects=(active("adhesion", F=1.0),))
+    assert "do not touch anything" in (reason_against(flying) or "")
     published = PublishedLaw(batch(0.3), batch(1e4), batch(10.0))
     assert "'published'" in (reason_against(replace(world, contact=published)) or "")
     assert "its bodies may have 4104 contacts" in (reason_against(crowded(2044)) or "")
@@ -583,8 +592,19 @@ def test_threads_change_no_bit_on_the_cpu() -> None:
 def test_flight_alone_is_for_the_kernel_too() -> None:
     world = replace(world_of(box_body()), touching=False, effects=(active("linear_drag", c=0.3),))
     agree(simulate(world, tossed(5), times(0.5)), simulate_on_host(world, tossed(5), times(0.5)), 1e-12)
-    pulled = replace(world, effects=(active("ground_magnet", A=1.0, l=0.1),))
-    assert "its bodies do not touch anything" in (lacking(pulled) or "")
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_pulls_of_a_ground_that_is_not_touched(fused: Fused, tilt: float) -> None:
+    """Several of them, on bodies whose contacts do not count: in pieces of flight every range is tried at once."""
+    pulls = tuple(active("ground_magnet", A=a, l=reach) for a, reach in (([1.0, 5.0], 0.01), (2.0, 0.05), (0.0, 0.1)))
+    normal = quat_rotate(quat_exp(torch.tensor([tilt, 0.0, 0.0], dtype=F64)), torch.tensor([0.0, 0, 1], dtype=F64))
+    world = replace(world_of(cube(), ball_body()), touching=False, effects=pulls, ground_normal=normal)
+    state = flight()[1]
+    expected = simulate(world, state, times(0.3))
+    agree(expected, fused(world, state, times(0.3)), 1e-9)
+    free = simulate(replace(world, effects=()), state, times(0.3))
+    assert (free.position_m - expected.position_m).abs().amax((0, 1, 3)).min() > 1e-3
 
 
 def test_a_compiler_that_fails_leaves_the_torch_engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

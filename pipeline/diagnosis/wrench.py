@@ -12,7 +12,8 @@ from scipy.stats import chi2 as chi2_law
 from torch import Tensor
 
 from ..estimation.observations import Observations
-from ..physics.effects.effect import ActiveEffect, BodyMotion, Effect, EffectParameter, Values, Wrench, vector
+from ..physics.effects.effect import ActiveEffect
+from ..physics.effects.residual_wrench import ResidualWrench
 from ..physics.parameters import effect_parameters
 from ..physics.rotation import quat_rotate
 from ..physics.world import World
@@ -30,29 +31,6 @@ BINS = 4
 COORDINATES = ("time", "x", "y", "height", "heading", "speed", "spin", "episode")
 WEAK_STD = 1e4
 """Prior of an acceleration [m/s2, rad/s2]: holds those that were not measured (a centroid has no spin)."""
-AXES = ("a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
-UNIT = ("m/s2",) * 3 + ("rad/s2",) * 3
-
-
-class ResidualWrench(Effect):
-    """a = (a_x, a_y, a_z), alpha = (alpha_x, alpha_y, alpha_z), world frame: what a model lacks, whatever it is."""
-
-    name = "residual_wrench"
-    summary = "A constant acceleration and angular acceleration."
-    formula = "a = (a_x, a_y, a_z), alpha = (alpha_x, alpha_y, alpha_z)"
-    parameters = tuple(
-        EffectParameter(name, unit, scale=0.3 if unit == "m/s2" else 3.0, limit=1e6)
-        for name, unit in zip(AXES, UNIT, strict=True)
-    )
-    phase = "flight"
-    reveals = "any motion"
-    source = "Newton and Euler"
-
-    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
-        """Return the wrench."""
-        force = motion.mass[:, None] * vector(values, *AXES[:3])
-        torque = (motion.inertia @ vector(values, *AXES[3:])[..., None]).squeeze(-1)
-        return Wrench(force, torque)
 
 
 @dataclass(frozen=True, eq=False)

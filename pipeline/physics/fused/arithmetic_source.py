@@ -168,6 +168,13 @@ __device__ inline Sym turned(const Mat& R, const Sym& S) {  // R S R^T
     Sym T = {dot(R.x, x), dot(R.y, y), dot(R.z, z), dot(R.x, y), dot(R.x, z), dot(R.y, z)};
     return T;
 }
+// The solution x of S x = v, by minors.
+__device__ inline Vec solved(const Sym& S, Vec v) {
+    Sym minors = {S.yy * S.zz - S.yz * S.yz, S.xx * S.zz - S.xz * S.xz, S.xx * S.yy - S.xy * S.xy,
+                  S.xz * S.yz - S.xy * S.zz, S.xy * S.yz - S.xz * S.yy, S.xy * S.xz - S.yz * S.xx};
+    Real each = reciprocal(S.xx * minors.xx + S.xy * minors.xy + S.xz * minors.xz);
+    return each * (minors * v);
+}
 __device__ inline Sym no_inertia() {
     Sym S = {Real(0), Real(0), Real(0), Real(0), Real(0), Real(0)};
     return S;

@@ -25,11 +25,10 @@ INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocit
 INLINE void stick(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec& velocity,
                   Vec& spin) {
     const Surface& s = env.law.surface;
-    int p = plane_pair(b), start = contact_start(p);
     Real sum = Real(0), most = Real(0), each = reciprocal(s.reach);
     Vec arms = none();
-    for (int k = env.lanes.lane; k < contact_count(p); k += LANES) {
-        long long row = env.geometry + 4LL * problem.spheres[start + k];
+    for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
+        long long row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
         Vec arm = rotation * (problem.geometry.vector(row) - env.constants[b].com);
         arm.z = arm.z - problem.geometry.at(row + 3);
         Real far = each * (env.bodies[b].position.z - env.ground + arm.z);
@@ -50,13 +49,12 @@ INLINE void stick(const Problem& problem, const Environment& env, int b, const M
 }
 #endif
 
-#if MAGNET
+#if MAGNETS
 // Height of the lowest sphere of a body that the ground can touch, at least 0.
 __device__ Real height_of(const Problem& problem, const Environment& env, int b, const Mat& rotation) {
-    int p = plane_pair(b), start = contact_start(p);
     Real lowest = Real(Number(1e30));
-    for (int k = env.lanes.lane; k < contact_count(p); k += LANES) {
-        long long row = env.geometry + 4LL * problem.spheres[start + k];
+    for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
+        long long row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
         Vec arm = problem.geometry.vector(row) - env.constants[b].com;
         Real low = dot(rotation.z, arm) - problem.geometry.at(row + 3);
         if (plain(low) < plain(lowest)) lowest = low;
@@ -74,11 +72,15 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
     // the tiny number keeps the derivative finite at rest
     Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
     Vec a = w.acceleration - drag * u + w.magnus * cross(omega, u);
-#if MAGNET
-    a.z = a.z - w.magnet * exponential(-height_of(problem, env, b, rotation) * reciprocal(w.magnet_range));
+#if MAGNETS
+    Real height = height_of(problem, env, b, rotation);
+    for (int i = 0; i < MAGNETS; i++) a.z = a.z - w.magnets[i] * exponential(-height * reciprocal(w.magnet_ranges[i]));
 #endif
     velocity = velocity + h * a;
     spin = spin - h * w.spin_damping * body.spin;
+#if TWISTED
+    spin = spin + h * (rotation * solved(env.constants[b].inverse_inertia, transposed(rotation, w.twist)));
+#endif
 #if SURFACE
     stick(problem, env, b, rotation, velocity, spin);
 #endif

@@ -28,10 +28,16 @@ struct Body {
 };
 
 // Accelerations of the free bodies in flight: a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with
-// u = v - wind and the height of the lowest sphere, and angular acceleration -d omega.
+// u = v - wind and the height of the lowest sphere, summed over the magnets, and angular acceleration twist - d omega.
 struct Wrenches {
-    Real linear_drag, quadratic_drag, magnus, spin_damping, magnet, magnet_range;
+    Real linear_drag, quadratic_drag, magnus, spin_damping;
     Vec acceleration, wind;
+#if TWISTED
+    Vec twist;
+#endif
+#if MAGNETS
+    Real magnets[MAGNETS], magnet_ranges[MAGNETS];
+#endif
 };
 
 struct Constants {
@@ -93,9 +99,17 @@ INLINE void load(const Problem& problem, Environment& env) {
     w.spin_damping = table.at(at + 3);
     w.acceleration = table.vector(at + 4);
     w.wind = table.vector(at + 7);
-    w.magnet = table.at(at + 10);
-    w.magnet_range = table.at(at + 11);
-    at += 12;
+    at += 10;
+#if TWISTED
+    w.twist = table.vector(at);
+    at += 3;
+#endif
+#if MAGNETS
+    for (int i = 0; i < MAGNETS; i++, at += 2) {
+        w.magnets[i] = table.at(at);
+        w.magnet_ranges[i] = table.at(at + 1);
+    }
+#endif
 #endif
 #if SURFACE
     Surface& s = env.law.surface;

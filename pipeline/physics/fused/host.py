@@ -17,10 +17,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from ...compiler import compiler
+from ...threads import kernel_threads
 from ..driven import Drive
 from ..rollout import Rollout
 from ..world import State, World
@@ -93,7 +93,7 @@ def simulate_on_host(
 
 def _launch(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
     pointers = [ctypes.c_void_p(None if tensor is None else tensor.data_ptr()) for tensor in tensors]
-    threads = max(1, min(torch.get_num_threads(), numbers[0] // THREAD_ROLLOUTS))
+    threads = max(1, min(kernel_threads(), numbers[0] // THREAD_ROLLOUTS))
     _library(structure).run(ctypes.c_int(threads), *pointers, *(ctypes.c_int(number) for number in numbers))
 
 

@@ -96,12 +96,15 @@ def pack(
     pairs = tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world))
     single = world.gravity.dtype == torch.float32
     starts = [sum(body.radii.shape[-1] for body in world.bodies[:index]) for index in range(len(world.bodies))]
+    listed, lowest = _contact_spheres(world, starts), ()
+    if wrenches.takes_heights(world):
+        listed, lowest = _with_lowest(world, starts, listed)
     structure = Structure(
-        single, False, 1, record, bool(effects), wrenches.has_magnet(world), turned,
+        single, False, 1, record, bool(effects), wrenches.magnets(world), wrenches.is_twisted(world), turned,
         tuple(body.free for body in world.bodies),
         tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
-        tuple(body.radii.shape[-1] for body in world.bodies), pairs, surface=wrenches.has_surface(world),
-        elliptic=wrenches.has_ellipse(world),
+        tuple(body.radii.shape[-1] for body in world.bodies), pairs, lowest,
+        surface=wrenches.has_surface(world), elliptic=wrenches.has_ellipse(world),
     )  # fmt: skip
     return Packed(
         structure,
@@ -110,7 +113,7 @@ def pack(
         _joined(spheres, batch),
         _joined([row for row, _ in rows.values()], batch) if rows else times.new_zeros(1, 0, 14),
         numbers,
-        _contact_spheres(world, starts),
+        listed,
         _drive_starts(rows, times),
         _joined([last[:, None] for _, last in rows.values()], batch).to(torch.int32)
         if rows
@@ -180,10 +183,35 @@ def _contact_spheres(world: World, starts: list[int]) -> Tensor:
     for a, b in pairs_of(world):
         on_plane = world.bodies[a].on_plane if b == GROUND else None
         for index in (a,) if b == GROUND else (b, a):
-            radii = world.bodies[index].radii
-            every = torch.arange(radii.shape[-1], device=radii.device)
-            parts.append((every if on_plane is None else on_plane) + starts[index])
+            parts.append(_rows(world.bodies[index], on_plane, starts[index]))
     return torch.cat(parts).to(torch.int32)
+
+
+def _rows(body: Body, chosen: Tensor | None, start: int) -> Tensor:
+    every = torch.arange(body.radii.shape[-1], device=body.radii.device)
+    return (every if chosen is None else chosen) + start
+
+
+def _with_lowest(world: World, starts: list[int], listed: Tensor) -> tuple[Tensor, tuple[tuple[int, int], ...]]:
+    """Return the list of spheres, and where in it those are that may be the lowest of each body, and how many.
+
+    They are those of the contacts with the ground; of bodies that touch nothing they are added at the end.
+    """
+    pairs, lowest, begin = pairs_of(world), [], 0
+    within = {}
+    for pair in pairs:
+        count = slot_count(world, pair)
+        if pair[1] == GROUND:
+            within[pair[0]] = (begin, count)
+        begin += count
+    for index, body in enumerate(world.bodies):
+        if index in within or not body.free or world.ground_normal is None:
+            lowest.append(within.get(index, (0, 0)))
+            continue
+        rows = _rows(body, body.on_plane, starts[index]).to(torch.int32)
+        lowest.append((len(listed), len(rows)))
+        listed = torch.cat((listed, rows))
+    return listed, tuple(lowest)
 
 
 def _joined(parts: list[Tensor], batch: int) -> Tensor:

@@ -17,7 +17,8 @@ from .surface_source import SURFACE
 
 THREADS = 32
 """Of a block: one warp, so that few environments still spread over all multiprocessors."""
-BODY_COLUMNS, WRENCH_COLUMNS, SURFACE_COLUMNS, TURN_COLUMNS, WORLD_COLUMNS = 23, 12, 22, 4, 5
+BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 2, 22
+TURN_COLUMNS, WORLD_COLUMNS = 4, 5
 MOTION_COLUMNS = 13
 """The last ones of a body: position, orientation, velocity and spin."""
 _BUSY_THREADS = 262_144
@@ -51,11 +52,13 @@ class Structure:
     """The constants of a kernel.
 
     single: float32, else float64; dual: with a derivative in one direction; lanes: threads of an environment, a power
-    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnet: one of them by the
-    ground's pull; turned: whether the frame of bodies that touch each other is not the world's; free (bodies,); drives
-    (bodies,): number of the drive, -1 without; spheres (bodies,): how many; pairs: bodies that may touch, -1 for the
-    ground, each with its number of contacts; carried: whether each launch goes on where the one before ended; surface:
-    effects of the contact of one body with the ground; elliptic: one of them is friction that depends on the direction.
+    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnets: how many of them
+    are the ground's pull; twisted: whether there is a constant angular one; turned: whether the frame of bodies that
+    touch each other is not the world's; free (bodies,); drives (bodies,): number of the drive, -1 without; spheres
+    (bodies,): how many; pairs: bodies that may touch, -1 for the ground, each with its number of contacts; lowest
+    (bodies,): first row and number of the spheres whose heights count, where heights do; carried: whether each launch
+    goes on where the one before ended; surface: effects of the contact of one body with the ground; elliptic: one of
+    them is friction that depends on the direction.
     """
 
     single: bool
@@ -63,12 +66,14 @@ class Structure:
     lanes: int
     record: bool
     effects: bool
-    magnet: bool
+    magnets: int
+    twisted: bool
     turned: bool
     free: tuple[bool, ...]
     drives: tuple[int, ...]
     spheres: tuple[int, ...]
     pairs: tuple[tuple[int, int, int], ...]
+    lowest: tuple[tuple[int, int], ...] = ()
     carried: bool = False
     surface: bool = False
     elliptic: bool = False
@@ -87,7 +92,8 @@ class Structure:
     def table_width(self) -> int:
         """Numbers of an environment."""
         world = WORLD_COLUMNS + self.turned * TURN_COLUMNS
-        world += self.effects * WRENCH_COLUMNS + self.surface * SURFACE_COLUMNS
+        world += self.effects * WRENCH_COLUMNS + self.twisted * TWIST_COLUMNS + self.magnets * MAGNET_COLUMNS
+        world += self.surface * SURFACE_COLUMNS
         return world + len(self.free) * BODY_COLUMNS
 
     @property
@@ -103,8 +109,8 @@ class Structure:
         held = unrolled and not paired and not (self.record and self.slots > _FREE_SLOTS[False, False])
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
-            "RECORD": self.record, "EFFECTS": self.effects, "MAGNET": self.magnet, "SURFACE": self.surface,
-            "ELLIPTIC": self.elliptic, "TURNED": self.turned,
+            "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
+            "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
@@ -119,7 +125,7 @@ class Structure:
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
             "contact_start": _starts([count for _, _, count in self.pairs]),
-            "plane_pair": [_plane_pair(self.pairs, index) for index in range(len(self.free))],
+            "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]
         parts = (ARITHMETIC, SURFACE, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT)
@@ -134,11 +140,6 @@ def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired
     while lanes < min(wanted, 32):
         lanes *= 2
     return lanes
-
-
-def _plane_pair(pairs: Sequence[tuple[int, int, int]], body: int) -> int:
-    """Return the number of the pair of a body with the ground, -1 without."""
-    return next((number for number, (a, b, _) in enumerate(pairs) if a == body and b < 0), -1)
 
 
 def _starts(counts: Sequence[int]) -> list[int]:

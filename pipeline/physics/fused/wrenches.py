@@ -18,6 +18,7 @@ from ..effects.ground_magnet import GroundMagnet
 from ..effects.linear_drag import LinearDrag
 from ..effects.magnus_lift import MagnusLift
 from ..effects.quadratic_drag import QuadraticDrag
+from ..effects.residual_wrench import ResidualWrench
 from ..effects.rolling_resistance import RollingResistance
 from ..effects.spin_damping import SpinDamping
 from ..effects.stribeck_friction import StribeckFriction
@@ -27,7 +28,17 @@ from ..effects.viscous_friction import ViscousFriction
 from ..effects.wind import Wind
 from ..world import World
 
-_KNOWN = (LinearDrag, QuadraticDrag, MagnusLift, SpinDamping, ConstantForce, Buoyancy, Wind, GroundMagnet)
+_KNOWN = (
+    LinearDrag,
+    QuadraticDrag,
+    MagnusLift,
+    SpinDamping,
+    ConstantForce,
+    Buoyancy,
+    Wind,
+    GroundMagnet,
+    ResidualWrench,
+)
 _DIRECTED = (AnisotropicFriction, FrictionPatch)
 _SURFACE = (
     *_DIRECTED, Adhesion, RollingResistance, StribeckFriction, TorsionalFriction, VelocityRestitution, ViscousFriction,
@@ -42,11 +53,11 @@ def reason_against(world: World) -> str | None:
     for effect in acting:
         if type(effect) not in (*_KNOWN, *_SURFACE):  # a user's subclass of a known one is another effect
             return f"the kernel does not have its effect '{effect.name}'"
-    for kind in (GroundMagnet, *_SURFACE):
+    for kind in _SURFACE:
         if sum(isinstance(effect, kind) for effect in acting) > 1:
             return f"the kernel takes one {kind.name}, and it has several"
-        if kind in (GroundMagnet, Adhesion) and not world.touching and any(isinstance(e, kind) for e in acting):
-            return f"the kernel finds the height for {kind.name} by contacts, and its bodies do not touch anything"
+    if not world.touching and any(isinstance(effect, Adhesion) for effect in acting):
+        return f"the kernel finds the height for {Adhesion.name} by contacts, and its bodies do not touch anything"
     return _against_surface(world, acting)
 
 
@@ -66,9 +77,19 @@ def _acts(effect: Effect) -> bool:
     return any(effect.has(hook) for hook in ("flow", "wrench", "contact"))
 
 
-def has_magnet(world: World) -> bool:
-    """Whether the ground pulls."""
-    return any(isinstance(active.effect, GroundMagnet) for active in world.effects)
+def magnets(world: World) -> int:
+    """Return how many pulls the ground has."""
+    return sum(isinstance(active.effect, GroundMagnet) for active in world.effects)
+
+
+def takes_heights(world: World) -> bool:
+    """Whether heights over the ground are needed for more than contacts."""
+    return magnets(world) > 0 or has_surface(world)
+
+
+def is_twisted(world: World) -> bool:
+    """Whether a constant angular acceleration acts."""
+    return any(isinstance(active.effect, ResidualWrench) for active in world.effects)
 
 
 def has_surface(world: World) -> bool:
@@ -84,16 +105,17 @@ def has_ellipse(world: World) -> bool:
 def coefficients(world: World) -> list[Tensor]:
     """Return the coefficients (1 or B, k) of the effects, world frame; none where no effect acts.
 
-    In this order: c, k, s, d; f (3) with the buoyancy; wind (3); A, l of the ground's pull:
-    a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with u = v - wind, and alpha = -d omega. Then those of
-    the contact, where there are any, in the order of `Surface` in the source.
+    In this order: c, k, s, d; f (3) with the buoyancy; wind (3); a constant angular acceleration (3) where there is
+    one; A, l of each of the ground's pulls: a = -(c + k |u|) u + s omega x u + f - sum A exp(-height / l) n with
+    u = v - wind, and alpha = twist - d omega. Then those of the contact, where there are any, in the order of `Surface`
+    in the source.
     """
     if not any(_acts(active.effect) for active in world.effects):
         return []
     zero = torch.zeros_like(world.gravity[:1, :1])
-    linear = quadratic = magnus = damping = magnet = zero
+    linear = quadratic = magnus = damping = zero
     still = torch.zeros_like(world.gravity[:1])
-    force, wind, reach = still, still, zero + 1.0
+    force, wind, twist, pulls = still, still, still, []
     for active in world.effects:
         values = {name: value[:, None] for name, value in active.values.items()}
         match active.effect:
@@ -112,8 +134,11 @@ def coefficients(world: World) -> list[Tensor]:
             case Wind() as effect:
                 wind = wind + effect.along(active.values, world.up)
             case GroundMagnet():
-                magnet, reach = values["A"], values["l"]
-    found = [linear, quadratic, magnus, damping, force, wind, magnet, reach]
+                pulls += [values["A"], values["l"]]
+            case ResidualWrench() as effect:
+                force = force + effect.acceleration(active.values)
+                twist = twist + effect.angular_acceleration(active.values)
+    found = [linear, quadratic, magnus, damping, force, wind, *([twist] if is_twisted(world) else []), *pulls]
     return [*found, *_surface(world, zero)] if has_surface(world) else found
 
 
