@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import importlib
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from . import kernel_cache
 
 
 @cache
@@ -25,12 +28,20 @@ def available() -> bool:
 
 
 def compiled(source: str, name: str, device: int) -> Any:
-    """Return the kernel of that name for a device; the caller keeps it."""
+    """Return the kernel of that name for a device, built or taken from an earlier process; the caller keeps it."""
     core = _core()
     core.Device(device).set_current()
     major, minor = torch.cuda.get_device_capability(device)
-    options = core.ProgramOptions(std="c++17", arch=f"sm_{major}{minor}")
-    return core.Program(source, "c++", options).compile("cubin").get_kernel(name)
+    options = {"std": "c++17", "arch": f"sm_{major}{minor}"}
+
+    def build(work: Path) -> Path:
+        found = core.Program(source, "c++", core.ProgramOptions(**options)).compile("cubin")
+        (work / "kernel.cubin").write_bytes(bytes(found.code))
+        return work / "kernel.cubin"
+
+    recipe = "\n".join((f"cuda.core {core.__version__}, CUDA {torch.version.cuda}", *options.values(), source))
+    program = kernel_cache.built(recipe, ".cubin", build, lambda file: core.ObjectCode.from_cubin(file.read_bytes()))
+    return program.get_kernel(name)
 
 
 def launch(

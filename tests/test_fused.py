@@ -631,6 +631,18 @@ def test_a_kernel_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
         host._built(source)
 
 
+@NEEDS_GPU
+def test_a_kernel_for_the_gpu_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = 'extern "C" __global__ void answer(double *to, int k) { to[0] = k; }'
+    core, to = nvrtc._core(), torch.zeros(1, dtype=F64, device="cuda")
+    for k in (41, 42):
+        nvrtc.launch(nvrtc.compiled(source, "answer", 0), to.device, 1, 1, (to,), np.int32(k))
+        assert to.item() == k
+        assert [path.suffix for path in (tmp_path / "cgwm" / "kernels").iterdir()] == [".cubin"]
+        monkeypatch.setattr(core, "Program", None)
+
+
 def test_which_derivatives_want_the_torch_engine() -> None:
     world, state, driven = crowd()
     commands = {name: Drive.of([track], state.position_m) for name, track in driven.items() if isinstance(track, Track)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,6 @@ from torch.autograd import forward_ad
 
 from ..compiler import compiler
 from .detection import pairs_of, slot_count
-from .devices import on_device
 from .driven import Drive
 from .fused import simulate_fused, unsupported
 from .fused.host import lacking, simulate_on_host
@@ -46,12 +44,9 @@ def rollout(
     """
     home = world.gravity.device
     if world.rolls_on not in (None, home.type) and home.type == "cpu":
-        away = on_device(replace(world, rolls_on=None), world.rolls_on)
-        reason = unsupported(away) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
+        reason = unsupported(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
         if reason is None:
-            state, times_s = on_device((state, times_s), world.rolls_on)
-            driven = {name: on_device(command, world.rolls_on) for name, command in (driven or {}).items()}
-            return on_device(simulate_fused(away, state, times_s, driven, record_contacts), home)
+            return simulate_fused(world, state, times_s, driven, record_contacts)
         _note(reason)
     run, against = (simulate_fused, unsupported) if home.type == "cuda" else (simulate_on_host, lacking)
     reason = against(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)

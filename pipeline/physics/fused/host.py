@@ -7,11 +7,9 @@ operations on small tensors, each of which costs more to begin than to do.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import os
 import platform
 import subprocess
-import tempfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -19,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from ... import kernel_cache
 from ...compiler import compiler
 from ...threads import kernel_threads
 from ..driven import Drive
@@ -117,33 +116,14 @@ def _built(source: str) -> ctypes.CDLL:
     """Build a source, or take what an earlier run built of it."""
     command = compiler()
     assert command is not None  # see lacking
-    recipe = "\n".join((command, platform.machine(), str(Path(command).stat().st_mtime_ns), *FLAGS, source))
-    name = hashlib.sha256(recipe.encode()).hexdigest()[:32]
-    kept = _folder()
-    if kept is not None and (kept / f"{name}.so").exists():
-        return ctypes.CDLL(str(kept / f"{name}.so"))
-    # an interrupt kills the compiler, which then leaves what it had in its own temporary files: they lie here, too
-    with tempfile.TemporaryDirectory(dir=kept, prefix="build-", ignore_cleanup_errors=True) as work:
-        program, library = Path(work) / "rollout.cpp", Path(work) / "rollout.so"
+
+    def build(work: Path) -> Path:
+        program, library = work / "rollout.cpp", work / "rollout.so"
         program.write_text(source, encoding="utf-8")
         steps = [command, *FLAGS, str(program), "-o", str(library)]
-        own = os.environ | {"TMPDIR": work}
+        own = os.environ | {"TMPDIR": str(work)}
         subprocess.run(steps, check=True, capture_output=True, text=True, timeout=BUILD_S, env=own)
-        if kept is None:
-            return ctypes.CDLL(str(library))
-        # in one step: other processes see all of it or nothing
-        library.replace(kept / f"{name}.so")
-    return ctypes.CDLL(str(kept / f"{name}.so"))
+        return library
 
-
-def _folder() -> Path | None:
-    """Return where built kernels are kept; None where that cannot be written, or another user could."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    folder = Path(base) / "cgwm" / "kernels"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = folder.stat()
-    except OSError:
-        return None
-    safe = status.st_uid == os.getuid() and not status.st_mode & 0o022
-    return folder if safe and os.access(folder, os.W_OK) else None
+    recipe = "\n".join((command, platform.machine(), str(Path(command).stat().st_mtime_ns), *FLAGS, source))
+    return kernel_cache.built(recipe, ".so", build, lambda library: ctypes.CDLL(str(library)))

@@ -19,7 +19,7 @@ from ..records import ContactRecord
 from ..rollout import Rollout
 from ..rotation import quat_conjugate, quat_multiply, quat_rotate
 from ..world import State, World
-from .launch import launch
+from .launch import launch, launch_away
 from .packing import Packed, pack, reason_against
 from .structure import Structure, lanes_for
 
@@ -32,8 +32,8 @@ FRAME_WIDTH, _LABEL_WIDTH = 16, 12
 
 
 def unsupported(world: World) -> str | None:
-    """Return why the fused kernel cannot take a world; None where it can."""
-    if world.gravity.device.type != "cuda":
+    """Return why the fused kernel cannot take a world, which lies or rolls on CUDA; None where it can."""
+    if "cuda" not in (world.rolls_on, world.gravity.device.type):
         return f"its tensors are on the device '{world.gravity.device.type}', not on CUDA"
     if not nvrtc.available():
         return "cuda.core is not installed, which compiles the kernel (pip install 'cgwm[gpu]')"
@@ -48,7 +48,9 @@ def simulate_fused(
     record_contacts: bool = False,
     lanes: int | None = None,
 ) -> Rollout:
-    """Roll the world out from `state` in one kernel, as `simulate` does; all tensors on one CUDA device.
+    """Roll the world out from `state` in one kernel, as `simulate` does; all tensors on one CUDA device, or on the CPU.
+
+    A world on the CPU that rolls on CUDA (`World.rolls_on`) is packed on the CPU and sent in one piece.
 
     Forward derivatives (`forward_ad`, `batched_jacobian`) of poses and velocities are exact: the same program runs on
     dual numbers. There are none of the contact record, and none in reverse.
@@ -71,7 +73,8 @@ def simulate_fused(
     reason = unsupported(world)
     if reason is not None:
         raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use simulate, which can.")
-    return roll(launch, world, state, times_s, driven, record_contacts, lanes)
+    run = launch if world.gravity.is_cuda else launch_away
+    return roll(run, world, state, times_s, driven, record_contacts, lanes)
 
 
 def roll(
