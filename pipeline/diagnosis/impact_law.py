@@ -83,12 +83,17 @@ def rebound_speed(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffec
     probe = _touched(impact, law, effects, slip, None)
     springs = [active for active in effects if active.effect.has("contact")] if _changes_spring(probe, law) else []
 
+    def numbers(tau: Tensor, zeta: Tensor) -> tuple[Tensor, Tensor]:
+        return tau.square().reciprocal(), 2 * zeta / tau
+
+    stiffness, damping = numbers(law.contact_time_s, law.damping_ratio)
+
     def push(x: Tensor, u: Tensor) -> Tensor:
-        tau, zeta = law.contact_time_s, law.damping_ratio
-        if springs:
-            touch = _touched(impact, law, springs, slip + u[:, None] * impact.normal, None, x)
-            tau, zeta = touch.contact_time_s[:, 0], touch.damping_ratio[:, 0]
-        return -x / tau.square() - 2 * zeta * u / tau
+        if not springs:
+            return -stiffness * x - damping * u
+        touch = _touched(impact, law, springs, slip + u[:, None] * impact.normal, None, x)
+        k, c = numbers(touch.contact_time_s[:, 0], touch.damping_ratio[:, 0])
+        return -k * x - c * u
 
     before = push(x, u)
     for _ in range(STEPS):
@@ -111,19 +116,19 @@ def after_impact(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect
     across = tangent_axes(normal)[1:]  # (2, 3)
     twist = impact.before
     slice_ = impact.impulse / SLICES
-    flat = across @ k @ across.T
+    stopping = -torch.linalg.inv(across @ k @ across.T)
+    by_slice = slice_[:, None] * ((k @ normal) @ across.T)
+    spun = torch.linalg.inv(impact.inertia)
     for _ in range(SLICES):
         u = point_velocity(twist, impact.arm)
         touch = _touched(impact, law, effects, u, twist[:, 3:])
         # the impulse that would end the slip, less what the normal one does to it
-        slip = u @ across.T + slice_[:, None] * (k @ normal) @ across.T
-        wanted = -torch.linalg.solve(flat, slip[..., None])[..., 0]
+        slip = u @ across.T + by_slice
+        wanted = (stopping @ slip[..., None])[..., 0]
         friction = within_cone(wanted, slip, _cone(touch), slice_)
         push = slice_[:, None] * normal + friction @ across
         turn = torch.linalg.cross(impact.arm, push)
-        twist = twist + torch.cat(
-            [push / impact.mass[:, None], torch.linalg.solve(impact.inertia, turn[..., None])[..., 0]], -1
-        )
+        twist = twist + torch.cat([push / impact.mass[:, None], (spun @ turn[..., None])[..., 0]], -1)
         twist = _braked(impact, touch, slice_, twist)
     return twist
 
