@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import t as student
 from torch import Tensor
 
 from ..datasets.tracks import Track
@@ -25,6 +24,7 @@ from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .estimation.warmup import flight_frames
 from .physics.parameters import Parameter, apply_parameters
 from .physics.world import World
+from .tails import student_quantile
 from .window_errors import ROBUST_SCALE, WindowErrors
 
 Array = NDArray[np.float64]
@@ -116,7 +116,7 @@ def fit_first_contacts(
         rows, _ = residuals(solution.shared, solution.states, False)
         errors = WindowErrors.of(rows, solution, observations, np.zeros(len(observations.names), bool))
         factor, dof = errors.factor(len(names))
-        missed = factor * (student.ppf(0.975, dof) / REACH) ** 2 * inverse(solution.information.numpy())
+        missed = factor * (student_quantile(0.975, dof) / REACH) ** 2 * inverse(solution.information.numpy())
         covariance = _wider(covariance, missed)
     std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
@@ -164,7 +164,7 @@ def few_covariance(information: Array, scores: Array, prior: Array | None = None
         return scatter
     if count < 2:
         return curvature
-    return _wider(curvature, count / (count - 1) * (student.ppf(0.975, count - 1) / REACH) ** 2 * scatter)
+    return _wider(curvature, count / (count - 1) * (student_quantile(0.975, count - 1) / REACH) ** 2 * scatter)
 
 
 def _wider(covariance: Array, other: Array) -> Array:

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import t as student
 from torch import Tensor
 
 from ..datasets.tracks import Track
@@ -31,6 +30,7 @@ from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
 from .first_contacts import ITERATIONS, MODEL_ERROR, FirstContacts, correlation_of, described, windows_of
 from .physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from .physics.world import World
+from .tails import student_quantile
 from .window_errors import ROBUST_SCALE, WindowErrors
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ def fit_own_numbers(
         return result
     at = int(np.flatnonzero(owner == numbers.index(GROUND_SHIFT))[0])
     z, std = float(found.values[at]), float(np.sqrt(found.covariance[at, at]))
-    ground = described(GROUND_SHIFT, z, std, float(student.ppf(0.975, found.dof)))
+    ground = described(GROUND_SHIFT, z, std, student_quantile(0.975, found.dof))
     moved = replace(result.world, ground_offset=result.world.ground_offset + ground.estimate)
     record = result.record | {"ground_shift_m": ground.estimate}
     return replace(result, world=moved, ground=ground, record=record)
@@ -279,7 +279,7 @@ def _result(
     groups: Mapping[str, str],
     solution: Solution,
 ) -> FirstContacts:
-    reach, rows, centres = float(student.ppf(0.975, found.dof)), [], []
+    reach, rows, centres = student_quantile(0.975, found.dof), [], []
     own: dict[str, dict[str, float]] = {}
     spread: dict[str, float] = {}
     for k, (p, _) in enumerate(wanted):
@@ -293,7 +293,7 @@ def _result(
         centre, count = float(np.clip(found.mean[at[0]], *p.limits)), len(at)
         spread[p.name] = float(found.tau[at[0]])
         error = float(np.sqrt((found.tau[at[0]] ** 2 + (std**2).mean()) / count))
-        mean = described(p, centre, error, float(student.ppf(0.975, max(count - 1, 1))))
+        mean = described(p, centre, error, student_quantile(0.975, max(count - 1, 1)))
         note = f"mean over {count} {p.shared}s, which differ by {spread[p.name]:.3g} {p.unit} (standard deviation)"
         rows.append(mean.model_copy(update={"note": note}))
         centres.append(centre)

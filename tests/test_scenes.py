@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -302,9 +303,16 @@ def test_photos_have_features_and_markers_where_the_manifest_says(film_set: Set)
     assert np.median(np.linalg.norm(offsets, axis=1)) < 1.0
 
 
-def test_same_arguments_same_bytes(fall: Path, tmp_path: Path) -> None:
-    again = make_scene("fall", tmp_path / "again", seed=2, **SMALL)
-    assert sha256(again) == sha256(fall)
+@pytest.mark.parametrize("make", [made, pytest.param(make_scene, marks=pytest.mark.evidence)])
+def test_same_arguments_same_bytes(fall: Path, tmp_path: Path, make: Callable[..., Path]) -> None:
+    """From one plan, and from one that is planned anew."""
+    assert sha256(make("fall", tmp_path / "again", seed=2, **(SMALL if make is make_scene else {}))) == sha256(fall)
+
+
+def test_a_plan_repeats_itself(push: Path) -> None:
+    again = plan_scene("push", 1)
+    for one, other in zip(planned("push", 1).episodes, again.episodes, strict=True):
+        np.testing.assert_array_equal(one.motion.qpos, other.motion.qpos)
 
 
 def test_the_truth_is_that_of_the_plan_and_seeds_differ(fall: Path) -> None:

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.stats import chi2 as chi2_law
 
 from ..physics.effects.effect import ActiveEffect
 from ..physics.world import World
+from ..tails import chi2_tail
 from .candidates import Candidate, base_parameters, base_values
 from .refit import Refit, refit
 from .score import ScoreTest
@@ -92,6 +92,6 @@ def _evidence(candidate: Candidate, fitted: Refit, gain: float, count: float) ->
     penalty = size * float(np.log(count))
     estimate = np.array([value for value, _ in numbers.values()])
     covariance = np.diag([std**2 for _, std in numbers.values()])
-    p_value = float(chi2_law.sf(max(gain, 0.0), size))
+    p_value = chi2_tail(max(gain, 0.0), size)
     test = ScoreTest(gain, size, p_value, estimate, covariance, True)
     return Evidence(candidate, {}, test, p_value, refitted=fitted, delta_bic=penalty - gain, numbers=numbers)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
 
 from ..physics.world import World
+from ..tails import chi2_tail
 from .candidates import base_values
 from .score import Picture, picture, solved
 from .segments import Segments
@@ -82,4 +82,4 @@ def _over(
     shared = float(values @ by_unit.sum(0) @ values) / dispersion
     excess = max(statistic - dof, 0.0)
     share = shared / (shared + excess) if shared + excess > 0 else 1.0
-    return Consistency(statistic, dof, float(chi2_law.sf(statistic, dof)) if dof > 0 else 1.0, share)
+    return Consistency(statistic, dof, chi2_tail(statistic, dof) if dof > 0 else 1.0, share)

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
 
 from ..physics.parameters import GROUND_SHIFT
 from ..physics.world import World
+from ..tails import chi2_tail
 from .candidates import Candidate, Variant, admissible, base_parameters, variants_of
 from .linear import robust_excess
 from .prepared import Prepared
@@ -171,7 +171,7 @@ def _test(found: RobustFit, without: RobustFit) -> ScoreTest:
     covariance = np.linalg.inv(found.information)[count:, count:].astype(np.float64)
     # at a bound an effect does nothing: its sign would have to be the other
     acts = bool((estimate != 0.0).any())
-    return ScoreTest(statistic, len(estimate), float(chi2_law.sf(statistic, len(estimate))), estimate, covariance, acts)
+    return ScoreTest(statistic, len(estimate), chi2_tail(statistic, len(estimate)), estimate, covariance, acts)
 
 
 def reweighted(seen: Picture, columns: Sequence[int]) -> Picture:

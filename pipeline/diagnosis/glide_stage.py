@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.stats import chi2 as chi2_law
 from torch import Tensor
 
 from ..physics.contact import ContactLaw
 from ..physics.effects.effect import ActiveEffect
 from ..physics.parameters import FRICTION, GROUND_SHIFT, Parameter, effect_parameters
 from ..physics.world import State, World
+from ..tails import chi2_tail
 from .candidates import Candidate, Variant, admissible, base_parameters, base_values, variants_of, with_variants
 from .glide_fits import ITERATIONS, GlideFit, fit_groups, soft_world
 from .glides import glides_of, settled
@@ -275,7 +275,7 @@ def _ranked(
         candidate, values = kept[variant.place], fit.values[0, -len(variant.parameters) :].numpy().astype(np.float64)
         gain, number = max(0.0, (base - fit.cost) / spread), len(values)
         covariance = torch.linalg.pinv(fit.information[0], hermitian=True)[-number:, -number:].numpy() * spread
-        p_value = float(chi2_law.sf(gain, number))
+        p_value = chi2_tail(gain, number)
         test = ScoreTest(gain, number, p_value, values, covariance, bool((values != 0).any()))
         names = [p.name for p in candidate.effect.parameters]
         deviations = np.sqrt(np.clip(np.diag(covariance), 0.0, None))

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.stats import chi2 as chi2_law
 from torch import Tensor
 
 from ..physics.parameters import CONTACT_PARAMETERS, Parameter
 from ..physics.world import World
+from ..tails import chi2_tail
 from .candidates import Candidate, Variant, admissible, variants_of
 from .cuts import Segment
 from .glide_fits import GlideFit
@@ -164,7 +164,7 @@ def _ranked(
         spread = spread - share[:, None] * spread[0]
         values = moved[-number:].numpy().astype(np.float64)
         covariance = spread[-number:, -number:].numpy().astype(np.float64)
-        p_value = float(chi2_law.sf(gain, number))
+        p_value = chi2_tail(gain, number)
         test = ScoreTest(gain, number, p_value, values, covariance, bool((values != 0).any()))
         deviations = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         names = [p.name for p in candidate.effect.parameters]

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import f as f_law
 
 from ..physics.contact import ContactLaw
 from ..physics.effects.effect import ActiveEffect
 from ..physics.parameters import Parameter
 from ..physics.world import World
+from ..tails import f_tail
 from .candidates import Candidate, Variant, admissible, base_values, variants_of, with_variants
 from .glide_stage import own_numbers
 from .impact_fits import BASE, ImpactFit, ImpactProblem, fit_impacts
@@ -204,7 +204,7 @@ def _ranked(
         part = int(np.argmax(falls / spread))
         share = float(falls[part] / max(base.fit.chi2[part] - degrees[part], 1.0))
         freedom = max(float(degrees.sum()) - number, 1.0)
-        p_value = float(f_law.sf(fall / number, number, freedom))
+        p_value = f_tail(fall / number, number, freedom)
         covariance = np.linalg.inv(fit.information)[-number:, -number:] * spread[part]
         test = ScoreTest(fall, number, p_value, values, covariance, bool((values != 0).any()))
         numbers = {

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
-from scipy.stats import norm
 
 from ..physics.fused.packing import reason_against
 from ..physics.parameters import Parameter
 from ..physics.world import World
+from ..tails import chi2_tail, normal_tail
 from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
 from .linear import Linear, projected
 from .segments import Segments, world_for
@@ -189,9 +188,9 @@ def score_test(
         return ScoreTest(0.0, 0, 1.0, estimate, covariance, True)
     if size == 1 and nonnegative[0]:
         z = float(np.sign(estimate[0]) * np.sqrt(statistic))
-        return ScoreTest(statistic if z > 0 else 0.0, 1, float(norm.sf(z)), estimate, covariance, z > 0)
+        return ScoreTest(statistic if z > 0 else 0.0, 1, normal_tail(z), estimate, covariance, z > 0)
     fine = not (size == len(given) and bool((shared[nonnegative] < 0).any()))
-    return ScoreTest(statistic, rank, float(chi2_law.sf(statistic, rank)), estimate, covariance, fine)
+    return ScoreTest(statistic, rank, chi2_tail(statistic, rank), estimate, covariance, fine)
 
 
 def gain_by_episode(seen: Picture, columns: Sequence[int], nuisance: Sequence[int] | None = None) -> Array:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
 from torch import Tensor
 
 from ..estimation.observations import Observations
@@ -17,6 +16,7 @@ from ..physics.effects.residual_wrench import ResidualWrench
 from ..physics.parameters import effect_parameters
 from ..physics.rotation import quat_rotate
 from ..physics.world import World
+from ..tails import chi2_tail
 from .cuts import Segment
 from .linear import linearised
 from .segment_states import fit_states
@@ -112,7 +112,7 @@ def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:
     score = np.einsum("nij,nj->ni", found.information, found.wrench)
     chi2 = float(np.einsum("ni,ni->", score, found.wrench)) / scatter
     dof = float(np.einsum("nij,nji->", found.information, found.covariance))
-    return Omnibus(chi2 / max(dof, 1e-9), dof, float(chi2_law.sf(chi2, max(dof, 1e-9))))
+    return Omnibus(chi2 / max(dof, 1e-9), dof, chi2_tail(chi2, max(dof, 1e-9)))
 
 
 def dispersion(segments: Segments, found: ResidualWrenches) -> float:
@@ -146,13 +146,13 @@ def organisers(found: ResidualWrenches) -> list[Organiser]:
         return total
 
     everywhere = gain(np.zeros(len(score)))
-    results = [Organiser("constant", _share(everywhere - 6, excess), everywhere, float(chi2_law.sf(everywhere, 6)))]
+    results = [Organiser("constant", _share(everywhere - 6, excess), everywhere, chi2_tail(everywhere, 6))]
     for name, values in found.coordinates.items():
         groups = values if name == "episode" else _bins(values)
         numbers = 6 * (len(np.unique(groups)) - 1)
         if numbers:
             more = gain(groups) - everywhere
-            results.append(Organiser(name, _share(more - numbers, excess), more, float(chi2_law.sf(more, numbers))))
+            results.append(Organiser(name, _share(more - numbers, excess), more, chi2_tail(more, numbers)))
     return sorted(results, key=lambda one: -one.share)
 
 
