@@ -11,7 +11,7 @@ from .options import AnyDevice, Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
-    from ..schemas import DiagnoseResult, NextExperiment, RankedEffect
+    from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, RankedEffect
 
 SHOWN = 8
 """So many candidates are listed; --json has all."""
@@ -83,6 +83,7 @@ def _summary(result: DiagnoseResult) -> str:
         lines.append(
             f"flight, mean chi2 of what is left: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
         )
+    lines += _limits(result.contact_limits)
     for entry in result.ranking:
         if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
             errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
@@ -98,6 +99,19 @@ def _summary(result: DiagnoseResult) -> str:
     if added:
         lines.append(f"Next: cgwm fit CAPTURE --from MODEL --effects {','.join(added)} --out NEW")
     return "\n".join([*lines, *warnings(result.warnings)])
+
+
+def _limits(limits: tuple[ContactLimit, ...]) -> list[str]:
+    """Return what contact could have shown; a silent diagnosis says nothing about less."""
+    seen = [f"{one.effect} from {_sizes(one)}" for one in limits if one.sizes]
+    blind = [one.effect for one in limits if not one.sizes]
+    lines = [f"contact would have shown, about: {'; '.join(seen)}"] if seen else []
+    return [*lines, *([f"contact can hardly judge: {', '.join(blind)}"] if blind else [])]
+
+
+def _sizes(limit: ContactLimit) -> str:
+    words = [f"{name} = {size:.2g} {limit.units[name]}".removesuffix(" 1") for name, size in limit.sizes.items()]
+    return ", ".join(words)
 
 
 def _experiment(found: NextExperiment) -> list[str]:

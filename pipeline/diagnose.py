@@ -13,6 +13,7 @@ import torch
 from ..datasets.capture import Capture
 from ..datasets.models import Model, read_model
 from ..schemas import (
+    ContactLimit,
     DiagnoseResult,
     EffectEstimate,
     FlightTest,
@@ -23,6 +24,7 @@ from ..schemas import (
     UsageError,
 )
 from .diagnosis.candidates import Candidate, admissible
+from .diagnosis.contact_limits import ContactLimit as FoundLimit
 from .diagnosis.episodes import diagnosed_episodes
 from .diagnosis.law_file import require_law_file, save_law
 from .diagnosis.next_throw import next_experiment
@@ -132,6 +134,7 @@ def report(
         flight_before=_flight_test(findings.before),
         flight_after=_flight_test(findings.after),
         contact_chi2=findings.contact_chi2,
+        contact_limits=tuple(_limit(one) for one in findings.limits),
         not_tested=dict(sorted(refused.items())),
         warnings=tuple(warnings),
     )
@@ -248,6 +251,11 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
         ),
         constants=evidence.constants,
     )
+
+
+def _limit(found: FoundLimit) -> ContactLimit:
+    units = {p.name: p.unit for p in found.candidate.effect.parameters if p.name in found.sizes}
+    return ContactLimit(effect=found.candidate.spec, sizes=found.sizes, units=units, constants=found.constants)
 
 
 def _finite(value: float) -> float | None:

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from .diagnosis.glide_fits import GlideFit, told_by_each
-from .diagnosis.glide_stage import StartedGlides, fitted_along, fitted_base, fitted_glides
+from .diagnosis.glide_fits import told_by_each
+from .diagnosis.glide_stage import StartedGlides, fitted_along, fitted_glides
 from .diagnosis.prepared import Prepared
 from .diagnosis.segments import world_for
 from .first_contacts import FirstContacts
-from .physics.contact import ContactLaw
 from .physics.effects import Effect
 from .physics.parameters import FRICTION
 from .physics.world import World
@@ -25,10 +24,9 @@ from .shown_effects import at_nothing, shown_effects
 
 @dataclass(frozen=True)
 class EffectGlides:
-    """Glides of episodes: started, without the effects that are wanted, and their fit with a friction alone."""
+    """Glides of episodes, started without the effects that are wanted."""
 
     started: StartedGlides
-    base: GlideFit
 
     @staticmethod
     def may_tell(effect: Effect) -> bool:
@@ -44,9 +42,7 @@ class EffectGlides:
             bare: The world without the effects that are wanted.
         """
         started = StartedGlides.of(prepared, bare, prepared.flight)
-        if started is None or not isinstance(bare.contact, ContactLaw):
-            return None
-        return EffectGlides(started, fitted_base(started, bare.contact))
+        return None if started is None else EffectGlides(started)
 
     def fit(self, world: World, names: Sequence[str]) -> FirstContacts:
         """Fit the effects at their constants, with the friction beside them and a start of each glide.
@@ -55,11 +51,11 @@ class EffectGlides:
             world: With the effects, and others.
             names: Of the effects.
         """
-        told = self.started.told
-        beside = replace(self.base.segments.world, effects=at_nothing(world, names).effects)
+        told, base = self.started.told, self.started.base
+        beside = replace(base.segments.world, effects=at_nothing(world, names).effects)
         parameters = fitted_along(beside, told)
-        begun = self.base.values[0, :2]  # friction and height; the effects at nothing
-        found = fitted_glides(beside, [], [(self.base.segments, begun)], told)[0]
+        begun = base.values[0, :2]  # friction and height; the effects at nothing
+        found = fitted_glides(beside, [], [(base.segments, begun)], told)[0]
         glides = replace(found.segments, world=world_for("contact", beside))
         information, score = told_by_each(glides, parameters, found.values[0])
         # none of the friction: it begins at what glides tell, and a prior there would tell what acts like it
@@ -68,7 +64,7 @@ class EffectGlides:
         friction = float(found.values[0, 0].exp())
         record = {
             "glides": len(glides.items),
-            "costs": [self.base.cost, found.cost],
+            "costs": [base.cost, found.cost],
             "chi2": excess,
             "friction": friction,
         }

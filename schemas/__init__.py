@@ -57,6 +57,7 @@ from .demo import (
     SplatCheck,
 )
 from .diagnose import (
+    ContactLimit,
     DiagnoseResult,
     EffectEstimate,
     FlightTest,
@@ -126,6 +127,7 @@ __all__ = [
     "CheckFailedError",
     "CompareResult",
     "ComparedParameter",
+    "ContactLimit",
     "ContactParameters",
     "Correlation",
     "DamagedShardError",

@@ -43,6 +43,16 @@ class RankedEffect(FileModel):
     constants: dict[str, float] = {}
 
 
+class ContactLimit(FileModel):
+    """From which size on an effect of contact would have been named, had it been there; about, and on the safe side."""
+
+    effect: str
+    sizes: dict[str, float] = {}
+    """By the names of its numbers, in their units; empty where no size would have shown."""
+    units: dict[str, str] = {}
+    constants: dict[str, float] = {}
+
+
 class NextExperiment(FileModel):
     """The motion that tells rivals apart best."""
 
@@ -147,6 +157,8 @@ class DiagnoseResult(FileModel):
     flight_after: FlightTest | None = None
     contact_chi2: float | None = None
     """Mean chi2 of short contact segments: what the contact law cannot do counts in it."""
+    contact_limits: tuple[ContactLimit, ...] = ()
+    """What contact could have shown, where it shows nothing: a verdict says nothing about smaller effects."""
     not_tested: dict[str, str] = {}
     """Candidates that these data cannot judge, and why."""
     warnings: tuple[str, ...] = ()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnosis.candidates import Candidate
+from cgwm.pipeline.diagnosis.contact_limits import ContactLimit, contact_limits
 from cgwm.pipeline.diagnosis.contact_search import GLIDE_SCORE, equal_in_glides
 from cgwm.pipeline.diagnosis.cuts import Segment
 from cgwm.pipeline.diagnosis.glide_fits import soft_world, without_loads
@@ -150,6 +151,36 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     after = with_effect(world, found[0])
     assert after.effects[-1].effect.name == name
     assert float(after.contact.friction[0]) == pytest.approx(0.22, rel=0.1)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY) -> dict[str, ContactLimit]:
+    started = StartedGlides.of(prepared, world, prepared.flight)
+    blind_to = ("velocity_restitution",)
+    found = contact_limits(started, world, library, (GLIDE_SCORE, 400.0), prepared.turned, blind_to)
+    return {one.candidate.effect.name: one for one in found}
+
+
+def test_from_the_limit_on_an_effect_is_named() -> None:
+    library = [*LIBRARY, *(Candidate(name, load_effect(name)) for name in ("friction_patch", "velocity_restitution"))]
+    found = limits(*rolls(), library)
+    assert "linear_drag" not in found  # it acts in flight
+    assert found["velocity_restitution"].sizes == {}
+    for name, number in (("rolling_resistance", "c_r"), ("torsional_friction", "c_t"), ("viscous_friction", "c_v")):
+        (limit,) = found[name].sizes.values()
+        for times, seen in ((1.1, True), (0.2, False)):
+            prepared, world = rolls({name: {number: times * limit}})
+            ranked = glide_evidence(prepared, world, LIBRARY, 20.0, StartedGlides.of(prepared, world, prepared.flight))
+            named = bool(ranked) and ranked[0].evidence.name == name and ranked[0].score > GLIDE_SCORE
+            assert named == seen, (name, times, limit, [(one.evidence.name, one.score) for one in ranked])
+
+
+def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
+    prepared, world = rolls()
+    worse = replace(prepared, noise=(3 * prepared.noise[0], 3 * prepared.noise[1]))
+    near, far = limits(prepared, world)["rolling_resistance"], limits(worse, world)["rolling_resistance"]
+    assert far.sizes["c_r"] == pytest.approx(3 * near.sizes["c_r"], rel=0.5)
+    tossed = prepare(world, tosses(world, 1, count=2, duration_s=0.3, height_m=(0.6, 0.7)))
+    assert limits(tossed, world) == {}
 
 
 def test_glides_are_silent_under_another_contact_law() -> None:

@@ -20,13 +20,13 @@ from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.driven import Drive
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
-from cgwm.pipeline.physics.effects.residual_wrench import AXES, ResidualWrench
 from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
+from cgwm.pipeline.physics.residual_wrench import AXES, ResidualWrench
 from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply, quat_rotate
 from cgwm.schemas import InputDataError, UsageError
 from torch import Tensor

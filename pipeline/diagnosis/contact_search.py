@@ -14,6 +14,7 @@ from ..physics.effects.effect import ActiveEffect
 from ..physics.effects.registry import CONTACT_ALIASES
 from ..physics.world import World
 from .candidates import Candidate, base_parameters, base_values, without_effect
+from .contact_limits import ContactLimit, contact_limits
 from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
 from .glide_stage import GlideEvidence, StartedGlides, glide_evidence, with_effect
 from .grip_stage import grip_evidence, named_by_grip
@@ -71,6 +72,23 @@ class Chosen:
     where: Literal["flight", "contact"]
 
 
+@dataclass(frozen=True)
+class ContactFindings:
+    """What flight and contact say together.
+
+    chosen: the selected effects, those of flight first; evidence: of contact; world: with them; chi2: per degree of
+    freedom of the segments of contact, None without contact; segments: those; limits: what contact could have shown,
+    where it shows nothing.
+    """
+
+    chosen: list[Chosen]
+    evidence: list[ContactEvidence]
+    world: World
+    chi2: float | None = None
+    segments: Segments | None = None
+    limits: tuple[ContactLimit, ...] = ()
+
+
 def with_contact(
     prepared: Prepared,
     world: World,
@@ -79,8 +97,8 @@ def with_contact(
     candidates: Sequence[Candidate],
     flight: Segments | None,
     explained: bool,
-) -> tuple[list[Chosen], list[ContactEvidence], World, float | None, Segments | None]:
-    """Return the selected effects, the evidence of contact, the world with them, chi2 / dof and segments of contact."""
+) -> ContactFindings:
+    """Return what contact leaves of the equals of flight, and what it names itself."""
     filled = [slot for slot in slots if slot.flagged]
     open_slots = [slot for slot in filled if len(slot.equals) > 1]
     clear_world = after_flight
@@ -89,7 +107,7 @@ def with_contact(
     fitted = fitted_contact(prepared, clear_world)
     if fitted is None:
         chosen = [Chosen(slot.best, slot.equals, "flight") for slot in filled]
-        return chosen, [], after_flight, None, None
+        return ContactFindings(chosen, [], after_flight)
     base, contact = fitted
     final, chosen = after_flight, []
     for slot in filled:
@@ -111,24 +129,30 @@ def with_contact(
     alike = equal_in_glides(glides, explained, bool(chosen))
     if alike:
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in glides]
-        return [*chosen, _chosen(alike)], told, with_effect(base.world, alike[0]), chi2, contact
+        return ContactFindings([*chosen, _chosen(alike)], told, with_effect(base.world, alike[0]), chi2, contact)
     impacts = impact_evidence(prepared, base.world, candidates)
     struck = named_by_impacts(impacts)
     if struck:
         told = [ContactEvidence(one.evidence, one.score, one.gain, one.t) for one in impacts]
-        return [*chosen, _chosen(struck)], told, with_impact_effect(base.world, struck[0]), chi2, contact
+        found = with_impact_effect(base.world, struck[0])
+        return ContactFindings([*chosen, _chosen(struck)], told, found, chi2, contact)
     gripped = named_by_grip(grip_evidence(prepared, base.world, contact, candidates, started))
     if gripped:
         told = [ContactEvidence(one.evidence, one.score, None, None) for one in gripped]
-        return [*chosen, _chosen(gripped)], told, with_effect(base.world, gripped[0]), chi2, contact
+        return ContactFindings([*chosen, _chosen(gripped)], told, with_effect(base.world, gripped[0]), chi2, contact)
     evidence = contact_evidence(contact, base.world, candidates, prepared.groups, prepared.turned)
     named = _named(evidence, glides)
     if named:
         found, numbers = _added(base.world, contact, named[0].evidence)
         if any(abs(value) > CONFIRMED * error for value, error in numbers.values()):
             first = replace(named[0], evidence=replace(named[0].evidence, numbers=numbers))
-            return [*chosen, _chosen([first, *named[1:]])], evidence, found, chi2, contact
-    return chosen, evidence, replace(final, contact=base.world.contact), chi2, contact
+            return ContactFindings([*chosen, _chosen([first, *named[1:]])], evidence, found, chi2, contact)
+    # what impacts alone show is left out where there are impacts
+    asked = [c for c in candidates if not impacts or c.effect.name not in IN_IMPACTS_ALONE]
+    scores = (GLIDE_SCORE, GLIDE_SCORE_FLEXIBLE)
+    limits = contact_limits(started, base.world, asked, scores, prepared.turned, IN_IMPACTS_ALONE)
+    final = replace(final, contact=base.world.contact)
+    return ContactFindings(chosen, evidence, final, chi2, contact, tuple(limits))
 
 
 def _chosen(equals: Sequence[GlideEvidence | ImpactEvidence | ContactEvidence]) -> Chosen:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..estimation.trajectory import STATE_SIZE
+from ..estimation.trajectory import STATE_SIZE, TrajectoryResiduals
 from ..physics.contact import ContactLaw
 from ..physics.parameters import Parameter
 from ..physics.rotation import quat_to_matrix
@@ -180,6 +180,31 @@ def _projected(
     information = _added(by_value.mT @ by_value - mixed.mT @ by_numbers, own, count)
     score = _added(-(by_value.mT @ error - mixed.mT @ by_slope)[..., 0], own, count)
     return information, score, by_slope, by_numbers
+
+
+def lasting_misfits(
+    segments: Segments, parameters: Sequence[Parameter], values: Tensor, others: Tensor, along: int
+) -> list[float]:
+    """Return what chi2 the first numbers alone leave (K,) of motions without noise that other numbers made.
+
+    Args:
+        segments: Glides with fitted states, from which the motions begin.
+        parameters: Numbers of their world (P), first those that are fitted.
+        values: What they are (P,), in fitted coordinates; from there the fits begin.
+        others: What made the motions (K, P).
+        along: How many are fitted.
+    """
+    count, each, free = len(segments.items), len(others), list(segments.observations.free)
+    every = segments.select(list(range(count)) * each)
+    seen = every.observations
+    made = TrajectoryResiduals(every.world, parameters, seen, *every.noise).rollout(
+        others.repeat_interleave(count, 0), torch.zeros(count * each, STATE_SIZE * len(free)).to(values)
+    )
+    seen = replace(seen, position_m=made.position_m[:, :, free], quat_wxyz=made.quat_wxyz[:, :, free])
+    group = torch.arange(each).repeat_interleave(count)
+    columns = torch.arange(along).expand(each, along)
+    found = fit_groups(replace(every, observations=seen), parameters, values.repeat(each, 1), columns, group)
+    return found.chi2.unflatten(0, (each, count)).sum(1).tolist()
 
 
 def _placed(segments: Segments, places: list[int], moved: Segments, taken: Tensor) -> Segments:

@@ -62,14 +62,16 @@ class GlideEvidence:
 class StartedGlides:
     """Glides, each with a start fitted with a friction of its own, before any effect is looked for.
 
-    segments: in the world with the soft contact; friction (1,): logarithm of the one that most tell; told: parameters
-    of what acts in flight, with the standard errors that flights leave them as priors. It acts in glides, too, and is
-    known no better there: an error of half a thousandth of a radian in a tilt is a millimetre in a slide of half a
-    second.
+    segments: in the world with the soft contact; friction (1,): logarithm of the one that most tell; base: their fit by
+    what the model has, with one friction for all; told:
+    parameters of what acts in flight, with the standard errors that flights leave them as priors. It acts in glides,
+    too, and is known no better there: an error of half a thousandth of a radian in a tilt is a millimetre in a slide
+    of half a second.
     """
 
     segments: Segments
     friction: Tensor
+    base: GlideFit
     told: tuple[Parameter, ...]
 
     @staticmethod
@@ -89,7 +91,9 @@ class StartedGlides:
         soft = soft_world(world)
         glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
         glides, friction = _started(glides, float(world.contact.friction[0]))
-        return StartedGlides(glides, friction, _told_by_flight(flight, soft, prepared.groups))
+        told = _told_by_flight(flight, soft, prepared.groups)
+        base = _base(glides, (friction, world.contact.friction[0].log().to(friction)), told)
+        return StartedGlides(glides, friction, base, told)
 
 
 def glide_evidence(
@@ -108,10 +112,8 @@ def glide_evidence(
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
     if started is None or not variants:
         return []
-    assert isinstance(world.contact, ContactLaw)  # see StartedGlides.of
-    glides, told = started.segments, started.told
+    glides, told, base = started.segments, started.told, started.base
     soft = glides.world
-    base = fitted_base(started, world.contact)
     degrees = float(glides.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
         return []
@@ -134,13 +136,12 @@ def glide_evidence(
     return _ranked(list(found.values()), kept, base, least_cost, degrees)
 
 
-def fitted_base(started: StartedGlides, law: ContactLaw) -> GlideFit:
-    """Return the fit of what the model has: from the friction that most glides tell, or from that of a law.
+def _base(glides: Segments, frictions: Sequence[Tensor], told: Sequence[Parameter]) -> GlideFit:
+    """Return the best fit of what the model has, from logarithms of frictions: that which most glides tell, its law's.
 
     A single glide may mislead the former, and a wrong friction is a valley of its own.
     """
-    begun = (started.friction, law.friction[0].log().to(started.friction))
-    tried = (fitted_glides(started.segments.world, [], [(started.segments, one)], started.told)[0] for one in begun)
+    tried = (fitted_glides(glides.world, [], [(glides, one)], told)[0] for one in frictions)
     return min(tried, key=lambda fit: fit.cost)
 
 

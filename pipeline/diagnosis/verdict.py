@@ -9,6 +9,7 @@ from typing import Literal
 from ..physics.world import World
 from .candidates import Candidate
 from .consistency import consistency
+from .contact_limits import ContactLimit
 from .contact_search import Chosen, with_contact
 from .contact_stage import ContactEvidence
 from .flight_search import flight_search
@@ -37,7 +38,8 @@ class Findings:
     before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
     candidates, the best first; contact: all contact evidence; world: with the selected effects; base: without them;
     errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect;
-    as_good: other laws that explain the flights as well as those of effects found.
+    as_good: other laws that explain the flights as well as those of effects found; limits: what contact could have
+    shown, where it shows nothing.
     """
 
     verdict: VerdictName
@@ -52,6 +54,7 @@ class Findings:
     base: World
     errors: dict[str, tuple[float, float]]
     as_good: tuple[OtherLaw, ...] = ()
+    limits: tuple[ContactLimit, ...] = ()
 
     @property
     def judged_in_contact(self) -> set[str]:
@@ -68,9 +71,8 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
     before = _worst_omnibus(pieces, scatter)
     slots, after_flight, flight = flight_search(prepared, world, candidates, scatter)
     flown = _worst_omnibus(_pieces(prepared, after_flight), scatter)
-    chosen, contact, final, chi2, fitted = with_contact(
-        prepared, world, after_flight, slots, candidates, flight, explained=not _is_left(flown)
-    )
+    touched = with_contact(prepared, world, after_flight, slots, candidates, flight, explained=not _is_left(flown))
+    chosen, final = touched.chosen, touched.world
     after = _worst_omnibus(_pieces(prepared, final), scatter) if chosen else before
     in_flight = [slot.best.name for slot in slots if slot.flagged]
     alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
@@ -85,10 +87,10 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
         verdict = "not_separable"
     elif chosen:
         verdict = "missing_effect"
-    ranking = _ranking(chosen, slots, contact)
+    ranking = _ranking(chosen, slots, touched.evidence)
     errors = {}
     for one in chosen if verdict != "unexplained" else []:
-        segments = flight if one.where == "flight" else fitted
+        segments = flight if one.where == "flight" else touched.segments
         if segments is not None:
             errors[one.evidence.name] = held_out_errors(segments, final, one.evidence.name)
     return Findings(
@@ -98,12 +100,13 @@ def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> F
         before,
         after,
         tuple(ranking),
-        tuple(contact),
+        tuple(touched.evidence),
         final,
-        chi2,
+        touched.chi2,
         world,
         errors,
         tuple(one for one in others if one.as_good),
+        touched.limits,
     )
 
 

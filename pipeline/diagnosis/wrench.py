@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..estimation.observations import Observations
 from ..physics.effects.effect import ActiveEffect
-from ..physics.effects.residual_wrench import ResidualWrench
 from ..physics.parameters import effect_parameters
+from ..physics.residual_wrench import ResidualWrench
 from ..physics.rotation import quat_rotate
 from ..physics.world import World
 from ..tails import chi2_tail

@@ -18,7 +18,6 @@ from ..effects.ground_magnet import GroundMagnet
 from ..effects.linear_drag import LinearDrag
 from ..effects.magnus_lift import MagnusLift
 from ..effects.quadratic_drag import QuadraticDrag
-from ..effects.residual_wrench import ResidualWrench
 from ..effects.rolling_resistance import RollingResistance
 from ..effects.spin_damping import SpinDamping
 from ..effects.stribeck_friction import StribeckFriction
@@ -26,6 +25,7 @@ from ..effects.torsional_friction import TorsionalFriction
 from ..effects.velocity_restitution import VelocityRestitution
 from ..effects.viscous_friction import ViscousFriction
 from ..effects.wind import Wind
+from ..residual_wrench import ResidualWrench
 from ..world import World
 
 _KNOWN = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .effect import BodyMotion, Effect, EffectParameter, Values, Wrench, vector
+from .effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench, vector
 
 AXES = ("a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 
