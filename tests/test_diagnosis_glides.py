@@ -164,8 +164,10 @@ def test_from_the_limit_on_an_effect_is_named() -> None:
     library = [*LIBRARY, *(Candidate(name, load_effect(name)) for name in ("friction_patch", "velocity_restitution"))]
     found = limits(*rolls(), library)
     assert "linear_drag" not in found  # it acts in flight
-    assert found["velocity_restitution"].sizes == {}
-    for name, number in (("rolling_resistance", "c_r"), ("torsional_friction", "c_t"), ("viscous_friction", "c_v")):
+    assert found["velocity_restitution"].sizes == found["friction_patch"].sizes == {}
+    # as much of it as would show stops a ball's slide at once, as more friction does
+    assert found["viscous_friction"].sizes == {}
+    for name, number in (("rolling_resistance", "c_r"), ("torsional_friction", "c_t")):
         (limit,) = found[name].sizes.values()
         for times, seen in ((1.1, True), (0.2, False)):
             prepared, world = rolls({name: {number: times * limit}})

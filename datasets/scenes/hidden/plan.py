@@ -12,13 +12,13 @@ from .case import Case
 from .registry import EFFECTS, Size
 from .things import Kind
 
-Stage = Literal["development", "report", "report2", "report3", "report4", "report5", "report6"]
+Stage = Literal["development", "report", "report2", "report3", "report4", "report5", "report6", "report7"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen by the first alone. The summary of `report` was seen when glides were added to `diagnose`,
 that of `report2` when impacts were, that of `report3` when rivals in glides were, and that of `report4` when what comes
 second in flight had to explain most of what is left, that of `report5` when one episode alone no longer named an effect
 in glides beside one of flight, and that of `report6` when tilted frames were no longer refused and friction against
-spinning had to beat maps (2026-11-22), so that what came after is to be judged by a stage that is yet to be added."""
+spinning had to beat maps (2026-11-22), so that what came after is to be judged by `report7`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
