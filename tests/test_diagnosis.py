@@ -19,10 +19,10 @@ from cgwm.pipeline.diagnosis.noise import flight_noise, without_outliers
 from cgwm.pipeline.diagnosis.phases import phases_of
 from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
 from cgwm.pipeline.diagnosis.residual_law import residual_law
-from cgwm.pipeline.diagnosis.score import picture, score_test
+from cgwm.pipeline.diagnosis.score import ScoreTest, picture, score_test
 from cgwm.pipeline.diagnosis.segment_states import fit_states
 from cgwm.pipeline.diagnosis.segments import Segments
-from cgwm.pipeline.diagnosis.slots import Slot, fill
+from cgwm.pipeline.diagnosis.slots import Evidence, Slot, fill, is_slight
 from cgwm.pipeline.diagnosis.wrench import omnibus, organisers, residual_wrenches, wrench_windows
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.effects.gravity_tilt import GravityTilt
@@ -344,3 +344,15 @@ def test_a_body_that_slides_above_the_ground_does_not_fly() -> None:
     assert any("nothing falls" in words for words in prepared.warnings)
     flying = prepared.clear.float().mean(1)
     assert float(flying.max()) < 0.75  # they rest on the ground at their ends
+
+
+@pytest.mark.parametrize(
+    ("size", "delta_bic", "slight"),
+    [(0.1, -15.0, True), (0.1, -25.0, False), (0.2, -15.0, False), (0.1, None, False)],
+)
+def test_what_is_small_needs_more_evidence(size: float, delta_bic: float | None, slight: bool) -> None:
+    effect = load_effect("marker_offset")
+    numbers = {p.name: ((-size if k else 0.0) * p.scale, 0.0) for k, p in enumerate(effect.parameters)}
+    test = ScoreTest(30.0, 3, 1e-5, np.zeros(3), np.eye(3), True)
+    found = Evidence(Candidate("marker_offset", effect), {}, test, 1e-5, delta_bic=delta_bic, numbers=numbers)
+    assert is_slight(found) == slight

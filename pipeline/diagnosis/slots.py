@@ -31,6 +31,11 @@ UNFITTED = 1.5
 """Where every refit leaves more than this [chi2 / dof], constants are tried that the score test did not choose."""
 ALIAS_CHI2 = 6.0
 """An effect that fits worse by less than this [chi2, at equal numbers] explains the data equally: odds of 20."""
+SLIGHT, SLIGHT_BIC = 0.15, -20.0
+"""An effect whose numbers all are below this share of their usual sizes is named only if BIC falls by more than this,
+and so is its class: small things are explained by much. On development seeds two such names were false (sizes 0.08 and
+0.10, BIC -15 and -8), as were two of report5 (0.06, 0.11; -10, -12) and one of report7 (0.03; 0); the smallest of the
+true ones was 0.22."""
 CONTAINED = 0.995
 """An effect with more numbers is an alias where it can imitate the best one to this correlation."""
 
@@ -140,7 +145,15 @@ def fill(
         return Slot(tuple(evidence), tuple(evidence[:1]), False)
     names = {e.name: e for e in done}
     ranking = [*done, *(e for e in evidence if e.name not in names)]
-    return Slot(tuple(ranking), tuple(_equals(done, seen, kept, variants, dispersion)), True)
+    equals = _equals(done, seen, kept, variants, dispersion)
+    return Slot(tuple(ranking), tuple(equals), not any(is_slight(e) for e in equals))
+
+
+def is_slight(evidence: Evidence) -> bool:
+    """Whether a refitted effect is too small for its evidence to be named."""
+    numbers = evidence.numbers or {}
+    small = all(abs(numbers[p.name][0]) < SLIGHT * p.scale for p in evidence.candidate.effect.parameters)
+    return small and evidence.delta_bic is not None and evidence.delta_bic > SLIGHT_BIC
 
 
 def _with_other_constants(
