@@ -35,6 +35,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         # Whoever read our output has gone ("cgwm ... | head"): nobody is left to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
+    if _interrupted:
+        _leave(code)
     sys.exit(code)
 
 
@@ -153,6 +155,18 @@ def _catch_signals() -> None:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             with contextlib.suppress(ValueError):  # not in the main thread
                 signal.signal(number, _interrupt)
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process without waiting for threads: one that an interrupt kept from being known waits for ever."""
+    import atexit
+
+    with contextlib.suppress(BaseException):
+        atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:

@@ -210,7 +210,7 @@ def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
     if prepared.flight is None:
         return None
     world = findings.base if findings.verdict == "unexplained" else findings.world
-    windows = wrench_windows(world, prepared.whole, prepared.flight.items, prepared.noise)
+    windows = wrench_windows(world, prepared.whole, prepared.flight.items, prepared.noise, prepared.memory)
     if windows is None:
         return None
     law = residual_law(windows)

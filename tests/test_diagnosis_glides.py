@@ -34,13 +34,18 @@ GRAIN = Candidate("anisotropic_friction", load_effect("anisotropic_friction"))
 """Two balls with friction against spinning give it over a third of the score; it is no candidate there."""
 
 
-def rolls(effects: Effects | None = None, law: dict[str, float] | None = None, seed: int = 3) -> tuple[Prepared, World]:
-    """Balls that slide, then roll, by a world with effects and with numbers of contact of its own."""
+def rolls(
+    effects: Effects | None = None, law: dict[str, float] | None = None, seed: int = 3, thrown: int = 0
+) -> tuple[Prepared, World]:
+    """Balls that slide, then roll, by a world with effects and with numbers of contact of its own; and thrown ones."""
     truth, world = world_with("ball", effects), world_with("ball")
     assert isinstance(truth.contact, ContactLaw)
     changed = {name: torch.full((1,), value, dtype=torch.float64) for name, value in (law or {}).items()}
     truth = replace(truth, contact=replace(truth.contact, **changed))
     episodes = tosses(truth, seed, count=2, duration_s=0.5, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
+    if thrown:
+        flights = tosses(truth, seed + 1, count=thrown, duration_s=0.3, height_m=(0.6, 0.8))
+        episodes += [(f"thrown {name}", tracks) for name, tracks in flights]
     return prepare(world, episodes), world
 
 
@@ -138,7 +143,7 @@ def test_evidence_tells_what_the_other_episodes_say() -> None:
 )
 def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None:
     # another contact than the model's, and a friction that it does not know
-    prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22})
+    prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22}, thrown=2)
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
     found = glide_evidence(prepared, world, library, GLIDE_SCORE, StartedGlides.of(prepared, world, prepared.flight))
     assert found[0].evidence.name == name
@@ -192,13 +197,28 @@ def test_glides_are_silent_under_another_contact_law() -> None:
 
 
 def test_what_glides_tell_is_the_verdict() -> None:
-    prepared, world = rolls({"rolling_resistance": {"c_r": 0.0015}})
+    prepared, world = rolls({"rolling_resistance": {"c_r": 0.0015}}, thrown=2)
     found = find(prepared, world, LIBRARY)
     assert found.verdict == "missing_effect"
     assert [one.evidence.name for one in found.chosen] == ["rolling_resistance"]
     assert found.chosen[0].where == "contact"
     before, after = found.errors["rolling_resistance"]
     assert np.isfinite([before, after]).all()
+
+
+@pytest.mark.parametrize(("name", "values"), [("rolling_resistance", {"c_r": 0.0015}), ("linear_drag", {"c": 0.3})])
+def test_without_flight_what_acts_there_is_a_rival(name: str, values: dict[str, float]) -> None:
+    """Two rolls of half a second do not tell rolling resistance from a drag, one throw does."""
+    prepared, world = rolls({name: values})
+    assert prepared.flight is None and prepared.least_force_m_s2 == np.inf
+    (chosen,) = find(prepared, world, LIBRARY).chosen
+    assert name in {one.name for one in chosen.equals}
+    assert {"rolling_resistance", "linear_drag"} & {
+        one.name for one in chosen.equals[1:]
+    } or chosen.evidence.name == name
+    known, world = rolls({name: values}, thrown=2)
+    assert known.least_force_m_s2 < 0.1
+    assert [one.evidence.name for one in find(known, world, LIBRARY).chosen] == [name]
 
 
 def test_a_box_that_turns_over_an_edge_does_not_glide() -> None:

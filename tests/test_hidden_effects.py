@@ -475,3 +475,35 @@ def test_the_filmed_cases_have_seeds_of_their_own() -> None:
     stages = [hidden_effects.filmed_cases(stage) for stage in ("development", "report")]
     assert [len(found) for found in stages] == [6, 6] and all(case.filmed for found in stages for case in found)
     assert not {case.seed for case in stages[0]} & {case.seed for case in stages[1]}
+
+
+def test_the_odd_cases() -> None:
+    found = hidden_effects.odd_cases("development")
+    assert len({case.name for case in found}) == len(found) and len({case.seed for case in found}) == len(found)
+    assert not {case.seed for case in found} & {case.seed for case in hidden_effects.cases("development")}
+    plain = Case("x", "cube", seed=3)
+    rod = replace(plain, proportions=(2.0, 0.3, 0.3), friction=0.9, damping_ratio=0.06)
+    thing, body = plain.drawn_thing(), rod.drawn_thing()
+    np.testing.assert_allclose(body.half_extents_m / thing.half_extents_m, (2.0, 0.3, 0.3))
+    assert (body.friction, body.damping_ratio, body.mass_kg) == (0.9, 0.06, thing.mass_kg)
+
+
+def test_errors_that_last_and_smoothed_tracks(tmp_path: Path) -> None:
+    case = Case("x", "ball", train=1, test=1, seed=3)
+    found = {}
+    for name, changes in (
+        ("exact", {"position_std_m": 1e-12, "rotation_std_rad": 1e-12}),
+        ("plain", {}),
+        ("lasting", {"lasting": 0.8}),
+        ("smoothed", {"smoothed": 7}),
+    ):
+        hidden_effects.make_capture(tmp_path / name, replace(case, **changes))
+        found[name] = Capture.open(tmp_path / name).tracks("000")["ball"]
+    errors = {name: found[name].position_m - found["exact"].position_m for name in ("plain", "lasting")}
+    shares = {name: (e[1:] * e[:-1]).sum() / (e**2).sum() for name, e in errors.items()}
+    assert abs(shares["plain"]) < 0.2 and 0.6 < shares["lasting"] < 0.95
+    assert errors["lasting"].std() == pytest.approx(case.position_std_m, rel=0.3)
+    assert (
+        np.abs(np.diff(found["smoothed"].position_m, 3, axis=0)).mean()
+        < 0.5 * np.abs(np.diff(found["plain"].position_m, 3, axis=0)).mean()
+    )

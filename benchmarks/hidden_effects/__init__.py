@@ -22,6 +22,7 @@ from cgwm.datasets.scenes.hidden import (
     film_capture,
     filmed_cases,
     make_capture,
+    odd_cases,
     rough_cases,
 )
 
@@ -42,5 +43,6 @@ __all__ = [
     "film_capture",
     "filmed_cases",
     "make_capture",
+    "odd_cases",
     "rough_cases",
 ]

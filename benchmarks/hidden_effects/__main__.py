@@ -10,9 +10,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from . import STAGES, Case, cases, drake_cases, film_capture, filmed_cases, make_capture, rough_cases
+from . import STAGES, Case, cases, drake_cases, film_capture, filmed_cases, make_capture, odd_cases, rough_cases
 
-LISTS = {"all": cases, "drake": drake_cases, "rough": rough_cases}
+LISTS = {"all": cases, "drake": drake_cases, "odd": odd_cases, "rough": rough_cases}
 
 
 def _make(folder: Path, case: Case, truth: Path) -> None:

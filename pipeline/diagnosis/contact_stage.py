@@ -79,7 +79,8 @@ def separated(
 ) -> tuple[list[Evidence], dict[str, float]]:
     """Return those of several equals in flight that contact leaves, the best first, and the gain of each there.
 
-    Each has the numbers that flight gave it; the contact's own numbers follow.
+    Each has the numbers that flight gave it, moved as far as their standard errors let contact move them; the contact's
+    own numbers follow. Numbers that flight hardly knows would say more of their errors than of the effects.
 
     Args:
         equals: Refitted in flight.
@@ -96,13 +97,13 @@ def separated(
     seen = reweighted(seen, [k for v in picked for k in seen.columns(v.parameters)])
     # what the contact law misses anyway says nothing against an effect
     misfit = max(1.0, float((seen.weight * seen.chi2).sum() / (seen.weight * seen.dof).sum()))
-    gains = []
-    for evidence, variant in zip(equals, picked, strict=True):
+    gains, total = [], np.array([float(e.refitted.cost) if e.refitted else math.inf for e in equals])
+    for k, (evidence, variant) in enumerate(zip(equals, picked, strict=True)):
         assert evidence.numbers is not None
-        value = np.array([evidence.numbers[p.name][0] for p in evidence.candidate.effect.parameters])
-        gains.append(_gains_at(seen, seen.columns(variant.parameters), value) / misfit)
-    total = np.array([float(e.refitted.cost) if e.refitted else math.inf for e in equals])
-    total = total - np.array([g.sum() for g in gains])
+        known = np.array([evidence.numbers[p.name] for p in evidence.candidate.effect.parameters])
+        by_episode, moved = _gains_near(seen, seen.columns(variant.parameters), known[:, 0], known[:, 1], misfit)
+        gains.append(by_episode / misfit)
+        total[k] += moved - gains[k].sum()
     order = sorted(range(len(equals)), key=lambda k: (total[k] + _bic(equals[k], seen), equals[k].name))
     best = min(order, key=lambda k: total[k])
     kept = []
@@ -189,23 +190,27 @@ def reweighted(seen: Picture, columns: Sequence[int]) -> Picture:
     return replace(seen, weight=weight)
 
 
-def _gains_at(seen: Picture, columns: Sequence[int], value: Array) -> Array:
-    """Return the gain of each episode with given values of an effect, the model's numbers following."""
-    base = list(range(seen.base))
-    m = (seen.information * seen.weight[:, None, None]).sum(0)
-    g = (seen.score * seen.weight[:, None]).sum(0)
-    prior = np.diag(seen.prior[: seen.base])
-    follow = np.linalg.solve(m[np.ix_(base, base)] + prior, g[base] - m[np.ix_(base, list(columns))] @ value)
-    without = np.linalg.solve(m[np.ix_(base, base)] + prior, g[base])
+def _gains_near(seen: Picture, columns: Sequence[int], value: Array, std: Array, misfit: float) -> tuple[Array, float]:
+    """Return the gain of each episode with an effect near values with standard errors, and the chi2 of moving them.
+
+    The model's numbers follow; misfit: by what factor chi2 in contact exceeds that of noise.
+    """
+    base, count = list(range(seen.base)), seen.base
     chosen = [*base, *columns]
+    known = misfit / np.maximum(std, 1e-12) ** 2
+    m = (seen.information * seen.weight[:, None, None]).sum(0)[np.ix_(chosen, chosen)]
+    g = (seen.score * seen.weight[:, None]).sum(0)[chosen]
+    prior = np.concatenate([seen.prior[:count], known])
+    with_effect = np.linalg.solve(m + np.diag(prior), g + np.concatenate([np.zeros(count), known * value]))
+    without = np.linalg.solve(m[:count, :count] + np.diag(prior[:count]), g[:count])
+    both = [with_effect, np.concatenate([without, np.zeros_like(value)])]
     gains = []
     for episode in np.unique(seen.episode):
         mine = seen.weight * (seen.episode == episode)
         own = (seen.information * mine[:, None, None]).sum(0)[np.ix_(chosen, chosen)]
         slope = (seen.score * mine[:, None]).sum(0)[chosen]
-        both = [np.concatenate([follow, value]), np.concatenate([without, np.zeros_like(value)])]
         gains.append(np.subtract(*[2 * slope @ x - x @ own @ x for x in both]))
-    return np.array(gains)
+    return np.array(gains), float((known / misfit) @ (with_effect[count:] - value) ** 2)
 
 
 def _bic(evidence: Evidence, seen: Picture) -> float:

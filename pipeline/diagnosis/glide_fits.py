@@ -247,6 +247,7 @@ def without_loads(segments: Segments, rows: Tensor) -> Tensor:
     reach = body.centers[0].norm(dim=-1).max()
     torque = world.contact.friction[0] * world.gravity[0].norm() * body.mass[0] * reach
     spread = LOADS_UNKNOWN * torque / body.inertia[0].diagonal().mean()
+    turns = segments.innovations(turns)
     directions, sizes, _ = torch.linalg.svd(turns.flatten(1, 2), full_matrices=False)
     known = 1 - (1 + (spread * sizes).square()).rsqrt()
     along = directions.mT @ rows.flatten(1)[..., None]

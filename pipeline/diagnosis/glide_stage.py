@@ -29,6 +29,8 @@ from .slots import Evidence
 
 START_FRAMES = (4, 7)
 START_FRICTION = (0.15, 0.35)
+FLIGHT_TELLS_M_S2 = 0.3
+"""Where flights show no force of this size, a tenth of usual friction, what acts in flight is a rival in glides."""
 WELL_KNOWN = 100.0
 """Information on the logarithm of the friction from which one glide tells it, to a tenth."""
 WELL_FITTED = 4.0
@@ -89,7 +91,7 @@ class StartedGlides:
         if not items:
             return None
         soft = soft_world(world)
-        glides = Segments.of("contact", soft, prepared.whole, items, prepared.noise)
+        glides = prepared.segments("contact", soft, items)
         glides, friction = _started(glides, float(world.contact.friction[0]))
         told = _told_by_flight(flight, soft, prepared.groups)
         base = _base(glides, (friction, world.contact.friction[0].log().to(friction)), told)
@@ -101,6 +103,9 @@ def glide_evidence(
 ) -> list[GlideEvidence]:
     """Return the evidence of the candidates that act in contact, the best first; none where none can reach a score.
 
+    Where flights show no force of the size of friction, those that act in flight are asked, too: along the ground a
+    drag brakes a ball much as rolling resistance does.
+
     Args:
         prepared: The episodes.
         world: The model's world.
@@ -109,7 +114,8 @@ def glide_evidence(
         started: Its glides.
     """
     kept, _ = admissible(world, candidates, prepared.turned)
-    variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
+    asked = {"contact", "flight"} if prepared.least_force_m_s2 > FLIGHT_TELLS_M_S2 else {"contact"}
+    variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase in asked]
     if started is None or not variants:
         return []
     glides, told, base = started.segments, started.told, started.base

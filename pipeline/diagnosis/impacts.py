@@ -77,7 +77,7 @@ def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
     items = [item for chain in chains for item in chain]
     if not any(len(chain) > 1 for chain in chains):
         return None
-    flights = fit_states(Segments.of("flight", world, whole, items, prepared.noise))
+    flights = fit_states(prepared.segments("flight", world, items))
     starts, ends, good = _ends(flights)
     pairs, place = [], 0
     for chain in chains:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -15,17 +16,22 @@ from ..estimation.observations import Observations
 from ..physics.world import World
 from .carried import carried_frames
 from .cuts import Segment, cut_episodes, whole_episodes
+from .memory import FORGETFUL, Memory, memory_of, told_memory
 from .noise import flight_noise, slow_noise, without_outliers
 from .phases import is_round
 from .releases import held_starts, told, without_held
 from .segment_states import fit_states
-from .segments import Segments
+from .segments import Kind, Segments
 
 if TYPE_CHECKING:
     from ...datasets.tracks import Track
 
 NOISE_DISAGREES = 1.3
 """A given noise that differs from the measured one by this factor is not believed."""
+
+SURE = 4.0
+SMEARED = 3
+"""Frames beside a contact that count as contact where errors last: a filter of seven frames smears impacts so far."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,8 @@ class Prepared:
 
     names (E); groups (E): session of each episode; whole (E): all frames; clear (E, T): frames surely in flight;
     carried (E, T): frames above the ground in which nothing falls; noise:
-    position [m], rotation [rad]; slow: by what factor the variance of slow errors of a centroid exceeds that of all;
+    position [m], rotation [rad]; memory: how long errors last; slow: by what factor the variance of slow errors of a
+    centroid exceeds that of all, where that was not told by the memory;
     flight: segments with fitted states, None where there are none; contact_items: the contact segments; outliers:
     frames left out; turned: whether orientations were measured; warnings; released_s: of episodes that begin in a hand,
     by name, the time [s] from which they fly freely: what comes before counts as not measured.
@@ -53,19 +60,36 @@ class Prepared:
     turned: bool
     warnings: tuple[str, ...]
     released_s: Mapping[str, float] = field(default_factory=dict)
+    memory: Memory = FORGETFUL
+
+    @property
+    def least_force_m_s2(self) -> float:
+        """The acceleration that all flights together show, `SURE` of its standard errors; infinite without flight.
+
+        A parabola through n points of noise s over a time T tells it within s (720 / (n T^4))^1/2.
+        """
+        information = 0.0
+        for item in () if self.flight is None else self.flight.items:
+            times = self.whole.times_s[item.episode, item.first : item.last + 1]
+            information += len(times) * float(times[-1] - times[0]) ** 4 / (720 * self.noise[0] ** 2)
+        return SURE / math.sqrt(information) if information > 0 else math.inf
+
+    def segments(self, kind: Kind, world: World, items: Sequence[Segment]) -> Segments:
+        """Return segments of these episodes, with first guesses of their states."""
+        return Segments.of(kind, world, self.whole, items, self.noise, self.memory)
 
     def contact(self, world: World) -> Segments | None:
         """Return the contact segments with states fitted by a world; None where there are none."""
         if not self.contact_items:
             return None
-        return fit_states(Segments.of("contact", world, self.whole, self.contact_items, self.noise))
+        return fit_states(self.segments("contact", world, self.contact_items))
 
     def pieces(self, world: World, longest_s: float) -> Segments | None:
         """Return the flights cut into equal pieces of at most a length [s], states fitted; None for none."""
         if self.flight is None:
             return None
         items = [piece for item in self.flight.items for piece in _cut(item, self.whole, longest_s)]
-        return fit_states(Segments.of("flight", world, self.whole, items, self.noise))
+        return fit_states(self.segments("flight", world, items))
 
 
 def prepare(
@@ -121,6 +145,12 @@ def prepare(
         fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
     if outliers:
         warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
+    memory, lasting = memory_of(whole, flight)
+    if memory != FORGETFUL and flight:
+        noise = lasting[0] or noise[0], lasting[1] or noise[1]
+        flight, contact, clear = cut_episodes(world, whole, noise, touched | _smeared(whole, ~clear))
+        fitted = fit_states(Segments.of("flight", world, whole, flight, noise, memory))
+        warnings.append(told_memory(memory))
     released = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
     warnings += told(released, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
     return Prepared(
@@ -130,14 +160,22 @@ def prepare(
         clear,
         carried,
         noise,
-        slow_noise(whole, flight),
+        1.0 if memory.position.share else slow_noise(whole, flight),
         fitted,
         tuple(contact),
         outliers,
         turned,
         tuple(warnings),
         released,
+        memory,
     )
+
+
+def _smeared(whole: Observations, contact: Tensor) -> Tensor:
+    """Return the frames (E, T) into which a filter smears contacts."""
+    seen = whole.seen.amax(-1) > 0
+    near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * SMEARED + 1, 1, SMEARED)
+    return near[:, 0] > 0
 
 
 def _agreed(

@@ -119,7 +119,7 @@ def told(released_s: Mapping[str, float], starts_s: Mapping[str, float]) -> list
 
 
 def _fitted(flight: Segments, whole: Observations, items: Sequence[Segment]) -> Segments:
-    return fit_states(Segments.of("flight", flight.world, whole, items, flight.noise))
+    return fit_states(Segments.of("flight", flight.world, whole, items, flight.noise, flight.memory))
 
 
 def _rotation_chi2(flight: Segments) -> Tensor:

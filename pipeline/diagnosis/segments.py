@@ -20,6 +20,7 @@ from ..physics.rollout import Rollout
 from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..physics.world import State, World
 from .cuts import Segment
+from .memory import FORGETFUL, Memory, without_memory
 
 Kind = Literal["flight", "contact"]
 
@@ -38,7 +39,8 @@ class Segments:
     """Segments of one kind as a batch.
 
     kind; world: in which they are rolled out; items (B); observations (B): their frames, padded, with the state that
-    is the best known; noise: standard deviations of the tracks (position [m], rotation [rad]).
+    is the best known; noise: standard deviations of the tracks (position [m], rotation [rad]); memory: how long their
+    errors last.
     """
 
     kind: Kind
@@ -46,12 +48,20 @@ class Segments:
     items: tuple[Segment, ...]
     observations: Observations
     noise: tuple[float, float]
+    memory: Memory = FORGETFUL
 
     @staticmethod
-    def of(kind: Kind, world: World, whole: Observations, items: Sequence[Segment], noise: tuple[float, float]):
+    def of(
+        kind: Kind,
+        world: World,
+        whole: Observations,
+        items: Sequence[Segment],
+        noise: tuple[float, float],
+        memory: Memory = FORGETFUL,
+    ) -> Segments:
         """Cut whole episodes; the states are first guesses, see :func:`fit_states`."""
         cut = _windows(whole, items)
-        found = Segments(kind, world_for(kind, world), tuple(items), cut, noise)
+        found = Segments(kind, world_for(kind, world), tuple(items), cut, noise, memory)
         return found.with_state(line_state(found, START_FRAMES[1]))
 
     @property
@@ -97,6 +107,8 @@ class Segments:
     ) -> tuple[Tensor, Tensor | None]:
         """Return residuals (B, T nf, 6) in sigmas and, if wanted, their Jacobian (B, T nf, 6, P + S).
 
+        Of errors that last they are the innovations, see `memory`.
+
         It is one of differences: in contact they see past the roughness of a step, and in flight, which is smooth,
         they cost a third of exact derivatives and agree with them to 1e-4.
 
@@ -112,9 +124,15 @@ class Segments:
             some = self.observations.select(places)
             problem = TrajectoryResiduals(self.world, parameters, some, *self.noise, True, steps)
             shared = values if values.ndim == 1 else values[places]
-            parts.append(problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian))
+            rows, slopes = problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian)
+            fresh = None if slopes is None else _innovations(some, slopes, self.memory)
+            parts.append((_innovations(some, rows, self.memory), fresh))
         rows = torch.cat([r for r, _ in parts])
         return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
+
+    def innovations(self, rows: Tensor) -> Tensor:
+        """Return rows (B, T nf, 6, ...) less what the errors of earlier frames, which last, make one expect."""
+        return _innovations(self.observations, rows, self.memory)
 
     def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
         """Return differences (B, T nf, 6, P) of the residuals by parameters alone.
@@ -156,6 +174,19 @@ class Segments:
     def moved(self, change: Tensor) -> Segments:
         """Return the segments with their states moved by changes (B, S)."""
         return self.with_state(retract(self.observations.state, change, self.observations.free))
+
+
+def _innovations(seen: Observations, rows: Tensor, memory: Memory) -> Tensor:
+    if memory == FORGETFUL:
+        return rows
+    bodies = len(seen.free)
+    by_body = rows.unflatten(1, (-1, bodies)).movedim(2, 1).flatten(0, 1)  # (B nf, T, 6, ...)
+    times = seen.times_s.repeat_interleave(bodies, 0)
+    parts = [
+        part if lasting.share == 0 else without_memory(part, times, mask.movedim(2, 1).flatten(0, 1), lasting)
+        for part, mask, lasting in zip(by_body.split(3, 2), (seen.seen, seen.turned), memory, strict=True)
+    ]
+    return torch.cat(parts, 2).unflatten(0, (-1, bodies)).movedim(1, 2).flatten(1, 2)
 
 
 def _difference(parameter: Parameter) -> tuple[float, float]:

@@ -65,7 +65,7 @@ def information_of_data(
     items = prepared.contact_items
     if items:
         places = np.linspace(0, len(items) - 1, min(len(items), MOST_CONTACTS)).round().astype(int)
-        some = Segments.of("contact", world, prepared.whole, [items[k] for k in places], prepared.noise)
+        some = prepared.segments("contact", world, [items[k] for k in places])
         share = len(items) / len(places) / discount
         found += share * _embedded(some, world, variants, layout).sum(0)
     return found
@@ -118,7 +118,7 @@ def information_of_throws(
     ]
     for kind, items, share in parts:
         if items:
-            segments = _at_truth(Segments.of(kind, world, whole, items, prepared.noise), true, fine)
+            segments = _at_truth(Segments.of(kind, world, whole, items, prepared.noise, prepared.memory), true, fine)
             found = _embedded(segments, world, variants, layout)
             np.add.at(total, np.array([item.episode for item in items]), share * found)
     place = {k: n for n, k in enumerate(fine)}

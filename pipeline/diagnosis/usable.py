@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ...datasets.tracks import Track
 from ...schemas import InputDataError
+from ..estimation.noise import estimate_noise
 from ..estimation.observations import Observations
 from ..estimation.warmup import clearance
 from ..physics.world import World
@@ -26,6 +27,8 @@ LONGEST_STEP_S = 0.2
 MOST_OFF = 0.2
 """A body whose lowest point lies deeper than this share of its size under the ground, or rests higher above it, has
 another shape or ground."""
+NOISE_SIGMAS = 2.0
+"""Beyond it: 2 % of the frames of a body at rest are measured so much deeper, of a box, whose corners all may, 5 %."""
 MOST_TILT = 0.1
 """Of the measured frame [rad], for a ground that is level in the manifest: an error of measurement that has a name."""
 ENVELOPE_ITERATIONS, ENVELOPE_WEIGHT = 20, 0.02
@@ -38,7 +41,6 @@ ALIKE_SIGMAS = 3.0
 """Motions that differ by less, root mean square, are one motion measured several times."""
 LEAST_SEEN = 0.25
 """Share of gravity: where no force below it could be told from the noise, nothing that is worth a name could."""
-SURE = 4.0
 SHARE_OF_SIZE = 0.25
 _BELONG_TOGETHER = (
     "a shape, a ground and tracks that belong together.",
@@ -81,7 +83,9 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
     seen = whole.seen.amax(-1) > 0
     gap, place = clearance(world, whole)[seen], whole.position_m[:, :, 0][seen]
     deep = float(torch.quantile(gap, 0.05))
-    if deep < -MOST_OFF * size and not _on_a_tilted_plane(gap, place, world.ground_normal, MOST_OFF * size):
+    position, rotation = estimate_noise([t[name] for _, t in episodes for name in free if name in t])
+    most = MOST_OFF * size + NOISE_SIGMAS * math.hypot(position, rotation * size)
+    if deep < -most and not _on_a_tilted_plane(gap, place, world.ground_normal, most):
         raise InputDataError(
             f"{where}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
             f"size is {1e3 * size:.0f} mm.",
@@ -134,7 +138,7 @@ def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
     """
     whole, sigma = prepared.whole, prepared.noise[0]
     size = min(size_of(world.bodies[k]) for k in world.free)
-    gravity, seen = float(world.gravity.norm()) or 9.81, _least_force(prepared)
+    gravity, seen = float(world.gravity.norm()) or 9.81, prepared.least_force_m_s2
     if seen > LEAST_SEEN * gravity and sigma > SHARE_OF_SIZE * size:
         what = f"no force below {100 * seen / gravity:.0f} % of the weight" if math.isfinite(seen) else "no force"
         raise InputDataError(
@@ -197,17 +201,3 @@ def _apart(whole: Observations) -> float:
         return math.inf
     away = (whole.position_m[1:] - whole.position_m[:1]).square().mean(-1)
     return float(((both * away).sum((1, 2)) / both.sum((1, 2))).max().sqrt())
-
-
-def _least_force(prepared: Prepared) -> float:
-    """Return the acceleration [m/s2] that all flights together show; infinite without flight.
-
-    A parabola through n points of noise s over a time T has an acceleration of standard error s (720 / (n T^4))^1/2.
-    """
-    if prepared.flight is None:
-        return math.inf
-    information = 0.0
-    for item in prepared.flight.items:
-        times = prepared.whole.times_s[item.episode, item.first : item.last + 1]
-        information += len(times) * float(times[-1] - times[0]) ** 4 / (720 * prepared.noise[0] ** 2)
-    return SURE / math.sqrt(information) if information > 0 else math.inf

@@ -19,6 +19,7 @@ from ..physics.world import World
 from ..tails import chi2_tail
 from .cuts import Segment
 from .linear import linearised
+from .memory import FORGETFUL, Memory
 from .segment_states import fit_states
 from .segments import Segments
 
@@ -93,7 +94,11 @@ def residual_wrenches(segments: Segments) -> ResidualWrenches:
 
 
 def wrench_windows(
-    world: World, whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]
+    world: World,
+    whole: Observations,
+    flight: Sequence[Segment],
+    noise: tuple[float, float],
+    memory: Memory = FORGETFUL,
 ) -> ResidualWrenches | None:
     """Return the residual wrenches of half-overlapping windows of the flights, their states fitted; None for none."""
     windows: list[Segment] = []
@@ -104,7 +109,7 @@ def wrench_windows(
             windows.append(Segment(segment.episode, first, first + length - 1))
     if not windows:
         return None
-    return residual_wrenches(fit_states(Segments.of("flight", world, whole, windows, noise)))
+    return residual_wrenches(fit_states(Segments.of("flight", world, whole, windows, noise, memory)))
 
 
 def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:

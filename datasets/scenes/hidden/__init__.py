@@ -8,7 +8,7 @@ from . import contact, flight, measured, unknown
 from .case import Case
 from .filmed import film_capture
 from .mystery import draw_mystery, make_mystery, open_sealed
-from .plan import KNOWN, PAIRS, STAGES, UNKNOWN, cases, filmed_cases, rough_cases
+from .plan import KNOWN, PAIRS, STAGES, UNKNOWN, cases, filmed_cases, odd_cases, rough_cases
 from .record import ENGINES, make_capture
 from .registry import EFFECTS
 
@@ -30,6 +30,7 @@ __all__ = [
     "filmed_cases",
     "make_capture",
     "make_mystery",
+    "odd_cases",
     "open_sealed",
     "rough_cases",
 ]

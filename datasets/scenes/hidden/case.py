@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,11 @@ class Case:
         outliers: Share of the samples that are grossly wrong (2 to 10 cm, and 20 to 60 degrees).
         gaps: Number of gaps of 3 to 8 samples in every episode.
         uneven: Spread of the times, in sampling intervals (0.3: each time off by up to that).
+        lasting: Share of an error that the next frame still has.
+        smoothed: Frames of the window in which parabolas smooth the tracks (Savitzky & Golay 1964), odd; 0 for none.
+        proportions: By what the body's half extents are multiplied.
+        friction: In place of the drawn one.
+        damping_ratio: The same, of the contact.
         engine: The truth, one of `record.ENGINES`.
         filmed: Whether it is measured by two videos with masks, and has no tracks (`filmed.film_capture`).
     """
@@ -61,6 +66,11 @@ class Case:
     outliers: float = 0.0
     gaps: int = 0
     uneven: float = 0.0
+    lasting: float = 0.0
+    smoothed: int = 0
+    proportions: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    friction: float | None = None
+    damping_ratio: float | None = None
     engine: str = "mujoco"
     filmed: bool = False
 
@@ -79,7 +89,11 @@ class Case:
 
     def drawn_thing(self) -> Thing:
         """Return the body and its contact."""
-        return draw_thing(self.thing, self.law, self.rng("thing"))
+        drawn = draw_thing(self.thing, self.law, self.rng("thing"))
+        half = drawn.half_extents_m * np.array(self.proportions)
+        friction = drawn.friction if self.friction is None else self.friction
+        damping = drawn.damping_ratio if self.damping_ratio is None else self.damping_ratio
+        return replace(drawn, half_extents_m=half, friction=friction, damping_ratio=damping)
 
     def drawn_effects(self) -> list[Hidden]:
         """Return the effects with their true numbers."""

@@ -92,8 +92,11 @@ def measured(
     for effect in hidden:
         if effect.observe:
             position, rotation = effect.observe(position, rotation)
-    position = position + case.position_std_m * rng.standard_normal((count, 3))
-    quat = _with_noise(rotation, case.rotation_std_rad * rng.standard_normal((count, 3)))
+    position = position + case.position_std_m * _errors(case, count, rng)
+    quat = _with_noise(rotation, case.rotation_std_rad * _errors(case, count, rng))
+    if case.smoothed:
+        position, quat = _smoothed(position, case.smoothed), _smoothed(_continuous(quat), case.smoothed)
+        quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     wrong = rng.random(count) < case.outliers
     gross = rng.standard_normal((count, 3))
     gross /= np.linalg.norm(gross, axis=1, keepdims=True)
@@ -117,6 +120,26 @@ def poses(motion: Motion, times: Array) -> tuple[Array, Array]:
     position = (1 - share) * motion.position_m[row - 1] + share * motion.position_m[row]
     quat = (1 - share) * motion.quat_wxyz[row - 1] + share * motion.quat_wxyz[row]
     return position, rotations(quat / np.linalg.norm(quat, axis=1, keepdims=True))
+
+
+def _errors(case: Case, count: int, rng: np.random.Generator) -> Array:
+    """Return errors (T, 3) of variance 1, of which the next frame has a share left."""
+    fresh = rng.standard_normal((count, 3))
+    for frame in range(1, count if case.lasting else 0):
+        fresh[frame] = case.lasting * fresh[frame - 1] + np.sqrt(1 - case.lasting**2) * fresh[frame]
+    return fresh
+
+
+def _smoothed(values: Array, window: int) -> Array:
+    from scipy.signal import savgol_filter
+
+    return np.asarray(savgol_filter(values, window, 2, axis=0))
+
+
+def _continuous(quat: Array) -> Array:
+    """Return quaternions (T, 4) of which none has the other sign than the one before."""
+    flips = np.sign((quat[1:] * quat[:-1]).sum(1))
+    return quat * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
 
 def _with_noise(rotation: Array, vector: Array) -> Array:
