@@ -11,7 +11,6 @@ from ..datasets.tracks import Track
 from .diagnosis.linear import linearised
 from .diagnosis.prepared import prepare
 from .diagnosis.refit import refit
-from .diagnosis.segments import world_for
 from .first_contacts import UNOBSERVABLE_SHARE, FirstContacts, correlation_of, described, few_covariance, placed
 from .physics.parameters import Parameter
 from .physics.world import World
@@ -43,7 +42,7 @@ def fit_effect_flights(
         return None
     names = [parameter for parameter, _ in wanted]
     start = torch.tensor([parameter.encode(value) for parameter, value in wanted]).to(world.gravity)
-    found = refit([prepared.flight], world_for("flight", world), names, start, ITERATIONS)
+    found = refit([prepared.flight], world, names, start, ITERATIONS)
     linear = linearised(found.segments[0], names, found.values)
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start).numpy()
     information = linear.information.sum(0).numpy()

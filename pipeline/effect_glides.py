@@ -14,7 +14,6 @@ import torch
 from .diagnosis.glide_fits import told_by_each
 from .diagnosis.glide_stage import StartedGlides, fitted_along, fitted_glides
 from .diagnosis.prepared import Prepared
-from .diagnosis.segments import world_for
 from .first_contacts import FirstContacts
 from .physics.effects import Effect
 from .physics.parameters import FRICTION
@@ -56,7 +55,7 @@ class EffectGlides:
         parameters = fitted_along(beside, told)
         begun = base.values[0, :2]  # friction and height; the effects at nothing
         found = fitted_glides(beside, [], [(base.segments, begun)], told)[0]
-        glides = replace(found.segments, world=world_for("contact", beside))
+        glides = found.segments.in_world(beside)
         information, score = told_by_each(glides, parameters, found.values[0])
         # none of the friction: it begins at what glides tell, and a prior there would tell what acts like it
         prior = torch.tensor([0.0 if p is FRICTION else 1 / p.prior[1] ** 2 for p in parameters]).to(information)

@@ -188,7 +188,7 @@ def fit_physics(
     if effect_parameters(world):
         # flight needs no contact and no short steps
         effects = fit_effect_motions(
-            world_for("flight", world) if flying else world, episodes, [] if flying else start, sigma, groups
+            world_for("flight", world, sigma[0]) if flying else world, episodes, [] if flying else start, sigma, groups
         )
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         start = [(p, effects.along.get(p.name, value)) for p, value in start]

@@ -21,7 +21,7 @@ from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
 from cgwm.pipeline.diagnosis.residual_law import residual_law
 from cgwm.pipeline.diagnosis.score import ScoreTest, picture, score_test
 from cgwm.pipeline.diagnosis.segment_states import fit_states
-from cgwm.pipeline.diagnosis.segments import Segments
+from cgwm.pipeline.diagnosis.segments import FLIGHT_STEP_S, Segments
 from cgwm.pipeline.diagnosis.slots import Evidence, Slot, fill, is_slight
 from cgwm.pipeline.diagnosis.wrench import omnibus, organisers, residual_wrenches, wrench_windows
 from cgwm.pipeline.physics.effects import load_effect
@@ -356,3 +356,17 @@ def test_what_is_small_needs_more_evidence(size: float, delta_bic: float | None,
     test = ScoreTest(30.0, 3, 1e-5, np.zeros(3), np.eye(3), True)
     found = Evidence(Candidate("marker_offset", effect), {}, test, 1e-5, delta_bic=delta_bic, numbers=numbers)
     assert is_slight(found) == slight
+
+
+def test_steps_in_flight_are_short_enough_for_fine_measurements() -> None:
+    """Through a noise of 0.05 mm the error of a drag in steps of 2.5 ms looked like buoyancy or another scale."""
+    truth, world = world_with("cube", {"linear_drag": {"c": 0.6}}, ground=False), world_with("cube", ground=False)
+    truth = replace(truth, step_s=2e-4)
+    noise = (3e-5, 3e-4)
+    prepared = prepare(world, tosses(truth, 1, count=5, duration_s=0.5, noise=noise))
+    assert prepared.flight is not None and prepared.flight.world.step_s < 0.0005
+    slots, found, _ = flight_search.flight_search(prepared, world, LIBRARY, 1.0)
+    assert [slot.best.name for slot in slots if slot.flagged] == ["linear_drag"]
+    assert found.effects[0].values["c"].item() == pytest.approx(0.6, rel=2e-3)
+    coarse = prepare(world, tosses(truth, 1, count=5, duration_s=0.5))
+    assert coarse.flight is not None and coarse.flight.world.step_s == FLIGHT_STEP_S

@@ -91,6 +91,13 @@ def test_errors_that_do_not_last_are_not_taken_for_such(body: str, effects: dict
     assert prepared.flight is not None and prepared.flight.memory == FORGETFUL
 
 
+def test_rounding_does_not_last() -> None:
+    world = world_with("ball", {"linear_drag": {"c": 0.3}})
+    exact = tosses(world, 1, count=4, duration_s=0.5, noise=(1e-14, 1e-14))
+    prepared = prepare(world_with("ball"), exact, NOISE)
+    assert prepared.memory == FORGETFUL and prepared.noise == NOISE
+
+
 def test_few_frames_tell_nothing() -> None:
     prepared, _ = ready("ball", {}, lasting(0.9, 3))
     assert memory_of(prepared.whole, [prepared.flight.items[0]]) == (FORGETFUL, (None, None))  # pyright: ignore

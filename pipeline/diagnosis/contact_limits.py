@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from ..physics.world import World
 from .candidates import Candidate, Variant, admissible, base_values, variants_of, with_variants
 from .glide_fits import GlideFit, lasting_misfits
 from .glide_stage import StartedGlides, batches, fitted_along, fitted_glides
-from .segments import world_for
 
 SAFE = 1.5
 """Limits are by this larger than where an effect that stays as linear as it begins would reach its score. Of 78 effects
@@ -117,7 +116,7 @@ def _misfits(started: StartedGlides, told: Sequence[_Told]) -> list[float]:
     others = values.repeat(len(told), 1)
     for row, one in zip(others, told, strict=True):
         row[[place[name] for name in one.variant.parameters]] = torch.as_tensor(one.values).to(row)
-    glides = replace(started.base.segments, world=world_for("contact", beside))
+    glides = started.base.segments.in_world(beside)
     return lasting_misfits(glides, parameters, values, others, len(known))
 
 

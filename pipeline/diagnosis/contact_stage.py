@@ -25,7 +25,7 @@ from .refit import Refit, refit
 from .robust import RobustFit, robust_fit, robust_gains, with_own_numbers
 from .score import Picture, ScoreTest, picture, score_test
 from .segment_states import fit_states
-from .segments import Segments, world_for
+from .segments import Segments
 from .slots import Evidence
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def fitted_contact(prepared: Prepared, world: World, start: Segments | None = No
 
 
 def _again(start: Segments, world: World) -> Segments:
-    return fit_states(replace(start, world=world_for("contact", world)), iterations=4, search=False)
+    return fit_states(start.in_world(world), iterations=4, search=False)
 
 
 def separated(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 from ..physics.world import World
 from .bundles import DRAGS, drag_in_wind
@@ -17,7 +16,7 @@ from .candidates import Candidate, without_effect
 from .forecast import held_out_loss
 from .prepared import Prepared
 from .segment_states import fit_states
-from .segments import Segments, world_for
+from .segments import Segments
 from .slots import ALIAS_CHI2, Slot, fill
 
 MOST_EFFECTS = 3
@@ -64,7 +63,7 @@ def flight_search(
             without = without_effect(current, filled[place].best.name)
             if len(without.effects) < len(current.effects) - 1:
                 continue  # another effect acts through this one
-            states = fit_states(replace(flight, world=world_for("flight", without)))
+            states = fit_states(flight.in_world(without))
             slot = fill(states, without, candidates, prepared.groups, prepared.turned, scatter)
             refitted = slot.best.refitted
             if slot.flagged and refitted is not None:

@@ -13,7 +13,7 @@ from ..physics.world import World
 from .candidates import base_parameters, base_values, without_effect
 from .linear import linearised
 from .segment_states import fit_states
-from .segments import Segments, world_for
+from .segments import Segments
 
 KNOWN_SHARE = 0.5
 """The state is fitted to this share of a segment's frames; the error is that of the rest."""
@@ -34,9 +34,9 @@ def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[floa
     """
     without = without_effect(world, effect)
     parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
-    with_it = replace(segments, world=world_for(segments.kind, world))
+    with_it = segments.in_world(world)
     values = _by_others(with_it, parameters, base_values(world, parameters))
-    before = replace(segments, world=world_for(segments.kind, without))
+    before = segments.in_world(without)
     return _error(before, [], values.new_zeros(0)), _error(with_it, parameters, values)
 
 
@@ -50,7 +50,7 @@ def held_out_loss(segments: Segments, world: World) -> float:
         world: The world with its effects at their estimates.
     """
     parameters = base_parameters(world, segments.kind)
-    at = replace(segments, world=world_for(segments.kind, world))
+    at = segments.in_world(world)
     values = _by_others(at, parameters, base_values(world, parameters))
     fitted, late = _continued(at, parameters, values)
     away = fitted.residuals(parameters, values, jacobian=False)[0].unflatten(1, (late.shape[1], -1))

@@ -24,7 +24,7 @@ from .glide_fits import ITERATIONS, GlideFit, fit_groups, soft_world
 from .glides import glides_of, settled
 from .prepared import Prepared
 from .score import ScoreTest, picture, sums
-from .segments import Segments, line_state, world_for
+from .segments import Segments, line_state
 from .slots import Evidence
 
 START_FRAMES = (4, 7)
@@ -233,7 +233,7 @@ def fitted_glides(
     free_start = [k for k, p in enumerate(parameters) if p not in told]
     middle[:, free_start] = values[:, free_start]
     glides = starts[0][0]
-    every = replace(glides, world=world_for("contact", beside)).select(list(range(count)) * len(rows))
+    every = glides.in_world(beside).select(list(range(count)) * len(rows))
     every = every.with_state(State.joined(*(segments.observations.state for segments, _ in starts)))
     group = torch.arange(len(rows)).repeat_interleave(count)
     found = fit_groups(every, parameters, values, free, group, iterations, middle)

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..estimation.noise import FLOOR_M, FLOOR_RAD
 from ..estimation.observations import Observations
 from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
 from .cuts import Segment
@@ -42,6 +43,7 @@ SURE, SURE_ALONE = 20.0, 6.0
 than that of the kind itself. Noise that does not last, four times larger along one axis, reached 10."""
 LIKELY = 2.0
 """Of memories whose evidence is within this of the largest (two thirds of the true ones are), the slowest is taken."""
+FLOORS = (FLOOR_M, FLOOR_RAD)
 WRONG = 9.0
 """Windows whose mean square is so many times the median's hold more than errors: a contact, or an outlier."""
 ENOUGH = 60
@@ -116,7 +118,10 @@ def memory_of(whole: Observations, flight: Sequence[Segment]) -> tuple[Memory, t
     found = [_lasting(whole, flight, kind) for kind in (0, 1)]
     if sum(one.evidence for one in found) < SURE:
         return FORGETFUL, (None, None)
-    sure = [one.evidence > SURE_ALONE for one in found]
+    # what is exact but for rounding errs alike from frame to frame, too
+    sure = [one.evidence > SURE_ALONE and one.std > floor for one, floor in zip(found, FLOORS, strict=True)]
+    if not any(sure):
+        return FORGETFUL, (None, None)
     lasting = Memory(*(one.lasting if yes else Lasting() for one, yes in zip(found, sure, strict=True)))
     position, rotation = (one.std if yes else None for one, yes in zip(found, sure, strict=True))
     return lasting, (position, rotation)

@@ -147,7 +147,8 @@ def prepare(
         warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
     memory, lasting = memory_of(whole, flight)
     if memory != FORGETFUL and flight:
-        noise = lasting[0] or noise[0], lasting[1] or noise[1]
+        # what is given counts where it is more, as everywhere
+        noise = max(lasting[0] or noise[0], given[0] or 0.0), max(lasting[1] or noise[1], given[1] or 0.0)
         flight, contact, clear = cut_episodes(world, whole, noise, touched | _smeared(whole, ~clear))
         fitted = fit_states(Segments.of("flight", world, whole, flight, noise, memory))
         warnings.append(told_memory(memory))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from ..physics.world import World
 from .candidates import base_values
 from .linear import Linear, linearised, robust_excess, summed
 from .segment_states import best_of
-from .segments import Segments, world_for
+from .segments import Segments
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def refit(
     values = centre if start is None else start
     prior = torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(centre)
     bounds = torch.tensor([p.limits for p in parameters]).reshape(-1, 2).to(centre)
-    parts = [replace(part, world=world_for(part.kind, world)) for part in parts]
+    parts = [part.in_world(world) for part in parts]
     pictures = [linearised(part, parameters, values) for part in parts]
     cost, damping = _cost(parts, pictures, values, centre, prior), 1e-3
     for _ in range(iterations):

@@ -22,7 +22,7 @@ from ..physics.world import World
 from ..tails import chi2_tail, normal_tail
 from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
 from .linear import Linear, projected
-from .segments import Segments, world_for
+from .segments import Segments
 
 Array = NDArray[np.float64]
 
@@ -99,14 +99,14 @@ def picture(
     parameters = [*base, *with_variants(world, variants, segments.kind)[1]]
     if not parameters:
         raise ValueError("no candidate acts in these segments")
-    at = replace(segments, world=world_for(segments.kind, world))
+    at = segments.in_world(world)
     rows, jacobian = at.residuals(base, base_values(world, base))
     assert jacobian is not None
     columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
     # at neutral a candidate does nothing, so that each part of them has a world, and rollouts, of its own
-    for part in _parts(variants, segments, world_for(segments.kind, world)):
+    for part in _parts(variants, segments, segments.in_world(world).world):
         beside, numbers = with_variants(world, part, segments.kind)
-        at = replace(segments, world=world_for(segments.kind, beside))
+        at = segments.in_world(beside)
         slopes = at.slopes(numbers, base_values(beside, numbers), rows)
         columns |= {p.name: slopes[..., k] for k, p in enumerate(numbers)}
     own = torch.stack([columns[p.name] for p in parameters], -1)

@@ -24,8 +24,10 @@ from .memory import FORGETFUL, Memory, without_memory
 
 Kind = Literal["flight", "contact"]
 
-FLIGHT_STEP_S = 0.0025
-"""Largest step in flight, where nothing is stiff; the error of a drag of 1 / s is 0.1 %."""
+FLIGHT_STEP_S, FLIGHT_STEP_NOISE_M = 0.0025, 2e-4
+"""Largest step in flight, where nothing is stiff, and the noise down to which it serves: the error of a drag of 1 / s
+is 0.1 %, some 0.1 mm, which through a noise of 0.05 mm looks like an effect of its own."""
+LEAST_STEP_S = 2.5e-4
 START_FRAMES = (2, 4, 7)
 """A contact segment's state is searched from straight lines through so many frames (pitfall P2)."""
 PARAMETER_STEP = 0.04
@@ -61,7 +63,7 @@ class Segments:
     ) -> Segments:
         """Cut whole episodes; the states are first guesses, see :func:`fit_states`."""
         cut = _windows(whole, items)
-        found = Segments(kind, world_for(kind, world), tuple(items), cut, noise, memory)
+        found = Segments(kind, world_for(kind, world, noise[0]), tuple(items), cut, noise, memory)
         return found.with_state(line_state(found, START_FRAMES[1]))
 
     @property
@@ -89,6 +91,10 @@ class Segments:
     def with_state(self, state: State) -> Segments:
         """Return the segments with other states."""
         return replace(self, observations=replace(self.observations, state=state))
+
+    def in_world(self, world: World) -> Segments:
+        """Return the segments in another world, stepped as their kind wants."""
+        return replace(self, world=world_for(self.kind, world, self.noise[0]))
 
     def in_states(self, states: Sequence[State]) -> Segments:
         """Return the segments once in each of several states (B), as one batch."""
@@ -194,12 +200,19 @@ def _difference(parameter: Parameter) -> tuple[float, float]:
     return 0.0, PARAMETER_STEP * parameter.prior[1]
 
 
-def world_for(kind: Kind, world: World) -> World:
-    """Return the world in which segments of a kind are rolled out: flight needs no contact and takes longer steps."""
+def world_for(kind: Kind, world: World, noise_m: float) -> World:
+    """Return the world in which segments of a kind are rolled out: flight needs no contact and takes longer steps.
+
+    Args:
+        kind: Of the segments.
+        world: The world.
+        noise_m: Standard deviation of the measured positions: steps are short enough to be exact below it.
+    """
     if kind == "contact":
         half = 0.5 * float(world.contact.contact_time_s.min()) if isinstance(world.contact, ContactLaw) else 0.0
         return replace(world, step_s=max(world.step_s, min(CONTACT_STEP_S, half)))
-    return replace(world, touching=False, step_s=max(world.step_s, FLIGHT_STEP_S))
+    step = max(LEAST_STEP_S, FLIGHT_STEP_S * min(1.0, noise_m / FLIGHT_STEP_NOISE_M))
+    return replace(world, touching=False, step_s=step)
 
 
 def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
