@@ -83,8 +83,10 @@ def test_errors_that_last_are_measured(body: str) -> None:
     assert any("last from frame to frame" in warning for warning in prepared.warnings)
 
 
-@pytest.mark.parametrize("effects", [{}, {"com_offset": {"d_x": 0.008}}, {"ground_magnet": {"A": 12.0}}])
-@pytest.mark.parametrize("body", ["cube", "ball"])
+@pytest.mark.parametrize(
+    ("body", "effects"),
+    [("ball", {}), ("cube", {"com_offset": {"d_x": 0.008}}), ("ball", {"ground_magnet": {"A": 12.0}})],
+)
 def test_errors_that_do_not_last_are_not_taken_for_such(body: str, effects: dict) -> None:
     prepared, _ = ready(body, effects, None)
     assert prepared.memory == FORGETFUL
