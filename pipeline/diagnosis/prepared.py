@@ -16,7 +16,7 @@ from ..estimation.observations import Observations
 from ..physics.world import World
 from .carried import carried_frames
 from .cuts import Segment, cut_episodes, whole_episodes
-from .memory import FORGETFUL, Memory, memory_of, told_memory
+from .lasting import FORGETFUL, Memory, memory_of, told_memory
 from .noise import flight_noise, slow_noise, without_outliers
 from .phases import is_round
 from .releases import held_starts, told, without_held

@@ -20,7 +20,7 @@ from ..physics.rollout import Rollout
 from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..physics.world import State, World
 from .cuts import Segment
-from .memory import FORGETFUL, Memory, without_memory
+from .lasting import FORGETFUL, Memory, without_memory
 
 Kind = Literal["flight", "contact"]
 
@@ -113,7 +113,7 @@ class Segments:
     ) -> tuple[Tensor, Tensor | None]:
         """Return residuals (B, T nf, 6) in sigmas and, if wanted, their Jacobian (B, T nf, 6, P + S).
 
-        Of errors that last they are the innovations, see `memory`.
+        Of errors that last they are the innovations, see `lasting`.
 
         It is one of differences: in contact they see past the roughness of a step, and in flight, which is smooth,
         they cost a third of exact derivatives and agree with them to 1e-4.

@@ -18,8 +18,8 @@ from ..physics.rotation import quat_rotate
 from ..physics.world import World
 from ..tails import chi2_tail
 from .cuts import Segment
+from .lasting import FORGETFUL, Memory
 from .linear import linearised
-from .memory import FORGETFUL, Memory
 from .segment_states import fit_states
 from .segments import Segments
 

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 LONGEST_S = 0.4
 """Of a window: a longer one shows more of what lasts, and a force that changes within it may be taken for errors."""
 LEAST_DEGREE, MOST_DEGREE = 4, 12
-LEFT = 1e-3
-"""Of the circle of a point that turns about the centre of mass, polynomials of the degree chosen leave this share."""
+CIRCLE_LEFT = 1e-3
+"""Share of the circle of a point about the centre of mass that polynomials of the degree chosen leave."""
 LARGEST_TURN = 2.5
 """Of a window of rotations [rad]: rotation vectors of a tumbling body are polynomials near none only."""
 LEAST = 4
@@ -154,10 +154,10 @@ def _lasting(whole: Observations, flight: Sequence[Segment], kind: int) -> _Foun
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
     alone = _likelihood(windows, Lasting())[0]
     tried = []
-    for left, share in itertools.product(REMEMBERED, SHARES):
-        lasting = Lasting(share, -step / math.log(left))
+    for remembered, share in itertools.product(REMEMBERED, SHARES):
+        lasting = Lasting(share, -step / math.log(remembered))
         likelihood, std = _likelihood(windows, lasting)
-        slow = std**2 * (1 - share + share * (1 + left) / (1 - left))
+        slow = std**2 * (1 - share + share * (1 + remembered) / (1 - remembered))
         tried.append((2 * (likelihood - alone), slow, lasting, std))
     most, _, _, likeliest = max(tried)
     # what forces are found by is the slow part of the errors, which windows show least: rather too much of it
@@ -243,9 +243,9 @@ def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind
     length = int(len(frames) // number)
     turn = spin * float(times[max(length - 1, 0)] - times[0])
     # Chebyshev's series of exp(i turn x / 2) on [-1, 1]: the first term left out has 2 (turn / 4)^n / n!
-    degree = next((d for d in range(LEAST_DEGREE, MOST_DEGREE) if _left(turn, d) < LEFT), MOST_DEGREE)
+    degree = next((d for d in range(LEAST_DEGREE, MOST_DEGREE) if _circle_left(turn, d) < CIRCLE_LEFT), MOST_DEGREE)
     return length, degree
 
 
-def _left(turn: float, degree: int) -> float:
+def _circle_left(turn: float, degree: int) -> float:
     return 2 * (turn / 4) ** (degree + 1) / math.factorial(degree + 1)

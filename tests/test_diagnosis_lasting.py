@@ -8,7 +8,7 @@ import pytest
 import torch
 from cgwm.datasets.tracks import Track
 from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.memory import FORGETFUL, Lasting, Memory, memory_of, without_memory
+from cgwm.pipeline.diagnosis.lasting import FORGETFUL, Lasting, Memory, memory_of, without_memory
 from cgwm.pipeline.diagnosis.prepared import SMEARED, Prepared, prepare
 from cgwm.pipeline.diagnosis.verdict import find
 from cgwm.pipeline.physics.effects.registry import BUILT_IN, load_effect
