@@ -130,7 +130,7 @@ def memory_of(whole: Observations, flight: Sequence[Segment]) -> tuple[Memory, t
 def told_memory(memory: Memory) -> str:
     """Say how long errors last, and what follows."""
     times = [
-        f"those of {name} for {1e3 * lasting.time_s:.2g} ms"
+        f"those of {name} for {1e3 * lasting.time_s:.0f} ms"
         for name, lasting in zip(("position", "rotation"), memory, strict=True)
         if lasting.share
     ]
