@@ -132,3 +132,18 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
         # what smoothing lifts above the ground may move the contact by a frame
         assert len(flies & near) <= 2 * max(1, len(contact))
         assert contact.size == 0 or len(flies) < int(sharp.clear[episode].sum())
+
+
+def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cgwm.pipeline.diagnosis.prepared.SMEARED", 200)
+    prepared, _ = ready("ball", {}, lasting(0.8, 5))
+    assert prepared.memory != FORGETFUL and prepared.least_force_m_s2 > 0
+    touched = {item.episode for item in prepared.contact_items}
+    assert prepared.flight is None or not touched & {item.episode for item in prepared.flight.items}
+
+
+def test_a_box_without_orientation_has_no_contact_though_errors_last() -> None:
+    change = lasting(0.8, 5)
+    prepared, _ = ready("cube", {}, lambda track: replace(change(track), quat_wxyz=None))
+    assert prepared.memory != FORGETFUL and not prepared.turned
+    assert prepared.contact_items == ()

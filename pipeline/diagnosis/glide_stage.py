@@ -65,10 +65,9 @@ class StartedGlides:
     """Glides, each with a start fitted with a friction of its own, before any effect is looked for.
 
     segments: in the world with the soft contact; friction (1,): logarithm of the one that most tell; base: their fit by
-    what the model has, with one friction for all; told:
-    parameters of what acts in flight, with the standard errors that flights leave them as priors. It acts in glides,
-    too, and is known no better there: an error of half a thousandth of a radian in a tilt is a millimetre in a slide
-    of half a second.
+    what the model has, with one friction for all; told: parameters of what acts in flight, with the standard errors
+    that flights leave them as priors. It acts in glides, too, and is known no better there: an error of half a
+    thousandth of a radian in a tilt is a millimetre in a slide of half a second.
     """
 
     segments: Segments

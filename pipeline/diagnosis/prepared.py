@@ -30,6 +30,7 @@ NOISE_DISAGREES = 1.3
 """A given noise that differs from the measured one by this factor is not believed."""
 
 SURE = 4.0
+"""A force is shown where it is so many of its standard errors."""
 SMEARED = 3
 """Frames beside a contact that count as contact where errors last: a filter of seven frames smears impacts so far."""
 
@@ -129,10 +130,7 @@ def prepare(
         flight, contact, clear = cut_episodes(world, whole, noise, touched)
         noise = _agreed(given, flight_noise(whole, flight), noise, [])
     flight, contact, clear = cut_episodes(world, whole, noise, touched)
-    if not turned and not all(is_round(world.bodies[k]) for k in world.free):
-        contact = []
-        warnings.append("no orientation was measured and the body is no ball: contacts cannot be looked at.")
-    fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
+    fitted = _flown(world, whole, flight, noise)
     held: dict[int, int] = {}
     while fitted is not None and (found := held_starts(fitted, whole)):
         # the noise was measured with the hand in it, and hid other wrong frames
@@ -142,16 +140,19 @@ def prepare(
         whole, more, again = without_outliers(whole, cut_episodes(world, whole, noise, touched)[0], noise)
         outliers, touched = outliers + more, touched | again
         flight, contact, clear = cut_episodes(world, whole, noise, touched)
-        fitted = fit_states(Segments.of("flight", world, whole, flight, noise)) if flight else None
+        fitted = _flown(world, whole, flight, noise)
     if outliers:
         warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
     memory, lasting = memory_of(whole, flight)
-    if memory != FORGETFUL and flight:
+    if memory != FORGETFUL:
         # what is given counts where it is more, as everywhere
         noise = max(lasting[0] or noise[0], given[0] or 0.0), max(lasting[1] or noise[1], given[1] or 0.0)
         flight, contact, clear = cut_episodes(world, whole, noise, touched | _smeared(whole, ~clear))
-        fitted = fit_states(Segments.of("flight", world, whole, flight, noise, memory))
+        fitted = _flown(world, whole, flight, noise, memory)
         warnings.append(told_memory(memory))
+    if not turned and not all(is_round(world.bodies[k]) for k in world.free):
+        contact = []
+        warnings.append("no orientation was measured and the body is no ball: contacts cannot be looked at.")
     released = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
     warnings += told(released, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
     return Prepared(
@@ -170,6 +171,13 @@ def prepare(
         released,
         memory,
     )
+
+
+def _flown(
+    world: World, whole: Observations, items: Sequence[Segment], noise: tuple[float, float], memory: Memory = FORGETFUL
+) -> Segments | None:
+    """Return flights with states fitted by a world; None for none."""
+    return fit_states(Segments.of("flight", world, whole, items, noise, memory)) if items else None
 
 
 def _smeared(whole: Observations, contact: Tensor) -> Tensor:

@@ -104,7 +104,7 @@ def picture(
     assert jacobian is not None
     columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
     # at neutral a candidate does nothing, so that each part of them has a world, and rollouts, of its own
-    for part in _parts(variants, segments, segments.in_world(world).world):
+    for part in _parts(variants, segments, at.world):
         beside, numbers = with_variants(world, part, segments.kind)
         at = segments.in_world(beside)
         slopes = at.slopes(numbers, base_values(beside, numbers), rows)

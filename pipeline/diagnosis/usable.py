@@ -83,6 +83,8 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
     seen = whole.seen.amax(-1) > 0
     gap, place = clearance(world, whole)[seen], whole.position_m[:, :, 0][seen]
     deep = float(torch.quantile(gap, 0.05))
+    if deep >= -MOST_OFF * size:
+        return
     position, rotation = estimate_noise([t[name] for _, t in episodes for name in free if name in t])
     most = MOST_OFF * size + NOISE_SIGMAS * math.hypot(position, rotation * size)
     if deep < -most and not _on_a_tilted_plane(gap, place, world.ground_normal, most):
