@@ -5,16 +5,20 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
-FILES := $(sort $(shell find cgwm cgwm_cli datasets pipeline schemas -name '*.py' -o -name py.typed))
+FILES := $(sort $(shell find cgwm cgwm_cli datasets pipeline schemas -name '*.py' -o -name py.typed -o -name '*.cuh' -o -name '*.js' -o -name '*.css'))
 
-.PHONY: help install demo test lint evidence clean force
+.PHONY: help install demo test lint same graph docs results evidence clean force
 
 help:
 	@echo 'make demo      run the whole pipeline on a scene that it makes itself; the report: $(OUT)/report.html'
 	@echo 'make test      lint, type check and tests, as the continuous integration runs them'
 	@echo 'make install   only install cgwm into $(VENV)/ (the two above do it by themselves)'
 	@echo 'make lint      ruff and pyright alone'
+	@echo 'make same      compare what this tree computes with the outputs of a reference commit (tools/same.py)'
+	@echo 'make graph     print the import graph of the rooms, and draw it: docs/import-graph.svg'
+	@echo 'make docs      build the documentation as a site that is read offline: build/docs/index.html'
 	@echo 'make evidence  the measurements that take longer than tests may; resumable, results in out/evidence/'
+	@echo 'make results   write docs/results.md from the figures in benchmarks/results/'
 	@echo 'make clean     remove what make made: $(VENV)/, build/, out/'
 
 install: $(VENV)/linked
@@ -32,9 +36,24 @@ lint: install
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 
+same: install
+	$(BIN)/python tools/same.py
+
+graph:
+	$(PYTHON) tools/import_graph.py
+
+# Strict: a dead link, a missing reference or a page outside of the navigation fails.
+docs: $(VENV)/docs
+	@mkdir -p build/docs-source  # it has to be there before mkdocs resolves the search path of the reference
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo 'Open build/docs/index.html'
+
 evidence: install
 	$(BIN)/pytest -m evidence
 	cd benchmarks && for one in calibrate tosses fall coverage known_mesh next_throw real_data; do echo "== $$one"; ../$(BIN)/python $$one.py || echo "$$one: a bar was missed"; done
+
+results:
+	$(PYTHON) benchmarks/render_results.py
 
 clean:
 	rm -rf $(VENV) build out *.egg-info .pytest_cache .ruff_cache
@@ -57,12 +76,19 @@ $(VENV)/dependencies: pyproject.toml constraints.txt | $(VENV)/made
 	  $(PIP) install --quiet --no-deps 'torch==$(TORCH)+cpu' 2>/dev/null || \
 	  $(PIP) install --quiet --no-deps 'torch==$(TORCH)+cpu' --index-url https://download.pytorch.org/whl/cpu; \
 	else $(PIP) install --quiet --no-deps 'torch==$(TORCH)'; fi
-	@$(BIN)/python -c "import shutil, tomllib; project = tomllib.load(open('pyproject.toml', 'rb')); \
+	@$(BIN)/python -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb')); \
 	  extras = project['project']['optional-dependencies']; \
-	  lists = project['build-system']['requires'], project['project']['dependencies'], extras['dev'], \
-	    extras['gpu'] if shutil.which('nvidia-smi') else []; \
+	  lists = project['build-system']['requires'], project['project']['dependencies'], extras['dev']; \
 	  print(*sum(lists, []), sep='\n')" > $(VENV)/requirements.txt
 	@$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements.txt
+	@touch $@
+
+# Only 'make docs' needs these, and it needs no other dependency: the reference is drawn without importing anything.
+$(VENV)/docs: pyproject.toml constraints.txt | $(VENV)/made
+	@$(BIN)/python -c "import tomllib; \
+	  print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['docs'], sep='\n')" \
+	  > $(VENV)/requirements-docs.txt
+	@$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements-docs.txt
 	@touch $@
 
 # Strict editable mode links each file, so that type checkers follow it; new files need to be linked anew.

@@ -20,10 +20,10 @@ import time
 
 import numpy as np
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.models import Model
-from cgwm.datasets.ply import Splats
-from cgwm.pipeline.closed_loop import ClosedLoop, Command, Velocity
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.models.model import Model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.pipeline.control.closed_loop import ClosedLoop, Command, Velocity
 from cgwm.pipeline.physics.world import State
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Pose, Provenance, Solver
 
@@ -86,7 +86,7 @@ def model(pushed: bool) -> Model:
         solver=Solver(step_s=0.001),
         provenance=Provenance(capture="none"),
     )
-    return Model(None, file, splats, collision, table(rng))
+    return Model(root=None, file=file, body_splats=splats, collision=collision, scene=table(rng))
 
 
 def camera(width: int, height: int) -> Camera:
@@ -95,7 +95,7 @@ def camera(width: int, height: int) -> Camera:
     T[:3, :3] = np.array([[1.0, 0, 0], [0, -0.5, math.sqrt(0.75)], [0, -math.sqrt(0.75), -0.5]])
     T[:3, 3] = (0.0, -0.52, 0.34)
     K = np.array([[1.1 * height, 0, width / 2], [0, 1.1 * height, height / 2], [0, 0, 1.0]])
-    return Camera(width, height, K, np.zeros(0), T)
+    return Camera(width=width, height=height, K=K, distortion=np.zeros(0), T_world_cam=T)
 
 
 def start(rng: np.random.Generator, pushed: bool) -> State:

@@ -25,16 +25,16 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.estimation.observations import Observations
-from cgwm.pipeline.estimation.search import Prior, importance_search
-from cgwm.pipeline.phys_geo import _open_loop
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.geometry.mesh import mesh_mass_properties, read_mesh
+from cgwm.pipeline.geometry.rotation import geodesic_angle
+from cgwm.pipeline.optimization.importance_sampling import NormalPrior, importance_search
+from cgwm.pipeline.phys_geo.tracks.open_loop_search import open_loop_errors
 from cgwm.pipeline.physics import Body, ContactLaw, State, World, simulate
-from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
-from cgwm.pipeline.physics.rotation import geodesic_angle
-from cgwm.pipeline.splats.collision import shape_to_spheres
-from cgwm.pipeline.splats.mesh import mesh_mass_properties, read_mesh
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
+from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
+from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.schemas import BoxShape, FileShape, Shape, SphereShape
 from numpy.typing import NDArray
 from store import Store, shared_data
@@ -111,7 +111,17 @@ def _body(shape: Shape, root: Path, mass: float, inertia: Array, com: Array) -> 
         return torch.as_tensor(np.asarray(value, float))[None]
 
     on_plane = plane_contacts(centers, radii)
-    return Body("body", "free", one(mass), one(inertia), one(com), centers[None], radii[None], None, on_plane)
+    return Body(
+        name="body",
+        motion="free",
+        mass=one(mass),
+        inertia=one(inertia),
+        com=one(com),
+        centers=centers[None],
+        radii=radii[None],
+        place=None,
+        on_plane=on_plane,
+    )
 
 
 def _words(values: Any) -> str:
@@ -177,7 +187,7 @@ def world_of(body: Body) -> World:
     law = ContactLaw(*(torch.tensor([p.prior[0]], dtype=torch.float64) for p in CONTACT_PARAMETERS))
     gravity = torch.tensor([[0.0, 0.0, -9.81]], dtype=torch.float64)
     up, zero = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    return World((body,), gravity, up, zero, law)
+    return World(bodies=(body,), gravity=gravity, ground_normal=up, ground_offset=zero, contact=law)
 
 
 def fitted(world: World, tosses: Tosses, seed: int) -> tuple[Array, World]:
@@ -190,13 +200,13 @@ def fitted(world: World, tosses: Tosses, seed: int) -> tuple[Array, World]:
     observations = Observations.of(world, episodes, [(0.0, LENGTH_S + 1e-9)] * len(episodes))
     observations = Observations(**{**vars(observations), "state": state_of(tosses)})
     warm = torch.zeros_like(observations.times_s, dtype=torch.bool)
-    prior = Prior(
+    prior = NormalPrior(
         np.array([p.encode(p.prior[0]) for p in names]),
         np.array([p.prior[1] for p in names]),
         np.array([p.limits for p in names]),
     )
     found = importance_search(
-        _open_loop(world, observations, warm, names),
+        open_loop_errors(world, observations, warm, names),
         prior,
         seed=seed,
         population=POPULATION,

@@ -25,18 +25,18 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from cgwm.datasets.scenes import plan_scene, read_truth
-from cgwm.datasets.scenes.dynamics import STEPS_PER_S, Motion
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.scenes.plan import EpisodePlan, ScenePlan
-from cgwm.datasets.scenes.record import POSITION_STD, ROTATION_STD, build_set, measure_tracks, record
+from cgwm.datasets.synthetic import plan_scene, read_truth
+from cgwm.datasets.synthetic.dynamics import STEPS_PER_S, Motion
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.datasets.synthetic.plan import EpisodePlan, ScenePlan
+from cgwm.datasets.synthetic.record import POSITION_STD, ROTATION_STD, build_set, measure_tracks, record
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.phys_geo import fit_physics
+from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.physics import Body, ContactLaw, World
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State
-from cgwm.pipeline.sg_gs import resolve_device
-from cgwm.schemas import Parameter, PhysConfig, SplatConfig
+from cgwm.pipeline.runtime.device import resolve_device
+from cgwm.schemas import FittedParameter, PhysConfig, SplatConfig
 from numpy.typing import NDArray
 from store import Store, timed
 
@@ -58,16 +58,22 @@ def world_of(solid: SolidObject) -> World:
     arms = solid.vertices - solid.com
     centers = solid.com + arms * (1 - CORNER_M / np.linalg.norm(arms, axis=1, keepdims=True))
     body = Body(
-        "object",
-        "free",
-        tensor(solid.mass),
-        tensor(solid.inertia),
-        tensor(solid.com),
-        tensor(centers),
-        tensor(np.full(len(centers), CORNER_M)),
+        name="object",
+        motion="free",
+        mass=tensor(solid.mass),
+        inertia=tensor(solid.inertia),
+        com=tensor(solid.com),
+        centers=tensor(centers),
+        radii=tensor(np.full(len(centers), CORNER_M)),
     )
     law = ContactLaw(*(tensor(value) for value in (0.3, 0.005, 0.4)))
-    return World((body,), tensor((0.0, 0.0, -9.81)), tensor((0.0, 0.0, 1.0))[0], tensor(0.0), law)
+    return World(
+        bodies=(body,),
+        gravity=tensor((0.0, 0.0, -9.81)),
+        ground_normal=tensor((0.0, 0.0, 1.0))[0],
+        ground_offset=tensor(0.0),
+        contact=law,
+    )
 
 
 def own_motion(plan: ScenePlan, toss: EpisodePlan) -> Motion:
@@ -87,14 +93,14 @@ def own_motion(plan: ScenePlan, toss: EpisodePlan) -> Motion:
     return Motion(toss.motion.start, rows[:, :7], rows[:, 7:], toss.motion.first_contact)
 
 
-def tracked(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[Parameter, ...]:
+def tracked(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[FittedParameter, ...]:
     """Return what a fit to the toss's measured track finds, on the object's true corners."""
     world = replace(world_of(plan.solid), rolls_on=resolve_device(device).type)
     noise = (POSITION_STD, float(ROTATION_STD))
     return fit_physics(world, [(toss.name, measure_tracks(plan, toss))], PhysConfig(seed=plan.seed), noise).parameters
 
 
-def filmed(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[Parameter, ...]:
+def filmed(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[FittedParameter, ...]:
     """Return what a fit to the toss's videos finds; the shape is learned from photos with true cameras."""
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"

@@ -1,7 +1,7 @@
 """Does `cgwm diagnose` name what is hidden, and nothing where nothing is? Captures whose truth is another engine.
 
     python benchmarks/diagnose.py --stage development --workers 2 [--nulls 20] [--only cube/com_offset] [--list rough]
-    python benchmarks/diagnose.py --stage report8 --table
+    python benchmarks/diagnose.py --stage report8 --table [--record]
     python benchmarks/diagnose.py --list odd               # what is unlike the plan: noise, protocols, bodies
     python benchmarks/diagnose.py --list video             # six captures with videos only
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
@@ -10,7 +10,8 @@ Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with f
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
 --effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
 by report to report8, whose seeds are others (each later one: since what the one before said was seen).
-Results are stored case by case and taken up again.
+Results are stored case by case and taken up again; `--record` writes the figures of a whole report into
+benchmarks/results/, from which `make results` makes docs/results.md.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import itertools
 import json
 import multiprocessing
 import os
+import shlex
 import sys
 import tempfile
 import time
@@ -30,13 +32,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import read_model
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.diagnose import diagnose
-from cgwm.pipeline.eval import evaluate_model
+from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.effects.registry import FLIGHT_ALIASES
 from cgwm.schemas import CgwmError, PhysConfig
+from diagnose_figures import record_figures
 from hidden_effects import (
     EFFECTS,
     STAGES,
@@ -244,9 +247,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         lines.append(f"| {name} | {len(some)} | " + " | ".join(str(counts[column]) for column in COLUMNS) + " |")
     nulls = [row for row in rows if row.get("magnitude") == "null"]
     alarms = [row for row in nulls if row["judged"] == "false alarm"]
-    lines.append(
-        f"\nNulls: {len(alarms)} false alarms of {len(nulls)}; 95 % bound {100 * _bound(alarms, nulls):.1f} %."
-    )
+    bound = 100 * _bound(len(alarms), len(nulls))
+    lines.append(f"\nNulls: {len(alarms)} false alarms of {len(nulls)}; 95 % bound {bound:.1f} %.")
     lines += [f"- {row['case']}: {row['found']['verdict']} {', '.join(row['found']['selected'])}" for row in alarms]
     lines += ["", "Not right:"]
     for row in rows:
@@ -277,11 +279,11 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _bound(alarms: Sequence[Any], nulls: Sequence[Any]) -> float:
+def _bound(alarms: int, nulls: int) -> float:
     """Return the upper 95 % bound of the rate (Clopper & Pearson)."""
     from scipy.stats import beta
 
-    return float(beta.ppf(0.95, len(alarms) + 1, max(len(nulls) - len(alarms), 1e-9))) if nulls else 1.0
+    return float(beta.ppf(0.95, alarms + 1, max(nulls - alarms, 1e-9))) if nulls else 1.0
 
 
 def _above_its_limit(row: dict[str, Any]) -> bool | None:
@@ -320,9 +322,13 @@ def main() -> int:
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
+    parser.add_argument("--record", action="store_true", help="write the figures of a whole report to results/")
     parser.add_argument("--time", action="store_true", help="time diagnoses of ten tosses of 1 s, and no more")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of --time")
     given = parser.parse_args()
+    part = given.list != "all" or given.only or not given.nulls or not given.stage.startswith("report")
+    if given.record and part:
+        parser.error("--record wants a whole report: --stage report..., with nulls, and neither --list nor --only.")
     if given.time:
         for line in timing(given.device):
             print(line, flush=True)
@@ -342,7 +348,15 @@ def main() -> int:
         deadline = time.monotonic() + given.seconds
         run([chosen[k] for k in order], store, given.workers, not given.no_refit, deadline)
     names = {case.name for case in chosen}
-    print(table([row for row in store.results() if row["key"] in names]))
+    rows = [row for row in store.results() if row["key"] in names]
+    print(table(rows))
+    if given.record:
+        if len(rows) < len(names):
+            print(f"{len(names) - len(rows)} cases are not measured yet: nothing is recorded.", file=sys.stderr)
+            return 1
+        command = shlex.join(word for word in ("python", "benchmarks/diagnose.py", *sys.argv[1:]) if word != "--record")
+        acts = {name: entry.acts for name, entry in EFFECTS.items()}
+        record_figures(rows, acts=acts.__getitem__, bound=_bound, covered=_covered, command=command)
     return 0
 
 

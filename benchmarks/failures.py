@@ -3,7 +3,8 @@
 python benchmarks/failures.py MODEL CAPTURE PICTURE.png
 
 Above the frames of one camera, below what the model renders; the yellow outline is where the object really was. The
-start is estimated from the first 0.1 s, as `cgwm eval` does it. docs/benchmarks.md says which cells the pictures show.
+start is estimated from the first 0.1 s, as `cgwm eval` does it. docs/results.md links two
+of these pictures, from Fall and Push on wood: the mug (episode 010) and the box (episode 006).
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import read_model
-from cgwm.pipeline.eval import EpisodeEvaluation, evaluate_model
-from cgwm.pipeline.reporting.episodes import strips_of
-from cgwm.pipeline.reporting.pictures import contact_sheet, small_png, telling, tiles
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.evaluate.frame_strips import strips_of
+from cgwm.pipeline.evaluate.stage import EpisodeEvaluation, evaluate_model
+from cgwm.pipeline.rendering.contact_sheets import contact_sheet, small_png, telling, tiles
 
 MOMENTS = 7
 TILE_PX = 200

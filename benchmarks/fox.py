@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.pipeline.sg_gs import fit_scene
-from cgwm.pipeline.splats.losses import psnr, ssim_map
-from cgwm.pipeline.splats.views import View, load_views
+from cgwm.datasets.capture.capture import Capture
+from cgwm.pipeline.rendering.image_metrics import psnr, ssim_map
+from cgwm.pipeline.sg_gs.stage import fit_scene
+from cgwm.pipeline.sg_gs.views import View, load_views
 from cgwm.schemas import SplatConfig
 from store import shared_data
 from torch import Tensor

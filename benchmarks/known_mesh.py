@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.models import read_model
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.splats.mesh import Mesh
-from cgwm.pipeline.splats.surface import Gap, Union
+from cgwm.pipeline.geometry.mesh import Mesh
+from cgwm.pipeline.geometry.surface_distance import Gap, Union
 from cgwm.schemas import SplatConfig
 from mesh_photos import Painted, built_in, scanned, write_capture
 from numpy.typing import NDArray

@@ -13,12 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from cgwm.datasets.cameras import Camera, to_intrinsics
-from cgwm.datasets.images import write_image
-from cgwm.datasets.scenes.objects import make_object
-from cgwm.datasets.scenes.rig import look_at, make_paint
-from cgwm.pipeline.splats.directions import fibonacci_directions
-from cgwm.pipeline.splats.mesh import Mesh
+from cgwm.datasets.capture.cameras import Camera, to_intrinsics
+from cgwm.datasets.capture.images import write_image
+from cgwm.datasets.synthetic.objects import make_object
+from cgwm.datasets.synthetic.rig import look_at, make_paint
+from cgwm.pipeline.geometry.directions import fibonacci_directions
+from cgwm.pipeline.geometry.mesh import Mesh
 from cgwm.schemas import CamerasFile, PosedImage, Scale
 from numpy.typing import NDArray
 
@@ -99,7 +99,13 @@ def cameras_around(mesh: Mesh, count: int, size: int) -> dict[str, Camera]:
     order = np.random.default_rng(0).permutation(count)
     directions = fibonacci_directions(count)[order]
     return {
-        f"{index:03d}.png": Camera(size, size, K, np.zeros(0), look_at(middle + _DISTANCE * radius * way, middle))
+        f"{index:03d}.png": Camera(
+            width=size,
+            height=size,
+            K=K,
+            distortion=np.zeros(0),
+            T_world_cam=look_at(middle + _DISTANCE * radius * way, middle),
+        )
         for index, way in enumerate(directions)
     }
 

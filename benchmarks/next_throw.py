@@ -26,25 +26,25 @@ from typing import Any, Literal
 from zlib import crc32
 
 import numpy as np
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import read_model
-from cgwm.datasets.scenes.hidden.mechanics import Mechanics, Start, build
-from cgwm.datasets.scenes.hidden.record import ENGINES, measured
-from cgwm.datasets.scenes.hidden.things import Kind
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.diagnose import prepared_world
-from cgwm.pipeline.diagnosis.candidates import Candidate, base_parameters
-from cgwm.pipeline.diagnosis.next_throw import RankedThrow, Rivals, ranked_throws
-from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
-from cgwm.pipeline.diagnosis.refit import Refit, refit
-from cgwm.pipeline.diagnosis.score import ScoreTest
-from cgwm.pipeline.diagnosis.segments import Segments
-from cgwm.pipeline.diagnosis.slots import Evidence
-from cgwm.pipeline.diagnosis.throws import DEFAULT, throws_of
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
+from cgwm.datasets.synthetic.hidden_effects.mechanics import Mechanics, Start, build
+from cgwm.datasets.synthetic.hidden_effects.record import ENGINES, measured
+from cgwm.datasets.synthetic.hidden_effects.things import Kind
+from cgwm.pipeline.diagnose.effect_selection import Evidence
+from cgwm.pipeline.diagnose.experiments import DEFAULT, experiments_of
+from cgwm.pipeline.diagnose.next_experiment import RankedExperiment, Rivals, ranked_experiments
+from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.stage import prepared_world
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.parameters import effect_parameters
 from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.segments.candidates import Candidate, base_parameters
+from cgwm.pipeline.segments.prepare import Prepared, prepare
+from cgwm.pipeline.segments.segment_fit import Refit, refit
+from cgwm.pipeline.segments.segments import Segments
 from cgwm.schemas import PhysConfig
 from hidden_effects import Case, make_capture
 from store import Store, timed
@@ -96,7 +96,7 @@ def measure(case: Case, rival: str) -> dict[str, Any]:
     fits = [_with(prepared, world, name) for name in pair]
     discount = max(1.0, min(_contact_chi2(one) for one in fits))
     rivals = Rivals((_evidence(pair[0], fits[0]), _evidence(pair[1], fits[1])), world)
-    ranked = ranked_throws(prepared, rivals, throws_of(DEFAULT), discount)
+    ranked = ranked_experiments(prepared, rivals, experiments_of(DEFAULT), discount)
     before = _nats(fits[0], fits[1], discount)
     rows = {}
     for place, one in (("first", ranked[0]), ("last", ranked[-1])):
@@ -112,7 +112,7 @@ def measure(case: Case, rival: str) -> dict[str, Any]:
     return {"case": case.name, "hidden": pair[0], "rival": rival, "before_nats": round(before, 2), **rows}
 
 
-def made(case: Case, ranked: RankedThrow) -> Track:
+def made(case: Case, ranked: RankedExperiment) -> Track:
     """Return a throw as MuJoCo moves it, measured as the case is."""
     hidden = case.drawn_effects()
     world = build(Mechanics.of(case.drawn_thing(), case.law), hidden)
@@ -157,8 +157,10 @@ def _evidence(name: str, found: Refit) -> Evidence:
     effect = load_effect(name)
     numbers = {p.name: found.number(f"{name}.{p.name}") for p in effect.parameters}
     values = np.array([value for value, _ in numbers.values()])
-    test = ScoreTest(0.0, len(values), 1.0, values, np.eye(len(values)), True)
-    return Evidence(Candidate(name, effect), {}, test, 1.0, numbers=numbers)
+    test = ScoreTest(
+        statistic=0.0, dof=len(values), p_value=1.0, estimate=values, covariance=np.eye(len(values)), admissible=True
+    )
+    return Evidence(candidate=Candidate(name, effect), constants={}, test=test, p_value=1.0, numbers=numbers)
 
 
 def _timed(case: Case, rival: str) -> dict[str, Any]:

@@ -7,7 +7,8 @@ It is `cgwm import pinwm`, `cgwm fit --stage phys-geo --supervise images` and `c
 position [mm] and orientation [deg] over frames 12 to 31 of the push that was fitted and over all frames after the
 warm-up of the one that was not, for the model and a block that stays where the warm-up left it (frozen), and that goes
 on as it was (ballistic). The predictions start from the poses of the warm-up, the first four frames. What the import
-assumes of the pusher, which is in no picture, stands in `datasets/pinwm.py`; nothing was chosen on frames 12 to 31.
+assumes of the pusher, which is in no picture, stands in `datasets/importers/pinwm.py`; nothing was chosen on frames
+12 to 31.
 Published for PIN-WM on its own pushes: friction within 2 to 6 %, one-step errors of 17 mm in the object's frame.
 """
 
@@ -21,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from cgwm.cli.settings import StageSettings
 from cgwm.datasets import Capture, import_pinwm, read_model
-from cgwm.pipeline.eval import evaluate_model
+from cgwm.pipeline.evaluate.prediction import BALLISTIC, FROZEN, MODEL, EpisodePrediction
+from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.prediction import BALLISTIC, FROZEN, MODEL, EpisodePrediction
 from cgwm.schemas import PhysConfig, SplatConfig
 
 FIRST_PREDICTED = 12

@@ -9,7 +9,7 @@ import argparse
 import time
 
 import torch
-from cgwm.datasets.loader import RolloutDataset
+from cgwm.datasets.rollouts.loader import RolloutDataset
 from torch.utils.data import DataLoader
 
 KINDS = {"colour": ("image",), "colour, depth, mask": ("image", "depth", "mask")}

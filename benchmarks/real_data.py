@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.balldrops import import_balldrops
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.contactnets import import_contactnets
-from cgwm.datasets.jugglebot import import_jugglebot
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.models import read_model
-from cgwm.pipeline.compare import compare_models
-from cgwm.pipeline.compared import ComparedModel
-from cgwm.pipeline.eval import Evaluation
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.importers.balldrops import import_balldrops
+from cgwm.datasets.importers.contactnets import import_contactnets
+from cgwm.datasets.importers.jugglebot import import_jugglebot
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.compare.model_comparison import ComparedModel
+from cgwm.pipeline.compare.stage import compare_models
+from cgwm.pipeline.evaluate.stage import Evaluation
 from cgwm.pipeline.fit import fit
 from cgwm.schemas import PhysConfig
 from store import Store, shared_data

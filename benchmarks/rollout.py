@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.pipeline import nvrtc
-from cgwm.pipeline.estimation.forward import batched_jacobian
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, simulate
-from cgwm.pipeline.physics.distance import plane_contacts
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
+from cgwm.pipeline.runtime import kernel_build
 from store import Store
 from torch import Tensor
 
@@ -58,11 +58,27 @@ def world_of(device: str, dtype: torch.dtype, sweeps: int = 10) -> World:
     com = torch.zeros(3, dtype=torch.float64)
     touching = plane_contacts(centers, radii).to(device)
     body = Body(
-        "cube", "free", tensor(MASS_KG), tensor(inertia), tensor(com), tensor(centers), tensor(radii), None, touching
+        name="cube",
+        motion="free",
+        mass=tensor(MASS_KG),
+        inertia=tensor(inertia),
+        com=tensor(com),
+        centers=tensor(centers),
+        radii=tensor(radii),
+        place=None,
+        on_plane=touching,
     )
     law = ContactLaw(tensor(FRICTION), tensor(CONTACT_TIME_S), tensor(DAMPING_RATIO))
     up = tensor([0.0, 0.0, 1.0])[0]
-    return World((body,), tensor([0.0, 0.0, -9.81]), up, tensor(0.0), law, STEP_S, sweeps)
+    return World(
+        bodies=(body,),
+        gravity=tensor([0.0, 0.0, -9.81]),
+        ground_normal=up,
+        ground_offset=tensor(0.0),
+        contact=law,
+        step_s=STEP_S,
+        sweeps=sweeps,
+    )
 
 
 def starts(count: int) -> tuple[np.ndarray, ...]:
@@ -233,7 +249,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="names to measure, or their beginnings")
     parser.add_argument("--lanes", action="store_true", help="measure other numbers of threads an environment, too")
     options = parser.parse_args()
-    store, cuda = Store("rollout"), torch.cuda.is_available() and nvrtc.available()
+    store, cuda = Store("rollout"), torch.cuda.is_available() and kernel_build.available()
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
     tasks: dict[str, Callable[[], dict[str, Any]]] = {}
     if cuda:

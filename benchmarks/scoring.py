@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import Model, read_model
-from cgwm.datasets.scenes import TruthFile, read_truth
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.exposure import estimate_exposures
-from cgwm.pipeline.image_errors import VideoErrors, usable_cameras
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import Model, read_model
+from cgwm.datasets.synthetic import TruthFile, read_truth
+from cgwm.pipeline.demo.truth_tables import OBJECT, true_parameters
+from cgwm.pipeline.evaluate.image_errors import VideoErrors
+from cgwm.pipeline.evaluate.prediction import MODEL, EpisodePrediction, Motion
+from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures
 from cgwm.pipeline.physics.world import State
-from cgwm.pipeline.prediction import MODEL, EpisodePrediction, Motion
-from cgwm.pipeline.reporting.against_truth import OBJECT, true_parameters
+from cgwm.pipeline.rendering.video_view import usable_cameras
 from cgwm.schemas import InputDataError, NotConvergedError
 from contenders.base import Array, Cell, Fitted, Prediction
 
@@ -67,7 +68,7 @@ class Judge:
             return Judge(truth, episodes, None)
         exposures = estimate_exposures(model, capture, "train", cell.device)
         exposed = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
-        return Judge(truth, episodes, VideoErrors(exposed, capture, cell.device, every=psnr_every))
+        return Judge(truth, episodes, VideoErrors(model=exposed, capture=capture, device=cell.device, every=psnr_every))
 
     def episode_errors(self, fitted: Fitted) -> list[dict[str, Any]]:
         """Return a record for each test episode: its errors, or why the prediction failed.

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.scenes import plan_scene
-from cgwm.datasets.scenes.record import build_set, manifest, take_photos, truth
-from cgwm.pipeline.splats.separation import separate
-from cgwm.pipeline.splats.views import View, load_views
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.synthetic import plan_scene
+from cgwm.datasets.synthetic.record import build_set, manifest, take_photos, truth
+from cgwm.pipeline.sg_gs.body_separation import separate
+from cgwm.pipeline.sg_gs.views import View, load_views
 from cgwm.schemas import PhotoBox, SplatConfig
 from store import Store
 

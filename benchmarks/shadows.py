@@ -13,8 +13,8 @@ import argparse
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.scenes import plan_scene
-from cgwm.datasets.scenes.record import Set, _empty, build_set, frame_of
+from cgwm.datasets.synthetic import plan_scene
+from cgwm.datasets.synthetic.record import Set, _empty, build_set, frame_of
 from store import Store
 
 GROUND_M = 1e-4

@@ -18,8 +18,8 @@ import time
 from collections.abc import Callable
 
 import torch
-from cgwm.pipeline.splats.rasterize import Raster, rasterize
-from cgwm.pipeline.splats.render import render
+from cgwm.pipeline.rendering.rasterize import Raster, rasterize
+from cgwm.pipeline.rendering.render import render
 from torch import Tensor
 
 SIZES = {

@@ -36,7 +36,7 @@ class Store:
 
     def __init__(self, name: str, path: Path | None = None, any_commit: bool = False) -> None:
         self._path = path or ROOT / "out" / "evidence" / f"{name}.jsonl"
-        self._commit, self._any = _commit(), any_commit
+        self._commit, self._any = commit_of_tree(), any_commit
         lines = self._path.read_text(encoding="utf-8").splitlines() if self._path.is_file() else []
         # a line that was cut off by a kill is measured again
         self._rows = [row for row in map(_parsed, lines) if row is not None]
@@ -81,7 +81,7 @@ def timed(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return {"wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1), **figures}
 
 
-def _commit() -> str:
+def commit_of_tree() -> str:
     """Return the commit, with a + if files differ from it: such results are not taken up again."""
 
     def git(*words: str) -> str:

@@ -24,18 +24,18 @@ from typing import Any
 import numpy as np
 import synthesize_model
 import torch
-from cgwm.datasets import chunks
-from cgwm.datasets.models import read_model
-from cgwm.datasets.processors import processors
-from cgwm.datasets.rollout_writer import RolloutWriter, _encoded_images
-from cgwm.datasets.rollouts import FrameBlock
-from cgwm.pipeline import synthesis_job
-from cgwm.pipeline import synthesize as stage
-from cgwm.pipeline.cluster import synthesize_shards
-from cgwm.pipeline.draws import draw_rollout
-from cgwm.pipeline.rollout_batches import Motion
-from cgwm.pipeline.rollout_labels import labels_of
-from cgwm.pipeline.stopwatch import Stopwatch
+from cgwm.datasets.io.processors import processors
+from cgwm.datasets.models.model import read_model
+from cgwm.datasets.rollouts import chunks
+from cgwm.datasets.rollouts.rollout_writer import RolloutWriter, _encoded_images
+from cgwm.datasets.rollouts.rollouts import FrameBlock
+from cgwm.pipeline.runtime.device import resolve_device
+from cgwm.pipeline.runtime.timing import Stopwatch
+from cgwm.pipeline.synthesize import job, stage
+from cgwm.pipeline.synthesize.draw import draw_rollout
+from cgwm.pipeline.synthesize.labels import labels_of
+from cgwm.pipeline.synthesize.shards import synthesize_shards
+from cgwm.pipeline.synthesize.simulator import Motion
 from cgwm.schemas import SynthesizeConfig
 from store import Store
 
@@ -57,7 +57,7 @@ class Bench:
     @property
     def device(self) -> str:
         """Cpu or cuda."""
-        return synthesis_job.device_of(self.config)
+        return str(resolve_device(self.config.device))
 
     def end_to_end(self, compression: str) -> dict[str, Any]:
         """Return the speed of the whole."""
@@ -116,7 +116,7 @@ class Bench:
 
     def job(self) -> Any:
         """Return what the stage prepares once."""
-        return synthesis_job.prepared(self.model, self.config)
+        return job.prepared(self.model, self.config)
 
     def motions(self, job: Any, count: int) -> list[Motion]:
         """Return the first rollouts."""

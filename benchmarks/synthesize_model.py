@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.ply import Splats
-from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Parameter, Pose, Provenance, Solver
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.schemas import BodyModel, ContactParameters, FittedParameter, Ground, ModelFile, Pose, Provenance, Solver
 
 BODY_SPHERES, SCENE_SPHERES, COLLISION_PER_SIDE = 5_000, 20_000, 4
 HALF_M, MASS_KG, SCENE_HALF_M, WALL_M = 0.05, 0.4, 0.8, 0.8
@@ -67,14 +67,16 @@ def model() -> Model:
         bodies=(body,),
         contact=ContactParameters(friction=0.3, contact_time_s=0.004, damping_ratio=0.3),
         parameters=(
-            Parameter(name="friction", unit="1", estimate=0.3, std_error=0.03, bounds=(0.01, 2.0)),
-            Parameter(name="contact_time_s", unit="s", estimate=0.004, std_error=0.0004, bounds=(0.001, 0.03)),
-            Parameter(name="damping_ratio", unit="1", estimate=0.3, std_error=0.03, bounds=(0.02, 3.0)),
+            FittedParameter(name="friction", unit="1", estimate=0.3, std_error=0.03, bounds=(0.01, 2.0)),
+            FittedParameter(name="contact_time_s", unit="s", estimate=0.004, std_error=0.0004, bounds=(0.001, 0.03)),
+            FittedParameter(name="damping_ratio", unit="1", estimate=0.3, std_error=0.03, bounds=(0.02, 3.0)),
         ),
         solver=Solver(step_s=0.001),
         provenance=Provenance(capture="none"),
     )
-    return Model(None, file, {"cube": body_splats()}, {"cube": collision}, scene_splats())
+    return Model(
+        root=None, file=file, body_splats={"cube": body_splats()}, collision={"cube": collision}, scene=scene_splats()
+    )
 
 
 def write(path: Path) -> Path:

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.pipeline.estimation.noise import estimate_noise
-from cgwm.pipeline.estimation.observations import Observations
-from cgwm.pipeline.estimation.states import covariance_root
-from cgwm.pipeline.estimation.trajectory import retract
-from cgwm.pipeline.estimation.warmup import clearance, estimate_states, warmup_frames
-from cgwm.pipeline.phys_geo import track_episodes
+from cgwm.datasets.capture.capture import Capture
+from cgwm.pipeline.geometry.rotation import geodesic_angle
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters
 from cgwm.pipeline.physics.rollout import simulate
-from cgwm.pipeline.physics.rotation import geodesic_angle
 from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.trajectories.initial_state import clearance, estimate_states, warmup_frames
+from cgwm.pipeline.trajectories.observations import Observations, track_episodes
+from cgwm.pipeline.trajectories.residuals import retract
+from cgwm.pipeline.trajectories.state_uncertainty import covariance_root
+from cgwm.pipeline.trajectories.track_noise import estimate_noise
 from torch import Tensor
 
 Motions = tuple[Tensor, Tensor]

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.contactnets import HALF_WIDTH_M, INERTIA_KG_M2, RATE_HZ, import_contactnets
-from cgwm.datasets.models import read_model
-from cgwm.pipeline.eval import evaluate
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.importers.contactnets import HALF_WIDTH_M, INERTIA_KG_M2, RATE_HZ, import_contactnets
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.evaluate import evaluate
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import PhysConfig

@@ -18,6 +18,7 @@ _PUBLIC = {
     "Capture": ".datasets.capture",
     "CgwmError": ".schemas",
     "CheckFailedError": ".schemas",
+    "ClosedLoop": ".pipeline.control",
     "DamagedShardError": ".schemas",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
@@ -25,58 +26,67 @@ _PUBLIC = {
     "NotEnoughMemoryError": ".schemas",
     "NotEnoughSpaceError": ".schemas",
     "PhysConfig": ".schemas",
+    "Reach": ".pipeline.control",
     "SplatConfig": ".schemas",
     "SynthesizeConfig": ".schemas",
     "UsageError": ".schemas",
+    "Velocity": ".pipeline.control",
     "calibrate": ".pipeline.calibrate",
     "compare": ".pipeline.compare",
     "diagnose": ".pipeline.diagnose",
-    "doctor": ".pipeline.doctor",
-    "evaluate": ".pipeline.eval",
+    "doctor": ".pipeline.runtime.doctor",
+    "evaluate": ".pipeline.evaluate",
     "export": ".pipeline.export",
     "fit": ".pipeline.fit",
-    "import_balldrops": ".datasets.balldrops",
-    "import_contactnets": ".datasets.contactnets",
-    "import_csv": ".datasets.csv_tracks",
-    "import_hdf5": ".datasets.hdf5_tracks",
-    "import_jugglebot": ".datasets.jugglebot",
-    "import_pinwm": ".datasets.pinwm",
-    "import_rosbag": ".datasets.rosbag",
-    "import_tum": ".datasets.tum",
-    "merge": ".pipeline.merge",
+    "import_balldrops": ".datasets.importers.balldrops",
+    "import_contactnets": ".datasets.importers.contactnets",
+    "import_csv": ".datasets.importers.csv_tracks",
+    "import_hdf5": ".datasets.importers.hdf5_tracks",
+    "import_jugglebot": ".datasets.importers.jugglebot",
+    "import_pinwm": ".datasets.importers.pinwm",
+    "import_rosbag": ".datasets.importers.rosbag",
+    "import_tum": ".datasets.importers.tum",
+    "merge": ".pipeline.synthesize",
     "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
-    "run_mystery": ".pipeline.mystery",
+    "run_mystery": ".pipeline.demo",
     "synthesize": ".pipeline.synthesize",
     "validate": ".pipeline.validate",
 }
 
-if TYPE_CHECKING:  # installed, all rooms lie in this package; in the source tree they lie beside it
-    from .datasets.balldrops import import_balldrops  # pyright: ignore[reportMissingImports]
-    from .datasets.capture import Capture  # pyright: ignore[reportMissingImports]
-    from .datasets.contactnets import import_contactnets  # pyright: ignore[reportMissingImports]
-    from .datasets.csv_tracks import import_csv  # pyright: ignore[reportMissingImports]
-    from .datasets.hdf5_tracks import import_hdf5  # pyright: ignore[reportMissingImports]
-    from .datasets.jugglebot import import_jugglebot  # pyright: ignore[reportMissingImports]
-    from .datasets.models import Model, read_model  # pyright: ignore[reportMissingImports]
-    from .datasets.pinwm import import_pinwm  # pyright: ignore[reportMissingImports]
-    from .datasets.rosbag import import_rosbag  # pyright: ignore[reportMissingImports]
-    from .datasets.tum import import_tum  # pyright: ignore[reportMissingImports]
-    from .pipeline.calibrate import calibrate  # pyright: ignore[reportMissingImports]
-    from .pipeline.compare import compare  # pyright: ignore[reportMissingImports]
-    from .pipeline.demo import run_demo  # pyright: ignore[reportMissingImports]
-    from .pipeline.diagnose import diagnose  # pyright: ignore[reportMissingImports]
-    from .pipeline.doctor import doctor  # pyright: ignore[reportMissingImports]
-    from .pipeline.eval import evaluate  # pyright: ignore[reportMissingImports]
-    from .pipeline.export import export  # pyright: ignore[reportMissingImports]
-    from .pipeline.fit import fit  # pyright: ignore[reportMissingImports]
-    from .pipeline.merge import merge  # pyright: ignore[reportMissingImports]
-    from .pipeline.mystery import run_mystery  # pyright: ignore[reportMissingImports]
-    from .pipeline.synthesize import synthesize  # pyright: ignore[reportMissingImports]
-    from .pipeline.validate import validate  # pyright: ignore[reportMissingImports]
-    from .pipeline.view import open_view  # pyright: ignore[reportMissingImports]
-    from .schemas import (  # pyright: ignore[reportMissingImports]
+# Installed, all rooms lie in this package; in the source tree they lie next to it.
+# pyright: reportMissingImports=false
+if TYPE_CHECKING:
+    from .datasets.capture import Capture
+    from .datasets.importers.balldrops import import_balldrops
+    from .datasets.importers.contactnets import import_contactnets
+    from .datasets.importers.csv_tracks import import_csv
+    from .datasets.importers.hdf5_tracks import import_hdf5
+    from .datasets.importers.jugglebot import import_jugglebot
+    from .datasets.importers.pinwm import import_pinwm
+    from .datasets.importers.rosbag import import_rosbag
+    from .datasets.importers.tum import import_tum
+    from .datasets.models import Model, read_model
+    from .pipeline.calibrate import calibrate
+    from .pipeline.compare import compare
+    from .pipeline.control import ClosedLoop, Reach, Velocity
+    from .pipeline.demo import (
+        run_demo,
+        run_mystery,
+    )
+    from .pipeline.diagnose import diagnose
+    from .pipeline.evaluate import evaluate
+    from .pipeline.export import export
+    from .pipeline.fit import fit
+    from .pipeline.runtime.doctor import doctor
+    from .pipeline.synthesize import (
+        merge,
+        synthesize,
+    )
+    from .pipeline.validate import validate
+    from .pipeline.view import open_view
+    from .schemas import (
         CalibrateConfig,
         CgwmError,
         CheckFailedError,
@@ -96,6 +106,7 @@ __all__ = [
     "Capture",
     "CgwmError",
     "CheckFailedError",
+    "ClosedLoop",
     "DamagedShardError",
     "InputDataError",
     "Model",
@@ -103,9 +114,11 @@ __all__ = [
     "NotEnoughMemoryError",
     "NotEnoughSpaceError",
     "PhysConfig",
+    "Reach",
     "SplatConfig",
     "SynthesizeConfig",
     "UsageError",
+    "Velocity",
     "__version__",
     "calibrate",
     "compare",

@@ -1,4 +1,4 @@
-"""The verbs of `cgwm`, in the order in which a capture meets them."""
+"""The verbs of `cgwm`, in the order in which they are usually run."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from .validate import validate
 from .view import view
 
 VERBS = (
-    ("demo", demo, "The whole pipeline on a scene that it makes itself."),
-    ("calibrate", calibrate, "Photos to cameras, with a metric scale."),
-    ("fit", fit, "A capture to a world model."),
-    ("synthesize", synthesize, "A model to labelled rollouts in HDF5."),
-    ("merge", merge, "The shards of a dataset as one HDF5 file."),
-    ("view", view, "A dataset or a model in the browser."),
-    ("eval", evaluate, "A model against measurements."),
-    ("compare", compare, "Where and when each model fails, side by side."),
-    ("diagnose", diagnose, "Which effect a model lacks."),
-    ("import", import_capture, "Recordings in another format to a capture."),
-    ("export", export, "A dataset or a model in the format of another tool."),
+    ("demo", demo, "Run the whole pipeline on a simulated scene."),
+    ("calibrate", calibrate, "Estimate cameras from photos, with a metric scale."),
+    ("fit", fit, "Fit a world model to a capture."),
+    ("synthesize", synthesize, "Make labelled rollouts of a model, in HDF5."),
+    ("merge", merge, "Join the shards of a dataset into one HDF5 file."),
+    ("view", view, "Show a dataset or a model in the browser."),
+    ("eval", evaluate, "Evaluate a model against measurements."),
+    ("compare", compare, "Compare models: where and when each fails."),
+    ("diagnose", diagnose, "Find the effect that a model lacks."),
+    ("import", import_capture, "Convert recordings in another format to a capture."),
+    ("export", export, "Convert a dataset or model to another tool's format."),
     ("validate", validate, "Check a capture, a model or a dataset."),
-    ("doctor", doctor, "What this machine has, and what would be used."),
+    ("doctor", doctor, "Report what this machine has and what would be used."),
 )
 
 GROUPS = {
     "effects": (
-        "Effects that can be added to a model; a template.",
+        "List, show and create effects that extend a model.",
         (
-            ("list", list_effects, "All effects that there are."),
-            ("show", show_effect, "An effect's formula, parameters, and what reveals it."),
-            ("new", new_effect, "A template of one's own effect."),
+            ("list", list_effects, "List all available effects."),
+            ("show", show_effect, "Show an effect's formula, parameters and evidence."),
+            ("new", new_effect, "Write a template of a custom effect."),
         ),
     ),
 }
-"""Verbs with verbs of their own."""
+"""Groups of verbs."""
 
 _MANNERS: dict[str, Any] = {
     "no_args_is_help": True,
@@ -85,4 +85,4 @@ def _root(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
-    """Take the options that stand before the verb."""
+    """Handle the options before the verb."""

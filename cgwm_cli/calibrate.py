@@ -1,4 +1,4 @@
-"""`cgwm calibrate`: photos to cameras."""
+"""The verb `cgwm calibrate`: estimate cameras from photos."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def calibrate(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Photos to cameras: poses, lens, metric scale, and a verdict for each image."""
+    """Estimate cameras from photos: poses, lens, metric scale, and a verdict for each image."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.calibrate import calibrate as work
         from ..schemas import CalibrateConfig

@@ -1,4 +1,4 @@
-"""`cgwm compare`: models side by side, and where each of them fails."""
+"""The verb `cgwm compare`: compare models, and show where each of them fails."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def compare(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Where and when each model fails, side by side; an HTML page to look at."""
+    """Compare models on measured motion: where and when each fails, as figures and as an HTML page."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.compare import compare as work
         from ..schemas import UsageError
 
         if not warmup_s > 0:
-            raise UsageError(f"--warmup-s {warmup_s:g}: no length of time.", "more than 0 s.")
+            raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
         emit(work(models, capture, split, out, warmup_s, device, overwrite), _summary)
 
 

@@ -1,4 +1,4 @@
-"""`cgwm demo`: the whole pipeline on a scene that it makes itself, or the loop from a model to what it lacks."""
+"""The verb `cgwm demo`: run the whole pipeline on a simulated scene, or search for a hidden effect."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ def demo(
         Literal["fall", "push", "mystery"],
         typer.Option(
             "--scene",
-            help="fall: an object dropped and bouncing; push: one pushed by a fingertip; mystery: something is hidden "
-            "in the physics or the measurement, and found by fit, compare and diagnose.",
+            help="fall: an object falls and bounces; push: a fingertip pushes an object; mystery: fit, compare and "
+            "diagnose search for an effect that is hidden in the physics or the measurement.",
         ),
     ] = "fall",
     renderer: Annotated[
-        Literal["raycast"], typer.Option("--renderer", help="How the photos are made; raycast needs no OpenGL.")
+        Literal["raycast"], typer.Option("--renderer", help="Renderer of the photos; raycast needs no OpenGL.")
     ] = "raycast",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Object, parameters and noise vary with it.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of object, parameters and noise.")] = 0,
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """The whole pipeline on a scene that it makes itself, with a report at the end."""
+    """Run the whole pipeline on a simulated scene, and write a report."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         if scene == "mystery":
-            from ..pipeline.mystery import run_mystery
+            from ..pipeline.demo import run_mystery
 
             emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
             return
@@ -47,13 +47,13 @@ def demo(
 
 
 def _story(result: MysteryResult, out: Path) -> str:
-    """Tell the mystery in the order in which it was solved."""
+    """Summarise the mystery in the order in which it was solved."""
     from .output import millimetres, quantity, warnings
 
     errors = [millimetres(model.translation_error_m.median) for model in result.comparison.models]
     lines = [
         f"fit       m0, from {result.train_episodes} episodes of a {result.body}",
-        f"compare   m0 errs by {errors[0]} on {result.test_episodes} episodes that it has not seen (median)",
+        f"compare   m0: median error {errors[0]} on {result.test_episodes} episodes that it has not seen",
         f"diagnose  {result.diagnosis.sentence}",
     ]
     if result.diagnosis.selected:
@@ -106,7 +106,7 @@ def _images_only(fit: ImagesOnlyFit) -> str:
         return f"Physics from the video frames alone did not converge: {fit.message}"
     turn = fit.evaluation.rotation_error_deg
     words = f"Physics from the video frames alone: {millimetres(fit.evaluation.translation_error_m.median)}"
-    return words + (f" and {turn.median:.1f} deg" if turn else "") + " (medians; no target is set)."
+    return words + (f" and {turn.median:.1f} deg" if turn else "") + " (medians; without a target)."
 
 
 def _wanted(target: DemoTarget) -> str:

@@ -1,4 +1,4 @@
-"""`cgwm diagnose`: which effect a model lacks."""
+"""The verb `cgwm diagnose`: find the effect that a model lacks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, RankedEffect
 
 SHOWN = 8
-"""So many candidates are listed; --json has all."""
+"""Number of candidates that are listed; --json has all."""
 THROWS_SHOWN = 3
-"""And so many throws."""
+"""Number of throws that are listed."""
 
 
 def diagnose(
@@ -35,7 +35,7 @@ def diagnose(
         typer.Option(
             "--candidates",
             metavar="FILE.py:CLASS,...",
-            help="Effects of your own, beside the built-in ones.",
+            help="Custom effects, in addition to the built-in ones.",
             show_default=False,
         ),
     ] = "",
@@ -44,8 +44,8 @@ def diagnose(
         typer.Option(
             "--throws",
             metavar="FILE",
-            help="Throws among which to look for the next one: a TOML file of [[throws]] tables.",
-            show_default="about 30 that a hand can make",
+            help="Candidates for the next throw: a TOML file of [[throws]] tables.",
+            show_default="about 30 that can be thrown by hand",
         ),
     ] = None,
     save_law: Annotated[
@@ -53,7 +53,7 @@ def diagnose(
         typer.Option(
             "--save-law",
             metavar="FILE.py",
-            help="Write the law of what no candidate explains as an effect of your own.",
+            help="If no candidate explains the residual, write its law as a custom effect.",
             show_default=False,
         ),
     ] = None,
@@ -63,7 +63,7 @@ def diagnose(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Which physical or measurement effect is missing, and what these data cannot tell apart."""
+    """Find the missing physical or measurement effect, and the effects that these data cannot distinguish."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.diagnose import diagnose as work
 
@@ -81,16 +81,16 @@ def _summary(result: DiagnoseResult) -> str:
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
         lines.append(
-            f"flight, mean chi2 of what is left: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
+            f"flight, mean chi2 of the residual: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
         )
     lines += _limits(result.contact_limits)
     for entry in result.ranking:
         if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
             errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
-            lines.append(f"{entry.effect}: short predictions in episodes that it was not fitted to {errors}")
+            lines.append(f"{entry.effect}: error of short predictions in episodes held out from its fit {errors}")
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
-        lines.append(f"law of what is left: {terms}; organised by {result.residual_law.where}")
+        lines.append(f"law of the residual: {terms}; explained by {result.residual_law.where}")
     if result.next_experiment is not None:
         lines += _experiment(result.next_experiment)
     if result.saved_law is not None:
@@ -102,11 +102,11 @@ def _summary(result: DiagnoseResult) -> str:
 
 
 def _limits(limits: tuple[ContactLimit, ...]) -> list[str]:
-    """Return what contact could have shown; a silent diagnosis says nothing about less."""
+    """Return the detection limits of effects in contact, below which the diagnosis makes no statement."""
     seen = [f"{one.effect} from {_sizes(one)}" for one in limits if one.sizes]
     blind = [one.effect for one in limits if not one.sizes]
-    lines = [f"contact would have shown, about: {'; '.join(seen)}"] if seen else []
-    return [*lines, *([f"contact can hardly judge: {', '.join(blind)}"] if blind else [])]
+    lines = [f"approximate detection limits in contact: {'; '.join(seen)}"] if seen else []
+    return [*lines, *([f"hardly detectable in contact: {', '.join(blind)}"] if blind else [])]
 
 
 def _sizes(limit: ContactLimit) -> str:
@@ -116,11 +116,11 @@ def _sizes(limit: ContactLimit) -> str:
 
 def _experiment(found: NextExperiment) -> list[str]:
     if not found.ranked:
-        return [f"To tell them apart: {found.what}."]
-    lines = [f"To tell {' and '.join(found.separates)} apart: {found.what}."]
-    lines.append(f"  1. {found.ranked[0]['what']} (some {found.ranked[0]['order_of_magnitude']:g} nats to expect)")
+        return [f"To distinguish them: {found.what}."]
+    lines = [f"To distinguish {' and '.join(found.separates)}: {found.what}."]
+    lines.append(f"  1. {found.ranked[0]['what']} (about {found.ranked[0]['order_of_magnitude']:g} nats expected)")
     lines += [
-        f"  {entry['rank']}. {entry['what']} (some {entry['order_of_magnitude']:g} nats)"
+        f"  {entry['rank']}. {entry['what']} (about {entry['order_of_magnitude']:g} nats)"
         for entry in found.ranked[1:THROWS_SHOWN]
     ]
     return lines

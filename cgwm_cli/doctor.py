@@ -1,4 +1,4 @@
-"""`cgwm doctor`: what this machine has."""
+"""The verb `cgwm doctor`: report what this machine has."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def doctor(json: Json = False, quiet: Quiet = False, debug: Debug = False) -> None:
-    """What this machine has, what is missing, and what would be used."""
+    """Report what this machine has, what is missing, and what cgwm would use."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.doctor import doctor as work
+        from ..pipeline.runtime.doctor import doctor as work
 
         report = work()
         emit(report, _summary)

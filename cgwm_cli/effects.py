@@ -1,4 +1,4 @@
-"""`cgwm effects`: what can be added to a model, and a template of one's own."""
+"""The verbs `cgwm effects`: list and show effects, and write a template of a custom effect."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def list_effects(json: Json = False, quiet: Quiet = False, debug: Debug = False) -> None:
-    """The effects that can be added to a model: built in, and those of installed packages."""
+    """List the effects that can be added to a model: built-in ones and those of installed packages."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.effects import list_effects as work
+        from ..pipeline.physics.effects.catalogue import list_effects as work
 
         emit(work(), _listed)
 
@@ -30,9 +30,9 @@ def show_effect(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """An effect's formula, its parameters, the motion that reveals it, and what it can be mistaken for."""
+    """Show an effect's formula, its parameters, the motion that reveals it, and effects it can be mistaken for."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.effects import show_effect as work
+        from ..pipeline.physics.effects.catalogue import show_effect as work
 
         emit(work(name), _shown)
 
@@ -44,9 +44,9 @@ def new_effect(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """A template of one's own effect, which runs as it stands."""
+    """Write a template of a custom effect, which runs unchanged."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.effects import new_effect as work
+        from ..pipeline.physics.effects.catalogue import new_effect as work
 
         emit(work(file, overwrite), _written)
 
@@ -82,4 +82,4 @@ def _sign(sign: str) -> str:
 
 
 def _written(new: NewEffect) -> str:
-    return f"Wrote {new.path}.\nNext: change it, then cgwm effects show {new.name}"
+    return f"Wrote {new.path}.\nNext: edit it, then cgwm effects show {new.name}"

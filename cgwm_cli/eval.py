@@ -1,4 +1,4 @@
-"""`cgwm eval`: a model against measurements."""
+"""The verb `cgwm eval`: evaluate a model against measurements."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def evaluate(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """A model against measurements: open-loop errors of position, rotation and image."""
+    """Evaluate a model against measurements: open-loop errors of position, rotation and image."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.eval import evaluate as work
+        from ..pipeline.evaluate import evaluate as work
         from ..schemas import UsageError
 
         if not warmup_s > 0:
-            raise UsageError(f"--warmup-s {warmup_s:g}: no length of time.", "more than 0 s.")
+            raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
         emit(work(model, target, split, warmup_s, device), _summary)
 
 

@@ -1,4 +1,4 @@
-"""`cgwm export`: a dataset or a model in the format of another tool."""
+"""The verb `cgwm export`: convert a dataset or a model to the format of another tool."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="Of a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout). "
-            "Of a model: mjcf, ply (3D Gaussian splatting), colmap, glb (KHR_gaussian_splatting).",
+            help="For a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout). "
+            "For a model: mjcf, ply (3D Gaussian splatting), colmap, glb (KHR_gaussian_splatting).",
             show_default=False,
         ),
     ],
@@ -33,7 +33,7 @@ def export(
             "--out",
             "-o",
             metavar="PATH",
-            help="The directory to write; for mjcf an .xml, for glb a .glb, for ply a directory or one .ply of all.",
+            help="The directory to write; for mjcf an .xml, for glb a .glb, for ply a directory or a single .ply.",
             show_default=False,
         ),
     ],
@@ -51,23 +51,23 @@ def export(
         typer.Option("--every", min=1, help="lerobot, bop, nerfstudio: every n-th frame (1).", show_default=False),
     ] = None,
     task: Annotated[
-        str | None, typer.Option("--task", help="lerobot: what the task is, in words.", show_default=False)
+        str | None, typer.Option("--task", help="lerobot: description of the task.", show_default=False)
     ] = None,
     rollout: Annotated[
-        int | None, typer.Option("--rollout", min=0, help="nerfstudio: number of the rollout (0).", show_default=False)
+        int | None, typer.Option("--rollout", min=0, help="nerfstudio: index of the rollout (0).", show_default=False)
     ] = None,
     mask: Annotated[
         Literal["none", "scene", "bodies"] | None,
         typer.Option(
             "--mask",
-            help="nerfstudio: pixels that count; scene leaves the moving bodies out (none: all count).",
+            help="nerfstudio: pixels that count; scene excludes the moving bodies (none: all count).",
             show_default=False,
         ),
     ] = None,
     sh_degree: Annotated[
         int | None,
         typer.Option(
-            "--sh-degree", min=0, max=3, help="ply: pad with zeros; INRIA's viewer wants 3 (0).", show_default=False
+            "--sh-degree", min=0, max=3, help="ply: pad with zeros; INRIA's viewer needs 3 (0).", show_default=False
         ),
     ] = None,
     capture: Annotated[
@@ -78,23 +78,23 @@ def export(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option("--seed", min=0, help="mjcf: of the throw or push to compare by (0).", show_default=False),
+        typer.Option("--seed", min=0, help="mjcf: seed of the motion compared with MuJoCo (0).", show_default=False),
     ] = None,
     duration: Annotated[
         float | None,
-        typer.Option("--duration", min=0.02, help="mjcf: how long it is compared [s] (1).", show_default=False),
+        typer.Option("--duration", min=0.02, help="mjcf: length of that motion [s] (1).", show_default=False),
     ] = None,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """A dataset or a model in the format of another tool."""
+    """Convert a dataset or a model to the format of another tool."""
     given = {"split": split, "cameras": cameras, "every": every, "task": task, "rollout": rollout, "mask": mask}
     given |= {"sh_degree": sh_degree, "capture": capture, "seed": seed, "duration_s": duration}
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.export import OPTIONS, ExportOptions
         from ..pipeline.export import export as work
+        from ..pipeline.export.stage import OPTIONS, ExportOptions
 
         words = {name: value for name, value in given.items() if value is not None}
         refuse_foreign(words, OPTIONS[to], f"--to {to}")

@@ -1,4 +1,4 @@
-"""`cgwm fit`: a capture to a world model."""
+"""The verb `cgwm fit`: fit a world model to a capture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Se
 from .run import running
 
 if TYPE_CHECKING:
-    from ..schemas import ModelFile, Parameter
+    from ..schemas import FittedParameter, ModelFile
 
 
 def fit(
@@ -20,14 +20,15 @@ def fit(
         Path, typer.Option("--out", "-o", metavar="MODEL", help="The directory to write.", show_default=False)
     ],
     stage: Annotated[
-        Literal["all", "sg-gs", "phys-geo"], typer.Option("--stage", help="all: what the capture has inputs for.")
+        Literal["all", "sg-gs", "phys-geo"],
+        typer.Option("--stage", help="all: the stages that the capture has inputs for."),
     ] = "all",
     parent: Annotated[
-        Path | None, typer.Option("--from", metavar="MODEL", help="Start from a fitted model; it stays as it is.")
+        Path | None, typer.Option("--from", metavar="MODEL", help="Start from a fitted model, which is not changed.")
     ] = None,
     supervise: Annotated[
         Literal["tracks", "images", "both"] | None,
-        typer.Option("--supervise", show_default="tracks", help="What the motion is compared with."),
+        typer.Option("--supervise", show_default="tracks", help="Measurement that the motion is fitted to."),
     ] = None,
     split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to fit.")] = "train",
     effects: Annotated[
@@ -35,32 +36,34 @@ def fit(
         typer.Option(
             "--effects",
             metavar="NAME,NAME",
-            help="Effects to add and to fit ('cgwm effects list'), or one's own: file.py:Class.",
+            help="Effects to add and fit ('cgwm effects list'), or custom ones: file.py:Class.",
             show_default=False,
         ),
     ] = None,
     spheres: Annotated[
         int | None,
-        typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres that go where needed."),
+        typer.Option("--spheres", metavar="N", help="Fit the background with up to N spheres, placed where needed."),
     ] = None,
     joint: Annotated[
         bool | None,
         typer.Option(
             "--joint/--two-step",
             show_default=False,
-            help="Fit geometry and colours of bodies together, or geometry first (the default where maps guide it).",
+            help="Fit geometry and colours of bodies together, or geometry first (the default with geometry maps).",
         ),
     ] = None,
     exposure: Annotated[
-        bool | None, typer.Option("--exposure", help="Learn exposure and white balance of every photo.")
+        bool | None, typer.Option("--exposure", help="Estimate exposure and white balance of every photo.")
     ] = None,
     refine_poses: Annotated[
         bool | None, typer.Option("--refine-poses", help="Refine the poses of the photos' cameras first.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a fit of MODEL that was interrupted.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted fit of MODEL.")] = False,
     collision: Annotated[
         Literal["distilled", "visual"] | None,
-        typer.Option("--collision", show_default="distilled", help="What collides: a small set, or what is seen."),
+        typer.Option(
+            "--collision", show_default="distilled", help="Collision spheres: a small set, or the visual spheres."
+        ),
     ] = None,
     seed: Seed = None,
     device: Device = None,
@@ -71,7 +74,7 @@ def fit(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """A capture to a world model: its shape and looks (sg-gs), its physics (phys-geo)."""
+    """Fit a world model to a capture: shape and appearance (sg-gs), then physics (phys-geo)."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.fit import fit as work
         from ..schemas import PhysConfig, SplatConfig
@@ -99,7 +102,7 @@ def _summary(model: ModelFile, out: Path) -> str:
     from .output import table, warnings
 
     bodies = ", ".join(f"{body.name} ({body.motion})" for body in model.bodies)
-    state = "with physics" if model.contact else "shape and looks only: no physics yet"
+    state = "with physics" if model.contact else "shape and appearance only, without physics"
     lines = [f"Fitted {out}: {bodies}; {state}."]
     if model.parameters:
         lines.append(
@@ -108,7 +111,7 @@ def _summary(model: ModelFile, out: Path) -> str:
     return "\n".join([*lines, *warnings(model.warnings)])
 
 
-def _row(parameter: Parameter) -> list[str]:
+def _row(parameter: FittedParameter) -> list[str]:
     from .output import quantity
 
     interval = parameter.interval_95

@@ -1,4 +1,4 @@
-"""`cgwm import`: other people's recordings to a capture."""
+"""The verb `cgwm import`: convert recordings in other formats to a capture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OPTIONS = {
     "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
     "rosbag": ("topic", *_TRACKS),
 }
-"""Which options mean something for which format."""
+"""Options that each format takes."""
 
 
 def import_capture(
@@ -34,8 +34,8 @@ def import_capture(
         Literal["contactnets", "pinwm", "jugglebot", "balldrops", "csv", "tum", "hdf5", "rosbag"],
         typer.Argument(
             metavar="FORMAT",
-            help="csv, tum, hdf5, rosbag: poses of your own; contactnets: tosses of a cube (.pt files or .npz); "
-            "pinwm: pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: balls that fall.",
+            help="csv, tum, hdf5, rosbag: your own poses; contactnets: tosses of a cube (.pt files or .npz); pinwm: "
+            "pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: falling balls.",
             show_default=False,
         ),
     ],
@@ -48,7 +48,7 @@ def import_capture(
         typer.Option(
             "--train",
             min=1,
-            help="Episodes of the split 'train' (contactnets: 50, else 60 %); pinwm: frames of each of them (12).",
+            help="Episodes of the split 'train' (contactnets: 50, else 60 %); pinwm: frames of each episode (12).",
             show_default=False,
         ),
     ] = None,
@@ -77,7 +77,7 @@ def import_capture(
             "--columns",
             metavar="KEY=NAME,...",
             help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz); "
-            "hdf5: of sets (time, position, quat_wxyz, quat_xyzw).",
+            "hdf5: names of datasets (time, position, quat_wxyz, quat_xyzw).",
             show_default=False,
         ),
     ] = None,
@@ -90,31 +90,31 @@ def import_capture(
         typer.Option("--time-unit", help="csv, tum, hdf5: unit of times (s).", show_default=False),
     ] = None,
     body: Annotated[
-        str | None, typer.Option("--body", help="Name of the body, where the data have none.", show_default=False)
+        str | None, typer.Option("--body", help="Name of the body, if the data have none.", show_default=False)
     ] = None,
     up: Annotated[
         Literal["z", "y"] | None, typer.Option("--up", help="The axis that points up (z).", show_default=False)
     ] = None,
     topic: Annotated[
         str | None,
-        typer.Option("--topic", help="rosbag: the poses; of transforms /tf:CHILD_FRAME.", show_default=False),
+        typer.Option("--topic", help="rosbag: topic of the poses; for transforms /tf:CHILD_FRAME.", show_default=False),
     ] = None,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Recordings in another format to a capture."""
+    """Convert recordings in another format to a capture."""
     given = {"train": train, "test": test, "seed": seed, "only": only, "columns": columns, "body": body, "up": up}
     given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic}
     with running(json=json, quiet=quiet, debug=debug) as emit:
         words = {name: value for name, value in given.items() if value is not None}
-        refuse_foreign(words, _OPTIONS[format_], format_, "leave it out.")
+        refuse_foreign(words, _OPTIONS[format_], format_, "omit it.")
         emit(_imported(format_, source, out, words, overwrite), _summary)
 
 
 def _imported(format_: str, source: Path, out: Path, given: dict[str, Any], overwrite: bool) -> ImportResult:
-    """Import with the options that were given, all others as the importer has them."""
+    """Import with the given options and the importer's defaults for all others."""
     from .. import datasets
 
     renamed = {"train": "n_train", "test": "n_test"}
@@ -127,14 +127,14 @@ def _imported(format_: str, source: Path, out: Path, given: dict[str, Any], over
 
 
 def _named(text: str) -> dict[str, str]:
-    """Return what `--columns` names: key to name."""
+    """Parse the value of `--columns` into names by key."""
     from ..schemas import UsageError
 
     named = {}
     for part in text.split(","):
         key, sign, name = part.partition("=")
         if not (sign and key.strip() and name.strip()):
-            raise UsageError(f"--columns: '{part}' is no KEY=NAME.", "KEY=NAME,KEY=NAME.", "for example time=t,px=X.")
+            raise UsageError(f"--columns: '{part}' is not KEY=NAME.", "KEY=NAME,KEY=NAME.", "for example time=t,px=X.")
         named[key.strip()] = name.strip()
     return named
 

@@ -1,4 +1,4 @@
-"""`cgwm merge`: the shards of a dataset as one file."""
+"""The verb `cgwm merge`: join the shards of a dataset into one file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def merge(
         list[Path],
         typer.Argument(
             metavar="DATASET...",
-            help="The dataset's directory; several where its shards lie in several.",
+            help="The directory of the dataset, or several that share its shards.",
             show_default=False,
         ),
     ],
@@ -29,7 +29,7 @@ def merge(
             "--out",
             "-o",
             metavar="PATH",
-            help="An index (.h5), or a directory for a dataset of links. [default: DATASET/index.h5]",
+            help="The index (.h5) to write, or a directory for a dataset of links. [default: DATASET/index.h5]",
             show_default=False,
         ),
     ] = None,
@@ -43,7 +43,7 @@ def merge(
 ) -> None:
     """Join the shards of a dataset into one HDF5 file of virtual datasets; nothing is copied."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.merge import merge as work
+        from ..pipeline.synthesize import merge as work
 
         emit(work(datasets, out, overwrite, hashes), _summary)
 

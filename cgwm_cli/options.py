@@ -1,7 +1,7 @@
-"""The options that several verbs share, so that they are spelt and explained alike.
+"""Options that several verbs share, so that their names and help texts agree.
 
-An option that is also a setting of a stage defaults to None, so that a settings file can give it; what it is then is
-shown in the help, and a test compares that with the stage's configuration.
+An option that is also a setting of a stage defaults to None, so that a settings file can give it. The help shows the
+default of the stage, and a test compares the two.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import typer
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only (and the document of --json).")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Seed = Annotated[int | None, typer.Option("--seed", min=0, show_default="0", help="Seed of everything random.")]
-AnyDevice = Annotated[DeviceName, typer.Option("--device", help="auto takes a CUDA device where there is one.")]
-"""Of verbs without settings: nothing but the option says it."""
+AnyDevice = Annotated[DeviceName, typer.Option("--device", help="auto takes a CUDA device if one is available.")]
+"""Device of verbs without settings: only the option sets it."""
 Device = Annotated[
     DeviceName | None,
-    typer.Option("--device", show_default="auto", help="auto takes a CUDA device where there is one."),
+    typer.Option("--device", show_default="auto", help="auto takes a CUDA device if one is available."),
 ]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace an output that exists, once the new one is complete.")
@@ -32,5 +32,5 @@ ConfigFile = Annotated[
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="STAGE.KEY=VALUE", help="One setting; may be repeated. Wins over --config."),
+    typer.Option("--set", metavar="STAGE.KEY=VALUE", help="One setting; may be repeated. Overrides --config."),
 ]

@@ -1,4 +1,4 @@
-"""Pieces of the summaries that people read: aligned plain text, numbers with their units."""
+"""Formatting of summaries as plain text: aligned tables, numbers with units, warnings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
-    """Align the columns of a table; the first to the left, numbers to the right.
+    """Align the columns of a table: text to the left, numbers to the right.
 
     >>> print(table([["translation", "8.1 mm"], ["rotation", "12.0 deg"]]))
       translation    8.1 mm
@@ -24,7 +24,7 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
-    """Write a number with its unit; a dash where there is none.
+    """Write a number with its unit; a dash if there is none.
 
     >>> quantity(0.0081234, "m"), quantity(None, "m"), quantity(25.0, "dB")
     ('0.00812 m', '-', '25 dB')

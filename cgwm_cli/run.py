@@ -1,4 +1,4 @@
-"""How every verb runs: signals, errors and exit codes, and a stdout that belongs to the result alone."""
+"""Execution of the verbs: signals, errors, exit codes, and a stdout that carries only the result."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _typed: list[str] = []
 _RAY_ADDRESS = re.compile(r"auto|local|ray://.+|[\w.-]+:\d+")
 
 
-def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run `cgwm` with these arguments (default: those of the process), and end the process with its exit code."""
+def run_command(load_app: Callable[[], Callable[..., Any]], arguments: list[str]) -> NoReturn:
+    """Run the application that `load_app` imports with arguments, and end the process with its exit code."""
     _catch_signals()
     try:
-        code = _invoke(sys.argv[1:] if arguments is None else arguments)
+        code = _invoke(load_app, arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
         code = _say_interrupted()
     except BrokenPipeError:
-        # Whoever read our output has gone ("cgwm ... | head"): nobody is left to tell.
+        # the reader of our output has closed it ("cgwm ... | head"), so the exit code is the only message
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     if _interrupted:
@@ -45,13 +45,13 @@ Emit = Callable[["FileModel", Callable[[Any], str]], None]
 
 @contextlib.contextmanager
 def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> Iterator[Emit]:
-    """Wrap the work of a verb: whatever it raises becomes one clear message on stderr and the right exit code.
+    """Run the work of a verb, and turn any exception into one message on stderr and the right exit code.
 
-    Yields a function that takes the result and how to summarise it; it is printed when the work is over. Progress, logs
-    and what libraries print meanwhile go to stderr if that is a terminal, and nowhere otherwise.
+    Yields a function that takes the result and a function that summarises it; the text is printed when the work is
+    done. Progress, logs and the output of libraries go to stderr if that is a terminal; otherwise they are discarded.
 
     Raises:
-        typer.Exit: With the exit code, when the work failed.
+        typer.Exit: With the exit code, if the work failed.
     """
     watched = _is_watched(quiet, debug)
     if not watched:
@@ -78,7 +78,7 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
 
 
 def with_values(arguments: list[str]) -> list[str]:
-    """Give `--ray` its value where it stands alone: typer has no options whose value may be left out.
+    """Add the value of a `--ray` without one, because typer has no options with an optional value.
 
     >>> with_values(["synthesize", "--ray", "model", "--out", "data"])
     ['synthesize', '--ray', 'auto', 'model', '--out', 'data']
@@ -96,14 +96,12 @@ def typed() -> list[str]:
     return _typed
 
 
-def _invoke(arguments: list[str]) -> int:
-    from .app import app
-
+def _invoke(load_app: Callable[[], Callable[..., Any]], arguments: list[str]) -> int:
     _typed[:] = arguments
     try:
-        return int(app(with_values(arguments), prog_name="cgwm", standalone_mode=False) or 0)
+        return int(load_app()(with_values(arguments), prog_name="cgwm", standalone_mode=False) or 0)
     except Exception as error:
-        # Typer's own errors are told by their shape: since 0.26 their classes are private.
+        # typer's errors are recognised by this method, because their classes are private since 0.26
         if not hasattr(error, "format_message"):
             raise
         from .usage import explain
@@ -130,35 +128,35 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror}."
-    from ..pipeline.memory import ran_out_of_memory
+    from ..pipeline.runtime.resources import ran_out_of_memory
 
     if ran_out_of_memory(error):
-        return "The memory did not suffice.\nNext: close other programs, or work on less at a time."
+        return "Out of memory.\nNext: close other programs, or work on less at a time."
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("cgwm"):
         return f"The package '{error.name}' is not installed.\nNext: run 'cgwm doctor', which prints the pip line."
     hint = "" if debug else "\nNext: run the command again with --debug, and report the traceback."
-    return f"A fault inside cgwm: {type(error).__name__}: {error}{hint}"
+    return f"Internal error in cgwm: {type(error).__name__}: {error}{hint}"
 
 
 def _say_interrupted(state: str = "") -> int:
-    """Say it, and what the work says about its state; most work leaves nothing."""
-    state = state or "nothing was left under the output's name."
+    """Print that the command was interrupted and the state that the work reports; most work leaves no output."""
+    state = state or "no output was written."
     print(f"Interrupted; {state}", file=sys.stderr)
     return INTERRUPTED
 
 
 def _catch_signals() -> None:
-    """Make SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, so that what is unfinished is cleaned up."""
+    """Make SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, so that unfinished output is cleaned up."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
-        # A signal that our parent had us ignore (nohup, a background job) stays ignored.
+        # a signal that the parent process set to be ignored (nohup, a background job) stays ignored
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             with contextlib.suppress(ValueError):  # not in the main thread
                 signal.signal(number, _interrupt)
 
 
 def _leave(code: int) -> NoReturn:
-    """End the process without waiting for threads: one that an interrupt kept from being known waits for ever."""
+    """End the process without waiting for threads: a thread whose start was interrupted may never end."""
     import atexit
 
     with contextlib.suppress(BaseException):
@@ -170,18 +168,18 @@ def _leave(code: int) -> NoReturn:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    global _interrupted  # noqa: PLW0603  a library may turn the exception into another; this tells them apart
+    global _interrupted  # noqa: PLW0603  remembered because a library may convert the exception
     _interrupted = True
     raise KeyboardInterrupt
 
 
 def _is_watched(quiet: bool, debug: bool) -> bool:
-    """Tell whether somebody wants to see progress and logs."""
+    """Return whether progress and logs are shown."""
     return debug or (sys.stderr.isatty() and not quiet)
 
 
 def _hush() -> None:
-    """Silence logs and warnings; the progress bars of cgwm.datasets.progress read the variable."""
+    """Silence logs and warnings; the progress bars of cgwm.datasets.io.progress read the variable."""
     import logging
     import warnings
 
@@ -192,9 +190,9 @@ def _hush() -> None:
 
 @contextlib.contextmanager
 def _stdout_for_results_only(watched: bool) -> Iterator[None]:
-    """Send what is printed inside to stderr if somebody watches, and nowhere otherwise.
+    """Redirect what is printed inside to stderr if `watched`, and discard it otherwise.
 
-    That is done to the file descriptors, because compiled libraries print past `sys.stdout`.
+    The file descriptors are redirected, because compiled libraries bypass `sys.stdout`.
     """
     _flush()
     saved = [os.dup(1), os.dup(2)]

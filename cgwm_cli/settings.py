@@ -1,4 +1,4 @@
-"""From a settings file, `--set` and options to the configuration of a stage. The later wins."""
+"""Configuration of a stage from a settings file, `--set` and options, each overriding the ones before."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ ConfigT = TypeVar("ConfigT", bound="FileModel")
 
 
 class StageSettings:
-    """What the user set for the stages of one command.
+    """Settings that the user gave for the stages of one command.
 
     Args:
-        stages: The stages that the command runs, with their configurations; settings of other stages are refused,
-            not passed over.
+        stages: The stages that the command runs, with their configurations; settings of other stages are refused.
         file: A TOML file with a table for each stage, or None.
         assignments: `stage.key=value` (or `stage.table.key=value`), as typed after `--set`.
 
     Raises:
         InputDataError: If the file is wrong.
-        UsageError: If an assignment is.
+        UsageError: If an assignment is wrong.
     """
 
     def __init__(
@@ -45,7 +44,7 @@ class StageSettings:
         Args:
             stage: The stage's name.
             config: The model of its configuration.
-            **options: Values of the command's own options, which win; None where one was not given.
+            **options: Values of the command's options, which override the others; None if not given.
 
         Raises:
             InputDataError: If a setting is unknown or out of its range.
@@ -63,7 +62,7 @@ class StageSettings:
         stage, *path = (part.strip() for part in key.split("."))
         if not (equals and stage and path and all(path)):
             example = f"{self._stages[0]}.seed=1"
-            raise UsageError(f"--set {text}: not understood.", f"STAGE.KEY=VALUE, for example {example}.")
+            raise UsageError(f"--set {text}: not a setting.", f"STAGE.KEY=VALUE, for example {example}.")
         if stage not in self._stages:
             legal = f"{', '.join(self._stages)}.{did_you_mean(stage, self._stages)}"
             raise UsageError(f"--set {text}: this command runs no stage '{stage}'.", legal)
@@ -71,7 +70,7 @@ class StageSettings:
         for part in [stage, *path[:-1]]:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
-                raise UsageError(f"--set {text}: '{part}' is no table.")
+                raise UsageError(f"--set {text}: '{part}' is not a table.")
         table[path[-1]] = _value(value.strip())
 
 
@@ -91,7 +90,7 @@ def _attribute(stage: str) -> str:
 
 
 def _value(text: str) -> Any:
-    """Read a value as TOML does (numbers, booleans, lists); anything else is a word."""
+    """Parse a value as TOML (numbers, booleans, lists); anything else is a string."""
     import tomllib
 
     try:

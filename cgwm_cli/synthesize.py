@@ -1,4 +1,4 @@
-"""`cgwm synthesize`: a world model to labelled rollouts."""
+"""The verb `cgwm synthesize`: make labelled rollouts of a world model."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def synthesize(
     plan: Annotated[
         Path | None,
         typer.Option(
-            "--plan", metavar="FILE", help="What to draw from (TOML); printed as resolved.", show_default=False
+            "--plan", metavar="FILE", help="Distributions to draw from (TOML); printed as resolved.", show_default=False
         ),
     ] = None,
     print_plan: Annotated[
-        bool, typer.Option("--print-plan", help="Print the plan for this model as TOML, to edit; make nothing.")
+        bool, typer.Option("--print-plan", help="Only print the plan for this model as TOML, to edit.")
     ] = False,
     rollouts: Annotated[
-        int | None, typer.Option("--rollouts", show_default="8", help="Number of rollouts, of all shards together.")
+        int | None, typer.Option("--rollouts", show_default="8", help="Number of rollouts in all shards together.")
     ] = None,
     shard: Annotated[
         str | None,
@@ -39,26 +39,26 @@ def synthesize(
     ] = None,
     shards: Annotated[
         int | None,
-        typer.Option("--shards", min=1, metavar="N", help="Make N shards, all of them.", show_default=False),
+        typer.Option("--shards", min=1, metavar="N", help="Make all of N shards.", show_default=False),
     ] = None,
     ray: Annotated[
         str | None,
         typer.Option(
             "--ray",
             metavar="[ADDRESS]",
-            help="Make the shards on a Ray cluster: its address; local; or the one that is there.",
+            help="Make the shards on a Ray cluster: its address, local, or (without a value) the running one.",
             show_default=False,
         ),
     ] = None,
     workers: Annotated[
         int,
-        typer.Option("--workers", min=1, metavar="K", help="Make K shards at a time, in processes of this machine."),
+        typer.Option("--workers", min=1, metavar="K", help="Make K shards at a time, in processes on this machine."),
     ] = 1,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Keep the shards that are complete; with --overwrite remake damaged ones.")
+        bool, typer.Option("--resume", help="Keep complete shards; with --overwrite remake damaged ones.")
     ] = False,
     preview: Annotated[
-        bool, typer.Option("--preview/--no-preview", help="Write preview.png and preview.webm beside the first shard.")
+        bool, typer.Option("--preview/--no-preview", help="Write preview.png and preview.webm next to the first shard.")
     ] = True,
     seed: Seed = None,
     device: Device = None,
@@ -69,7 +69,7 @@ def synthesize(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """A model to labelled rollouts in HDF5: images, depth, masks, poses, contacts, parameters."""
+    """Make labelled rollouts of a model, in HDF5: images, depth, masks, poses, contacts, parameters."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
         from .settings import StageSettings
@@ -78,7 +78,7 @@ def synthesize(
             other = "--shards" if shards is not None else "--ray"
             raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
         if workers > 1 and (shard is not None or ray is not None):
-            other = "--shard makes one" if shard is not None else "--ray has workers of its own"
+            other = "--shard makes one" if shard is not None else "--ray has its own workers"
             raise UsageError(f"--workers {workers} makes several shards at a time here; {other}.", "one of the two.")
         index, count = _shard(shard) if shard is not None else (None, shards)
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
@@ -86,10 +86,10 @@ def synthesize(
         )
         if plan is not None:
             if "plan" in settings.model_fields_set:
-                raise UsageError("--plan, and synthesize.plan in the settings.", "one of the two.")
+                raise UsageError("--plan and synthesize.plan in the settings were given.", "one of the two.")
             settings = settings.model_copy(update={"plan": read_plan(plan)})
         if print_plan:
-            from ..pipeline.synthesis_job import resolved_plan
+            from ..pipeline.synthesize.job import resolved_plan
 
             emit(resolved_plan(model, settings.plan), plan_toml)
         elif out is None:
@@ -100,7 +100,7 @@ def synthesize(
             done = work(model, out, settings, overwrite, resume, preview)
             emit(done, lambda found: (_plan(found) if plan is not None else "") + _summary(found, settings.shards))
         else:
-            from ..pipeline.cluster import default_shards, synthesize_shards
+            from ..pipeline.synthesize.shards import default_shards, synthesize_shards
 
             if "shards" not in settings.model_fields_set:
                 settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
@@ -113,7 +113,7 @@ def _shard(text: str) -> tuple[int, int]:
 
     index, slash, count = text.partition("/")
     if not (slash and index.isdecimal() and count.isdecimal()) or int(index) >= int(count):
-        raise UsageError(f"--shard {text}: no shard.", "I/N with 0 <= I < N, for example 3/64.")
+        raise UsageError(f"--shard {text}: not a shard.", "I/N with 0 <= I < N, for example 3/64.")
     return int(index), int(count)
 
 
@@ -159,7 +159,7 @@ def _preview(summary: DatasetSummary | ShardsSummary) -> list[str]:
 
 
 def _slurm_line(arguments: list[str], count: int) -> str:
-    """Return the command that submits all shards, from the one that made one of them.
+    """Return the command that submits all shards to SLURM, from the command that made one of them.
 
     >>> _slurm_line(["synthesize", "m", "--shard", "3/9", "-o", "data"], 9)
     "sbatch --array=0-8 --wrap 'cgwm synthesize m --shard $SLURM_ARRAY_TASK_ID/9 -o data --resume'"

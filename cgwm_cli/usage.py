@@ -1,4 +1,4 @@
-"""What is said when a command was typed in a way that it cannot be."""
+"""Messages about wrong usage of the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def explain(error: Any, arguments: list[str]) -> str:
-    """Put one of typer's usage errors into the three parts of our messages: found, allowed, what to do next."""
+    """Format a usage error of typer as our messages: what was found, what is allowed, what to do next."""
     from ..schemas import UsageError, did_you_mean
 
     context = getattr(error, "ctx", None)
@@ -24,7 +24,7 @@ def explain(error: Any, arguments: list[str]) -> str:
     verbs = list(getattr(context.command, "commands", {})) if context else []
     message = _sentence(error.format_message().replace("Value error, ", ""))
     if message.startswith("No such command"):
-        before = len(command.split()) - 1  # the group that the verb was looked for in
+        before = len(command.split()) - 1  # words of the group that should have the verb
         verb = next((word for word in arguments[before:] if not word.startswith("-")), "")
         found = f"{command}: there is no command '{verb}'."
         return str(UsageError(found, f"{', '.join(verbs)}.{did_you_mean(verb, verbs)}", todo))
@@ -32,33 +32,33 @@ def explain(error: Any, arguments: list[str]) -> str:
 
 
 def refuse_foreign(given: Iterable[str], legal: Iterable[str], where: str, todo: str = "") -> None:
-    """Refuse options of a verb that mean nothing for one of its formats.
+    """Refuse options of a verb that do not apply to one of its formats.
 
     Args:
-        given: Names of the arguments that were given; an option is spelt like its argument, without its unit.
-        legal: Names of those that mean something there.
-        where: What the options stood with, for the message.
+        given: Names of the arguments that were given; an option is named like its argument, without its unit.
+        legal: Names of the arguments that apply.
+        where: The format or option that they were given with, for the message.
         todo: What to do next.
 
     Raises:
-        UsageError: If one means nothing.
+        UsageError: If an option does not apply.
     """
     from ..schemas import UsageError
 
     options = [option_name(name) for name in legal]
     for name in given:
         if option_name(name) not in options:
-            allowed = ", ".join(options) or "no option of its own"
-            raise UsageError(f"{option_name(name)} with {where}: it means nothing there.", f"{allowed}.", todo)
+            allowed = ", ".join(options) or "no format-specific option"
+            raise UsageError(f"{option_name(name)} does not apply to {where}.", f"{allowed}.", todo)
 
 
 def option_name(name: str) -> str:
-    """Return how the option of an argument is spelt: without its unit."""
+    """Return the name of the option of an argument, without its unit."""
     return "--" + name.removesuffix("_s").replace("_", "-")
 
 
 def _nearest_choice(message: str) -> str:
-    """Suggest the legal value that is nearest to a wrong one, from a message that quotes both."""
+    """Suggest the allowed value that is most similar to a wrong one, from a message that quotes both."""
     from ..schemas import did_you_mean
 
     found, is_choice, legal = message.partition(" is not one of ")

@@ -1,4 +1,4 @@
-"""`cgwm validate`: is this capture, model or dataset what it should be?"""
+"""The verb `cgwm validate`: check a capture, model or dataset."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ def validate(
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A capture, model or dataset.", show_default=False)],
     sample: Annotated[
         int | None,
-        typer.Option("--sample", metavar="N", help="Of a dataset, N rollouts drawn at random.", show_default="all"),
+        typer.Option(
+            "--sample", metavar="N", help="Check only N rollouts of a dataset, drawn at random.", show_default="all"
+        ),
     ] = None,
     seed: Seed = None,
     json: Json = False,

@@ -1,4 +1,4 @@
-"""`cgwm view`: a dataset or a model in the browser."""
+"""The verb `cgwm view`: show a dataset or a model in the browser."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ if TYPE_CHECKING:
 
 
 def view(
-    thing: Annotated[Path, typer.Argument(metavar="DATASET|MODEL", help="What to look at.", show_default=False)],
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port to listen at; 0: any free one.")] = 8080,
+    thing: Annotated[
+        Path, typer.Argument(metavar="DATASET|MODEL", help="The dataset or model to show.", show_default=False)
+    ],
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port to listen on; 0: any free one.")] = 8080,
     host: Annotated[
-        str, typer.Option("--host", help="Address to listen at; with 0.0.0.0 everyone on the network can look.")
+        str, typer.Option("--host", help="Address to listen on; with 0.0.0.0 everyone on the network can connect.")
     ] = "127.0.0.1",
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Show a dataset's rollouts, or a model and its own motion, in the browser; Ctrl-C ends it."""
+    """Show the rollouts of a dataset, or a model and its simulated motion, in the browser until Ctrl-C."""
     with contextlib.ExitStack() as ends:
         with running(json=json, quiet=quiet, debug=debug) as emit:
             from ..pipeline.view import open_view
@@ -45,7 +47,7 @@ def _summary(report: ViewReport) -> str:
 
 
 def _open(url: str) -> None:
-    """Open a page where there is a screen; a browser in the terminal would take the terminal over."""
+    """Open a page in a browser if a display exists; a text browser would occupy the terminal."""
     import os
     import sys
     import webbrowser

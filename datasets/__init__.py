@@ -7,58 +7,58 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .atomic import new_directory, new_file, sha256
-    from .balldrops import import_balldrops
-    from .cameras import Camera, camera_of, read_cameras, to_intrinsics
-    from .capture import Capture
-    from .check import CaptureFacts, check_capture
-    from .contactnets import import_contactnets
-    from .csv_tracks import import_csv
-    from .dataset import read_manifest
-    from .hdf5_tracks import import_hdf5
-    from .images import read_label, read_rgb, write_image
-    from .jugglebot import import_jugglebot
-    from .kinds import kind_of
-    from .loader import RolloutDataset, RolloutReader
-    from .manifest import manifest_toml, write_manifest
-    from .meshes import Mesh, SolidProperties, mass_properties, read_mesh
-    from .mjcf import write_mjcf
-    from .models import Model, read_model, write_model
-    from .pinwm import import_pinwm
-    from .ply import Splats, read_splats, write_splats
-    from .progress import progress
-    from .recordings import Units
-    from .rosbag import import_rosbag
-    from .tracks import Track, read_tracks, write_tracks
-    from .tum import import_tum
-    from .video import read_video
+    from .capture.cameras import Camera, camera_of, read_cameras, to_intrinsics
+    from .capture.capture import Capture
+    from .capture.check import CaptureFacts, check_capture
+    from .capture.images import read_label, read_rgb, write_image
+    from .capture.manifest import manifest_toml, write_manifest
+    from .capture.tracks import Track, read_tracks, write_tracks
+    from .capture.video import read_video
+    from .importers.balldrops import import_balldrops
+    from .importers.contactnets import import_contactnets
+    from .importers.csv_tracks import import_csv
+    from .importers.hdf5_tracks import import_hdf5
+    from .importers.jugglebot import import_jugglebot
+    from .importers.pinwm import import_pinwm
+    from .importers.recordings import Units
+    from .importers.rosbag import import_rosbag
+    from .importers.tum import import_tum
+    from .io.atomic import new_directory, new_file, sha256
+    from .io.kinds import kind_of
+    from .io.progress import progress
+    from .models.mjcf import write_mjcf
+    from .models.model import Model, read_model, write_model
+    from .rollouts.dataset import read_manifest
+    from .rollouts.loader import RolloutDataset, RolloutReader
+    from .shapes.meshes import Mesh, SolidProperties, mass_properties, read_mesh
+    from .shapes.ply import Splats, read_splats, write_splats
 
 _HOMES = {
-    "atomic": ("new_directory", "new_file", "sha256"),
-    "balldrops": ("import_balldrops",),
-    "cameras": ("Camera", "camera_of", "read_cameras", "to_intrinsics"),
-    "capture": ("Capture",),
-    "check": ("CaptureFacts", "check_capture"),
-    "contactnets": ("import_contactnets",),
-    "csv_tracks": ("import_csv",),
-    "dataset": ("read_manifest",),
-    "hdf5_tracks": ("import_hdf5",),
-    "images": ("read_label", "read_rgb", "write_image"),
-    "jugglebot": ("import_jugglebot",),
-    "kinds": ("kind_of",),
-    "loader": ("RolloutDataset", "RolloutReader"),
-    "manifest": ("manifest_toml", "write_manifest"),
-    "meshes": ("Mesh", "SolidProperties", "mass_properties", "read_mesh"),
-    "mjcf": ("write_mjcf",),
-    "models": ("Model", "read_model", "write_model"),
-    "pinwm": ("import_pinwm",),
-    "ply": ("Splats", "read_splats", "write_splats"),
-    "progress": ("progress",),
-    "recordings": ("Units",),
-    "rosbag": ("import_rosbag",),
-    "tracks": ("Track", "read_tracks", "write_tracks"),
-    "tum": ("import_tum",),
-    "video": ("read_video",),
+    "io.atomic": ("new_directory", "new_file", "sha256"),
+    "importers.balldrops": ("import_balldrops",),
+    "capture.cameras": ("Camera", "camera_of", "read_cameras", "to_intrinsics"),
+    "capture.capture": ("Capture",),
+    "capture.check": ("CaptureFacts", "check_capture"),
+    "importers.contactnets": ("import_contactnets",),
+    "importers.csv_tracks": ("import_csv",),
+    "rollouts.dataset": ("read_manifest",),
+    "importers.hdf5_tracks": ("import_hdf5",),
+    "capture.images": ("read_label", "read_rgb", "write_image"),
+    "importers.jugglebot": ("import_jugglebot",),
+    "io.kinds": ("kind_of",),
+    "rollouts.loader": ("RolloutDataset", "RolloutReader"),
+    "capture.manifest": ("manifest_toml", "write_manifest"),
+    "shapes.meshes": ("Mesh", "SolidProperties", "mass_properties", "read_mesh"),
+    "models.mjcf": ("write_mjcf",),
+    "models.model": ("Model", "read_model", "write_model"),
+    "importers.pinwm": ("import_pinwm",),
+    "shapes.ply": ("Splats", "read_splats", "write_splats"),
+    "io.progress": ("progress",),
+    "importers.recordings": ("Units",),
+    "importers.rosbag": ("import_rosbag",),
+    "capture.tracks": ("Track", "read_tracks", "write_tracks"),
+    "importers.tum": ("import_tum",),
+    "capture.video": ("read_video",),
 }
 _PUBLIC = {name: f".{module}" for module, names in _HOMES.items() for name in names}
 

@@ -7,28 +7,29 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from ..datasets.atomic import refuse_existing, sha256
-from ..datasets.cameras import require_metric
-from ..datasets.capture import Capture
-from ..datasets.colmap_model import find_colmap_model
-from ..datasets.geometry_maps import KINDS
-from ..datasets.models import Model, read_model, write_model
-from ..datasets.ply import Splats
+from ..datasets.capture.cameras import require_metric
+from ..datasets.capture.capture import Capture
+from ..datasets.capture.colmap_model import find_colmap_model
+from ..datasets.capture.geometry_maps import KINDS
+from ..datasets.capture.sparse_points import POINTS_NAME
+from ..datasets.io.atomic import refuse_existing, sha256
+from ..datasets.models.model import Model, read_model, write_model
+from ..datasets.shapes.ply import Splats
 from ..schemas import (
     Body,
     BodyModel,
     ContactParameters,
     EffectModel,
     FitFile,
+    FittedParameter,
     InputDataError,
     ModelFile,
-    Parameter,
     PhysConfig,
     Pose,
     Provenance,
@@ -36,20 +37,21 @@ from ..schemas import (
     SplatConfig,
     UsageError,
 )
-from .checkpoint import Checkpoint
-from .fit_effects import fit_with_effects, fitted_effects, with_effects
-from .memory import enough_memory
-from .phys_geo import PhysicsFit, track_episodes
+from .phys_geo.effects.requested_effects import fit_with_effects, fitted_effects, with_effects
+from .phys_geo.images.video_checks import examine_videos
+from .phys_geo.tracks.contact_result import PhysicsFit
 from .physics.effects.registry import load_effect
 from .physics.world import World, symmetric
-from .sfm.points import POINTS_NAME
-from .sg_gs import SgGsResult, fit_scene, resolve_device
-from .video_checks import examine_videos
+from .runtime.checkpoint import Checkpoint
+from .runtime.device import resolve_device
+from .runtime.resources import enough_memory
+from .sg_gs.stage import SgGsResult, fit_scene
+from .trajectories.observations import track_episodes
 
 Stage = Literal["all", "sg-gs", "phys-geo"]
 
 ASSUMED_DENSITY_KG_M3 = 500.0
-"""Stands in for a mass that is not given; free motion and contact with the ground do not depend on it."""
+"""Density assumed for a body without a given mass; free motion and contact with the ground do not depend on it."""
 
 
 def fit(
@@ -63,70 +65,48 @@ def fit(
     overwrite: bool = False,
     resume: bool = False,
 ) -> ModelFile:
-    """Fit a capture and write the model.
+    """Fit a capture stage by stage and write the model.
 
     Args:
         capture: The capture's directory.
         out: The model's directory; it appears when the fit is complete.
-        stage: `sg-gs` (shape and looks), `phys-geo` (contact, needs a shape or `parent`), or all that the capture has
-            inputs for.
+        stage: `sg-gs` (shape and appearance), `phys-geo` (contact, needs a shape or `parent`), or `all` for which the
+            capture has inputs.
         parent: A model to start from; it is not changed.
-        split: The episodes to fit.
+        split: Name of the episodes to fit.
         splat_config: Settings of sg-gs.
         phys_config: Settings of phys-geo.
         overwrite: Replace an existing model.
-        resume: Go on with a fit of the same model that was interrupted, if there is one.
+        resume: Continue an interrupted fit of the same model, if there is one.
 
     Returns:
-        What stands in `model.json`.
+        The content of `model.json`.
 
     Raises:
         UsageError: If `out` exists, or the split does not.
         InputDataError: If the capture lacks what the stage needs.
         NotConvergedError: If the fit diverges; nothing is written then.
-        NotEnoughMemoryError: If the memory does not suffice.
+        NotEnoughMemoryError: If there is not enough memory.
     """
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
-    refuse_existing(out, overwrite)
-    with_effects((), phys_config.effects)  # a name that is wrong is told before hours of work
-    if phys_config.effects and stage == "sg-gs":
-        raise UsageError(
-            "--effects with --stage sg-gs: effects are fitted to motion.", "--stage phys-geo or all.", "leave one out."
-        )
+    _refuse_early(out, stage, phys_config, overwrite)
     opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
     started = time.perf_counter()
-    config = {"sg-gs": splat_config.model_dump(mode="json"), "phys-geo": phys_config.model_dump(mode="json")}
-    # phys-geo alone makes no spheres, so that the photos need not be read for their hashes
-    made_of = {} if stage == "phys-geo" else _made_of(opened, splat_config)
-    if stage != "sg-gs":
-        made_of |= _physics_made_of(opened, stage, parent, split, phys_config)
-    checkpoint = Checkpoint.beside(Path(out), made_of, resume, overwrite)
+    request = _Request(
+        capture=opened,
+        out=Path(out),
+        stage=stage,
+        parent=parent,
+        split=split,
+        splat_config=splat_config,
+        phys_config=phys_config,
+    )
+    checkpoint = Checkpoint.beside(request.out, _inputs(request), resume, overwrite)
     moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
-    # what videos cannot teach is told before hours of work
-    warnings = (
-        examine_videos(opened, split, phys_config.supervise == "both")
-        if moves and phys_config.supervise != "tracks"
-        else []
-    )
-    with enough_memory(*_needs(splat_config)):
-        model = _start(opened, stage, parent, splat_config, checkpoint)
-    if moves:
-        with enough_memory(*_needs(phys_config)):
-            model = _with_physics(model, opened, split, phys_config, checkpoint, warnings)
-    elif phys_config.effects:
-        raise InputDataError(
-            f"{opened.root}: --effects, but split '{split}' has no motion to fit them to.",
-            "tracks or videos of its episodes.",
-        )
-    provenance = Provenance(
-        capture=opened.root.resolve().name,
-        input_sha256=_input_hashes(opened, split, model.file.effects),
-        versions=_versions(),
-        seed=phys_config.seed,
-        # relative, so that models which are moved together still know each other
-        parent=None if parent is None else os.path.relpath(parent, Path(out).parent),
-        config={"stage": stage, "split": split, **config},
-    )
+    # videos that identify nothing are reported before hours of work
+    warnings = _video_warnings(request) if moves else []
+    model = _fitted_model(request, checkpoint, moves, warnings)
+    provenance = _provenance(request, model.file.effects)
     stages = model.fit.stages | {"total": {"seconds": round(time.perf_counter() - started, 2)}}
     file = model.file.model_copy(update={"provenance": provenance})
     fit_file = FitFile(stages=stages, warnings=file.warnings)
@@ -135,8 +115,90 @@ def fit(
     return written.file
 
 
+def _refuse_early(out: Path, stage: Stage, config: PhysConfig, overwrite: bool) -> None:
+    """Refuse what cannot succeed, before hours of work."""
+    refuse_existing(out, overwrite)
+    with_effects((), config.effects)
+    if config.effects and stage == "sg-gs":
+        raise UsageError(
+            "--effects with --stage sg-gs: effects are fitted to motion.", "--stage phys-geo or all.", "leave one out."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Request:
+    """Arguments of a fit."""
+
+    capture: Capture
+    """The opened capture."""
+    out: Path
+    """Directory of the new model."""
+    stage: Stage
+    """Stage, or `all`."""
+    parent: Path | None
+    """Directory of the model to start from."""
+    split: str
+    """Name of the episodes to fit."""
+    splat_config: SplatConfig
+    """Settings of sg-gs."""
+    phys_config: PhysConfig
+    """Settings of phys-geo."""
+
+
+def _inputs(request: _Request) -> dict[str, str]:
+    """Return the fingerprint of all inputs of a fit, against which its checkpoint is checked."""
+    # phys-geo alone makes no spheres, so the photos need not be hashed
+    made_of = {} if request.stage == "phys-geo" else _made_of(request.capture, request.splat_config)
+    if request.stage == "sg-gs":
+        return made_of
+    return made_of | _physics_made_of(
+        request.capture, request.stage, request.parent, request.split, request.phys_config
+    )
+
+
+def _video_warnings(request: _Request) -> list[str]:
+    """Return warnings about the videos that are to be fitted."""
+    if request.phys_config.supervise == "tracks":
+        return []
+    return examine_videos(request.capture, request.split, request.phys_config.supervise == "both")
+
+
+def _fitted_model(request: _Request, checkpoint: Checkpoint, moves: bool, warnings: Sequence[str]) -> Model:
+    """Run the stages and return their model; `moves`: whether there is motion for phys-geo."""
+    splat_config, phys_config = request.splat_config, request.phys_config
+    with enough_memory(*_needs(splat_config)):
+        model = _start(request.capture, request.stage, request.parent, splat_config, checkpoint)
+    if moves:
+        with enough_memory(*_needs(phys_config)):
+            return _with_physics(model, request.capture, request.split, phys_config, checkpoint, warnings)
+    if phys_config.effects:
+        raise InputDataError(
+            f"{request.capture.root}: --effects, but split '{request.split}' has no motion to fit them to.",
+            "tracks or videos of its episodes.",
+        )
+    return model
+
+
+def _provenance(request: _Request, effects: Sequence[EffectModel]) -> Provenance:
+    """Return the inputs, settings and versions from which the model was made."""
+    return Provenance(
+        capture=request.capture.root.resolve().name,
+        input_sha256=_input_hashes(request.capture, request.split, effects),
+        versions=_versions(),
+        seed=request.phys_config.seed,
+        # a relative path stays valid when both models are moved together
+        parent=None if request.parent is None else os.path.relpath(request.parent, request.out.parent),
+        config={
+            "stage": request.stage,
+            "split": request.split,
+            "sg-gs": request.splat_config.model_dump(mode="json"),
+            "phys-geo": request.phys_config.model_dump(mode="json"),
+        },
+    )
+
+
 def _needs(config: SplatConfig | PhysConfig) -> tuple[str, str, str]:
-    """Return what takes a stage's memory, the device, and what would take less."""
+    """Return a stage's sizes that need memory, its device, and the advice for using less."""
     device = resolve_device(config.device).type
     if isinstance(config, SplatConfig):
         scene = config.max_scene_spheres if config.spheres is None else config.spheres
@@ -148,7 +210,7 @@ def _needs(config: SplatConfig | PhysConfig) -> tuple[str, str, str]:
 
 
 def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:
-    """Return what the spheres are made of, so that checkpoints of anything else are refused."""
+    """Return the fingerprint of the inputs of sg-gs: settings, versions and hashes of files."""
     root, colmap = capture.root, find_colmap_model(capture.root)
     names = ("images", "masks", *KINDS, "capture.toml", "cameras.json", "transforms.json", POINTS_NAME)
     shapes = [file for body in capture.manifest.bodies if (file := capture.shape_file(body)) is not None]
@@ -160,7 +222,7 @@ def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:
 def _physics_made_of(
     capture: Capture, stage: Stage, parent: Path | None, split: str, config: PhysConfig
 ) -> dict[str, str]:
-    """Return what the physics is made of, so that checkpoints of anything else are refused."""
+    """Return the fingerprint of the inputs of phys-geo: settings, parent model and hashes of files."""
     made = {"physics settings": config.model_dump_json(), "split": split}
     if stage == "phys-geo" and parent is not None and (parent / "model.json").is_file():
         made["parent model"] = sha256(parent / "model.json")
@@ -176,7 +238,7 @@ def _physics_made_of(
 
 
 def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatConfig, checkpoint: Checkpoint) -> Model:
-    """Return the model that the physics starts from: the parent's, or a new one from the stage sg-gs."""
+    """Return the model from which the physics starts: the parent, or a new one from the stage sg-gs."""
     if not capture.manifest.bodies and stage == "phys-geo":
         raise InputDataError(
             f"{capture.root / 'capture.toml'}: no [[bodies]], so there is nothing whose physics could be fitted.",
@@ -206,6 +268,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
 
 
 def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
+    """Return a model from the result of the stage sg-gs, without fitted physics."""
     bodies, warnings = [], list(scene.warnings)
     for body in capture.manifest.bodies:
         found = scene.bodies[body.name]
@@ -240,19 +303,19 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
         provenance=Provenance(capture=capture.root.name),
     )
     return Model(
-        None,
-        file,
-        {name: body.visual for name, body in scene.bodies.items() if body.visual is not None},
-        {name: body.collision for name, body in scene.bodies.items()},
-        scene.scene,
-        FitFile(stages={"sg-gs": scene.record}),
-        scene.cameras,
-        scene.pictures,
+        root=None,
+        file=file,
+        body_splats={name: body.visual for name, body in scene.bodies.items() if body.visual is not None},
+        collision={name: body.collision for name, body in scene.bodies.items()},
+        scene=scene.scene,
+        fit=FitFile(stages={"sg-gs": scene.record}),
+        cameras=scene.cameras,
+        pictures=scene.pictures,
     )
 
 
-def _mass_parameters(body: Body, fitted: BodyModel) -> list[Parameter]:
-    """Say where mass and centre of mass come from; neither is fitted to the motion."""
+def _mass_parameters(body: Body, fitted: BodyModel) -> list[FittedParameter]:
+    """Return mass and centre of mass with their source; neither is fitted to the motion."""
     if body.motion != "free":
         return []
     given = body.mass_kg is not None
@@ -264,7 +327,7 @@ def _mass_parameters(body: Body, fitted: BodyModel) -> list[Parameter]:
         )
     )
     rows = [
-        Parameter(
+        FittedParameter(
             name=f"{body.name}.mass_kg",
             unit="kg",
             estimate=fitted.mass_kg,
@@ -274,7 +337,7 @@ def _mass_parameters(body: Body, fitted: BodyModel) -> list[Parameter]:
     ]
     source = "given" if body.com_m is not None else "derived"
     rows += [
-        Parameter(
+        FittedParameter(
             name=f"{body.name}.com_{axis}_m",
             unit="m",
             estimate=value,
@@ -287,6 +350,7 @@ def _mass_parameters(body: Body, fitted: BodyModel) -> list[Parameter]:
 
 
 def _has_motion(capture: Capture, split: str) -> bool:
+    """Return whether any episode of a split has tracks or videos."""
     if split not in capture.manifest.splits:
         return False
     episodes = capture.episodes(split)
@@ -296,99 +360,105 @@ def _has_motion(capture: Capture, split: str) -> bool:
 def _with_physics(
     model: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warnings: Sequence[str]
 ) -> Model:
+    """Return the model with fitted physics and, where there are videos, exposures and light."""
+    _require_fittable(model, capture, config)
+    ready = replace(model, file=_physics_start(model, capture, config))
+    started = time.perf_counter()
+    found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
+    found = replace(found, warnings=(*found.warnings, *warnings))
+    seconds = round(time.perf_counter() - started, 2)
+    record = found.record.to_json() | {"seconds": seconds, "supervise": config.supervise}
+    record |= {"warnings": list(found.warnings)}
+    fitted = _merge(ready.file, found)
+    fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
+    ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
+    if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
+        ready = _with_appearance(ready, capture, split, config, found)
+    return ready
+
+
+def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> None:
+    """Refuse a model or a capture from whose motion no physics can be fitted."""
     uses_photos = any(name in model.body_splats for name in capture.body_names)
     if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
         require_metric(capture.cameras)
     if not any(body.motion == "free" for body in model.file.bodies):
         raise InputDataError(
-            f"{capture.root / 'capture.toml'}: no body is free, so no motion tells about contact.",
+            f"{capture.root / 'capture.toml'}: no body is free, so no motion contains information about contact.",
             'motion = "free" for the body whose physics is wanted.',
         )
+
+
+def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelFile:
+    """Return the model file from which the fit of the physics starts."""
     effects = with_effects(model.file.effects, config.effects)
-    # what an earlier fit of the physics warned of is not true of this one
+    # warnings of an earlier fit of the physics do not apply to this one
     stale = set(model.fit.stages.get("phys-geo", {}).get("warnings", ()))
-    start = model.file.model_copy(
+    return model.file.model_copy(
         update={
             "contact": model.file.contact or ContactParameters(),
-            # one that an earlier fit moved would hide what moved it
+            # the ground of the capture, as an earlier fit may have moved the model's
             "ground": capture.manifest.world.ground or model.file.ground,
             "solver": Solver(step_s=config.step_s),
             "effects": effects,
             "warnings": tuple(text for text in model.file.warnings if text not in stale),
         }
     )
-    ready = replace(model, file=start)
+
+
+def _fitted_motion(
+    ready: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warm_started: bool
+) -> PhysicsFit:
+    """Fit the physics to tracks or videos; `warm_started`: whether the contact parameters come from an earlier fit."""
     world = replace(World.from_model(ready), rolls_on=resolve_device(config.device).type)
-    started = time.perf_counter()
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        episodes, begun = track_episodes(capture, split), model.file.contact is not None
-        found = fit_with_effects(world, episodes, config, noise, begun, capture.groups)
-    elif config.mass_distribution:
+        return fit_with_effects(world, track_episodes(capture, split), config, noise, warm_started, capture.groups)
+    if config.mass_distribution:
         raise UsageError(
-            f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not show where the mass is.",
+            f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not identify it.",
             "--supervise tracks.",
             "fit to tracks, or leave phys-geo.mass_distribution at false.",
         )
-    else:
-        from .phys_images import fit_physics_from_images
+    from .phys_geo.images.image_fit import fit_physics_from_images
 
-        both = config.supervise == "both"
-        found = fit_physics_from_images(world, ready, capture, split, config, both, checkpoint)
-    found = replace(found, warnings=(*found.warnings, *warnings))
-    record = found.record | {"seconds": round(time.perf_counter() - started, 2), "supervise": config.supervise}
-    record |= {"warnings": list(found.warnings)}
-    fitted = _merge(start, found)
-    fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
-    ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
-    if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
-        from .appearance import learn_appearance
-        from .exposure import estimate_exposures
+    return fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both", checkpoint)
 
-        exposures = estimate_exposures(ready, capture, split, config.device)
-        ready = replace(ready, file=fitted.model_copy(update={"exposures": exposures}))
-        # with images alone measured tracks are not to be looked at
-        ready = learn_appearance(
-            ready, capture, exposures, split, found.tracks if config.supervise == "images" else None
-        )
-    return ready
+
+def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:
+    """Return the model with the exposure of the video cameras and the light on the bodies."""
+    from .phys_geo.images.lighting_fit import learn_appearance
+    from .phys_geo.images.video_exposure import estimate_exposures
+
+    exposures = estimate_exposures(model, capture, split, config.device)
+    model = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
+    # with images alone measured tracks are not used
+    return learn_appearance(model, capture, exposures, split, found.tracks if config.supervise == "images" else None)
 
 
 def _with_collision(model: Model, moved: Mapping[str, Splats]) -> Model:
-    """Return the model with colliding spheres that were moved; where they are the visual ones, both move."""
+    """Return the model with moved collision spheres; where they are also the visual ones, both are moved."""
     shown = {name: spheres for name, spheres in moved.items() if model.collision[name] is model.body_splats.get(name)}
     return replace(model, collision=model.collision | dict(moved), body_splats=model.body_splats | shown)
 
 
 def _has_video(capture: Capture, split: str) -> bool:
+    """Return whether any episode of a split has a video."""
     return any(capture.videos(name) for name in capture.episodes(split))
 
 
 def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
+    """Return the model file with the results of the fit in place of earlier ones."""
     fresh = {parameter.name for parameter in found.parameters}
     kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
     correlations = [block for block in file.correlations if not fresh & set(block.parameters)]
     ground = file.ground
     if ground is not None and found.ground_offset_m is not None:
         ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
-    bodies = file.bodies
-    if found.mass is not None:
-        placed = {body.name: body for body in found.mass.world.bodies}
-        bodies = tuple(
-            body.model_copy(
-                update={
-                    "com_m": _three(placed[body.name].com[0].numpy()),
-                    "inertia_kg_m2": _six(placed[body.name].inertia[0].numpy()),
-                }
-            )
-            if body.motion == "free"
-            else body
-            for body in bodies
-        )
     return file.model_copy(
         update={
-            "bodies": bodies,
+            "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),
             "contact": found.contact,
             "ground": ground,
             "parameters": (*found.parameters, *kept),
@@ -407,7 +477,24 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     )
 
 
+def _with_mass(bodies: Sequence[BodyModel], world: World) -> tuple[BodyModel, ...]:
+    """Return the bodies with the centres of mass and inertias that the free ones have in a world."""
+    placed = {body.name: body for body in world.bodies}
+    return tuple(
+        body.model_copy(
+            update={
+                "com_m": _three(placed[body.name].com[0].numpy()),
+                "inertia_kg_m2": _six(placed[body.name].inertia[0].numpy()),
+            }
+        )
+        if body.motion == "free"
+        else body
+        for body in bodies
+    )
+
+
 def _input_hashes(capture: Capture, split: str, effects: Sequence[EffectModel]) -> dict[str, str]:
+    """Return the SHA-256 hashes of manifest, cameras, tracks and effect files, by name."""
     names = ["capture.toml", "cameras.json"]
     if split in capture.manifest.splits:
         names += [f"tracks/{episode}.csv" for episode in capture.episodes(split)]
@@ -417,14 +504,17 @@ def _input_hashes(capture: Capture, split: str, effects: Sequence[EffectModel]) 
 
 
 def _versions() -> dict[str, str]:
+    """Return the versions of cgwm and its numerical libraries."""
     return {name: importlib.metadata.version(name) for name in ("cgwm", "torch", "numpy", "scipy")}
 
 
 def _six(matrix: np.ndarray) -> tuple[float, float, float, float, float, float]:
+    """Return the elements xx, yy, zz, xy, xz, yz of a symmetric matrix (3, 3)."""
     xx, yy, zz, xy, xz, yz = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     return xx, yy, zz, xy, xz, yz
 
 
 def _three(vector: np.ndarray) -> tuple[float, float, float]:
+    """Return a vector (3,) as a tuple."""
     x, y, z = (float(value) for value in vector)
     return x, y, z

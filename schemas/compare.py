@@ -41,7 +41,7 @@ class WorstMoment(FileModel):
     """That residual in units of the noise."""
 
 
-class Organiser(FileModel):
+class CovariateShare(FileModel):
     """A coordinate of the motion that orders what a model misses."""
 
     coordinate: str
@@ -61,7 +61,7 @@ class ModelComparison(OpenLoopErrors):
     """Null where no frame is in that phase."""
     worst: tuple[WorstMoment, ...] = ()
     """The worst first, one a segment."""
-    wrench: tuple[Organiser, ...] = ()
+    wrench: tuple[CovariateShare, ...] = ()
     """What orders the residual wrench, the most telling coordinate first; empty where nothing is above the noise."""
 
 

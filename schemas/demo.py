@@ -6,7 +6,7 @@ from typing import Literal
 
 from .base import FileModel
 from .dataset import DatasetSummary
-from .model import Parameter, Provenance
+from .model import FittedParameter, Provenance
 from .results import EvalResult
 
 
@@ -73,7 +73,7 @@ class SplatCheck(FileModel):
 class ComparedParameter(FileModel):
     """A parameter of the model next to the truth."""
 
-    parameter: Parameter
+    parameter: FittedParameter
     true_value: float | None = None
     """Known only because the scene is simulated; the fit never sees it."""
     covered: bool | None = None

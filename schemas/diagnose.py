@@ -11,7 +11,7 @@ from .base import FileModel
 Verdict = Literal["missing_effect", "none_missing", "not_separable", "unexplained"]
 
 
-class EffectEstimate(FileModel):
+class EffectParameterEstimate(FileModel):
     """A number of an effect as these data show it, beside the model and the other selected effects."""
 
     name: str
@@ -39,7 +39,7 @@ class RankedEffect(FileModel):
     cv_error_before_m: float | None = None
     cv_error_after_m: float | None = None
     """Error of predictions in episodes that the effect's numbers were not fitted to, without it and with it [m]."""
-    parameters: tuple[EffectEstimate, ...] = ()
+    parameters: tuple[EffectParameterEstimate, ...] = ()
     constants: dict[str, float] = {}
 
 

@@ -41,7 +41,7 @@ class DoctorReport(FileModel):
     triton: str | None = None
     """Triton's version; on a CUDA device its kernels render, and it comes with torch's CUDA wheels."""
     cuda_core: str | None = None
-    """cuda-core's version, which compiles the faster kernels; never required."""
+    """Version of cuda-core, which compiles the CUDA kernels; a dependency on Linux x86-64 only."""
     egl: bool = False
     """Whether libEGL loads; never required."""
     colmap: str | None = None

@@ -57,7 +57,7 @@ class EffectList(FileModel):
 
 
 class NewEffect(FileModel):
-    """A template of one's own effect that was written."""
+    """The template of a custom effect that was written."""
 
     path: str
     name: str

@@ -12,7 +12,7 @@ from .capture import Ground, Name, Pose, Shape, Vector3
 MODEL_FORMAT = "cgwm-model/1"
 
 
-class Parameter(FileModel):
+class FittedParameter(FileModel):
     """A fitted (or given) physical number."""
 
     name: str
@@ -143,7 +143,7 @@ class ModelFile(FileModel):
     bodies: tuple[BodyModel, ...]
     contact: ContactParameters | None = None
     """None until the stage phys-geo has run."""
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[FittedParameter, ...] = ()
     correlations: tuple[Correlation, ...] = ()
     """Of parameters that were fitted together; between two of these blocks, none is known."""
     effects: tuple[EffectModel, ...] = ()

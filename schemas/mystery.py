@@ -17,7 +17,7 @@ that something is missing, but not what; silent: nothing, though there was somet
 
 
 class SealedFile(FileModel):
-    """`sealed.json`: what is hidden, so that nobody reads it by accident."""
+    """`sealed.json`: what is hidden, sealed so that it is not read by accident."""
 
     format: Literal["cgwm-sealed/1"] = SEALED_FORMAT
     how_to_open: str

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.ply import Splats
-from cgwm.datasets.tracks import Track, write_tracks
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.measured import measure
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.physics.observation_model import measure
 from cgwm.schemas import (
     CAPTURE_FORMAT,
     Body,
@@ -109,5 +109,5 @@ def write_capture(root: Path, world: World, episodes: Sequence[tuple[str, dict[s
     )
     sphere = Splats(np.zeros((1, 3)), np.array([radius]), np.array([0.9]), np.full((1, 3), 0.5))
     model = root.with_name(f"{root.name}-model")
-    write_model(model, Model(None, file, {}, {body.name: sphere}, None))
+    write_model(model, Model(root=None, file=file, body_splats={}, collision={body.name: sphere}, scene=None))
     return model

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from cgwm.pipeline.sfm.model import SfmCamera, SfmModel, VerifiedPair
+from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel, VerifiedPair
 
 
 def rotation_about(axis, angle: float) -> np.ndarray:
@@ -34,7 +34,9 @@ def make_scene(
     Every camera sees all points; a share of each pair's matches is false (uniform pixels).
     """
     rng = np.random.default_rng(seed)
-    camera = SfmCamera(640, 480, 600.0, 600.0, 320.0, 240.0, (0.05, -0.05, 0.0, 0.0))
+    camera = SfmCamera(
+        width=640, height=480, fx=600.0, fy=600.0, cx=320.0, cy=240.0, distortion=(0.05, -0.05, 0.0, 0.0)
+    )
     cloud = rng.uniform([-0.4, -0.4, 0.0], [0.4, 0.4, 0.5], (points, 3))
     names = [f"{index:02d}.jpg" for index in range(images)]
     poses, pixels = {}, {}

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.ply import Splats
-from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Parameter, Pose, Provenance, Solver
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.schemas import BodyModel, ContactParameters, FittedParameter, Ground, ModelFile, Pose, Provenance, Solver
 
 HALF = 0.05
 MASS = 0.37
@@ -64,16 +64,16 @@ def small_model(driven: bool = False, visible: bool = True, com_m: tuple[float, 
         bodies=tuple(bodies),
         contact=ContactParameters(friction=0.4, contact_time_s=0.008, damping_ratio=0.3),
         parameters=(
-            Parameter(name="friction", unit="1", estimate=0.4, std_error=0.05, bounds=(0.01, 2.0)),
-            Parameter(name="damping_ratio", unit="1", estimate=0.3, std_error=0.02, bounds=(0.02, 3.0)),
-            Parameter(name="cube.mass_kg", unit="kg", estimate=MASS, state="given"),
+            FittedParameter(name="friction", unit="1", estimate=0.4, std_error=0.05, bounds=(0.01, 2.0)),
+            FittedParameter(name="damping_ratio", unit="1", estimate=0.3, std_error=0.02, bounds=(0.02, 3.0)),
+            FittedParameter(name="cube.mass_kg", unit="kg", estimate=MASS, state="given"),
         ),
         solver=Solver(step_s=0.002),
         provenance=Provenance(capture="none"),
     )
     if not visible:
-        return Model(None, file, {}, collision, None)
-    return Model(None, file, splats, collision, table_splats())
+        return Model(root=None, file=file, body_splats={}, collision=collision, scene=None)
+    return Model(root=None, file=file, body_splats=splats, collision=collision, scene=table_splats())
 
 
 def write_small_model(path: Path, **options: object) -> Path:

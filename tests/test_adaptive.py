@@ -7,16 +7,17 @@ import math
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.ply import Splats, read_splats, write_splats
-from cgwm.pipeline.labels import LabelRenderer
-from cgwm.pipeline.splats.adaptive import DEAD, Population, fit_adaptively, shared_among
-from cgwm.pipeline.splats.exposures import Exposures
-from cgwm.pipeline.splats.fit import Rates, Trainable, descend
-from cgwm.pipeline.splats.harmonics import harmonics
-from cgwm.pipeline.splats.losses import psnr, scene_loss
-from cgwm.pipeline.splats.spheres import Spheres
-from cgwm.pipeline.splats.views import View, render_view
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.shapes.ply import Splats, read_splats, write_splats
+from cgwm.pipeline.geometry.spheres import Spheres
+from cgwm.pipeline.geometry.spherical_harmonics import harmonics
+from cgwm.pipeline.rendering.image_metrics import psnr
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
+from cgwm.pipeline.sg_gs.losses import scene_loss
+from cgwm.pipeline.sg_gs.mcmc import DEAD, Population, fit_adaptively, shared_among
+from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
+from cgwm.pipeline.sg_gs.photo_exposure import Exposures
+from cgwm.pipeline.sg_gs.views import View, render_view
 from cgwm.schemas import NotConvergedError
 from small_model import small_model
 
@@ -54,10 +55,12 @@ def _view(spheres, angle, higher=None):
     c, s = math.cos(angle), math.sin(angle)
     T[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
     T[:3, 3] = T[:3, :3] @ [0, 0, -1.6]
-    camera = Camera(48, 40, K, np.zeros(0), T)
+    camera = Camera(width=48, height=40, K=K, distortion=np.zeros(0), T_world_cam=T)
     tensors = [torch.as_tensor(a, dtype=torch.float32) for a in (K, camera.T_cam_world)]
     blank = View(str(angle), torch.zeros(40, 48, 3), None, *tensors, camera, None, torch.zeros(1, 1))
-    seen = Spheres(spheres.means, spheres.scales, spheres.opacities, spheres.colors, higher)
+    seen = Spheres(
+        means=spheres.means, scales=spheres.scales, opacities=spheres.opacities, colors=spheres.colors, harmonics=higher
+    )
     with torch.no_grad():
         picture = render_view(seen, blank).features[0]
     return View(blank.name, picture, None, *tensors, camera, None, blank.grey)
@@ -97,7 +100,9 @@ def test_colours_that_depend_on_the_direction_survive_the_file_and_reach_the_lab
     generator = torch.Generator().manual_seed(3)
     spheres = _spheres(80)
     higher = 0.15 * torch.randn(80, 8, 3, generator=generator)
-    splats = Spheres(spheres.means, spheres.scales, spheres.opacities, spheres.colors, higher).to_numpy()
+    splats = Spheres(
+        means=spheres.means, scales=spheres.scales, opacities=spheres.opacities, colors=spheres.colors, harmonics=higher
+    ).to_numpy()
     write_splats(tmp_path / "scene.ply", splats, "world", sh_degree=3)
     back = read_splats(tmp_path / "scene.ply", harmonics=True)
     assert back.harmonics is not None
@@ -108,7 +113,8 @@ def test_colours_that_depend_on_the_direction_survive_the_file_and_reach_the_lab
     assert float((views[0].image - _view(spheres, 0.0).image).abs().mean()) > 0.01
     model = small_model()
     scene = Splats(back.means, back.scales, back.opacities, back.colors, harmonics=back.harmonics)
-    renderer = LabelRenderer(type(model)(model.root, model.file, {}, {}, scene, model.fit), {"a": views[1].camera})
+    seen = type(model)(root=model.root, file=model.file, scene=scene, fit=model.fit)
+    renderer = LabelRenderer(seen, {"a": views[1].camera})
     block = next(iter(renderer.blocks(np.zeros((1, 2, 3)), np.tile([1.0, 0, 0, 0], (1, 2, 1)))))
     difference = np.abs(block.image[0] / 255 - views[1].image.clamp(0, 1).numpy())
     assert difference.mean() < 0.01
@@ -117,8 +123,14 @@ def test_colours_that_depend_on_the_direction_survive_the_file_and_reach_the_lab
 def test_what_turns_has_one_colour_from_all_sides():
     spheres = _spheres(5)
     higher = torch.zeros(5, 3, 3)
-    with pytest.raises(ValueError, match="turned"):
-        Spheres(spheres.means, spheres.scales, spheres.opacities, spheres.colors, higher).moved(torch.eye(4))
+    with pytest.raises(ValueError, match="rotated"):
+        Spheres(
+            means=spheres.means,
+            scales=spheres.scales,
+            opacities=spheres.opacities,
+            colors=spheres.colors,
+            harmonics=higher,
+        ).moved(torch.eye(4))
 
 
 @pytest.mark.parametrize("bad", ["loss", "gradient"])

@@ -7,12 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.models import Model
-from cgwm.datasets.ply import Splats
-from cgwm.pipeline.appearance import PRIOR_MEAN, _colored, _facing, _Frame, _in_frame, _ratios, _rendered, fit_light
-from cgwm.pipeline.physics.rotation import quat_to_matrix
-from cgwm.pipeline.splats.relighting import Relighting, brightness
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.models.model import Model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.pipeline.geometry.rotation import quat_to_matrix
+from cgwm.pipeline.phys_geo.images.lighting_fit import (
+    PRIOR_MEAN,
+    _colored,
+    _facing,
+    _Frame,
+    _in_frame,
+    _ratios,
+    _rendered,
+    fit_light,
+)
+from cgwm.pipeline.rendering.relighting import Relighting, brightness
 from cgwm.schemas import Light
 from small_model import small_model
 
@@ -74,13 +83,29 @@ def _ball_filmed(light: Light) -> tuple[Model, Splats, list[_Frame]]:
     body = model.file.bodies[0]
     relighting = Relighting.of(light, body, torch.as_tensor(normals))
     colors = albedo * relighting.in_photos.numpy()[:, None]
-    ball = Splats(0.05 * normals, np.full(900, 0.003), np.full(900, 0.95), colors, normals)
-    camera = Camera(96, 72, np.array([[150.0, 0, 48], [0, 150, 36], [0, 0, 1]]), np.zeros(0), np.eye(4))
+    ball = Splats(
+        means=0.05 * normals, scales=np.full(900, 0.003), opacities=np.full(900, 0.95), colors=colors, normals=normals
+    )
+    camera = Camera(
+        width=96,
+        height=72,
+        K=np.array([[150.0, 0, 48], [0, 150, 36], [0, 0, 1]]),
+        distortion=np.zeros(0),
+        T_world_cam=np.eye(4),
+    )
     position = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64)
     frames = []
     for quat in np.random.default_rng(9).standard_normal((24, 4)):
         rotation = quat_to_matrix(torch.as_tensor(quat / np.linalg.norm(quat)))
-        blank = _Frame(0, np.zeros((72, 96, 3)), np.ones((72, 96), bool), camera, rotation, position)
+        blank = _Frame(
+            body=0,
+            normals=normals,
+            image=np.zeros((72, 96, 3)),
+            usable=np.ones((72, 96), bool),
+            camera=camera,
+            rotation=rotation,
+            position=position,
+        )
         lit = torch.as_tensor(colors) * relighting.turned(rotation)[:, None]
         picture = _rendered(_in_frame(ball, blank, lit.float()), camera)
         usable = picture.alpha[0].numpy() > 0.97

@@ -11,11 +11,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cgwm.pipeline.doctor import satisfies
+from cgwm.pipeline.runtime.doctor import satisfies
 
 import cgwm
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+import import_graph  # noqa: E402  the tool behind 'make graph'
+
 ROOMS = {"schemas": "schemas", "datasets": "datasets", "pipeline": "pipeline", "cli": "cgwm_cli"}
 ORDER = list(ROOMS)
 HEAVY = ("torch", "numpy", "scipy", "mujoco", "h5py", "hdf5plugin", "pycolmap", "cv2", "matplotlib", "tqdm", "pydantic")
@@ -66,6 +69,31 @@ def test_imports_run_one_way() -> None:
     assert wrong == []
 
 
+def test_rooms_import_lower_floors_only() -> None:
+    found = import_graph.modules()
+    assert import_graph.upward(import_graph.imports(found), found) == []
+
+
+@pytest.mark.parametrize("level", ["modules", "rooms"])
+def test_imports_form_no_circles(level: str) -> None:
+    assert import_graph.circles(import_graph.imports(import_graph.modules()), level) == []
+
+
+def test_an_upward_import_is_found_with_both_floors() -> None:
+    found = import_graph.modules()
+    wrong = import_graph.Import("pipeline.segments.prepare", "pipeline.diagnose.verdict", 7, types_only=False)
+    assert import_graph.upward([wrong], found) == [
+        "pipeline/segments/prepare.py:7 (floor 3) imports pipeline.diagnose.verdict (floor 4)"
+    ]
+    back = import_graph.Import("pipeline.diagnose.verdict", "pipeline.segments.prepare", 7, types_only=False)
+    assert import_graph.circles([wrong, back]) == [[wrong.source, wrong.target][::-1]]
+
+
+def test_diagnose_reaches_few_modules() -> None:
+    edges = import_graph.imports(import_graph.modules())
+    assert len(import_graph.reach(edges, "cli.diagnose")) <= 110
+
+
 def test_the_rooms_import_each_other_relatively() -> None:
     # "import datasets" would find another package of that name in many environments.
     wrong = [
@@ -96,7 +124,7 @@ def test_the_command_line_imports_nothing_heavy_at_module_level() -> None:
 
 def test_only_one_module_speaks_to_colmap() -> None:
     users = {path.relative_to(ROOT).as_posix() for path in FILES for _, name in imports(path) if name == "pycolmap"}
-    assert users <= {"pipeline/sfm/colmap.py"}
+    assert users <= {"pipeline/calibrate/colmap.py"}
 
 
 def is_unsafe(call: ast.Call, name: str) -> bool:

@@ -13,14 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cgwm.datasets.cameras import read_cameras, require_metric
-from cgwm.pipeline import calibrate as stage
-from cgwm.pipeline.calibrate import calibrate
-from cgwm.pipeline.sfm import colmap
-from cgwm.pipeline.sfm.inputs import background_flow
-from cgwm.pipeline.sfm.markers import dictionary
-from cgwm.pipeline.sfm.points import read_points
-from cgwm.pipeline.sfm.selfcheck import PairCheck, SelfCheck
+from cgwm.datasets.capture.cameras import read_cameras, require_metric
+from cgwm.datasets.capture.sparse_points import read_points
+from cgwm.pipeline.calibrate import calibrate, colmap, stage
+from cgwm.pipeline.calibrate.consistency_check import PairCheck, SelfCheck
+from cgwm.pipeline.calibrate.markers import dictionary
+from cgwm.pipeline.calibrate.photos import background_flow
 from cgwm.schemas import (
     CalibrateConfig,
     CalibrationReport,

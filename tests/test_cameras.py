@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cgwm.datasets import Camera, camera_of, read_cameras, to_intrinsics
-from cgwm.datasets.transforms import opencv_from_opengl
+from cgwm.datasets.capture.transforms import opencv_from_opengl
 from cgwm.schemas import CamerasFile, InputDataError, PosedImage, PosedVideo, Scale
 
 POINTS = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
@@ -27,7 +27,7 @@ def camera(distortion: tuple[float, ...] = (0.06, -0.08, -0.001, 0.0002)) -> Cam
     T_world_cam[:3, :3] = rotation(rng)
     T_world_cam[:3, 3] = -2.0 * T_world_cam[:3, 2] + [0.1, 0.0, -0.05]
     K = np.array([[310.0, 0, 161.2], [0, 305.0, 118.9], [0, 0, 1]])
-    return Camera(320, 240, K, np.array(distortion), T_world_cam)
+    return Camera(width=320, height=240, K=K, distortion=np.array(distortion), T_world_cam=T_world_cam)
 
 
 def quat_wxyz(matrix: np.ndarray) -> np.ndarray:

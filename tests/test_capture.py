@@ -542,5 +542,5 @@ def test_opening_is_quick_and_decodes_no_photo(root: Path, monkeypatch: pytest.M
     def refuse(*_: Any) -> None:
         raise AssertionError("a photo was decoded")
 
-    monkeypatch.setattr("cgwm.datasets.images.cv2.cvtColor", refuse)
+    monkeypatch.setattr("cgwm.datasets.capture.images.cv2.cvtColor", refuse)
     Capture.open(root)

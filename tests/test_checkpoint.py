@@ -9,14 +9,13 @@ import time
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.models import read_model
-from cgwm.pipeline import sg_gs_bodies
-from cgwm.pipeline.checkpoint import Checkpoint
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import _made_of, fit
-from cgwm.pipeline.sg_gs import fit_scene
-from cgwm.pipeline.splats import adaptive
-from cgwm.pipeline.splats import fit as descents
-from cgwm.pipeline.splats.stereo import Refinement
+from cgwm.pipeline.runtime.checkpoint import Checkpoint
+from cgwm.pipeline.sg_gs import bodies, mcmc
+from cgwm.pipeline.sg_gs import optimize as descents
+from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.schemas import InputDataError, UsageError
 from test_sg_gs import CONFIG, make_capture
 
@@ -55,7 +54,7 @@ def test_a_state_comes_back_as_it_was(tmp_path):
 
 
 def test_nothing_is_written_by_a_short_fit(tmp_path, capture, monkeypatch):
-    monkeypatch.setattr(sg_gs_bodies, "refine", unrefined)
+    monkeypatch.setattr(bodies, "refine", unrefined)
     fit(capture.root, tmp_path / "model", "sg-gs", splat_config=CONFIG.model_copy(update={"iterations": 4}))
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
 
@@ -66,8 +65,8 @@ ADAPTIVE = {"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1}
 @pytest.mark.parametrize("settings", [{}, pytest.param(ADAPTIVE, marks=pytest.mark.evidence)])
 def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monkeypatch):
     config = CONFIG.model_copy(update={"iterations": 12, "joint": False, **settings})
-    monkeypatch.setattr(adaptive, "REFINED_EVERY", 10)
-    monkeypatch.setattr(sg_gs_bodies, "refine", unrefined)
+    monkeypatch.setattr(mcmc, "REFINED_EVERY", 10)
+    monkeypatch.setattr(bodies, "refine", unrefined)
     whole = fit_scene(capture, config)
     for stopped_after in (3, 5):  # again and again, in the midst of one descent or another
         written = 0
@@ -130,8 +129,9 @@ def test_a_folder_of_that_name_that_is_no_checkpoint_stays(tmp_path):
 def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
     out = tmp_path / "model"
     lines = (
-        "from cgwm.pipeline import checkpoint, sg_gs_bodies; from cgwm.pipeline.splats.stereo import Refinement; "
-        "sg_gs_bodies.refine = lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)); "
+        "from cgwm.pipeline.runtime import checkpoint; from cgwm.pipeline.sg_gs import bodies; "
+        "from cgwm.pipeline.sg_gs.depth_refinement import Refinement; "
+        "bodies.refine = lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)); "
         "checkpoint.Checkpoint.__init__.__defaults__ = (0.0,); from cgwm.cli import main; main()"
     )
     fast = [f"sg-gs.{key}={value}" for key, value in (("max_body_spheres", 200), ("max_scene_spheres", 400))]

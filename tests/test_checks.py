@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from cgwm.pipeline.physics import PublishedLaw, State, World, simulate
-from cgwm.pipeline.physics.checks import largest_step, require_apart, require_finite
+from cgwm.pipeline.physics import PaperLaw, State, World, simulate
+from cgwm.pipeline.physics.checks import largest_step, require_apart
 from cgwm.pipeline.physics.effects import ActiveEffect, Effect, EffectParameter, Values
+from cgwm.pipeline.physics.rollout import require_finite
 from cgwm.schemas import InputDataError, NotConvergedError
 from worlds import F64, ball_body, box_body, law, state_of, times, world_of
 
@@ -40,7 +41,10 @@ def values(*numbers: float) -> torch.Tensor:
         (world_of(box_body(), contact=law(damping_ratio=-1.0)), "damping_ratio is -1"),
         (world_of(box_body(), step_s=0.02), r"step of 20 ms is beyond the bound of its contacts, 13.2 ms"),
         (
-            world_of(box_body(), contact=PublishedLaw(values(0.3), values(2e5), values(10.0))),
+            world_of(
+                box_body(),
+                contact=PaperLaw(friction=values(0.3), stiffness_n_m=values(2e5), damping_n_s_m=values(10.0)),
+            ),
             r"step of 1 ms is beyond the bound of its contacts, 0.8 ms",
         ),
     ],
@@ -97,7 +101,7 @@ class Emptied(Effect):
     """A mass that loses more than there is: what a user's effect may do by mistake."""
 
     name = summary = formula = reveals = source = "emptied"
-    parameters = (EffectParameter("m", "kg", scale=0.1, limit=10.0),)
+    parameters = (EffectParameter(name="m", unit="kg", scale=0.1, limit=10.0),)
     phase = "flight"
 
     def world(self, values: Values, world: World) -> World:

@@ -246,7 +246,7 @@ def test_wrong_settings(run: Run, settings_seen: list[Any], tmp_path: Path) -> N
     assert run("calibrate", "c", "--set", "seed") == (
         2,
         "",
-        "--set seed: not understood.\nAllowed: STAGE.KEY=VALUE, for example calibrate.seed=1.\n",
+        "--set seed: not a setting.\nAllowed: STAGE.KEY=VALUE, for example calibrate.seed=1.\n",
     )
     assert run("calibrate", "c", "--set", "calibrate.retrys=1") == (
         2,
@@ -285,7 +285,7 @@ def test_a_wrong_shard(run: Run, stage: Callable[..., None], shard: str) -> None
     assert run("synthesize", "model", "--out", "dataset", f"--shard={shard}") == (
         2,
         "",
-        f"--shard {shard}: no shard.\nAllowed: I/N with 0 <= I < N, for example 3/64.\n",
+        f"--shard {shard}: not a shard.\nAllowed: I/N with 0 <= I < N, for example 3/64.\n",
     )
 
 
@@ -306,7 +306,7 @@ def test_the_command_makes_a_template_and_prints_the_plan_resolved(run: Run, tmp
     code, _, err = run(*command)
     assert (code, err) == (2, "--out is missing.\nNext: name the directory to write: --out DATASET.\n")
     code, _, err = run(*command, "--set", "synthesize.plan.views=1", "--out", tmp_path / "three")
-    assert code == 2 and err.startswith("--plan, and synthesize.plan in the settings.")
+    assert code == 2 and err.startswith("--plan and synthesize.plan in the settings were given.")
 
 
 # Outcomes
@@ -318,11 +318,11 @@ def test_the_command_makes_a_template_and_prints_the_plan_resolved(run: Run, tmp
         (NotConvergedError("The fit diverged.", todo="look."), 1, "The fit diverged.\nNext: look.\n"),
         (CheckFailedError("3 faults."), 1, "3 faults.\n"),
         (InputDataError("a.csv, line 3: NaN.", "numbers."), 2, "a.csv, line 3: NaN.\nAllowed: numbers.\n"),
-        (KeyboardInterrupt(), 130, "Interrupted; nothing was left under the output's name.\n"),
+        (KeyboardInterrupt(), 130, "Interrupted; no output was written.\n"),
         (
             RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."),
             1,
-            "The memory did not suffice.\nNext: close other programs, or work on less at a time.\n",
+            "Out of memory.\nNext: close other programs, or work on less at a time.\n",
         ),
         (OSError(28, "No space left on device", "out/x"), 1, "out/x: No space left on device.\n"),
         (
@@ -333,7 +333,7 @@ def test_the_command_makes_a_template_and_prints_the_plan_resolved(run: Run, tmp
         (
             ZeroDivisionError("division by zero"),
             1,
-            "A fault inside cgwm: ZeroDivisionError: division by zero\n"
+            "Internal error in cgwm: ZeroDivisionError: division by zero\n"
             "Next: run the command again with --debug, and report the traceback.\n",
         ),
     ],

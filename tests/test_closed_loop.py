@@ -8,20 +8,20 @@ import fused_host
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.pipeline import nvrtc
-from cgwm.pipeline.closed_loop import ClosedLoop, Reach, Velocity
-from cgwm.pipeline.labels import LabelRenderer
-from cgwm.pipeline.physics.dispatch import rollout
-from cgwm.pipeline.physics.driven import Drive
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.pipeline.control import ClosedLoop, Reach, Velocity
+from cgwm.pipeline.geometry.rotation import quat_exp
+from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.stepping import FusedStepper
-from cgwm.pipeline.physics.rotation import quat_exp
+from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
+from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import InputDataError, Light, NotConvergedError, UsageError
 from small_model import small_model
 
-CUDA = torch.cuda.is_available() and nvrtc.available()
+CUDA = torch.cuda.is_available() and kernel_build.available()
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core"))]
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
 DT, STEPS, SPEED = 0.02, 8, 0.3
@@ -32,7 +32,7 @@ def camera(width: int = 64, height: int = 48) -> Camera:
     T[:3, :3] = np.array([[1.0, 0, 0], [0, -0.5, np.sqrt(0.75)], [0, -np.sqrt(0.75), -0.5]])
     T[:3, 3] = (0.05, -0.45, 0.3)
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
-    return Camera(width, height, K, np.zeros(0), T)
+    return Camera(width=width, height=height, K=K, distortion=np.zeros(0), T_world_cam=T)
 
 
 def start() -> State:

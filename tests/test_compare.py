@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 import torch
 from cgwm.cli import main
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.tracks import Track, write_tracks
-from cgwm.pipeline.compare import Comparison, compare, compare_models
-from cgwm.pipeline.diagnosis.prepared import prepare
-from cgwm.pipeline.eval import evaluate
-from cgwm.pipeline.paired import LEAST_EPISODES, paired_difference
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.pipeline.compare.error_ladder import Rung, ladder_svg
+from cgwm.pipeline.compare.paired_difference import LEAST_EPISODES, paired_difference
+from cgwm.pipeline.compare.short_horizon_errors import short_errors
+from cgwm.pipeline.compare.stage import Comparison, compare, compare_models
+from cgwm.pipeline.compare.verdict import comparison_verdict
+from cgwm.pipeline.evaluate import evaluate
+from cgwm.pipeline.evaluate.prediction import Motion
 from cgwm.pipeline.physics import State, World, simulate
-from cgwm.pipeline.prediction import Motion
-from cgwm.pipeline.reporting.compared_verdict import compared_verdict
-from cgwm.pipeline.reporting.ladder import Rung, ladder_svg
-from cgwm.pipeline.short_errors import short_errors
+from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PHASES, CompareResult, EffectModel, InputDataError, UsageError
 from pages import Tags, clicked
 from small_model import HALF, small_model
@@ -117,19 +117,19 @@ def test_pairs_and_verdict(result: CompareResult) -> None:
 def test_the_verdict_says_when_it_may_be_chance(result: CompareResult) -> None:
     names = {result.models[0].model: "slippery", result.models[1].model: "true"}
     pair = result.pairs[0].model_copy(update={"better": 4, "interval_95_m": (-0.01, 0.002)})
-    words = compared_verdict(result.model_copy(update={"pairs": (pair,)}), names)
+    words = comparison_verdict(result.model_copy(update={"pairs": (pair,)}), names)
     assert "true predicts 4 of 6 test episodes better" in words
-    assert "may be chance: the 95 % interval of the difference holds zero" in words
+    assert "may be chance: the 95 % interval of the difference contains zero" in words
     pair = pair.model_copy(update={"episodes": 3, "better": 3, "interval_95_m": None})
-    words = compared_verdict(result.model_copy(update={"pairs": (pair,), "episodes": 3}), names)
-    assert "3 episodes are too few to tell whether a difference is more than chance." in words
+    words = comparison_verdict(result.model_copy(update={"pairs": (pair,), "episodes": 3}), names)
+    assert "3 episodes are too few to decide whether a difference is more than chance." in words
     worse = result.model_copy(update={"models": result.models[:1], "best": result.models[0].model, "pairs": ()})
-    words = compared_verdict(worse, names)
+    words = comparison_verdict(worse, names)
     assert "slippery predicts 6 test episodes with a median error of" in words
-    assert ", no better than to guess that it stands still (" in words
+    assert ", no better than assuming a body at rest (" in words
     assert "times the noise in " in words and "they are within the noise in flight" in words
     better = result.model_copy(update={"models": result.models[1:], "pairs": ()})
-    assert "; to guess that it stands still would err by" in compared_verdict(better, names)
+    assert "; assuming a body at rest gives" in comparison_verdict(better, names)
 
 
 def test_paired_differences() -> None:
@@ -264,13 +264,13 @@ def test_a_comparison_repeats_itself_and_tells_who_has_seen_the_episodes(gapped:
     source = model.file.provenance.model_copy(update={"input_sha256": {"tracks/000.csv": track}})
     model = replace(model, file=model.file.model_copy(update={"provenance": source}))
     again = compare_models([("</script><b>", model)], gapped[1], device="cpu").result
-    warned = "</script><b> was fitted to 1 of the 1 episodes: its errors there are no predictions."
+    warned = "</script><b> was fitted to 1 of the 1 episodes; its errors there are not predictions."
     assert again.warnings == (warned, *gapped[0].result.warnings)
     assert again.model_copy(update={"warnings": gapped[0].result.warnings}) == gapped[0].result
 
 
 def test_what_files_say_is_no_html(gapped: tuple[Comparison, Capture]) -> None:
-    from cgwm.pipeline.reporting.comparison import comparison_html
+    from cgwm.pipeline.compare.page import comparison_html
 
     html = comparison_html(gapped[0].result, gapped[0].models, {})
     assert "</script><b>" not in html and "&lt;/script&gt;&lt;b&gt;" in html
@@ -295,7 +295,7 @@ def test_bad_input_is_refused(folder: Path, tmp_path: Path, capsys: pytest.Captu
     assert "this model is given twice" in twice and "Allowed: each model once." in twice
     assert "no split 'tset'" in refused([slippery, capture, "--split", "tset", *out], capsys)
     assert "split 'empty' has no episode" in refused([slippery, capture, "--split", "empty", *out], capsys)
-    assert "no length of time" in refused([slippery, capture, "--warmup-s", "0", *out], capsys)
+    assert "not a positive duration" in refused([slippery, capture, "--warmup-s", "0", *out], capsys)
     there = tmp_path / "there.html"
     there.write_text("mine")
     assert "exists" in refused([slippery, capture, "--out", there], capsys)

@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.kinds import kind_of
-from cgwm.datasets.models import read_model
-from cgwm.pipeline import demo
-from cgwm.pipeline.demo import DemoSettings, run_demo
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.io.kinds import kind_of
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.demo import stage
+from cgwm.pipeline.demo.stage import DemoSettings, run_demo
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     CalibrateConfig,
@@ -51,8 +51,8 @@ def test_a_failing_stage_is_named_and_leaves_nothing(tmp_path: Path, monkeypatch
         assert config.seed == 7
         raise NotConvergedError(f"{capture}: 3 of 48 photos registered.", todo=f"look at {capture}.")
 
-    monkeypatch.setattr(demo, "make_scene", no_scene)
-    monkeypatch.setattr(demo, "calibrate", fail)
+    monkeypatch.setattr(stage, "make_scene", no_scene)
+    monkeypatch.setattr(stage, "calibrate", fail)
     out = tmp_path / "out"
     with pytest.raises(NotConvergedError) as error:
         run_demo(out, "fall", seed=7, device="cpu")
@@ -88,9 +88,9 @@ def test_a_fit_from_images_that_fails_is_a_result(tmp_path: Path, monkeypatch: p
         assert settings["phys_config"].supervise == "images"
         raise NotConvergedError(f"{capture}: the images say nothing.")
 
-    monkeypatch.setattr(demo, "fit", fail)
-    running = demo._Demo(tmp_path / ".out.partial", tmp_path / "out", SMALL, 0, "cpu")
-    found = demo._fit_from_images(running)
+    monkeypatch.setattr(stage, "fit", fail)
+    running = stage._Demo(tmp_path / ".out.partial", tmp_path / "out", SMALL, 0, "cpu")
+    found = stage._fit_from_images(running)
     assert found.outcome == "not_converged"
     assert found.message == f"{tmp_path / 'out'}/capture: the images say nothing."
     assert found.evaluation is None
@@ -100,9 +100,9 @@ def test_a_wrong_input_is_no_such_result(tmp_path: Path, monkeypatch: pytest.Mon
     def fail(*_: object, **__: object) -> None:
         raise InputDataError("no video.")
 
-    monkeypatch.setattr(demo, "fit", fail)
+    monkeypatch.setattr(stage, "fit", fail)
     with pytest.raises(InputDataError):
-        demo._fit_from_images(demo._Demo(tmp_path, tmp_path, SMALL, 0, "cpu"))
+        stage._fit_from_images(stage._Demo(tmp_path, tmp_path, SMALL, 0, "cpu"))
 
 
 @pytest.mark.evidence

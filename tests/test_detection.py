@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import State, simulate
-from cgwm.pipeline.physics.detection import PAIR_SMOOTHING_M, Placed, body_points
-from cgwm.pipeline.physics.distance import union_distance
-from cgwm.pipeline.physics.rotation import quat_to_matrix
-from cgwm.pipeline.splats.collision import shape_to_spheres
+from cgwm.pipeline.physics.contact_detection import PAIR_SMOOTHING_M, Placed, body_points
+from cgwm.pipeline.physics.smooth_distance import union_distance
+from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
 from cgwm.schemas import BoxShape, Shape
 from worlds import F64, ball_body, batch, box_body, state_of, times, world_of
 
@@ -29,7 +29,13 @@ def placed(body, count: int, seed: int, spread: float) -> Placed:
     quat = torch.randn(count, 4, generator=generator, dtype=F64)
     where = spread * torch.randn(count, 3, generator=generator, dtype=F64)
     motion = torch.randn(2, count, 3, generator=generator, dtype=F64)
-    return Placed(body, where, quat_to_matrix(quat / quat.norm(dim=-1, keepdim=True)), motion[0], motion[1])
+    return Placed(
+        body=body,
+        reference=where,
+        rotation=quat_to_matrix(quat / quat.norm(dim=-1, keepdim=True)),
+        velocity=motion[0],
+        omega=motion[1],
+    )
 
 
 def test_all_that_touches_is_found_both_ways_with_the_smooth_distance_of_all_spheres() -> None:

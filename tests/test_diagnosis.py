@@ -9,24 +9,24 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.diagnose import diagnose
-from cgwm.pipeline.diagnosis import flight_search
-from cgwm.pipeline.diagnosis.candidates import Candidate, variants_of
-from cgwm.pipeline.diagnosis.consistency import consistency
-from cgwm.pipeline.diagnosis.contact_stage import fitted_contact, separated
-from cgwm.pipeline.diagnosis.cuts import cut_episodes, whole_episodes
-from cgwm.pipeline.diagnosis.noise import flight_noise, without_outliers
-from cgwm.pipeline.diagnosis.phases import phases_of
-from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
-from cgwm.pipeline.diagnosis.residual_law import residual_law
-from cgwm.pipeline.diagnosis.score import ScoreTest, picture, score_test
-from cgwm.pipeline.diagnosis.segment_states import fit_states
-from cgwm.pipeline.diagnosis.segments import FLIGHT_STEP_S, Segments
-from cgwm.pipeline.diagnosis.slots import Evidence, Slot, fill, is_slight
-from cgwm.pipeline.diagnosis.wrench import omnibus, organisers, residual_wrenches, wrench_windows
+from cgwm.pipeline.diagnose import diagnose, flight_search
+from cgwm.pipeline.diagnose.contact_tests.segments import fitted_contact, separated
+from cgwm.pipeline.diagnose.effect_selection import Evidence, SelectionStep, is_slight, select_next
+from cgwm.pipeline.diagnose.falsification import consistency
+from cgwm.pipeline.diagnose.score_test import ScoreTest, score_test
+from cgwm.pipeline.diagnose.sparse_regression import residual_law
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.effects.gravity_tilt import GravityTilt
 from cgwm.pipeline.physics.effects.registry import BUILT_IN
+from cgwm.pipeline.segments.candidates import Candidate, variants_of
+from cgwm.pipeline.segments.contact_phases import phases_of
+from cgwm.pipeline.segments.linearization import linearize
+from cgwm.pipeline.segments.prepare import Prepared, prepare
+from cgwm.pipeline.segments.residual_wrench import covariates_of, omnibus, residual_wrenches, wrench_windows
+from cgwm.pipeline.segments.segment_states import fit_states
+from cgwm.pipeline.segments.segments import FLIGHT_STEP_S, Segments
+from cgwm.pipeline.trajectories.noise import flight_noise, without_outliers
+from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.schemas import InputDataError
 from diagnosis_data import NOISE, tosses, world_with, write_capture
 from scipy.stats import kstest
@@ -42,14 +42,16 @@ def ready(body: str, effects: dict, seed: int = 1, **options: object) -> tuple[P
     return prepare(world, tosses(truth, seed, **options)), world  # pyright: ignore[reportArgumentType]
 
 
-def flight_slot(effects: dict, seed: int = 1, library: list[Candidate] | None = None, body: str = "cube") -> Slot:
+def flight_slot(
+    effects: dict, seed: int = 1, library: list[Candidate] | None = None, body: str = "cube"
+) -> SelectionStep:
     prepared, world = ready(body, effects, seed, count=5, duration_s=0.4, ground=False)
     assert prepared.flight is not None
     chosen = LIBRARY if library is None else library
-    return fill(prepared.flight, world, chosen, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
+    return select_next(prepared.flight, world, chosen, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
 
 
-def names(slot: Slot) -> set[str]:
+def names(slot: SelectionStep) -> set[str]:
     return {e.name for e in slot.equals} if slot.flagged else set()
 
 
@@ -125,7 +127,7 @@ def test_score_tests_in_flight_are_calibrated() -> None:
     whole = whole_episodes(world, episodes)
     flight, _, _ = cut_episodes(world, whole, NOISE)
     fitted = fit_states(Segments.of("flight", world, whole, flight, NOISE), iterations=3)
-    seen = picture(fitted, world, variants, [0] * len(episodes), robust=False)
+    seen = linearize(fitted, world, variants, [0] * len(episodes), robust=False)
     found: list[list[float]] = []
     wholes: list[float] = []
     for seed in range(100):
@@ -159,7 +161,7 @@ def test_the_constants_of_a_large_effect_are_those_of_where_it_ends() -> None:
     library = [Candidate(name, load_effect(name)) for name in ("ground_magnet", "gravity_scale")]
     prepared, world = ready("ball", {"ground_magnet": {"A": 10.0, "l": 0.1}}, 3, duration_s=0.6)
     assert prepared.flight is not None
-    slot = fill(prepared.flight, world, library, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
+    slot = select_next(prepared.flight, world, library, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
     assert slot.best.name == "ground_magnet" and slot.best.constants == {"l": 0.1}
     assert slot.best.numbers is not None
     estimate, error = slot.best.numbers["A"]
@@ -178,12 +180,12 @@ def test_what_patches_up_the_law_of_another_is_no_second_effect(
     slots = []
     for name, cost in zip(("quadratic_drag", "gravity_tilt"), costs, strict=True):
         refitted = SimpleNamespace(cost=cost, world=world, segments=[prepared.flight])
-        slots.append(Slot((), (SimpleNamespace(name=name, refitted=refitted),), True))  # pyright: ignore
-    last, first = Slot((), (SimpleNamespace(name="wind", refitted=None),), False), iter(slots)  # pyright: ignore
-    monkeypatch.setattr(flight_search, "fill", lambda *_: next(first, last))
+        slots.append(SelectionStep((), (SimpleNamespace(name=name, refitted=refitted),), True))  # pyright: ignore
+    last, first = SelectionStep((), (SimpleNamespace(name="wind", refitted=None),), False), iter(slots)  # pyright: ignore
+    monkeypatch.setattr(flight_search, "select_next", lambda *_: next(first, last))
     losses = iter((3.0, 2.0))
     monkeypatch.setattr(flight_search, "held_out_loss", lambda *_: next(losses))
-    monkeypatch.setattr(flight_search, "_bundled", lambda *_: None)
+    monkeypatch.setattr(flight_search, "_coupled", lambda *_: None)
     found, _, _ = flight_search.flight_search(prepared, world, LIBRARY, 1.0)  # pyright: ignore[reportArgumentType]
     assert [slot.best.name for slot in found] == wanted
 
@@ -205,7 +207,7 @@ def test_what_flight_alone_cannot_tell_apart_is_stated_whole() -> None:
 def test_contact_separates_a_scale_from_gravity() -> None:
     prepared, world = ready("ball", {"length_scale": {"s": 0.02}}, 3, count=4, duration_s=0.7, height_m=(0.1, 0.25))
     assert prepared.flight is not None
-    slot = fill(prepared.flight, world, LIBRARY, prepared.groups, True)  # pyright: ignore[reportArgumentType]
+    slot = select_next(prepared.flight, world, LIBRARY, prepared.groups, True)  # pyright: ignore[reportArgumentType]
     assert "length_scale" in names(slot) and len(slot.equals) > 3
     fitted = fitted_contact(prepared, world)  # pyright: ignore[reportArgumentType]
     assert fitted is not None
@@ -242,7 +244,7 @@ def test_an_effect_may_have_a_value_for_each_episode() -> None:
     assert prepared.flight is not None
     library = [Candidate("sway", Sway()), Candidate("gravity_tilt", GravityTilt())]
     variants = variants_of(library, world.gravity[0, :1])
-    seen = picture(prepared.flight, world, variants, prepared.groups, robust=False)
+    seen = linearize(prepared.flight, world, variants, prepared.groups, robust=False)
     own, shared = (score_test(seen, seen.columns(v.parameters)) for v in variants)
     assert own.dof == 8 and shared.dof == 2
     assert own.statistic > 5 * shared.statistic
@@ -262,7 +264,7 @@ def test_the_residual_wrench_tells_what_organises_it_and_which_law() -> None:
     assert law.left_chi2 < 1.6
     tilted, world = ready("ball", {"gravity_tilt": {"tilt_x": 0.06}}, 8, count=6, duration_s=0.5, ground=False)
     windows = wrench_windows(world, tilted.whole, tilted.flight.items, tilted.noise)  # pyright: ignore
-    assert organisers(windows)[0].coordinate == "constant"  # pyright: ignore[reportArgumentType]
+    assert covariates_of(windows)[0].coordinate == "constant"  # pyright: ignore[reportArgumentType]
 
 
 def test_the_test_split_is_never_opened(tmp_path: Path) -> None:
@@ -319,7 +321,7 @@ def test_a_tilt_that_is_another_in_every_episode_is_no_tilt() -> None:
         prepared = prepare(world, [*one, *((f"b{name}", tracks) for name, tracks in second)])
         assert prepared.flight is not None
         library = [Candidate("gravity_tilt", load_effect("gravity_tilt"))]
-        refitted = fill(prepared.flight, world, library, prepared.groups, True).best.refitted
+        refitted = select_next(prepared.flight, world, library, prepared.groups, True).best.refitted
         assert refitted is not None
         found.append(consistency(refitted.segments[0], refitted.world, ["gravity_tilt"], prepared.groups, 1.0))
     same, changing = found
@@ -341,7 +343,7 @@ def test_a_body_that_slides_above_the_ground_does_not_fly() -> None:
         for name, tracks in sliding
     ]
     prepared = prepare(world, raised)
-    assert any("nothing falls" in words for words in prepared.warnings)
+    assert any("the body is not in free fall" in words for words in prepared.warnings)
     flying = prepared.clear.float().mean(1)
     assert float(flying.max()) < 0.75  # they rest on the ground at their ends
 
@@ -353,8 +355,15 @@ def test_a_body_that_slides_above_the_ground_does_not_fly() -> None:
 def test_what_is_small_needs_more_evidence(size: float, delta_bic: float | None, slight: bool) -> None:
     effect = load_effect("marker_offset")
     numbers = {p.name: ((-size if k else 0.0) * p.scale, 0.0) for k, p in enumerate(effect.parameters)}
-    test = ScoreTest(30.0, 3, 1e-5, np.zeros(3), np.eye(3), True)
-    found = Evidence(Candidate("marker_offset", effect), {}, test, 1e-5, delta_bic=delta_bic, numbers=numbers)
+    test = ScoreTest(statistic=30.0, dof=3, p_value=1e-5, estimate=np.zeros(3), covariance=np.eye(3), admissible=True)
+    found = Evidence(
+        candidate=Candidate("marker_offset", effect),
+        constants={},
+        test=test,
+        p_value=1e-5,
+        delta_bic=delta_bic,
+        numbers=numbers,
+    )
     assert is_slight(found) == slight
 
 

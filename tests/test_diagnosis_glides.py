@@ -5,24 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.contact_limits import ContactLimit, contact_limits
-from cgwm.pipeline.diagnosis.contact_search import GLIDE_SCORE, equal_in_glides
-from cgwm.pipeline.diagnosis.cuts import Segment
-from cgwm.pipeline.diagnosis.glide_fits import soft_world, without_loads
-from cgwm.pipeline.diagnosis.glide_stage import GlideEvidence, StartedGlides, glide_evidence, with_effect
-from cgwm.pipeline.diagnosis.glides import glides_of
-from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
-from cgwm.pipeline.diagnosis.score import ScoreTest
-from cgwm.pipeline.diagnosis.segments import Segments
-from cgwm.pipeline.diagnosis.slots import Evidence
-from cgwm.pipeline.diagnosis.verdict import find
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.contact_search import GLIDE_SCORE, selected_in_sliding
+from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingEvidence, sliding_evidence, with_effect
+from cgwm.pipeline.diagnose.detection_limits import DetectionLimit, detection_limits
+from cgwm.pipeline.diagnose.effect_selection import Evidence
+from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.verdict import find
+from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import World
-from cgwm.pipeline.physics.contact import ContactLaw
+from cgwm.pipeline.physics.contact_law import ContactLaw
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import FRICTION
-from cgwm.pipeline.physics.rotation import quat_to_matrix
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.prepare import Prepared, prepare
+from cgwm.pipeline.segments.segments import Segments
+from cgwm.pipeline.segments.sliding_fit import StartedSliding, soft_world, without_loads
+from cgwm.pipeline.segments.sliding_segments import find_sliding_segments
+from cgwm.pipeline.trajectories.segmentation import Segment
 from diagnosis_data import Effects, tosses, world_with
 
 LIBRARY = [
@@ -54,12 +54,12 @@ def test_a_glide_ends_at_an_impact() -> None:
     on = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
     off = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.3, 0.4), lift_m_s=(0.0, 0.0))
     slid, bounced = (prepare(world, episodes) for episodes in (on, off))
-    glides = glides_of(world, slid.whole, slid.clear, slid.noise)
+    glides = find_sliding_segments(world, slid.whole, slid.clear, slid.noise)
     assert {item.episode for item in glides} == {0, 1}
     covered = sum(item.last - item.first for item in glides)
     assert covered >= 0.9 * 2 * (len(slid.whole.times_s[0]) - 1)
     height = bounced.whole.position_m[:, :, 0, 2] - 0.04
-    for item in glides_of(world, bounced.whole, bounced.clear, bounced.noise):
+    for item in find_sliding_segments(world, bounced.whole, bounced.clear, bounced.noise):
         assert float(height[item.episode, item.first : item.last + 1].max()) < 0.01
 
 
@@ -72,21 +72,31 @@ def test_hidden_frames_shorten_no_glide() -> None:
     for mask in hidden.values():
         mask[:, :6] = 0  # in a hand
         mask[0, 20] = 0  # lost once
-    parts = [(item.episode, item.first, item.last) for item in glides_of(world, whole, seen.clear, seen.noise)]
-    later = glides_of(world, replace(whole, **hidden), seen.clear, seen.noise)
+    parts = [
+        (item.episode, item.first, item.last) for item in find_sliding_segments(world, whole, seen.clear, seen.noise)
+    ]
+    later = find_sliding_segments(world, replace(whole, **hidden), seen.clear, seen.noise)
     assert max(last for _, _, last in parts) == max(item.last for item in later) == len(whole.times_s[0]) - 1
     assert min(item.first for item in later) == 6
     covered = sum(item.last - item.first for item in later)
     assert covered >= sum(last - first for _, first, last in parts) - 2 * 7
 
 
-def evidence(name: str, score: float, share: float, size: float = 1.0) -> GlideEvidence:
+def evidence(name: str, score: float, share: float, size: float = 1.0) -> SlidingEvidence:
     """An effect in glides, each of its numbers so many times what is usual."""
     effect = load_effect(name)
     values = np.array([size * p.scale for p in effect.parameters])
-    test = ScoreTest(score, len(values), 0.0, values, np.eye(len(values)), True)
+    test = ScoreTest(
+        statistic=score, dof=len(values), p_value=0.0, estimate=values, covariance=np.eye(len(values)), admissible=True
+    )
     numbers = {p.name: (float(v), 0.0) for p, v in zip(effect.parameters, values, strict=True)}
-    return GlideEvidence(Evidence(Candidate(name, effect), {}, test, 0.0, numbers=numbers), score, 0.3, 1.0, share)
+    return SlidingEvidence(
+        evidence=Evidence(candidate=Candidate(name, effect), constants={}, test=test, p_value=0.0, numbers=numbers),
+        score=score,
+        friction=0.3,
+        left=1.0,
+        share=share,
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,21 +124,21 @@ def evidence(name: str, score: float, share: float, size: float = 1.0) -> GlideE
 )
 def test_what_glides_name(found: list[tuple], flown: bool, named: list[str]) -> None:
     given = [evidence(*one) for one in found]
-    assert [one.evidence.name for one in equal_in_glides(given, explained=True, flown=flown)] == named
+    assert [one.evidence.name for one in selected_in_sliding(given, explained=True, flown=flown)] == named
 
 
 def test_what_a_single_episode_says_is_not_named_beside_an_effect_of_flight() -> None:
     told = evidence("anisotropic_friction", 900, 0.9)
     alone, twice = replace(told, others=20.0), replace(told, others=200.0)
-    assert equal_in_glides([alone], explained=True, flown=True) == []
-    assert equal_in_glides([twice], explained=True, flown=True) == [twice]
-    assert equal_in_glides([alone], explained=True, flown=False) == [alone]  # no law from flight can be off
+    assert selected_in_sliding([alone], explained=True, flown=True) == []
+    assert selected_in_sliding([twice], explained=True, flown=True) == [twice]
+    assert selected_in_sliding([alone], explained=True, flown=False) == [alone]  # no law from flight can be off
 
 
 def test_evidence_tells_what_the_other_episodes_say() -> None:
     prepared, world = rolls({"rolling_resistance": {"c_r": 1e-3}})
-    started = StartedGlides.of(prepared, world, prepared.flight)
-    (first, *_) = glide_evidence(prepared, world, LIBRARY, 50.0, started)
+    started = StartedSliding.of(prepared, world, prepared.flight)
+    (first, *_) = sliding_evidence(prepared, world, LIBRARY, 50.0, started)
     assert first.evidence.name == "rolling_resistance"
     assert 80 < first.others < 0.6 * first.score  # two balls
 
@@ -145,7 +155,7 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22}, thrown=2)
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
-    found = glide_evidence(prepared, world, library, GLIDE_SCORE, StartedGlides.of(prepared, world, prepared.flight))
+    found = sliding_evidence(prepared, world, library, GLIDE_SCORE, StartedSliding.of(prepared, world, prepared.flight))
     assert found[0].evidence.name == name
     assert found[0].score > GLIDE_SCORE
     assert found[0].score > 3 * found[1].score
@@ -158,10 +168,10 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     assert float(after.contact.friction[0]) == pytest.approx(0.22, rel=0.1)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY) -> dict[str, ContactLimit]:
-    started = StartedGlides.of(prepared, world, prepared.flight)
+def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY) -> dict[str, DetectionLimit]:
+    started = StartedSliding.of(prepared, world, prepared.flight)
     blind_to = ("velocity_restitution",)
-    found = contact_limits(started, world, library, (GLIDE_SCORE, 400.0), prepared.turned, blind_to)
+    found = detection_limits(started, world, library, (GLIDE_SCORE, 400.0), prepared.turned, blind_to)
     return {one.candidate.effect.name: one for one in found}
 
 
@@ -176,7 +186,9 @@ def test_from_the_limit_on_an_effect_is_named() -> None:
         (limit,) = found[name].sizes.values()
         for times, seen in ((1.1, True), (0.2, False)):
             prepared, world = rolls({name: {number: times * limit}})
-            ranked = glide_evidence(prepared, world, LIBRARY, 20.0, StartedGlides.of(prepared, world, prepared.flight))
+            ranked = sliding_evidence(
+                prepared, world, LIBRARY, 20.0, StartedSliding.of(prepared, world, prepared.flight)
+            )
             named = bool(ranked) and ranked[0].evidence.name == name and ranked[0].score > GLIDE_SCORE
             assert named == seen, (name, times, limit, [(one.evidence.name, one.score) for one in ranked])
 
@@ -192,7 +204,7 @@ def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
 
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
-    found = glide_evidence(prepared, world, LIBRARY, GLIDE_SCORE, StartedGlides.of(prepared, world, prepared.flight))
+    found = sliding_evidence(prepared, world, LIBRARY, GLIDE_SCORE, StartedSliding.of(prepared, world, prepared.flight))
     assert not found or found[0].score < GLIDE_SCORE
 
 
@@ -234,7 +246,7 @@ def test_a_box_that_turns_over_an_edge_does_not_glide() -> None:
         level[:, 2] += 0.05 * (np.abs(np.cos(tilt)) + np.abs(np.sin(tilt))) - height
         track = Track(times, level, quat / np.linalg.norm(quat, axis=1, keepdims=True))
         prepared = prepare(world, [(name, {world.bodies[0].name: track})])
-        glides = glides_of(world, prepared.whole, prepared.clear, prepared.noise)
+        glides = find_sliding_segments(world, prepared.whole, prepared.clear, prepared.noise)
         found[name] = sum(item.last - item.first for item in glides)
         assert all(name == "flat" or item.last <= 32 or item.first >= 58 for item in glides)
     assert found["flat"] > 90 and 40 < found["over"] < 70

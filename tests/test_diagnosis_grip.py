@@ -3,23 +3,27 @@
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.contact_stage import fitted_contact
-from cgwm.pipeline.diagnosis.glide_stage import GlideEvidence, StartedGlides
-from cgwm.pipeline.diagnosis.grip_stage import grip_evidence, named_by_grip
-from cgwm.pipeline.diagnosis.prepared import prepare
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.contact_tests.friction_consistency import (
+    friction_consistency_evidence,
+    selected_by_friction_consistency,
+)
+from cgwm.pipeline.diagnose.contact_tests.segments import fitted_contact
+from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingEvidence
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State
 from cgwm.pipeline.physics.effects import load_effect
-from cgwm.pipeline.physics.measured import measure
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.physics.observation_model import measure
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.prepare import prepare
+from cgwm.pipeline.segments.sliding_fit import StartedSliding
 from diagnosis_data import NOISE, Effects, tosses, world_with
 from worlds import F64
 
 LIBRARY = [Candidate(name, load_effect(name)) for name in ("adhesion", "viscous_friction", "torsional_friction")]
 
 
-def told(body: str, effects: Effects | None = None) -> list[GlideEvidence]:
+def told(body: str, effects: Effects | None = None) -> list[SlidingEvidence]:
     """Return what three slides and three tosses say."""
     truth, world = world_with(body, effects), world_with(body)
     rng, count = np.random.default_rng(4), 3
@@ -39,15 +43,15 @@ def told(body: str, effects: Effects | None = None) -> list[GlideEvidence]:
     prepared = prepare(world, [*slides, *tosses(truth, 2, count=count, lift_m_s=(-0.5, 0.0))])
     found = fitted_contact(prepared, world)
     assert found is not None
-    return grip_evidence(
-        prepared, found[0].world, found[1], LIBRARY, StartedGlides.of(prepared, found[0].world, prepared.flight)
+    return friction_consistency_evidence(
+        prepared, found[0].world, found[1], LIBRARY, StartedSliding.of(prepared, found[0].world, prepared.flight)
     )
 
 
 def test_adhesion_shows_where_glides_have_more_friction_than_impacts() -> None:
     mass = float(world_with("cube").bodies[0].mass[0])
     pull = 9.81 * mass
-    named = named_by_grip(told("cube", {"adhesion": {"F": pull, "g": 0.002}}))
+    named = selected_by_friction_consistency(told("cube", {"adhesion": {"F": pull, "g": 0.002}}))
     assert [one.evidence.name for one in named] == ["adhesion"]
     assert named[0].evidence.numbers is not None
     # the friction of impacts is taken for known to 13 % alone

@@ -6,20 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.impact_fits import BASE, ImpactProblem, fit_impacts
-from cgwm.pipeline.diagnosis.impact_law import Impact, after_impact, point_velocity, rebound_speed, within_cone
-from cgwm.pipeline.diagnosis.impact_stage import impact_evidence, named_by_impacts, with_impact_effect
-from cgwm.pipeline.diagnosis.impacts import measured_impacts
-from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
-from cgwm.pipeline.diagnosis.verdict import find
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.contact_tests.impact import impact_evidence, selected_in_impacts, with_impact_effect
+from cgwm.pipeline.diagnose.verdict import find
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
-from cgwm.pipeline.physics.contact import restitution
+from cgwm.pipeline.physics.contact_law import restitution
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.measured import measure
+from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.impact_fit import BASE, ImpactProblem, fit_impacts
+from cgwm.pipeline.segments.impact_law import Impact, after_impact, point_velocity, rebound_speed, within_cone
+from cgwm.pipeline.segments.impact_velocities import measured_impacts
+from cgwm.pipeline.segments.prepare import Prepared, prepare
 from diagnosis_data import NOISE, Effects, tosses, world_with
 from worlds import F64, ball_body, law
 
@@ -35,16 +35,16 @@ def impact(twist: list[list[float]], bounce: float = 0.5) -> Impact:
     before, body = torch.tensor(twist, dtype=F64), ball_body(RADIUS, MASS)
     count = len(before)
     return Impact(
-        before,
-        -(1 + bounce) * MASS * before[:, 2],
-        torch.zeros(count, 3, dtype=F64),
-        torch.eye(3, dtype=F64).expand(count, 3, 3),
-        torch.tensor([0.0, 0.0, -RADIUS], dtype=F64).expand(count, 3),
-        body.inertia.expand(count, 3, 3),
-        body.mass.expand(count),
-        torch.tensor([0.0, 0.0, 1.0], dtype=F64),
-        torch.zeros(count, dtype=F64),
-        body,
+        before=before,
+        impulse=-(1 + bounce) * MASS * before[:, 2],
+        place=torch.zeros(count, 3, dtype=F64),
+        rotation=torch.eye(3, dtype=F64).expand(count, 3, 3),
+        arm=torch.tensor([0.0, 0.0, -RADIUS], dtype=F64).expand(count, 3),
+        inertia=body.inertia.expand(count, 3, 3),
+        mass=body.mass.expand(count),
+        normal=torch.tensor([0.0, 0.0, 1.0], dtype=F64),
+        weight=torch.zeros(count, dtype=F64),
+        body=body,
     )
 
 
@@ -174,7 +174,7 @@ def test_measured_impacts_tell_restitution_and_friction() -> None:
 def test_impacts_are_silent_where_nothing_is_missing() -> None:
     for fast in (False, True):
         prepared, world = throws(fast=fast, seed=7)
-        assert not named_by_impacts(impact_evidence(prepared, world, LIBRARY))
+        assert not selected_in_impacts(impact_evidence(prepared, world, LIBRARY))
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_impacts_are_silent_where_nothing_is_missing() -> None:
 )
 def test_impacts_name_what_is_hidden(name: str, values: dict[str, float], fast: bool) -> None:
     prepared, world = throws({name: values}, fast)
-    named = named_by_impacts(impact_evidence(prepared, world, LIBRARY))
+    named = selected_in_impacts(impact_evidence(prepared, world, LIBRARY))
     assert [one.evidence.name for one in named] == [name]
     assert named[0].evidence.numbers is not None
     for key, value in values.items():

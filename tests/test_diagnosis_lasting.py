@@ -6,13 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.lasting import FORGETFUL, Lasting, Memory, memory_of, without_memory
-from cgwm.pipeline.diagnosis.prepared import SMEARED, Prepared, prepare
-from cgwm.pipeline.diagnosis.verdict import find
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.verdict import find
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects.registry import BUILT_IN, load_effect
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.prepare import SMEARED, Prepared, prepare
+from cgwm.pipeline.trajectories.correlated_noise import (
+    WHITE,
+    CorrelatedNoise,
+    NoiseModel,
+    estimate_noise_model,
+    innovations,
+)
 from diagnosis_data import NOISE, tosses, world_with
 from scipy.signal import savgol_filter
 
@@ -61,7 +67,7 @@ def test_innovations_are_what_the_inverse_of_the_covariance_says() -> None:
     mask[0, [3, 4, 9]] = 0  # not measured, a gap among them
     rows = torch.as_tensor(rng.standard_normal((2, 12, 5))) * mask[..., None]
     for share in (1.0, 0.6):
-        found = without_memory(rows, times, mask, Lasting(share, 0.05, 2.0))
+        found = innovations(rows, times, mask, CorrelatedNoise(share, 0.05, 2.0))
         for k in range(2):
             kept = mask[k] > 0
             t = times[k, kept]
@@ -80,7 +86,7 @@ def test_errors_that_last_are_measured(body: str) -> None:
         fresh = (one.size * std / true) ** 2 * (1 - one.share * kept**2)
         assert kept >= 0.6 and one.share > 0.5 and fresh == pytest.approx(1 - 0.7**2, rel=0.25)
         assert 0.7 < std / true < 3
-    assert any("last from frame to frame" in warning for warning in prepared.warnings)
+    assert any("are correlated in time" in warning for warning in prepared.warnings)
 
 
 @pytest.mark.parametrize(
@@ -89,33 +95,33 @@ def test_errors_that_last_are_measured(body: str) -> None:
 )
 def test_errors_that_do_not_last_are_not_taken_for_such(body: str, effects: dict) -> None:
     prepared, _ = ready(body, effects, None)
-    assert prepared.memory == FORGETFUL
-    assert prepared.flight is not None and prepared.flight.memory == FORGETFUL
+    assert prepared.memory == WHITE
+    assert prepared.flight is not None and prepared.flight.memory == WHITE
 
 
 def test_rounding_does_not_last() -> None:
     world = world_with("ball", {"linear_drag": {"c": 0.3}})
     exact = tosses(world, 1, count=4, duration_s=0.5, noise=(1e-14, 1e-14))
     prepared = prepare(world_with("ball"), exact, NOISE)
-    assert prepared.memory == FORGETFUL and prepared.noise == NOISE
+    assert prepared.memory == WHITE and prepared.noise == NOISE
 
 
 def test_few_frames_tell_nothing() -> None:
     prepared, _ = ready("ball", {}, lasting(0.9, 3))
-    assert memory_of(prepared.whole, [prepared.flight.items[0]]) == (FORGETFUL, (None, None))  # pyright: ignore
-    assert memory_of(prepared.whole, []) == (FORGETFUL, (None, None))
+    assert estimate_noise_model(prepared.whole, [prepared.flight.items[0]]) == (WHITE, (None, None))  # pyright: ignore
+    assert estimate_noise_model(prepared.whole, []) == (WHITE, (None, None))
 
 
 @pytest.mark.parametrize("change", [lasting(0.8, 5), smoothed], ids=["lasting", "smoothed"])
 def test_they_are_no_effect_and_hide_none(change: Callable[[Track], Track]) -> None:
     prepared, world = ready("ball", {}, change)
-    assert prepared.memory != FORGETFUL
+    assert prepared.memory != WHITE
     assert find(prepared, world, LIBRARY).verdict == "none_missing"  # pyright: ignore[reportArgumentType]
-    blind = replace(prepared, memory=Memory())
+    blind = replace(prepared, memory=NoiseModel())
     assert prepared.flight is not None
     items = prepared.flight.items
     slow = [p.segments("flight", world, items) for p in (prepared, blind)]  # pyright: ignore[reportArgumentType]
-    assert slow[0].memory != FORGETFUL and slow[1].memory == FORGETFUL
+    assert slow[0].memory != WHITE and slow[1].memory == WHITE
     prepared, world = ready("ball", {"linear_drag": {"c": 0.6}}, change)
     found = find(prepared, world, LIBRARY)  # pyright: ignore[reportArgumentType]
     assert [one.evidence.name for one in found.chosen] == ["linear_drag"]
@@ -135,9 +141,9 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
 
 
 def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cgwm.pipeline.diagnosis.prepared.SMEARED", 200)
+    monkeypatch.setattr("cgwm.pipeline.segments.prepare.SMEARED", 200)
     prepared, _ = ready("ball", {}, lasting(0.8, 5))
-    assert prepared.memory != FORGETFUL and prepared.least_force_m_s2 > 0
+    assert prepared.memory != WHITE and prepared.least_force_m_s2 > 0
     touched = {item.episode for item in prepared.contact_items}
     assert prepared.flight is None or not touched & {item.episode for item in prepared.flight.items}
 
@@ -145,5 +151,5 @@ def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -
 def test_a_box_without_orientation_has_no_contact_though_errors_last() -> None:
     change = lasting(0.8, 5)
     prepared, _ = ready("cube", {}, lambda track: replace(change(track), quat_wxyz=None))
-    assert prepared.memory != FORGETFUL and not prepared.turned
+    assert prepared.memory != WHITE and not prepared.turned
     assert prepared.contact_items == ()

@@ -3,8 +3,8 @@
 from importlib import metadata
 
 import pytest
-from cgwm.pipeline import doctor as module
-from cgwm.pipeline.doctor import cpu_cores, doctor, memory_bytes, satisfies
+from cgwm.pipeline.runtime import doctor as module
+from cgwm.pipeline.runtime.doctor import cpu_cores, doctor, memory_bytes, satisfies
 from cgwm.schemas import DoctorReport
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from cgwm.pipeline.physics import World, simulate
-from cgwm.pipeline.physics.dispatch import rollout
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import changed_by_effects
-from cgwm.pipeline.physics.measured import as_measured
+from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.observation_model import as_measured
 from diagnosis_data import world_with
 from worlds import F64, box_body, law, state_of, times, world_of
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from cgwm.pipeline.effects import list_effects, new_effect, show_effect
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, Effect, effect_names, load_effect
 from cgwm.pipeline.physics.effects import effect as module
+from cgwm.pipeline.physics.effects.catalogue import list_effects, new_effect, show_effect
 from cgwm.pipeline.physics.effects.registry import BUILT_IN, FLIGHT_ALIASES
 from cgwm.schemas import UsageError
 from cgwm.schemas.effects import EffectCard, EffectList
@@ -61,7 +61,7 @@ def test_an_effect_of_an_installed_package_is_found(own: Path, tmp_path: Path, m
     assert load_effect("lift").formula == "a = b e_z"
     assert refused("broken") == (
         "effect 'broken' (nowhere:Lift): cannot be imported: ModuleNotFoundError: No module named 'nowhere'.\n"
-        "Next: mend or remove the package that brings it."
+        "Next: repair or remove the package that provides it."
     )
 
 
@@ -142,7 +142,7 @@ def test_a_class_that_wants_arguments_is_refused(own: Path) -> None:
 
 def test_the_built_in_effects_are_the_files_of_the_folder() -> None:
     folder = Path(module.__file__).parent
-    others = {"__init__", "effect", "registry", "template"}
+    others = {"__init__", "catalogue", "effect", "registry", "residual_wrench", "template"}
     assert sorted(path.stem for path in folder.glob("*.py") if path.stem not in others) == sorted(BUILT_IN)
 
 
@@ -189,7 +189,7 @@ def test_an_effect_is_shown_with_what_it_can_be_mistaken_for() -> None:
         "  l         m     each of 0.01, 0.02, 0.05, 0.1",
         "  acts in                     flight",
         "  needs                       ground",
-        "  shown best by               low bounces and slow passes just over the ground, beside flights high above it",
+        "  shown best by               low bounces and slow passes just over the ground, and flights high above it",
         "  in free flight the same as  no other effect",
         "  source                      a stand-in with one range for the fields of magnets and charges",
     ]
@@ -214,7 +214,7 @@ def test_the_template_runs_as_it_stands(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     done = cgwm("new", path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"Wrote {path}.\nNext: change it, then cgwm effects show {path}:MyEffect\n"
+    assert done.stdout == f"Wrote {path}.\nNext: edit it, then cgwm effects show {path}:MyEffect\n"
     assert show_effect(f"{path}:MyEffect").phase == "flight"
     effect = ActiveEffect.of(load_effect(f"{path}:MyEffect"), {"w": 4.0})
     world = replace(world_of(ball_body(), ground=False), effects=(effect,))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.pipeline.estimation.forward import batched_jacobian
-from cgwm.pipeline.physics import Body, PublishedLaw, State, World, simulate
+from cgwm.pipeline.geometry.rotation import geodesic_angle, quat_multiply, quat_rotate
+from cgwm.pipeline.optimization.forward_mode import batched_jacobian
+from cgwm.pipeline.physics import Body, PaperLaw, State, World, simulate
 from cgwm.pipeline.physics.effects import (
     ActiveEffect,
     BodyMotion,
@@ -17,7 +18,6 @@ from cgwm.pipeline.physics.effects import (
     load_effect,
 )
 from cgwm.pipeline.physics.effects.registry import BUILT_IN
-from cgwm.pipeline.physics.rotation import geodesic_angle, quat_multiply, quat_rotate
 from cgwm.schemas import UsageError
 from worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 
@@ -277,7 +277,18 @@ def motion_at(world: World, state: State) -> BodyMotion:
     body = world.bodies[0]
     eye, zero = torch.eye(3, dtype=F64)[None], torch.zeros(1, 3, dtype=F64)
     position = state.position_m[:, 0]
-    return BodyMotion(body, body.mass, body.inertia, position, eye, zero, zero, world.up, world.up, world.ground_offset)
+    return BodyMotion(
+        body=body,
+        mass=body.mass,
+        inertia=body.inertia,
+        com=position,
+        rotation=eye,
+        velocity=zero,
+        omega=zero,
+        up=world.up,
+        normal=world.up,
+        ground_offset=world.ground_offset,
+    )
 
 
 # In contact
@@ -529,7 +540,7 @@ def test_what_an_effect_needs_and_does_not_get_is_refused() -> None:
 
 
 def test_the_published_law_takes_effects_on_friction_alone() -> None:
-    published = PublishedLaw(batch(MU), batch(2000.0), batch(10.0))
+    published = PaperLaw(friction=batch(MU), stiffness_n_m=batch(2000.0), damping_n_s_m=batch(10.0))
     world = replace(world_of(box_body(half=FLAT)), contact=published)
     start = state_of(((0, 0, 0.0099), UP, (1, 0, 0), (0, 0, 0)))
     speeds = [

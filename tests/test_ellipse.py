@@ -10,8 +10,8 @@ import pytest
 import torch
 from cgwm.pipeline.physics import Body, Rollout, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.ellipse import FLATTEST, Ellipse
-from cgwm.pipeline.physics.sweeps import in_disc
+from cgwm.pipeline.physics.friction_ellipse import FLATTEST, Ellipse
+from cgwm.pipeline.physics.impulse_solver import in_disc
 from scipy.integrate import solve_ivp
 from worlds import F64, batch, box_body, law, state_of, times, world_of
 

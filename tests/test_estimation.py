@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.pipeline import phys_geo
-from cgwm.pipeline.estimation.least_squares import minimise
-from cgwm.pipeline.estimation.noise import estimate_noise
-from cgwm.pipeline.estimation.observations import Observations
-from cgwm.pipeline.estimation.search import Prior, SearchResult, episode_covariance, importance_search
-from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
-from cgwm.pipeline.phys_geo import _derived, fit_physics
+from cgwm.pipeline.optimization.importance_sampling import (
+    NormalPrior,
+    SearchResult,
+    episode_covariance,
+    importance_search,
+)
+from cgwm.pipeline.optimization.levenberg_marquardt import minimise
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
+from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
+from cgwm.pipeline.phys_geo.tracks.contact_result import _derived
 from cgwm.pipeline.physics import restitution, simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
+from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_frames, warmup_frames
+from cgwm.pipeline.trajectories.observations import Observations
+from cgwm.pipeline.trajectories.track_noise import estimate_noise
 from cgwm.schemas import PhysConfig
 from scipy.spatial.transform import Rotation
 from worlds import F64, box_body, law, state_of, times, world_of
@@ -79,7 +85,7 @@ def test_search_finds_the_deeper_of_two_valleys() -> None:
         deep, shallow = (z[:, :1] - 3) ** 2 / 10, 0.05 * (z[:, :1] + 3) ** 2 + 0.5
         return np.minimum(deep, shallow) + 0.1
 
-    prior = Prior(np.array([-3.0]), np.array([3.0]), np.array([[-8.0, 8.0]]))
+    prior = NormalPrior(np.array([-3.0]), np.array([3.0]), np.array([[-8.0, 8.0]]))
     found = importance_search(costs, prior, seed=0, population=48, generations=8, errors=40.0, floor=0.01)
     assert found.mean[0] == pytest.approx(3, abs=0.3)
 
@@ -92,7 +98,7 @@ def test_search_gives_the_posterior_of_a_linear_model() -> None:
     def costs(z: np.ndarray) -> np.ndarray:
         return np.sqrt(0.04 + np.einsum("ki,ij,kj->k", z - centre, curvature, z - centre))[:, None]
 
-    prior = Prior(np.zeros(2), np.array([1.0, 0.5]), np.array([[-9.0, 9.0]] * 2))
+    prior = NormalPrior(np.zeros(2), np.array([1.0, 0.5]), np.array([[-9.0, 9.0]] * 2))
     found = importance_search(costs, prior, seed=1, population=400, generations=8, errors=3.0, floor=0.01)
     precision = 3.0 * curvature / found.lowest**2 + np.diag(1 / prior.std**2)
     expected = np.linalg.solve(precision, 3.0 * curvature / found.lowest**2 @ centre)
@@ -106,7 +112,15 @@ def test_covariance_from_the_scatter_between_episodes_is_that_of_the_mean() -> N
     rng = np.random.default_rng(0)
     centres = 1 + 0.3 * rng.standard_normal(40)
     samples = rng.normal(centres.mean(), 0.3, (200, 1))
-    result = SearchResult(centres.mean(keepdims=True), np.eye(1), 0.0, samples, (samples - centres) ** 2, [], 200.0)
+    result = SearchResult(
+        mean=centres.mean(keepdims=True),
+        covariance=np.eye(1),
+        lowest=0.0,
+        samples=samples,
+        costs=(samples - centres) ** 2,
+        history=[],
+        effective_samples=200.0,
+    )
     covariance = episode_covariance(result, centres.mean(keepdims=True))
     assert covariance is not None
     assert covariance[0, 0] == pytest.approx(centres.var(ddof=1) / 40, rel=1e-3)
@@ -131,7 +145,7 @@ def test_one_toss_gives_back_the_parameters_that_made_it() -> None:
     start = world_of(box_body(), contact=law(friction=0.5, damping_ratio=0.2))
     config = PhysConfig(population=48, generations=6)
     fit = fit_physics(start, [("000", {"box": toss(3, true, duration_s=0.2)})], config, NOISE)
-    assert fit.record["kept"] == "shooting"  # the model explains its own motion down to the noise
+    assert fit.record.to_json()["kept"] == "shooting"  # the model explains its own motion down to the noise
     found = {parameter.name: parameter for parameter in fit.parameters}
     for name, value in (("friction", 0.25), ("damping_ratio", 0.4)):
         estimate = found[name]
@@ -146,7 +160,7 @@ def test_one_toss_gives_back_the_parameters_that_made_it() -> None:
 
 
 def test_two_fits_with_one_seed_are_identical(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
     episodes = [("000", {"box": toss(3, duration_s=0.15)})]
     config = PhysConfig(population=8, generations=2, iterations=1, seed=5, step_s=0.002)
     first, second = (fit_physics(world_of(box_body()), episodes, config, NOISE) for _ in range(2))

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import write_model
-from cgwm.datasets.tracks import Track, write_tracks
-from cgwm.pipeline.estimation.states import covariance_root
-from cgwm.pipeline.eval import Evaluation, evaluate, evaluate_model
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.models.model import write_model
+from cgwm.pipeline.evaluate.prediction import Motion
+from cgwm.pipeline.evaluate.stage import Evaluation, evaluate, evaluate_model
 from cgwm.pipeline.physics import State, World, simulate
-from cgwm.pipeline.prediction import Motion
+from cgwm.pipeline.trajectories.state_uncertainty import covariance_root
 from cgwm.schemas import EvalResult, InputDataError, SynthesizeConfig, UsageError
 from small_model import HALF, small_model
 from thrown_cube import (

@@ -15,24 +15,24 @@ import pycolmap
 import pytest
 from cgwm.cli import main
 from cgwm.cli.usage import option_name
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.cameras import Camera, camera_of, to_intrinsics
-from cgwm.datasets.colmap_model import read_colmap_model, rotation_from_quat_wxyz
+from cgwm.datasets.capture.cameras import Camera, camera_of, to_intrinsics
+from cgwm.datasets.capture.colmap_model import read_colmap_model, rotation_from_quat_wxyz
+from cgwm.datasets.capture.images import read_rgb, write_image
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.capture.transforms import read_transforms
 from cgwm.datasets.exports.bop_coco import run_lengths
 from cgwm.datasets.exports.glb import EXTENSION
 from cgwm.datasets.exports.lerobot_stats import PictureStats, together, vector_stats
 from cgwm.datasets.exports.selection import Selection
-from cgwm.datasets.images import read_rgb, write_image
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.meshes import Mesh, mass_properties
-from cgwm.datasets.mjcf import write_mjcf
-from cgwm.datasets.models import Model, read_model, write_model
-from cgwm.datasets.ply import SH_C0, Splats, read_splats
-from cgwm.datasets.tracks import Track
-from cgwm.datasets.transforms import read_transforms
-from cgwm.pipeline.export import DATASET_FORMATS, MODEL_FORMATS, OPTIONS, ExportOptions, export, object_model
-from cgwm.pipeline.resimulate import _commanded, keyframe_of, resimulate, start_of
-from cgwm.pipeline.splats.surface_nets import union_mesh
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.models.mjcf import write_mjcf
+from cgwm.datasets.models.model import Model, read_model, write_model
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.datasets.shapes.meshes import Mesh, mass_properties
+from cgwm.datasets.shapes.ply import SH_C0, Splats, read_splats
+from cgwm.pipeline.export.mujoco_check import _commanded, keyframe_of, resimulate, start_of
+from cgwm.pipeline.export.stage import DATASET_FORMATS, MODEL_FORMATS, OPTIONS, ExportOptions, export, object_model
+from cgwm.pipeline.geometry.isosurface import union_mesh
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import (
     CamerasFile,
@@ -68,7 +68,9 @@ def photo_cameras() -> CamerasFile:
     images, intrinsics = {}, {}
     for name, distortion in (("wide", [-0.2, 0.05, 0.001, -0.002, 0.01]), ("plain", [])):
         K = np.array([[52.0, 0, 30.5], [0, 51.0, 24.25], [0, 0, 1]])
-        intrinsics[name] = to_intrinsics(Camera(60, 48, K, np.array(distortion), np.eye(4)))
+        intrinsics[name] = to_intrinsics(
+            Camera(width=60, height=48, K=K, distortion=np.array(distortion), T_world_cam=np.eye(4))
+        )
     for name, camera in (("a/0.png", "wide"), ("a/1.png", "plain"), ("b.png", "plain")):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
@@ -213,7 +215,7 @@ def test_colmap_takes_the_cameras_and_photos_of_a_capture(tmp_path: Path) -> Non
     (capture / "capture.toml").write_text('format = "cgwm-capture/1"\n')
     (capture / "cameras.json").write_text(photo_cameras().model_dump_json())
     write_image(capture / "images" / "a" / "0.png", np.full((48, 60, 3), 77, np.uint8))
-    with pytest.raises(InputDataError, match=r"no cameras of photos in it(.|\n)*--capture CAPTURE"):
+    with pytest.raises(InputDataError, match=r"contains no cameras of photos(.|\n)*--capture CAPTURE"):
         export(tmp_path / "model", "colmap", tmp_path / "out")
     result = export(tmp_path / "model", "colmap", tmp_path / "out", ExportOptions(capture=capture))
     assert result.facts["photos_copied"] == 1
@@ -555,7 +557,7 @@ def test_statistics_of_parts_are_those_of_the_whole() -> None:
 @pytest.mark.parametrize("format_", [*DATASET_FORMATS, *MODEL_FORMATS])
 def test_the_wrong_kind_is_named(dataset: Path, model: Path, tmp_path: Path, format_: ExportFormat) -> None:
     thing, found = (model, "model") if format_ in DATASET_FORMATS else (dataset, "dataset")
-    with pytest.raises(InputDataError, match=rf"is a {found}; --to {format_} takes a (.|\n)*of a dataset: lerobot"):
+    with pytest.raises(InputDataError, match=rf"is a {found}; --to {format_} takes a (.|\n)*for a dataset: lerobot"):
         export(thing, format_, tmp_path / "out")
     with pytest.raises(InputDataError, match="no such"):
         export(tmp_path / "nothing", format_, tmp_path / "out")
@@ -621,7 +623,7 @@ def test_the_command_tells_what_was_measured(model: Path, tmp_path: Path, capfd:
     code, out, _ = run("--to", "mjcf", "--out", str(tmp_path / "n.xml"), "--duration", "0.2")
     assert code == 0 and "deviation in flight mm" in out
     code, _, err = run("--to", "mjcf", "--out", str(tmp_path / "o.xml"), "--every", "2")
-    assert code == 2 and err == "--every with --to mjcf: it means nothing there.\nAllowed: --seed, --duration.\n"
+    assert code == 2 and err == "--every does not apply to --to mjcf.\nAllowed: --seed, --duration.\n"
 
 
 def test_every_format_has_its_options() -> None:

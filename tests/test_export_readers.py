@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cgwm.datasets.dataset import read_manifest
 from cgwm.datasets.exports.selection import Selection
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.models import read_model
+from cgwm.datasets.models.model import read_model
+from cgwm.datasets.rollouts.dataset import read_manifest
+from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import SynthesizeConfig
 from small_model import write_small_model

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.images import read_rgb, write_image
-from cgwm.pipeline.exposure import estimate_exposures, fit_exposure
-from cgwm.pipeline.image_errors import expose
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.images import read_rgb, write_image
+from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures, fit_exposure
+from cgwm.pipeline.rendering.video_view import expose
 from cgwm.schemas import Exposure
 from small_model import small_model
 from thrown_cube import EXPOSURE, add_video, truth, write_capture

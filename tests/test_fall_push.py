@@ -12,13 +12,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.scenes import TRUTH_FILE, TRUTH_MESH, make_scene, read_truth
-from cgwm.datasets.scenes.objects import make_object
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline import phys_geo
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.synthetic import TRUTH_FILE, TRUTH_MESH, make_scene, read_truth
+from cgwm.datasets.synthetic.objects import make_object
 from cgwm.pipeline.fit import fit
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.schemas import NotConvergedError, SplatConfig
 from worlds import ball_body, box_body, state_of, world_of
 
@@ -96,7 +96,7 @@ def frozen(bench, blind, judge):
 
 @pytest.mark.evidence
 def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, judge, frozen, monkeypatch):
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 2)
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 2)
     fitted = bench.cgwm_default.Cgwm("cgwm", FEW).fit(blind, None)
     ballistic = errors(judge, bench.zeros.Ballistic().fit(blind, None))
     assert errors(judge, fitted) < 0.7 * min(frozen, ballistic)

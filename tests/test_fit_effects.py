@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.datasets.models import read_model
-from cgwm.datasets.tracks import write_tracks
-from cgwm.pipeline import first_contacts, phys_geo
-from cgwm.pipeline.effect_flights import fit_effect_flights
-from cgwm.pipeline.effect_motions import fit_effect_motions
-from cgwm.pipeline.estimation.search import SearchResult
+from cgwm.datasets.capture.tracks import write_tracks
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.fit_effects import fit_with_effects, fitted_effects, with_effects
+from cgwm.pipeline.optimization import uncertainty
+from cgwm.pipeline.optimization.importance_sampling import SearchResult
+from cgwm.pipeline.phys_geo.effects.by_motion import fit_effect_flights
+from cgwm.pipeline.phys_geo.effects.effect_fit import fit_effects
+from cgwm.pipeline.phys_geo.effects.requested_effects import fit_with_effects, fitted_effects, with_effects
+from cgwm.pipeline.phys_geo.tracks import contact_shooting, open_loop_search
 from cgwm.pipeline.physics import ContactLaw, World, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.measured import measure
+from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, effect_parameters
-from cgwm.schemas import EffectModel, InputDataError, Parameter, PhysConfig, UsageError
+from cgwm.pipeline.segments import first_contact_fit
+from cgwm.schemas import EffectModel, FittedParameter, InputDataError, PhysConfig, UsageError
 from small_model import write_small_model
 from worlds import F64, ball_body, box_body, state_of, times, world_of
 
@@ -53,7 +55,7 @@ def active(name: str, **values: float) -> ActiveEffect:
 
 
 def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)  # the search and the first contacts tell
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)  # the search and the first contacts tell
     episodes = thrown(replace(boxes(), effects=(active("quadratic_drag", k=0.2),)), 4)
     plain = fit_with_effects(boxes(), episodes, BRIEF, (5e-4, 1e-3))
     world = replace(boxes(), effects=(active("quadratic_drag"),))
@@ -62,12 +64,12 @@ def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest
     assert drag.interval_95 is not None and drag.interval_95[0] < 0.2 < drag.interval_95[1]
     assert drag.estimate == pytest.approx(0.2, rel=0.25) and drag.unit == "1/m"
     assert [block.parameters for block in found.correlations][1] == ("quadratic_drag.k",)
-    assert found.record["search_open_loop_m"][-1] < 0.75 * plain.record["search_open_loop_m"][-1]
+    assert found.record.to_json()["search_open_loop_m"][-1] < 0.75 * plain.record.to_json()["search_open_loop_m"][-1]
 
 
 def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_contacts, "ITERATIONS", 1)
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    monkeypatch.setattr(first_contact_fit, "ITERATIONS", 1)
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
     effect = load_effect("ground_magnet")
     (constant,) = effect.constants
     truth = {effect.parameters[0].name: 6.0, constant.name: constant.grid[-1]}
@@ -75,7 +77,7 @@ def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pyt
     brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "iterations": 1})
     world = replace(boxes(), effects=(active("ground_magnet"),))
     found = fit_with_effects(world, episodes, brief, (5e-4, 1e-3))
-    tried = found.record["effects"]["constants_tried"]
+    tried = found.record.to_json()["effects"]["constants_tried"]
     assert [row[f"ground_magnet.{constant.name}"] for row in tried] == list(constant.grid)
     best = min(tried, key=lambda row: row["cost"])
     assert found.constants == {f"ground_magnet.{constant.name}": best[f"ground_magnet.{constant.name}"]}
@@ -93,8 +95,8 @@ def test_effects_join_those_of_the_parent_and_take_their_fitted_values() -> None
     joined = with_effects(present, ["quadratic_drag", "linear_drag", "quadratic_drag"])
     assert [effect.name for effect in joined] == ["linear_drag", "quadratic_drag"]
     found = [
-        Parameter(name="quadratic_drag.k", unit="1/m", estimate=0.3),
-        Parameter(name="friction", unit="1", estimate=0.2),
+        FittedParameter(name="quadratic_drag.k", unit="1/m", estimate=0.3),
+        FittedParameter(name="friction", unit="1", estimate=0.2),
     ]
     names = {effect.name: effect.name for effect in joined}
     fitted = fitted_effects(joined, names, found, {})
@@ -142,7 +144,7 @@ def test_what_a_fit_cannot_find_is_refused(tmp_path: Path) -> None:
     episodes = thrown(boxes(), 1)
     driven = replace(ball_body(name="tip"), motion="driven")
     world = replace(world_of(box_body(), driven), effects=(active("length_scale"),))
-    with pytest.raises(InputDataError, match="'length_scale' with a driven body: its track is its command"):
+    with pytest.raises(InputDataError, match="'length_scale' with a driven body: the body's track is its command"):
         fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3))
     with pytest.raises(InputDataError, match=r"phys-geo.step_s is 5 ms(.|\n)*up to 3.1 ms"):
         fit_with_effects(boxes(), episodes, BRIEF.model_copy(update={"step_s": 0.005}), (5e-4, 1e-3))
@@ -165,17 +167,17 @@ def test_up_is_against_gravity_on_a_slope_too() -> None:
 
 
 def test_a_fit_that_was_begun_starts_at_the_worlds_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
     law = ContactLaw(*(torch.tensor([value], dtype=F64) for value in (0.12, 0.02, 5.0)))
     world = replace(boxes(), contact=law)
     seen: list[tuple[list[float], int]] = []
-    search = phys_geo.importance_search
+    search = open_loop_search.importance_search
 
     def noted(*arguments: Any, **more: Any) -> SearchResult:
         seen.append((more["first"].tolist(), more["generations"]))
         return search(*arguments, **more)
 
-    monkeypatch.setattr(phys_geo, "importance_search", noted)
+    monkeypatch.setattr(open_loop_search, "importance_search", noted)
     episodes = thrown(boxes(), 1)
     for begun in (True, False):
         fit_with_effects(world, episodes, BRIEF, (5e-4, 1e-3), begun)
@@ -216,7 +218,7 @@ def test_effects_of_flight_are_found_in_flights_from_nothing() -> None:
     hidden = tuple(active(name, **values) for name, values in truth.items())
     episodes = thrown(replace(boxes(), effects=hidden), 4)
     world = replace(boxes(), effects=tuple(active(name) for name in truth))
-    found = fit_effect_motions(world, episodes, [], (5e-4, 1e-3))
+    found = fit_effects(world, episodes, [], (5e-4, 1e-3))
     assert found.record["flights"] >= 4 and "windows" not in found.record
     for parameter in found.parameters:
         name, _, number = parameter.name.partition(".")
@@ -227,10 +229,10 @@ def test_effects_of_flight_are_found_in_flights_from_nothing() -> None:
 
 
 def test_what_flights_show_stands_beside_effects_of_contact(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_contacts, "ITERATIONS", 2)
+    monkeypatch.setattr(first_contact_fit, "ITERATIONS", 2)
     episodes = thrown(replace(boxes(), effects=(active("spin_damping", d=1.0),)), 3)
     alone, beside = (
-        fit_effect_motions(replace(boxes(), effects=effects), episodes, [], (5e-4, 1e-3))
+        fit_effects(replace(boxes(), effects=effects), episodes, [], (5e-4, 1e-3))
         for effects in (
             (active("spin_damping"),),
             (active("viscous_friction"), active("spin_damping")),
@@ -254,7 +256,7 @@ def test_what_carries_no_information_has_a_wide_interval() -> None:
     one, other = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
     turned = 4.0 * np.outer(one, one) - 1e-13 * np.outer(other, other)
     for information, known in ((turned, one), (np.diag([4.0, 0.0]), np.array([1.0, 0.0]))):
-        covariance = first_contacts.few_covariance(information, np.zeros((3, 2)))
+        covariance = uncertainty.few_covariance(information, np.zeros((3, 2)))
         assert np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()
         assert known @ covariance @ known == pytest.approx(0.25, rel=1e-3)
         assert np.sqrt(np.diag(covariance).max()) > 1e4
@@ -263,9 +265,9 @@ def test_what_carries_no_information_has_a_wide_interval() -> None:
 def test_few_episodes_make_intervals_wider_where_they_scatter_and_never_narrower() -> None:
     information = np.diag([100.0, 4.0])
     alike, apart = np.zeros((3, 2)), np.array([[30.0, 0.0], [-30.0, 0.0], [0.0, 0.0]])
-    assert np.allclose(first_contacts.few_covariance(information, alike), np.diag([0.01, 0.25]))
+    assert np.allclose(uncertainty.few_covariance(information, alike), np.diag([0.01, 0.25]))
     # 2 * 30^2 / 100^2 of scatter, times 3 / 2 and (4.303 / 1.96)^2
-    wide = first_contacts.few_covariance(information, apart)
+    wide = uncertainty.few_covariance(information, apart)
     assert wide[0, 0] == pytest.approx(0.18 * 1.5 * (4.3027 / 1.96) ** 2, rel=1e-3) and wide[1, 1] == 0.25
     many = np.tile(apart, (3, 1))
-    assert first_contacts.few_covariance(information, many)[0, 0] == pytest.approx(6 * 900 / 1e4)
+    assert uncertainty.few_covariance(information, many)[0, 0] == pytest.approx(6 * 900 / 1e4)

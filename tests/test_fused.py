@@ -11,28 +11,28 @@ import fused_host
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline import nvrtc
-from cgwm.pipeline.estimation.forward import batched_jacobian
-from cgwm.pipeline.physics import Body, ContactLaw, PublishedLaw, Rollout, State, World, dispatch, simulate
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_rotate
+from cgwm.pipeline.optimization.forward_mode import batched_jacobian
+from cgwm.pipeline.physics import Body, ContactLaw, PaperLaw, Rollout, State, World, engine, simulate
 from cgwm.pipeline.physics.devices import on_device
-from cgwm.pipeline.physics.distance import plane_contacts
-from cgwm.pipeline.physics.driven import Drive
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
+from cgwm.pipeline.physics.effects.residual_wrench import AXES, ResidualWrench
 from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
+from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
-from cgwm.pipeline.physics.residual_wrench import AXES, ResidualWrench
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply, quat_rotate
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
+from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import InputDataError, UsageError
 from torch import Tensor
 from worlds import F64, ball_body, batch, box_body, state_of, times, world_of
 
-CUDA = torch.cuda.is_available() and nvrtc.available()
+CUDA = torch.cuda.is_available() and kernel_build.available()
 NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
 POSES = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
@@ -531,7 +531,7 @@ def test_what_the_kernel_does_not_have() -> None:
     assert "'other'" in (reason_against(replace(world, effects=(ActiveEffect.of(Other()),))) or "")
     flying = replace(world, touching=False, effects=(active("adhesion", F=1.0),))
     assert "do not touch anything" in (reason_against(flying) or "")
-    published = PublishedLaw(batch(0.3), batch(1e4), batch(10.0))
+    published = PaperLaw(friction=batch(0.3), stiffness_n_m=batch(1e4), damping_n_s_m=batch(10.0))
     assert "'published'" in (reason_against(replace(world, contact=published)) or "")
     assert "its bodies may have 4104 contacts" in (reason_against(crowded(2044)) or "")
 
@@ -547,12 +547,12 @@ def test_the_torch_engine_is_taken_on_a_cpu_without_a_compiler(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(host, "compiler", lambda: None)
-    monkeypatch.setattr(dispatch, "compiler", lambda: None)
+    monkeypatch.setattr(engine, "compiler", lambda: None)
     world, state = world_of(box_body()), tossed(1)
     with caplog.at_level("INFO", "cgwm"):
         agree(
             simulate(world, state, times(0.05), None, True),
-            dispatch.rollout(world, state, times(0.05), None, True),
+            engine.rollout(world, state, times(0.05), None, True),
             0.0,
         )
     assert not caplog.records
@@ -561,14 +561,14 @@ def test_the_torch_engine_is_taken_on_a_cpu_without_a_compiler(
 @NEEDS_COMPILER
 def test_the_kernel_is_taken_on_a_cpu_with_a_compiler(caplog: pytest.LogCaptureFixture) -> None:
     world, state = world_of(box_body()), tossed(3)
-    dispatch._note.cache_clear()
+    engine._note.cache_clear()
     with caplog.at_level("INFO", "cgwm"):
-        found = dispatch.rollout(world, state, times(0.2), None, True)
+        found = engine.rollout(world, state, times(0.2), None, True)
         same_bits(found, simulate_on_host(world, state, times(0.2), None, True))
         agree(simulate(world, state, times(0.2), None, True), found, 1e-9)
         assert not caplog.records
         twice = replace(world, effects=(active("adhesion"), active("adhesion")))
-        same_bits(simulate(twice, state, times(0.05)), dispatch.rollout(twice, state, times(0.05)))
+        same_bits(simulate(twice, state, times(0.05)), engine.rollout(twice, state, times(0.05)))
     assert [record.getMessage() for record in caplog.records] == [
         "rollouts run in the torch engine, not in the fused kernel: the kernel takes one adhesion, and it has several"
     ]
@@ -635,9 +635,9 @@ def test_a_kernel_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
 def test_a_kernel_for_the_gpu_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     source = 'extern "C" __global__ void answer(double *to, int k) { to[0] = k; }'
-    core, to = nvrtc._core(), torch.zeros(1, dtype=F64, device="cuda")
+    core, to = kernel_build._core(), torch.zeros(1, dtype=F64, device="cuda")
     for k in (41, 42):
-        nvrtc.launch(nvrtc.compiled(source, "answer", 0), to.device, 1, 1, (to,), np.int32(k))
+        kernel_build.launch(kernel_build.compiled(source, "answer", 0), to.device, 1, 1, (to,), np.int32(k))
         assert to.item() == k
         assert [path.suffix for path in (tmp_path / "cgwm" / "kernels").iterdir()] == [".cubin"]
         monkeypatch.setattr(core, "Program", None)
@@ -646,7 +646,7 @@ def test_a_kernel_for_the_gpu_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp
 def test_which_derivatives_want_the_torch_engine() -> None:
     world, state, driven = crowd()
     commands = {name: Drive.of([track], state.position_m) for name, track in driven.items() if isinstance(track, Track)}
-    assert dispatch.lacking_derivatives(world, state, times(0.1), commands, True) is None
+    assert engine.lacking_derivatives(world, state, times(0.1), commands, True) is None
     for number, change in enumerate(("com", "effect", "law", "drive")):
         wanted = batch([0.1, 0.0, 0.0]).requires_grad_()
         value = wanted[:, 0]
@@ -660,14 +660,14 @@ def test_which_derivatives_want_the_torch_engine() -> None:
         else:
             given = {"pusher": replace(commands["pusher"], position_m=commands["pusher"].position_m + value)}
         arguments = (other, state, times(0.1), given, False)
-        assert dispatch.lacking_derivatives(*arguments) == "derivatives in reverse are asked for", number
+        assert engine.lacking_derivatives(*arguments) == "derivatives in reverse are asked for", number
         with torch.no_grad():
-            assert dispatch.lacking_derivatives(*arguments) is None
+            assert engine.lacking_derivatives(*arguments) is None
 
     def rolled(com: Tensor, repeats: int) -> Tensor:
         changed = world.with_body(0, com=com)
-        assert dispatch.lacking_derivatives(changed, state, times(0.1), commands, False) is None
-        reason = dispatch.lacking_derivatives(changed, state, times(0.1), commands, True)
+        assert engine.lacking_derivatives(changed, state, times(0.1), commands, False) is None
+        reason = engine.lacking_derivatives(changed, state, times(0.1), commands, True)
         assert reason == "derivatives of the contact record are asked for"
         return com
 
@@ -678,13 +678,13 @@ def test_which_derivatives_want_the_torch_engine() -> None:
 def test_the_kernel_is_taken_on_cuda(caplog: pytest.LogCaptureFixture) -> None:
     world, state, frames = (on_device(x, "cuda", F64) for x in (world_of(box_body()), tossed(1), times(0.1)))
     with caplog.at_level("INFO", "cgwm"):
-        found = dispatch.rollout(world, state, frames)
+        found = engine.rollout(world, state, frames)
         assert torch.equal(found.position_m, simulate_fused(world, state, frames).position_m)
         assert not caplog.records
         both = (active("rolling_resistance"), active("rolling_resistance"))
         rolling = on_device(replace(world_of(box_body()), effects=both), "cuda", F64)
         for _ in range(2):
-            agree(simulate(world_of(box_body()), tossed(1), times(0.1)), dispatch.rollout(rolling, state, frames), 1e-9)
+            agree(simulate(world_of(box_body()), tossed(1), times(0.1)), engine.rollout(rolling, state, frames), 1e-9)
         assert [record.getMessage() for record in caplog.records] == [
             "rollouts run in the torch engine, not in the fused kernel: "
             "the kernel takes one rolling_resistance, and it has several"
@@ -696,13 +696,13 @@ def test_rollouts_are_taken_to_the_gpu_and_brought_back() -> None:
     world, state, driven = crowd()
     away = replace(world, rolls_on="cuda")
     expected = simulate(world, state, times(0.2), driven, True)
-    found = dispatch.rollout(away, state, times(0.2), driven, True)
+    found = engine.rollout(away, state, times(0.2), driven, True)
     assert found.position_m.device.type == "cpu" and not torch.equal(found.position_m, expected.position_m)
     agree(expected, found, 1e-9)
 
     def ends(z: Tensor, repeats: int, on: World) -> Tensor:
         changed = apply_parameters(on, CONTACT_PARAMETERS, z.exp())
-        return dispatch.rollout(changed, tossed(repeats), times(0.1)).position_m[:, -1].flatten(1)
+        return engine.rollout(changed, tossed(repeats), times(0.1)).position_m[:, -1].flatten(1)
 
     start = torch.tensor([[0.3, 0.005, 0.4]], dtype=F64).log()
     here, there = (

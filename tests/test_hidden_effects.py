@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets import Capture
-from cgwm.datasets.check import check_capture
-from cgwm.datasets.images import read_label
-from cgwm.datasets.scenes.hidden import filmed, mechanics, protocol, record, things
+from cgwm.datasets.capture.check import check_capture
+from cgwm.datasets.capture.images import read_label
+from cgwm.datasets.synthetic.hidden_effects import filmed, mechanics, protocol, record, things
 from cgwm.pipeline.physics.effects.registry import effect_names
 from scipy.spatial.transform import Rotation
 

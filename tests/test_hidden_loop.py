@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from cgwm.cli.app import app
-from cgwm.datasets.scenes.hidden import cases, make_capture
+from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
 from typer.testing import CliRunner
 
 HIDDEN = {

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cgwm.datasets.models import read_model
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline import phys_geo
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import ASSUMED_DENSITY_KG_M3, fit
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.schemas import PhysConfig, SplatConfig
 from small_model import HALF, MASS
 from tiny_capture import model_of, thrown, with_manifest, with_tracks, write_tiny_capture
@@ -23,7 +23,7 @@ FRAMES = 7
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few steps of the shooting: each of many would add to what is but rounding."""
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
 
 
 def told(tmp_path: Path, masks: bool = True) -> Path:

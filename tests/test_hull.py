@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from cgwm.pipeline.splats.directions import fibonacci_directions
-from cgwm.pipeline.splats.hull import Silhouette, carve
+from cgwm.pipeline.geometry.directions import fibonacci_directions
+from cgwm.pipeline.sg_gs.visual_hull import Silhouette, carve
 from cgwm.schemas import Ground, InputDataError
 
 HALF = np.array([0.05, 0.035, 0.03])

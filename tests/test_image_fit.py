@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.models import read_model
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline import filmed, phys_geo, phys_images
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.imaging.pose_tracks import PoseTrack, PoseTracker
-from cgwm.pipeline.imaging.refinement import PATIENCE, ImageObjective, refine_end_to_end
-from cgwm.pipeline.imaging.touching import MOVED_STD_M, TouchingSpheres, dense_times
+from cgwm.pipeline.phys_geo.images import image_fit, video_episodes
+from cgwm.pipeline.phys_geo.images.contact_spheres import MOVED_STD_M, ContactSpheres, dense_times
+from cgwm.pipeline.phys_geo.images.end_to_end import PATIENCE, ImageObjective, refine_end_to_end
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.physics.rollout import Rollout, simulate
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import PhysConfig, UsageError
@@ -28,7 +29,7 @@ SHORT = 7
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ def test_an_interrupted_fit_does_not_look_for_poses_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(phys_images, "fit_with_effects", interrupted)
+        patch.setattr(image_fit, "fit_with_effects", interrupted)
         fitted(capture, out)
     assert not out.exists()
     checkpoint = tmp_path / "model.checkpoint"
@@ -97,7 +98,7 @@ def test_an_interrupted_fit_does_not_look_for_poses_again(
     def again(_: PoseTracker) -> PoseTrack:
         raise AssertionError("the poses were looked for again")
 
-    monkeypatch.setattr(filmed.PoseTracker, "run", again)
+    monkeypatch.setattr(video_episodes.PoseTracker, "run", again)
     with pytest.raises(UsageError, match=r"made with other physics settings(.|\n)*--overwrite"):
         fitted(capture, out, CONFIG.model_copy(update={"seed": 1}), resume=True)
     with pytest.raises(UsageError, match="--resume"):
@@ -154,13 +155,13 @@ def resting() -> tuple[World, Rollout]:
 
 def test_spheres_at_the_ground_are_chosen_and_only_they_change_the_motion() -> None:
     world, rollout = resting()
-    spheres = TouchingSpheres.of(world, rollout)
+    spheres = ContactSpheres.of(world, rollout)
     ((index, chosen),) = spheres.chosen
     bottom = (world.bodies[0].centers[0, :, 2] < 0).nonzero()[:, 0]
     assert index == 0 and sorted(chosen.tolist()) == bottom.tolist()
     assert spheres.count == 16
     high = replace(rollout, position_m=rollout.position_m + torch.tensor([0, 0, 0.1]))
-    assert TouchingSpheres.of(world, high).count == 0
+    assert ContactSpheres.of(world, high).count == 0
 
     start = state_of(((0, 0, 0.031), (1.0, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
     zero = spheres.apply(world, torch.zeros(1, 16, dtype=torch.float64))

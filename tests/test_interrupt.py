@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.ply import Splats
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.datasets.shapes.ply import Splats
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Provenance
 
 Case = tuple[list[str], Path]
@@ -82,7 +82,7 @@ def synthesize_case(folder: Path) -> Case:
     file = ModelFile(
         ground=Ground(), bodies=(body,), contact=ContactParameters(), provenance=Provenance(capture="made by a test")
     )
-    write_model(folder / "model", Model(None, file, {"ball": splats}))
+    write_model(folder / "model", Model(root=None, file=file, body_splats={"ball": splats}))
     out = folder / "dataset"
     return ["synthesize", str(folder / "model"), "--out", str(out), "--rollouts", "500"], out
 
@@ -158,7 +158,7 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
         assert set(tmp_path.iterdir()) - before == set(partial(out))  # nothing but what is plainly unfinished
     else:
         assert process.returncode == 130
-        assert said.decode() == "Interrupted; nothing was left under the output's name.\n"
+        assert said.decode() == "Interrupted; no output was written.\n"
         assert set(tmp_path.rglob("*")) == before
 
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.images import write_image
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.scenes.dynamics import ContactTruth
-from cgwm.datasets.scenes.objects import make_object
-from cgwm.datasets.tracks import Track, write_tracks
-from cgwm.pipeline.labels import LabelRenderer
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.capture.images import write_image
+from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.datasets.synthetic.dynamics import ContactTruth
+from cgwm.datasets.synthetic.objects import make_object
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from small_model import cube_splats, small_model, table_splats
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -182,7 +182,9 @@ def test_learning_from_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("pushed", [False, True])
 def test_true_trajectories_move_and_settle(pushed: bool) -> None:
-    contact = ContactTruth(0.35, 0.3, 0.0032, 0.4, 0.97)
+    contact = ContactTruth(
+        friction=0.35, friction_fingertip=0.3, natural_time=0.0032, damping_ratio=0.4, impedance=0.97
+    )
     times = np.arange(31) / RATE
     solid, down = make_object(0), np.array([0.0, 0.0, -1.0])
     ways = trajectories.draw_trajectories(solid, contact, down, pushed, 2, times, 0)

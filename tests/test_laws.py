@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.scenes.objects import make_object
+from cgwm.datasets.synthetic.objects import make_object
+from cgwm.pipeline.geometry.mesh import Mesh, mesh_mass_properties, mesh_volume
+from cgwm.pipeline.geometry.rotation import quat_rotate
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, damping_ratio_of, restitution, simulate
-from cgwm.pipeline.physics.distance import plane_contacts
-from cgwm.pipeline.physics.rotation import quat_rotate
-from cgwm.pipeline.splats.collision import distil, shape_to_spheres
-from cgwm.pipeline.splats.mesh import Mesh, mesh_mass_properties, mesh_volume
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
+from cgwm.pipeline.sg_gs.collision_spheres import distil, shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
 from worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 
@@ -52,7 +52,13 @@ def solid_body(mesh: Mesh, spheres: int, density: float = 500.0) -> Body:
     mass = density * properties.volume_m3
     inertia = torch.as_tensor(density * properties.volume_m3 * properties.inertia_m2)
     return Body(
-        "solid", "free", batch(mass), inertia[None], batch(properties.com_m), centers[keep][None], radii[keep][None]
+        name="solid",
+        motion="free",
+        mass=batch(mass),
+        inertia=inertia[None],
+        com=batch(properties.com_m),
+        centers=centers[keep][None],
+        radii=radii[keep][None],
     )
 
 
@@ -293,7 +299,13 @@ def test_rods_that_slide_on_an_end_do_not_explode() -> None:
     centers = torch.zeros(1, 5, 3, dtype=F64)
     centers[0, :, 2] = torch.linspace(radius - length / 2, length / 2 - radius, 5, dtype=F64)
     rod = Body(
-        "rod", "free", batch(mass), inertia[None], batch([0.0] * 3), centers, torch.full((1, 5), radius, dtype=F64)
+        name="rod",
+        motion="free",
+        mass=batch(mass),
+        inertia=inertia[None],
+        com=batch([0.0] * 3),
+        centers=centers,
+        radii=torch.full((1, 5), radius, dtype=F64),
     )
     half = (math.pi / 2 - angle) / 2 * values(*(row[2] for row in rows))
     zero = 0 * angle

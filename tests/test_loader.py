@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from cgwm.datasets import loader
-from cgwm.datasets.loader import RolloutDataset, RolloutReader, shard_files
+from cgwm.datasets.rollouts import loader
+from cgwm.datasets.rollouts.loader import RolloutDataset, RolloutReader, shard_files
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ROLLOUTS_FORMAT, SynthesizeConfig, UsageError
 from small_model import HALF, write_small_model

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.tracks import tracks_csv
-from cgwm.pipeline import phys_geo
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.capture.tracks import tracks_csv
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.mass_distribution import fit_mass_distribution
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
+from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
-from cgwm.pipeline.posterior import draw_parameters
+from cgwm.pipeline.synthesize.parameters import draw_parameters
 from cgwm.schemas import (
     Body,
     BoxShape,
@@ -119,7 +119,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_model_holds_the_mass_distribution_that_was_fitted(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(phys_geo, "SHOT_ITERATIONS", 1)  # the mass is fitted before
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)  # the mass is fitted before
     config = PhysConfig(population=8, generations=2, iterations=1, step_s=STEP_S, mass_distribution=True)
     file = fit(capture, tmp_path / "model", phys_config=config)
     numbers = {parameter.name: parameter for parameter in file.parameters}

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.pipeline import eval as evaluation
+from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline import fit as fitting
-from cgwm.pipeline import synthesize as synthesis
-from cgwm.pipeline.memory import enough_memory, ran_out_of_memory
+from cgwm.pipeline.evaluate import stage as evaluation
+from cgwm.pipeline.runtime.resources import enough_memory, ran_out_of_memory
+from cgwm.pipeline.synthesize import stage as synthesis
 from cgwm.schemas import NotEnoughMemoryError, SplatConfig, SynthesizeConfig
 from small_model import write_small_model
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets import Mesh, mass_properties, read_mesh
-from cgwm.datasets.meshes import box_properties, sphere_properties
+from cgwm.datasets.shapes.meshes import box_properties, sphere_properties
 from cgwm.schemas import InputDataError
 
 BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets import Model, kind_of, read_model, write_model
-from cgwm.schemas import BodyModel, FitFile, Ground, InputDataError, ModelFile, Parameter, Provenance, UsageError
+from cgwm.schemas import BodyModel, FitFile, FittedParameter, Ground, InputDataError, ModelFile, Provenance, UsageError
 from test_ply import splats
 
 INERTIA = (0.00081, 0.00081, 0.00081, 0.0, 0.0, 0.0)
@@ -21,12 +21,17 @@ def model() -> Model:
     file = ModelFile(
         ground=Ground(),
         bodies=bodies,
-        parameters=(Parameter(name="friction", unit="1", estimate=0.1 + 0.2, interval_95=(0.2, 0.4)),),
+        parameters=(FittedParameter(name="friction", unit="1", estimate=0.1 + 0.2, interval_95=(0.2, 0.4)),),
         provenance=Provenance(capture="c", seed=3),
     )
     visual = {"cube": splats(30), "scene": splats(5)}
     return Model(
-        None, file, visual, {"cube": splats(8), "scene": visual["scene"]}, splats(4), FitFile(warnings=("slow",))
+        root=None,
+        file=file,
+        body_splats=visual,
+        collision={"cube": splats(8), "scene": visual["scene"]},
+        scene=splats(4),
+        fit=FitFile(warnings=("slow",)),
     )
 
 

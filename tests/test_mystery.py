@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 from cgwm.cli.app import app
-from cgwm.datasets.kinds import kind_of
-from cgwm.datasets.models import read_model
-from cgwm.datasets.scenes.hidden import draw_mystery, make_mystery, open_sealed
-from cgwm.datasets.scenes.hidden.mystery import CHOICES
-from cgwm.pipeline import mystery
-from cgwm.pipeline.mystery import judged, run_mystery
+from cgwm.datasets.io.kinds import kind_of
+from cgwm.datasets.models.model import read_model
+from cgwm.datasets.synthetic.hidden_effects import draw_mystery, make_mystery, open_sealed
+from cgwm.datasets.synthetic.hidden_effects.mystery import CHOICES
+from cgwm.pipeline.demo import mystery
+from cgwm.pipeline.demo.mystery import judged, run_mystery
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     DiagnoseResult,
@@ -87,13 +87,20 @@ def test_a_broken_seal_is_refused(tmp_path: Path) -> None:
         ("unexplained", (), (), (), "wrong", "false alarm"),
         ("missing_effect", ("wind",), (), ("wind",), "right", "wind was named: right"),
         ("missing_effect", ("wind",), (), ("adhesion",), "wrong", "wind was named: wrong"),
-        ("missing_effect", ("wind", "adhesion"), (), ("wind",), "partly", "adhesion was named beside it"),
+        (
+            "missing_effect",
+            ("wind", "adhesion"),
+            (),
+            ("wind",),
+            "partly",
+            "adhesion, which was not hidden, was named, too",
+        ),
         ("not_separable", ("a",), (("a", "b", "c"),), ("b",), "right_class", "one of a, b and c"),
         ("not_separable", ("a",), (("a", "b", "c"),), ("a",), "right_class", "right, as a class"),
         ("not_separable", ("a",), (("a", "b", "c"),), ("d",), "wrong", "a was named: wrong"),
-        ("not_separable", ("a", "d"), (("a", "b"),), ("b",), "partly", "d was named beside it"),
-        ("unexplained", (), (), ("a",), "unnamed", "but not what"),
-        ("none_missing", (), (), ("a",), "silent", "it was missed"),
+        ("not_separable", ("a", "d"), (("a", "b"),), ("b",), "partly", "d, which was not hidden, was named, too"),
+        ("unexplained", (), (), ("a",), "unnamed", "but did not name it"),
+        ("none_missing", (), (), ("a",), "silent", "nothing was found: missed"),
     ],
 )
 def test_the_outcome_is_said_plainly(verdict, selected, aliases, hidden, outcome, words) -> None:
@@ -154,7 +161,7 @@ def test_the_command_prints_one_document(
         asked.append(arguments)
         return result
 
-    monkeypatch.setattr(mystery, "run_mystery", work)
+    monkeypatch.setattr("cgwm.pipeline.demo.run_mystery", work)
     words = ["demo", str(tmp_path / "out"), "--scene", "mystery", "--seed", "5", "--device", "cpu"]
     printed = CliRunner().invoke(app, [*words, "--json"])
     assert printed.exit_code == 0

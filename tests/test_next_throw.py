@@ -9,44 +9,64 @@ import numpy as np
 import pytest
 import torch
 from cgwm.cli.app import app
-from cgwm.datasets.models import read_model
-from cgwm.datasets.tracks import Track
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.diagnose import diagnose
-from cgwm.pipeline.diagnosis.candidates import Candidate
-from cgwm.pipeline.diagnosis.contact_search import Chosen
-from cgwm.pipeline.diagnosis.law_file import law_source, save_law
-from cgwm.pipeline.diagnosis.next_throw import RankedThrow, Rivals, next_experiment, ranked_throws, rivals_of
-from cgwm.pipeline.diagnosis.prepared import Prepared, prepare
-from cgwm.pipeline.diagnosis.refit import refit
-from cgwm.pipeline.diagnosis.score import ScoreTest
-from cgwm.pipeline.diagnosis.slots import Evidence
-from cgwm.pipeline.diagnosis.throws import DEFAULT, Throw, read_throws, states_of, throws_of
-from cgwm.pipeline.diagnosis.verdict import Findings
-from cgwm.pipeline.effects import new_effect
+from cgwm.pipeline.diagnose.contact_search import Chosen
+from cgwm.pipeline.diagnose.effect_selection import Evidence
+from cgwm.pipeline.diagnose.experiments import DEFAULT, Experiment, experiments_of, read_experiments, states_of
+from cgwm.pipeline.diagnose.law_export import law_source, save_law
+from cgwm.pipeline.diagnose.next_experiment import (
+    RankedExperiment,
+    Rivals,
+    next_experiment,
+    ranked_experiments,
+    rivals_of,
+)
+from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.verdict import Findings
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.measured import measure
+from cgwm.pipeline.physics.effects.catalogue import new_effect
+from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import effect_parameters
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.prepare import Prepared, prepare
+from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.schemas import DiagnoseResult, InputDataError, LawTerm, ResidualLaw, UsageError
 from diagnosis_data import NOISE, tosses, world_with, write_capture
 from PIL import Image
 from typer.testing import CliRunner
 
-THROWS = throws_of(DEFAULT)
+THROWS = experiments_of(DEFAULT)
 
 
 def evidence(name: str, **numbers: float) -> Evidence:
     """An effect with its estimates, as a refit leaves it."""
     effect = load_effect(name)
     value = np.array([numbers.get(p.name, 0.0) for p in effect.parameters])
-    test = ScoreTest(100.0, len(value), 1e-9, value, np.eye(len(value)), True)
+    test = ScoreTest(
+        statistic=100.0, dof=len(value), p_value=1e-9, estimate=value, covariance=np.eye(len(value)), admissible=True
+    )
     found = {p.name: (float(v), 0.1 * p.scale) for p, v in zip(effect.parameters, value, strict=True)}
-    return Evidence(Candidate(name, effect), {}, test, 1e-9, delta_bic=-50.0, numbers=found)
+    return Evidence(
+        candidate=Candidate(name, effect), constants={}, test=test, p_value=1e-9, delta_bic=-50.0, numbers=found
+    )
 
 
 def findings(world: World, *equals: Evidence) -> Findings:
     return Findings(
-        "not_separable", (Chosen(equals[0], equals, "flight"),), False, None, None, equals, (), world, 1.0, world, {}
+        verdict="not_separable",
+        chosen=(Chosen(equals[0], equals, "flight"),),
+        remaining=False,
+        before=None,
+        after=None,
+        ranking=equals,
+        contact=(),
+        world=world,
+        contact_chi2=1.0,
+        base=world,
+        errors={},
     )
 
 
@@ -54,13 +74,22 @@ def slow(world: World, seed: int = 1, count: int = 3) -> list[tuple[str, dict[st
     """Slow tosses from low down, which show little of the air."""
     rng = np.random.default_rng(seed)
     chosen = [
-        Throw(False, 0.25, float(v), 45.0, float(h), 5.0, "up", 0.3)
+        Experiment(
+            on_ground=False,
+            height_m=0.25,
+            speed_m_s=float(v),
+            elevation_deg=45.0,
+            heading_deg=float(h),
+            spin_rad_s=5.0,
+            spin_axis="up",
+            duration_s=0.3,
+        )
         for v, h in zip(rng.uniform(0.4, 1.0, count), rng.uniform(0, 360, count), strict=True)
     ]
     return thrown(world, chosen, seed)
 
 
-def thrown(world: World, throws: list[Throw], seed: int) -> list[tuple[str, dict[str, Track]]]:
+def thrown(world: World, throws: list[Experiment], seed: int) -> list[tuple[str, dict[str, Track]]]:
     """Throws, measured with noise at 100 Hz."""
     rng = np.random.default_rng(seed)
     zero = torch.zeros(1, 1, 3, dtype=torch.float64)
@@ -95,7 +124,7 @@ def test_a_fast_throw_tells_drags_apart_and_a_slow_drop_does_not() -> None:
     truth, world = world_with("ball", {"linear_drag": {"c": 0.3}}), world_with("ball")
     data = slow(truth)
     prepared = prepare(world, data, NOISE)
-    ranked = ranked_throws(prepared, rival_drags(world, 0.3), [t for t in THROWS if not t.on_ground], 1.0)
+    ranked = ranked_experiments(prepared, rival_drags(world, 0.3), [t for t in THROWS if not t.on_ground], 1.0)
     words = [r.throw.what for r in ranked]
     assert words[0].startswith("throw it") and "fast" in words[0]
     assert ranked[0].throw.speed_m_s == 4.0 and ranked[0].throw.spin_rad_s == 0.0
@@ -174,13 +203,13 @@ def test_the_command_says_what_to_throw_next(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["diagnose", str(model), str(root), "--throws", str(throws)])
     assert done.exit_code == 0, done.output
     # the measured frame is tilted, or gravity: where the ground is touched, its height tells
-    assert "To tell gravity_tilt and frame_tilt and constant_force apart: let it slide over the ground" in done.stdout
+    assert "To distinguish gravity_tilt and frame_tilt and constant_force: let it slide over the ground" in done.stdout
     assert "no throw tells gravity_tilt and constant_force apart: gravity_tilt: put a spirit level" in done.stdout
     assert "  2. let it slide over the ground" in done.stdout
 
 
 def test_the_gain_is_that_of_the_pair_that_is_separated_least() -> None:
-    one = RankedThrow(THROWS[0], {}, {("a", "b"): 5.0, ("a", "c"): 2.0}, {("a", "b"): 1.0, ("a", "c"): 1.5})
+    one = RankedExperiment(THROWS[0], {}, {("a", "b"): 5.0, ("a", "c"): 2.0}, {("a", "b"): 1.0, ("a", "c"): 1.5})
     assert one.least_gain([("a", "b"), ("a", "c")]) == 1.0
     assert one.gain([("a", "b")]) == 5.0 and one.gain([("a", "b"), ("a", "c")]) == 2.0 and one.gain([]) == 0.0
 
@@ -188,7 +217,7 @@ def test_the_gain_is_that_of_the_pair_that_is_separated_least() -> None:
 def test_the_user_sets_the_throws_up(tmp_path: Path) -> None:
     file = tmp_path / "throws.toml"
     file.write_text("[[throws]]\nspeed_m_s = [0.0, 3.0]\nelevation_deg = [0.0, 60.0]\nheading_deg = [0.0, 90.0]\n")
-    found = read_throws(file)
+    found = read_experiments(file)
     # a drop has neither elevation nor heading
     assert [t.what for t in found] == [
         "drop it without spin: 0.4 m high",
@@ -200,10 +229,10 @@ def test_the_user_sets_the_throws_up(tmp_path: Path) -> None:
     assert len(THROWS) == 30 == len({t.what for t in THROWS})
     file.write_text("[[throws]]\nspeed = [1.0]\n")
     with pytest.raises(InputDataError, match="unknown field 'speed'"):
-        read_throws(file)
+        read_experiments(file)
     file.write_text(f"[[throws]]\nspeed_m_s = {list(range(401))}\n")
     with pytest.raises(InputDataError, match="401 throws"):
-        read_throws(file)
+        read_experiments(file)
 
 
 LAW = ResidualLaw(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture import Capture
-from cgwm.pipeline.sfm.points import read_points, write_points
-from cgwm.pipeline.sg_gs import fit_scene
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.sparse_points import read_points, write_points
+from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.schemas import InputDataError
 from test_sg_gs import CONFIG, PLACE, RADIUS, make_capture
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.models import read_model
-from cgwm.datasets.tracks import Track, tracks_csv
-from cgwm.pipeline.eval import evaluate_model
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.capture.tracks import Track, tracks_csv
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.schemas import Body, CaptureManifest, InputDataError, PhysConfig, Shape, UsageError, World
@@ -85,7 +85,7 @@ def test_each_session_has_its_own_drag_and_its_unseen_throws_follow_it(
     assert left[0] is not None and left[1] is not None
     assert left[1].mean < 0.5 * left[0].mean
     assert left[1].mean < 3 * NOISE_M
-    with pytest.raises(InputDataError, match="belongs to none"):
+    with pytest.raises(InputDataError, match="belongs to no group"):
         fit(throws, tmp_path / "m2", "phys-geo", base, "stray", phys_config=effects)
 
 
@@ -95,7 +95,7 @@ def test_an_episode_that_the_fit_has_not_seen_is_fitted_beside_its_state(
     effects = PhysConfig(effects=("quadratic_drag@episode",))
     fit(throws, tmp_path / "m1", "phys-geo", base, phys_config=effects)
     found = evaluate_model(read_model(tmp_path / "m1"), Capture.open(throws, splits=("test",))).result
-    assert any("the fit has not seen them" in warning for warning in found.warnings)
+    assert any("belong to groups that the fit has not seen" in warning for warning in found.warnings)
     assert found.state_fitted_residual_m is not None
     assert found.state_fitted_residual_m.mean < 3 * NOISE_M
     # open loop there is the mean alone: the throws of the other balls miss by more

@@ -6,18 +6,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.check import find_faults
-from cgwm.pipeline.held_out import look
-from cgwm.pipeline.splats.colors import mean_colors
-from cgwm.pipeline.splats.exposures import Exposures
-from cgwm.pipeline.splats.fit import Rates, Trainable, descend
-from cgwm.pipeline.splats.hull import Silhouette, carve
-from cgwm.pipeline.splats.losses import geometry_loss, normals_of, scene_loss
-from cgwm.pipeline.splats.poses import Motions, motion_record, moved_for_good
-from cgwm.pipeline.splats.seeds import points_of_depth
-from cgwm.pipeline.splats.spheres import Spheres
-from cgwm.pipeline.splats.views import load_views, render_view, spread_of
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.check import find_faults
+from cgwm.pipeline.geometry.spheres import Spheres
+from cgwm.pipeline.sg_gs.camera_refinement import Motions, motion_record, moved_for_good
+from cgwm.pipeline.sg_gs.colors import mean_colors
+from cgwm.pipeline.sg_gs.held_out import look
+from cgwm.pipeline.sg_gs.initialization import points_of_depth
+from cgwm.pipeline.sg_gs.losses import geometry_loss, normals_of, scene_loss
+from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
+from cgwm.pipeline.sg_gs.photo_exposure import Exposures
+from cgwm.pipeline.sg_gs.views import load_views, render_view, spread_of
+from cgwm.pipeline.sg_gs.visual_hull import Silhouette, carve
 from test_sg_gs import PLACE, make_capture, world
 
 SIZE_M = 0.1

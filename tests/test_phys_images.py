@@ -8,26 +8,26 @@ import numpy as np
 import pytest
 import tiny_capture
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import Model
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.checkpoint import Checkpoint
-from cgwm.pipeline.estimation.observations import Observations
-from cgwm.pipeline.imaging import refinement
-from cgwm.pipeline.imaging.coarse import coarse_model, merged
-from cgwm.pipeline.imaging.footage import Footage, Video, load_footage
-from cgwm.pipeline.imaging.image_loss import ImageLoss
-from cgwm.pipeline.imaging.pose_search import rotation_grid
-from cgwm.pipeline.imaging.pose_tracks import PoseTracker
-from cgwm.pipeline.imaging.refinement import ImageObjective, TrackTerm, refine_end_to_end
-from cgwm.pipeline.imaging.touching import TouchingSpheres
-from cgwm.pipeline.phys_images import fit_physics_from_images
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import Model
+from cgwm.pipeline.geometry.rotation import geodesic_angle, quat_to_matrix
+from cgwm.pipeline.geometry.spheres import Spheres
+from cgwm.pipeline.phys_geo.images import end_to_end
+from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model, merged
+from cgwm.pipeline.phys_geo.images.contact_spheres import ContactSpheres
+from cgwm.pipeline.phys_geo.images.end_to_end import ImageObjective, TrackTerm, refine_end_to_end
+from cgwm.pipeline.phys_geo.images.image_fit import fit_physics_from_images
+from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
+from cgwm.pipeline.phys_geo.images.pose_search import rotation_grid
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker
+from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video, load_footage
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION, apply_parameters
 from cgwm.pipeline.physics.rollout import Rollout, simulate
-from cgwm.pipeline.physics.rotation import geodesic_angle, quat_to_matrix
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.splats.render import RenderOutput, render
-from cgwm.pipeline.splats.spheres import Spheres
+from cgwm.pipeline.rendering.render import RenderOutput, render
+from cgwm.pipeline.runtime.checkpoint import Checkpoint
+from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.schemas import InputDataError, NotConvergedError, PhysConfig
 from small_model import cube_splats, small_model, table_splats
 from tiny_capture import CAMERAS, HEIGHT, WIDTH, start_state
@@ -78,12 +78,12 @@ def film(model: Model, rollout: Rollout, masks: bool = True, noise: float = 0.01
         count = len(pictures)
         videos.append(
             Video(
-                name,
-                np.arange(count) / RATE,
-                torch.stack(pictures),
-                torch.stack(covers) if masks else None,
-                K,
-                view.expand(count, 4, 4),
+                camera=name,
+                times_s=np.arange(count) / RATE,
+                frames=torch.stack(pictures),
+                covers=torch.stack(covers) if masks else None,
+                K=K,
+                viewmats=view.expand(count, 4, 4),
             )
         )
     return Footage.of("000", tuple(videos))
@@ -109,7 +109,9 @@ def objective_of(scene: tuple[Model, World, Rollout], footage: Footage, min_alph
     model, world, rollout = scene
     loss = ImageLoss(model, footage, [0], min_alpha)
     columns = torch.arange(FRAMES).repeat(2, 1)
-    return ImageObjective(world, NAMES, observed(world, rollout), [loss], [columns])
+    return ImageObjective(
+        world=world, parameters=NAMES, observations=observed(world, rollout), losses=[loss], columns=[columns]
+    )
 
 
 def valued(objective: ImageObjective, shared: torch.Tensor, states: torch.Tensor) -> float:
@@ -126,14 +128,14 @@ def test_gradient_is_that_of_differences_through_contact(
     of spheres are tested as those of parameters and states are.
     """
     model, world, rollout = scene
-    monkeypatch.setattr(refinement, "PARAMETER_STEP", 0.01 * refinement.PARAMETER_STEP)
-    monkeypatch.setattr(refinement, "SPHERE_STEP", 0.01 * refinement.SPHERE_STEP)
-    monkeypatch.setattr(refinement, "STATE_STEPS", tuple(0.01 * step for step in refinement.STATE_STEPS))
+    monkeypatch.setattr(end_to_end, "PARAMETER_STEP", 0.01 * end_to_end.PARAMETER_STEP)
+    monkeypatch.setattr(end_to_end, "SPHERE_STEP", 0.01 * end_to_end.SPHERE_STEP)
+    monkeypatch.setattr(end_to_end, "STATE_STEPS", tuple(0.01 * step for step in end_to_end.STATE_STEPS))
     footage = Footage.of("000", film(model, rollout, noise=0.05, dtype=torch.float64).videos[:1])
     objective = objective_of(scene, footage, min_alpha=1e-12)
     if with_tracks:
         objective = replace(objective, tracks=TrackTerm(objective.observations, (0.02, 0.2)), scale=0.02)
-    spheres = TouchingSpheres.of(
+    spheres = ContactSpheres.of(
         world, replace(rollout, position_m=rollout.position_m[:, -2:], quat_wxyz=rollout.quat_wxyz[:, -2:])
     )
     assert spheres.count >= 4

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.pipeline.estimation.forward import batched_jacobian
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
+from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import State, simulate
-from cgwm.pipeline.physics.distance import plane_contacts, smooth_min, union_distance
-from cgwm.pipeline.physics.driven import Drive
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply, quat_to_matrix
-from cgwm.pipeline.splats.collision import shape_to_spheres
+from cgwm.pipeline.physics.kinematic import Drive
+from cgwm.pipeline.physics.smooth_distance import plane_contacts, smooth_min, union_distance
+from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
 from worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from cgwm.cli import main
 from cgwm.datasets import Capture, import_pinwm
-from cgwm.datasets.meshes import Mesh, mass_properties, read_mesh
-from cgwm.datasets.pinwm import MARGIN_M, hull, pusher_track, widened, write_obj
+from cgwm.datasets.importers.pinwm import MARGIN_M, hull, pusher_track, widened, write_obj
+from cgwm.datasets.shapes.meshes import Mesh, mass_properties, read_mesh
 from cgwm.schemas import InputDataError, UsageError
 
 SHARED = Path(os.environ.get("CGWM_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -139,7 +139,7 @@ def test_options_of_another_format_are_refused(tmp_path: Path, capfd: pytest.Cap
     source = write_source(tmp_path / "source")
     with pytest.raises(SystemExit) as ended:
         main(["import", "pinwm", str(source), "--out", str(tmp_path / "out"), "--seed", "3"])
-    assert ended.value.code == 2 and "--seed with pinwm" in capfd.readouterr().err
+    assert ended.value.code == 2 and "--seed does not apply to pinwm" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -153,10 +153,10 @@ def test_existing_output_is_refused(tmp_path: Path) -> None:
 def test_published_pushes(tmp_path: Path) -> None:
     """The masks are those of the block's mesh at its poses, seen by the camera as it was read."""
     import torch
-    from cgwm.pipeline.imaging.footage import load_footage
-    from cgwm.pipeline.imaging.silhouettes import Outline, covered
-    from cgwm.pipeline.imaging.windows import Window
-    from cgwm.pipeline.splats.mesh import read_mesh as closed_mesh
+    from cgwm.pipeline.geometry.mesh import read_mesh as closed_mesh
+    from cgwm.pipeline.phys_geo.images.crops import Window
+    from cgwm.pipeline.phys_geo.images.silhouettes import Outline, covered
+    from cgwm.pipeline.phys_geo.images.video_frames import load_footage
 
     result = import_pinwm(PINWM, tmp_path / "out")
     assert (result.episodes, result.samples, result.splits) == (3, 152, {"train": 1, "test": 2})

@@ -10,28 +10,30 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from cgwm.datasets.dataset import read_manifest
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.rollouts import ContactTable, RolloutLabels
-from cgwm.pipeline.distributions import draw
-from cgwm.pipeline.draws import draw_rollout
-from cgwm.pipeline.lights import draw_lighting
-from cgwm.pipeline.posterior import draw_parameters, require_admissible, with_correlations, with_parameter
-from cgwm.pipeline.pushes import push_track
-from cgwm.pipeline.rejection import Rejection, accepted_rollouts
-from cgwm.pipeline.sampling import draw_start, extent, look_at_cameras, resolve_plan, rotation_matrix
-from cgwm.pipeline.synthesis_job import resolved_plan
+from cgwm.datasets.rollouts.dataset import read_manifest
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.datasets.rollouts.rollouts import ContactTable, RolloutLabels
+from cgwm.pipeline.geometry.viewpoint import rotation_matrix
 from cgwm.pipeline.synthesize import synthesize
+from cgwm.pipeline.synthesize.distributions import draw
+from cgwm.pipeline.synthesize.draw import draw_lighting, draw_rollout
+from cgwm.pipeline.synthesize.job import resolved_plan
+from cgwm.pipeline.synthesize.parameters import draw_parameters, require_admissible, with_correlations, with_parameter
+from cgwm.pipeline.synthesize.plan import extent, resolve_plan
+from cgwm.pipeline.synthesize.pusher_paths import push_track
+from cgwm.pipeline.synthesize.rejection import Rejection, accepted_rollouts
+from cgwm.pipeline.synthesize.start_states import draw_start
+from cgwm.pipeline.synthesize.viewpoints import look_at_cameras
 from cgwm.schemas import (
     Correlation,
     Distribution,
     EffectModel,
     FitFile,
+    FittedParameter,
     InputDataError,
     Light,
     ModelFile,
     NotConvergedError,
-    Parameter,
     RejectionRules,
     SamplingPlan,
     SynthesizeConfig,
@@ -140,7 +142,7 @@ def test_correlations_of_older_models_are_read_from_their_fit() -> None:
 
 def test_what_follows_from_the_draws_follows() -> None:
     derived = tuple(
-        Parameter(name=name, unit="1", estimate=1.0, std_error=0.1, state="derived")
+        FittedParameter(name=name, unit="1", estimate=1.0, std_error=0.1, state="derived")
         for name in ("restitution", "stiffness_n_m", "damping_n_s_m")
     )
     file = small_model().file
@@ -183,7 +185,7 @@ def test_inadmissible_parameters_are_refused(name: str, given: object, message: 
 
 
 def test_a_factor_of_a_moment_stretches_the_inertia_that_was_fitted() -> None:
-    entry = Parameter(name="cube.moment_x", unit="1", estimate=2.0, std_error=0.2, bounds=(0.1, 10.0))
+    entry = FittedParameter(name="cube.moment_x", unit="1", estimate=2.0, std_error=0.2, bounds=(0.1, 10.0))
     file = small_model().file.model_copy(update={"parameters": (entry,)})
     assert with_parameter(file, "cube.moment_x", 2.0).bodies == file.bodies
     xx, yy, zz, *_ = with_parameter(file, "cube.moment_x", 3.0).bodies[0].inertia_kg_m2
@@ -346,15 +348,39 @@ def labels_of(speed: float = 0.0, depth: float = 0.0, impulse: float = 1.0) -> R
     zeros = np.zeros((5, 1, 3))
     velocity = zeros + np.array([0, -speed, 0])
     table = ContactTable(
-        np.array([0, 0, 1, 1, 1, 1]), np.array([0]), np.array([-1]), np.zeros((1, 3)), UP[None], np.array([-depth]),
-        impulse * UP[None], np.zeros(1, np.uint8),
-    )  # fmt: skip
+        offsets=np.array([0, 0, 1, 1, 1, 1]),
+        body_a=np.array([0]),
+        body_b=np.array([-1]),
+        position_m=np.zeros((1, 3)),
+        normal=UP[None],
+        distance_m=np.array([-depth]),
+        impulse_n_s=impulse * UP[None],
+        sliding=np.zeros(1, np.uint8),
+    )
     plan = resolve_plan(small_model(), SamplingPlan())
     return RolloutLabels(
-        0, 0, "", time, np.zeros((5, 1)), np.zeros((5, 1)), "", ("cube",), ("free",), np.array([MASS]), zeros[0],
-        np.ones((1, 6)), position, np.tile([1.0, 0, 0, 0], (5, 1, 1)), velocity, zeros, -9.81 * UP, table, zeros, zeros,
+        episode_index=0,
+        seed=0,
+        model_mjcf="",
+        time_s=time,
+        states=np.zeros((5, 1)),
+        actions=np.zeros((5, 1)),
+        action_meaning="",
+        bodies=("cube",),
+        motions=("free",),
+        mass_kg=np.array([MASS]),
+        com_m=zeros[0],
+        inertia_kg_m2=np.ones((1, 6)),
+        position_m=position,
+        quat_wxyz=np.tile([1.0, 0, 0, 0], (5, 1, 1)),
+        velocity_m_s=velocity,
+        omega_body_rad_s=zeros,
+        gravity_m_s2=-9.81 * UP,
+        contacts=table,
+        contact_force_n=zeros,
+        contact_torque_n_m=zeros,
         cameras=look_at_cameras(small_model(), plan, CONFIG),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(

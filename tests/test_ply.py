@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets import Splats, read_splats, write_splats
-from cgwm.datasets.ply import SH_C0
+from cgwm.datasets.shapes.ply import SH_C0
 from cgwm.schemas import InputDataError, UsageError
 
 

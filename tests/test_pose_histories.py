@@ -7,17 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.models import Model
-from cgwm.datasets.ply import Splats
-from cgwm.pipeline import filmed
-from cgwm.pipeline.filmed import RIVAL_NATS, Episode, track_warnings
-from cgwm.pipeline.imaging.coarse import coarse_model
-from cgwm.pipeline.imaging.footage import Footage
-from cgwm.pipeline.imaging.image_loss import ImageLoss
-from cgwm.pipeline.imaging.pose_search import Poses
-from cgwm.pipeline.imaging.pose_tracks import PoseTrack, PoseTracker, stored_track, track_state
+from cgwm.datasets.models.model import Model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.pipeline.geometry.rotation import geodesic_angle
+from cgwm.pipeline.phys_geo.images import video_episodes
+from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model
+from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
+from cgwm.pipeline.phys_geo.images.pose_search import Poses
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker, stored_track, track_state
+from cgwm.pipeline.phys_geo.images.video_episodes import RIVAL_NATS, VideoEpisode, track_warnings
+from cgwm.pipeline.phys_geo.images.video_frames import Footage
 from cgwm.pipeline.physics.rollout import Rollout, simulate
-from cgwm.pipeline.physics.rotation import geodesic_angle
 from cgwm.pipeline.physics.world import World
 from small_model import HALF, cube_splats, table_splats
 from test_phys_images import FRAMES, RATE, film, tiny_model
@@ -67,10 +67,10 @@ def test_a_body_that_looks_the_same_turned_about_keeps_one_history_and_the_other
     footage, found, _ = tracked(two_sided(0.0))
     assert turned_between_frames(found) < 60
     assert 0 <= found.rival_nats < RIVAL_NATS
-    (text,) = track_warnings([Episode("000", footage, None, {}, found)])
+    (text,) = track_warnings([VideoEpisode(name="000", footage=footage, loss=None, tracks={}, found=found)])
     assert text.startswith("000: another history of poses, from another orientation, explains the frames about as well")
     sure = replace(found, rival_nats=math.inf)
-    assert track_warnings([Episode("000", footage, None, {}, sure)]) == []
+    assert track_warnings([VideoEpisode(name="000", footage=footage, loss=None, tracks={}, found=sure)]) == []
     for one in (found, sure):  # as a checkpoint keeps it
         assert stored_track(track_state(one)).rival_nats == one.rival_nats
 
@@ -155,7 +155,7 @@ def test_bodies_that_are_small_in_the_picture_are_looked_for_in_larger_ones() ->
             footage=SimpleNamespace(videos=[video], frame_at=torch.tensor([[0, 1, 2, -1]])), free=[0]
         )
 
-    assert filmed._coarse_size(filmed_at(64, 320)) == 179  # 20 px of 64 * (179 / 320)^2
-    assert filmed._coarse_size(filmed_at(1000, 320)) == filmed.COARSE_SIZE
-    assert filmed._coarse_size(filmed_at(8, 320)) == 320  # no larger than it was filmed
-    assert filmed._coarse_size(filmed_at(0, 320)) == filmed.COARSE_SIZE
+    assert video_episodes._coarse_size(filmed_at(64, 320)) == 179  # 20 px of 64 * (179 / 320)^2
+    assert video_episodes._coarse_size(filmed_at(1000, 320)) == video_episodes.COARSE_SIZE
+    assert video_episodes._coarse_size(filmed_at(8, 320)) == 320  # no larger than it was filmed
+    assert video_episodes._coarse_size(filmed_at(0, 320)) == video_episodes.COARSE_SIZE

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.cli import main
-from cgwm.datasets import video
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.video import read_video
-from cgwm.pipeline import preview as previews
-from cgwm.pipeline.preview import FILM, SHEET, draw_contacts, telling_frames
-from cgwm.pipeline.sampling import look_at
+from cgwm.datasets.capture import video
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.capture.video import read_video
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.pipeline.geometry.viewpoint import look_at
+from cgwm.pipeline.rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB, arrow_scale, contact_marks
+from cgwm.pipeline.synthesize import preview as previews
 from cgwm.pipeline.synthesize import synthesize
-from cgwm.pipeline.viewing.contact_marks import SLIDING_RGB, STICKING_RGB, arrow_scale, contact_marks
+from cgwm.pipeline.synthesize.preview import FILM, SHEET, draw_contacts, telling_frames
 from cgwm.schemas import SynthesizeConfig
 from small_model import write_small_model
 
@@ -43,7 +43,7 @@ def dataset(model_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def front_camera() -> Camera:
     K = np.array([[100.0, 0, 80], [0, 100.0, 60], [0, 0, 1]])
     pose = look_at(np.array([0.0, -1.0, 0.0]), np.zeros(3), np.array([0.0, 0, 1]))
-    return Camera(160, 120, K, np.zeros(0), pose)
+    return Camera(width=160, height=120, K=K, distortion=np.zeros(0), T_world_cam=pose)
 
 
 def color_at(picture: np.ndarray, x: float, y: float) -> tuple[int, ...]:

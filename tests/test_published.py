@@ -5,22 +5,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cgwm.pipeline.physics import PublishedLaw, simulate
-from cgwm.pipeline.physics.distance import log_sum_exp_distance
-from cgwm.pipeline.physics.published import (
-    clamped,
-    creep_speed,
-    rest_penetration,
-    stable_step,
-)
+from cgwm.pipeline.physics import PaperLaw, simulate
+from cgwm.pipeline.physics.paper_law import clamped, creep_speed, rest_penetration, stable_step
+from cgwm.pipeline.physics.smooth_distance import log_sum_exp_distance
 from worlds import F64, ball_body, batch, box_body, state_of, times, world_of
 
 UP = (1.0, 0.0, 0.0, 0.0)
 MASS, STIFFNESS, DAMPING, MU, STEP = 0.4, 2000.0, 10.0, 0.5, 0.0005
 
 
-def law(**changes: object) -> PublishedLaw:
-    return replace(PublishedLaw(batch(MU), batch(STIFFNESS), batch(DAMPING)), **changes)
+def law(**changes: object) -> PaperLaw:
+    return replace(
+        PaperLaw(friction=batch(MU), stiffness_n_m=batch(STIFFNESS), damping_n_s_m=batch(DAMPING)), **changes
+    )
 
 
 def test_it_rests_at_the_depth_of_its_formula() -> None:

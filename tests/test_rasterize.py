@@ -7,20 +7,20 @@ import os
 
 import pytest
 import torch
-from cgwm.pipeline.splats.rays import pixel_rays
-from cgwm.pipeline.splats.render import render
+from cgwm.pipeline.rendering.rays import pixel_rays
+from cgwm.pipeline.rendering.render import render
 from test_render import BARREL, PINCUSHION, SKEWED, rotation, scene, twin, wide_scene
 
 CUDA = torch.cuda.is_available()
 if not CUDA:
     os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are imported
 pytest.importorskip("triton", reason="Triton has wheels for Linux only")
-from cgwm.pipeline import nvrtc  # noqa: E402
-from cgwm.pipeline.splats.rasterize import Raster, rasterize  # noqa: E402
+from cgwm.pipeline.rendering.rasterize import Raster, rasterize  # noqa: E402
+from cgwm.pipeline.runtime import kernel_build  # noqa: E402
 
 DEVICE = "cuda" if CUDA else "cpu"
 SIZE = (21, 11)  # two tiles, of which one is cut
-NEEDS_GPU = pytest.mark.skipif(not (CUDA and nvrtc.available()), reason="needs a CUDA device and cuda.core")
+NEEDS_GPU = pytest.mark.skipif(not (CUDA and kernel_build.available()), reason="needs a CUDA device and cuda.core")
 KERNELS = ["triton", pytest.param("cuda", marks=NEEDS_GPU)]
 
 

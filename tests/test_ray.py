@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from cgwm.datasets.atomic import sha256
-from cgwm.pipeline.cluster import synthesize_shards
+from cgwm.datasets.io.atomic import sha256
+from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.schemas import SynthesizeConfig, UsageError
 from small_model import write_small_model
 

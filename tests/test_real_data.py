@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.contactnets import import_contactnets
-from cgwm.datasets.jugglebot import import_jugglebot
-from cgwm.datasets.models import read_model
-from cgwm.pipeline.diagnosis.prepared import prepare
-from cgwm.pipeline.eval import evaluate_model
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.importers.contactnets import import_contactnets
+from cgwm.datasets.importers.jugglebot import import_jugglebot
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
+from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PhysConfig
 from worlds import box_body, world_of
 

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline import fit_effects
-from cgwm.pipeline.diagnosis.cuts import cut_episodes, whole_episodes
-from cgwm.pipeline.diagnosis.prepared import prepare
-from cgwm.pipeline.diagnosis.releases import after_release, find_releases
-from cgwm.pipeline.phys_geo import PhysicsFit
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.phys_geo.effects import requested_effects
+from cgwm.pipeline.phys_geo.tracks.contact_result import PhysicsFit
 from cgwm.pipeline.physics import World
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.segments.prepare import prepare
+from cgwm.pipeline.segments.release_detection import after_release, find_releases
+from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from diagnosis_data import tosses, world_with
 from worlds import F64
 
@@ -72,12 +72,14 @@ def test_a_fit_leaves_the_hand_out_and_says_so(monkeypatch: pytest.MonkeyPatch) 
 
     def physics(_: World, episodes: list[tuple[str, dict[str, Track]]], *__: Any) -> Any:
         given.update(episodes)
-        return PhysicsFit(None, (), None, NOISE, {}, ("its own",))  # pyright: ignore[reportArgumentType]
+        return PhysicsFit(
+            contact=None, parameters=(), ground_offset_m=None, noise=NOISE, record={}, warnings=("its own",)
+        )  # pyright: ignore[reportArgumentType]
 
-    monkeypatch.setattr(fit_effects, "fit_physics", physics)
+    monkeypatch.setattr(requested_effects, "fit_physics", physics)
     episodes = thrown(world)
     episodes[0] = held(episodes[0])
-    found = fit_effects.fit_with_effects(world, episodes, None, NOISE)  # pyright: ignore[reportArgumentType]
+    found = requested_effects.fit_with_effects(world, episodes, None, NOISE)  # pyright: ignore[reportArgumentType]
     assert found.warnings[0] == "its own" and "episode '000' begins in a hand" in found.warnings[1]
     lengths = [len(next(iter(tracks.values()))) for tracks in given.values()]
     assert lengths[0] < lengths[1] == lengths[5] == len(next(iter(episodes[1][1].values())))

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.cameras import distort
-from cgwm.pipeline.splats.render import render
+from cgwm.datasets.capture.cameras import distort
+from cgwm.pipeline.rendering.render import render
 
 EXACT = {"min_alpha": 0.0, "min_transmittance": 0.0}
 
@@ -139,7 +139,7 @@ def test_gradients_equal_the_twin():
 
 @pytest.mark.parametrize("coefficients", [BARREL, PINCUSHION, SKEWED])
 def test_distorted_rays_are_those_that_the_distortion_sends_there(coefficients):
-    from cgwm.pipeline.splats.rays import pixel_rays
+    from cgwm.pipeline.rendering.rays import pixel_rays
 
     _, _, _, _, _, Ks = wide_scene(1)[0]
     K = Ks[0 if coefficients == BARREL else 1]
@@ -289,7 +289,7 @@ def test_a_crop_is_a_shifted_camera():
 
 def test_distorted_rays_project_where_opencv_says():
     cv2 = pytest.importorskip("cv2")
-    from cgwm.pipeline.splats.rays import pixel_rays
+    from cgwm.pipeline.rendering.rays import pixel_rays
 
     K = torch.tensor([[[300.0, 0, 161], [0, 310, 118], [0, 0, 1]]], dtype=torch.float64)
     distortion = torch.tensor([[-0.2, 0.05, 0.001, -0.002]], dtype=torch.float64)

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.cli import demo
-from cgwm.pipeline.report import ReportPictures, write_report
-from cgwm.pipeline.reporting.against_truth import sphere_distance, true_parameters
-from cgwm.pipeline.reporting.charts import Chart, Line, chart_svg, decades, interval_svg
-from cgwm.pipeline.reporting.page import number
-from cgwm.pipeline.reporting.pictures import FrameStrip, RolloutTile, small_png, telling, tiles
-from cgwm.pipeline.reporting.verdict import targets_of, verdict_text
+from cgwm.pipeline.demo.page import ReportPictures, write_report
+from cgwm.pipeline.demo.truth_tables import sphere_distance, true_parameters
+from cgwm.pipeline.demo.verdict import targets_of, verdict_text
+from cgwm.pipeline.rendering.contact_sheets import FrameStrip, RolloutTile, small_png, telling, tiles
+from cgwm.pipeline.report.charts import Chart, Line, chart_svg, decades, interval_svg
+from cgwm.pipeline.report.page import number
 from cgwm.schemas import (
     BodyCheck,
     CalibrationCheck,
@@ -25,8 +25,8 @@ from cgwm.schemas import (
     ErrorCurve,
     ErrorSummary,
     EvalResult,
+    FittedParameter,
     ImagesOnlyFit,
-    Parameter,
     Provenance,
     SplatCheck,
     read_json,
@@ -63,10 +63,12 @@ def evaluation(turn_deg: float = 7.25, frozen_m: float = 0.21) -> EvalResult:
 def result(**changes: object) -> DemoResult:
     scored = evaluation()
     targets = targets_of(scored)
-    friction = Parameter(
+    friction = FittedParameter(
         name="friction", unit="1", estimate=0.2817, std_error=0.01, interval_95=(0.262, 0.3021), bounds=(0.01, 2.0)
     )
-    stuck = Parameter(name="contact_time_s", unit="s", estimate=0.001, state="on_bound", note="<b>bold</b> & more")
+    stuck = FittedParameter(
+        name="contact_time_s", unit="s", estimate=0.001, state="on_bound", note="<b>bold</b> & more"
+    )
     curve = ErrorCurve(translation_error_m=(0.001, None, 0.02), rotation_error_deg=(0.5, 2.0, 9.0))
     numbers = {
         "scene": "fall",
@@ -149,13 +151,15 @@ def strip(frames: int = 12, size: tuple[int, int] = (120, 160)) -> FrameStrip:
     for k in range(frames):
         left = 20 + 8 * min(k, frames // 2)
         masks[k, 40:60, left : left + 20] = 1
-    return FrameStrip("001", "left", np.arange(frames) / 30, real, real[:, :, ::-1], masks)
+    return FrameStrip(
+        episode="001", camera="left", times_s=np.arange(frames) / 30, real=real, predicted=real[:, :, ::-1], masks=masks
+    )
 
 
 def pictures() -> ReportPictures:
     image = np.full((24, 32, 3), 90, np.uint8)
     depth = np.linspace(0, 2, 24 * 32, dtype=np.float32).reshape(24, 32)
-    tile = RolloutTile(0, 0.5, image, depth, (depth > 1).astype(np.uint8))
+    tile = RolloutTile(rollout=0, time_s=0.5, image=image, depth_m=depth, mask=(depth > 1).astype(np.uint8))
     return ReportPictures([strip()], [tile])
 
 
@@ -191,7 +195,7 @@ def test_the_page_loads_nothing_from_elsewhere(page: tuple[Path, str]) -> None:
         "0.262 to 0.302",
         "0.270",  # the true friction
         "on bound",
-        "1 of 1 intervals hold the true value",
+        "1 of 1 intervals contain the true value",
         "47 of 48",
         "0.24 mm",  # camera centres
         "+0.019 %",
@@ -223,21 +227,21 @@ def test_the_verdict_is_honest() -> None:
     assert verdict_text(good, targets_of(good), 0.1) == (
         "Having seen 0.1 s of a test episode, the model predicts the rest of the motion with errors of 6.3 mm and "
         "7.2 deg (medians). Rendered, the object agrees with the recorded frames to 21.4 dB PSNR. All targets are met "
-        "(15 mm, 15 deg, 20 dB). To guess that the object stands still would err by 210 mm."
+        "(15 mm, 15 deg, 20 dB). Assuming that the object does not move gives an error of 210 mm."
     )
     bad = evaluation(turn_deg=16.3, frozen_m=0.008)
     targets = targets_of(bad)
     assert [target.met for target in targets] == [True, False, True]
     text = verdict_text(bad, targets, 0.1)
-    assert "Target missed: rotation error 16.3 deg (below 15 deg is wanted)." in text
-    assert "hardly better than to guess that the object stands still, which errs by 8.0 mm." in text
+    assert "Target missed: rotation error 16.3 deg (target: below 15 deg)." in text
+    assert "hardly better than assuming that the object does not move, with an error of 8.0 mm." in text
 
 
 def test_a_figure_without_a_value_misses_its_target() -> None:
     blind = evaluation().model_copy(update={"psnr_object_db": None})
     targets = targets_of(blind)
     assert [target.met for target in targets] == [True, True, False]
-    assert "PSNR within the object – (at least 20 dB is wanted)" in verdict_text(blind, targets, 0.1)
+    assert "PSNR within the object – (target: at least 20 dB)" in verdict_text(blind, targets, 0.1)
 
 
 def test_the_summary_of_the_command() -> None:
@@ -253,12 +257,12 @@ def test_the_summary_of_the_command() -> None:
     assert [line.split() for line in lines if "friction" in line] == [
         ["friction", "0.282", "0.262", "to", "0.302", "0.27", "1"]
     ]
-    assert "Physics from the video frames alone: 6.3 mm and 30.0 deg (medians; no target is set)." in lines
+    assert "Physics from the video frames alone: 6.3 mm and 30.0 deg (medians; without a target)." in lines
     assert lines[-1] == "Report: out/demo/report.html"
 
 
 def test_true_values_go_by_the_names_of_the_model() -> None:
-    from cgwm.datasets.scenes.truth import TrueContact, TrueObject, TruthFile
+    from cgwm.datasets.synthetic.truth import TrueContact, TrueObject, TruthFile
     from cgwm.schemas import CamerasFile, Scale
 
     truth = TruthFile(
@@ -304,7 +308,13 @@ def test_a_picture_is_made_to_fit() -> None:
 
 
 def test_charts_break_where_values_are_missing() -> None:
-    chart = Chart("error [mm]", [0.0, 0.1, 0.2, 0.3], [Line("model", "model", [1.0, None, 10.0, 1000.0])], 1.0, 100.0)
+    chart = Chart(
+        title="error [mm]",
+        times_s=[0.0, 0.1, 0.2, 0.3],
+        lines=[Line("model", "model", [1.0, None, 10.0, 1000.0])],
+        low=1.0,
+        high=100.0,
+    )
     (path,) = re.findall(r'<path class="line model" d="(.*?)"', chart_svg(chart))
     heights = [float(y) for y in re.findall(r"[ML][\d.]+ ([\d.]+)", path)]
     assert path.count("M") == 2

@@ -7,20 +7,20 @@ import fused_host
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.rollouts import ContactTable
-from cgwm.pipeline import nvrtc
-from cgwm.pipeline import rollout_batches as batches
-from cgwm.pipeline.net_forces import contact_force_n, contact_torque_n_m
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.datasets.rollouts.rollouts import ContactTable
 from cgwm.pipeline.physics.fused.rollout import roll
+from cgwm.pipeline.physics.net_contact_wrench import contact_force_n, contact_torque_n_m
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.rollout_batches import joined_worlds
+from cgwm.pipeline.runtime import kernel_build
+from cgwm.pipeline.synthesize import simulator as batches
 from cgwm.pipeline.synthesize import synthesize
+from cgwm.pipeline.synthesize.simulator import joined_worlds
 from cgwm.schemas import SynthesizeConfig
 from small_model import MASS, small_model, write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=9, duration_s=0.2, width=48, height=32, device="cpu", seed=5)
-CUDA = torch.cuda.is_available() and nvrtc.available()
+CUDA = torch.cuda.is_available() and kernel_build.available()
 NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
 

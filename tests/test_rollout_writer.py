@@ -10,12 +10,12 @@ import h5py
 import hdf5plugin
 import numpy as np
 import pytest
-from cgwm.datasets import rollout_demo, rollout_writer
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.chunks import chunked, encoded, image_of, jpeg_of
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.rollout_writer import RolloutWriter
-from cgwm.datasets.rollouts import amodal_dtype
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.rollouts import rollout_demo, rollout_writer
+from cgwm.datasets.rollouts.chunks import chunked, encoded, image_of, jpeg_of
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.datasets.rollouts.rollout_writer import RolloutWriter
+from cgwm.datasets.rollouts.rollouts import amodal_dtype
 from cgwm.schemas import InputDataError, NotEnoughSpaceError
 from test_rollouts import FRAMES, SIZE, blocks, labels
 
@@ -78,7 +78,7 @@ def test_a_full_disk_is_one_clear_message(tmp_path: Path) -> None:
 import resource, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
-from cgwm.datasets.rollout_writer import RolloutWriter
+from cgwm.datasets.rollouts.rollout_writer import RolloutWriter
 from cgwm.schemas import NotEnoughSpaceError
 from test_rollouts import blocks, labels
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))

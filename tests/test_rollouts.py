@@ -10,19 +10,13 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.loader import RolloutDataset, RolloutReader
-from cgwm.datasets.mjcf import mujoco_states, write_mjcf
-from cgwm.datasets.rollout_writer import RolloutWriter
-from cgwm.datasets.rollouts import (
-    ContactTable,
-    FrameBlock,
-    RolloutLabels,
-    RolloutParameter,
-    open_shard,
-)
-from cgwm.pipeline.sampling import look_at
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.models.mjcf import mujoco_states, write_mjcf
+from cgwm.datasets.rollouts.loader import RolloutDataset, RolloutReader
+from cgwm.datasets.rollouts.rollout_writer import RolloutWriter
+from cgwm.datasets.rollouts.rollouts import ContactTable, FrameBlock, RolloutLabels, RolloutParameter, open_shard
+from cgwm.pipeline.geometry.viewpoint import look_at
 from cgwm.schemas import InputDataError, UsageError
 from small_model import HALF, MASS, small_model
 
@@ -33,7 +27,7 @@ K = np.array([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]])
 
 def camera() -> Camera:
     pose = look_at(np.array([0.0, -0.5, 0.3]), np.zeros(3), np.array([0.0, 0, 1]))
-    return Camera(SIZE[1], SIZE[0], K, np.zeros(0), pose)
+    return Camera(width=SIZE[1], height=SIZE[0], K=K, distortion=np.zeros(0), T_world_cam=pose)
 
 
 def labels(index: int, seed: int = 3) -> RolloutLabels:
@@ -76,7 +70,7 @@ def labels(index: int, seed: int = 3) -> RolloutLabels:
         contacts=table,
         contact_force_n=rng.normal(size=(FRAMES, 1, 3)),
         contact_torque_n_m=rng.normal(size=(FRAMES, 1, 3)),
-        parameters=(RolloutParameter("friction", "1", 0.41, 0.4, 0.05),),
+        parameters=(RolloutParameter(name="friction", unit="1", value=0.41, estimate=0.4, std_error=0.05),),
         cameras={"left": camera()},
     )
 

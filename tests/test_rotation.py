@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cgwm.pipeline.physics.rotation import (
+from cgwm.pipeline.geometry.rotation import (
     geodesic_angle,
     matrix_to_quat,
     quat_conjugate,

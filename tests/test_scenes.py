@@ -8,12 +8,12 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
-from cgwm.datasets import Capture, scenes, sha256
-from cgwm.datasets.scenes import make_scene, plan_scene, read_truth
-from cgwm.datasets.scenes.dynamics import GRAVITY, STEPS_PER_S, matrix_from_quat, rest_pose, simulate, smooth_path
-from cgwm.datasets.scenes.objects import FAMILIES, facet_normals, make_object, resting_down, volume_moments
-from cgwm.datasets.scenes.record import Set, build_set, frame_of
-from cgwm.datasets.scenes.sensor import READ_NOISE, SHOT_NOISE, expose
+from cgwm.datasets import Capture, sha256, synthetic
+from cgwm.datasets.synthetic import make_scene, plan_scene, read_truth
+from cgwm.datasets.synthetic.dynamics import GRAVITY, STEPS_PER_S, matrix_from_quat, rest_pose, simulate, smooth_path
+from cgwm.datasets.synthetic.objects import FAMILIES, facet_normals, make_object, resting_down, volume_moments
+from cgwm.datasets.synthetic.record import Set, build_set, frame_of
+from cgwm.datasets.synthetic.sensor import READ_NOISE, SHOT_NOISE, expose
 from cgwm.schemas import CaptureManifest, UsageError, read_toml
 
 SMALL = {"photo_size": (160, 120), "video_size": (96, 72), "photos": 4}
@@ -25,7 +25,7 @@ planned = cache(plan_scene)
 
 def made(name: str, directory: Path, seed: int) -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "plan_scene", planned)
+        patch.setattr(synthetic, "plan_scene", planned)
         return make_scene(name, directory, seed=seed, **SMALL)
 
 

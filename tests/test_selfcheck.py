@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cgwm.pipeline.sfm.model import SfmCamera, SfmModel, Similarity, VerifiedPair
-from cgwm.pipeline.sfm.selfcheck import check_model, consistent_inliers, sampson_error
+from cgwm.pipeline.calibrate.consistency_check import check_model, consistent_inliers, sampson_error
+from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel, Similarity, VerifiedPair
 from numpy.typing import NDArray
 from sfm_scene import look_at, make_scene, rotation_about
 
@@ -162,7 +162,7 @@ def test_no_baseline_compares_the_rotated_rays():
 
 @pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), (0.08, -0.12, 0.002, -0.001), (-0.2, 0.2, 0.0, 0.0)])
 def test_rays_undo_projection(distortion):
-    camera = SfmCamera(640, 480, 600.0, 610.0, 322.0, 238.0, distortion)
+    camera = SfmCamera(width=640, height=480, fx=600.0, fy=610.0, cx=322.0, cy=238.0, distortion=distortion)
     rng = np.random.default_rng(1)
     points: NDArray[np.float64] = rng.uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.2], (200, 3))
     np.testing.assert_allclose(camera.rays(camera.project(points)), points[:, :2] / points[:, 2:], atol=1e-12)

@@ -7,17 +7,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.manifest import write_manifest
-from cgwm.datasets.models import read_model
-from cgwm.datasets.scenes.dynamics import draw_contact, rest_pose
-from cgwm.datasets.scenes.objects import make_object, resting_down
-from cgwm.datasets.scenes.plan import ScenePlan
-from cgwm.datasets.scenes.record import build_set, take_photos, truth
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.models.model import read_model
+from cgwm.datasets.synthetic.dynamics import draw_contact, rest_pose
+from cgwm.datasets.synthetic.objects import make_object, resting_down
+from cgwm.datasets.synthetic.plan import ScenePlan
+from cgwm.datasets.synthetic.record import build_set, take_photos, truth
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.splats.separation import separate
-from cgwm.pipeline.splats.stereo import Refinement
-from cgwm.pipeline.splats.views import load_views, with_labels
+from cgwm.pipeline.sg_gs.body_separation import separate
+from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.views import load_views, with_labels
 from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, PhotoBox, Shape, SplatConfig, World
 from cgwm.schemas.capture import SphereShape
 from pydantic import ValidationError
@@ -37,7 +37,16 @@ def capture(tmp_path_factory):
     root.mkdir()
     solid = make_object(4)
     pose = rest_pose(solid, resting_down(solid), 0.5, 0.0, 0.0)
-    plan = ScenePlan("fall", 4, solid, draw_contact(np.random.default_rng(0)), pose, 30.0, (), fingertip=False)
+    plan = ScenePlan(
+        name="fall",
+        seed=4,
+        solid=solid,
+        contact=draw_contact(np.random.default_rng(0)),
+        photo_qpos=pose,
+        frame_rate=30.0,
+        episodes=(),
+        fingertip=False,
+    )
     scene = build_set(plan, (160, 120), (16, 16), 16)
     take_photos(scene, root)
     cameras = truth(scene).cameras.model_copy(update={"videos": {}})
@@ -127,10 +136,15 @@ def test_no_body_is_separated_that_has_masks_or_a_shape(capture):
 
 def test_what_cannot_be_known_is_refused(capture):
     views, _ = unmasked(capture)
-    with pytest.raises(InputDataError, match=r"neither a shape nor masks, nor a box or a ground(.|\n)*photo_box"):
+    with pytest.raises(
+        InputDataError,
+        match=r"neither a shape nor masks, and can be found neither by a box nor by the ground(.|\n)*photo_box",
+    ):
         separate(with_bodies(capture, Body(name="block")), views, [], None, None, CONFIG)
     two = with_bodies(capture, Body(name="a"), Body(name="b"))
-    with pytest.raises(InputDataError, match="'a', 'b' have neither masks, shapes nor boxes; which is which"):
+    with pytest.raises(
+        InputDataError, match="'a', 'b' have neither masks, shapes nor boxes, so they cannot be distinguished"
+    ):
         separate(two, views, [], Ground(), None, CONFIG)
 
 
@@ -151,8 +165,8 @@ def test_the_fit_shows_what_it_took_for_the_body(capture, found, tmp_path, monke
     root = shutil.copytree(capture.root, tmp_path / "capture")
     shutil.rmtree(root / "masks")
     write_manifest(root / "capture.toml", with_bodies(capture, Body(name="block")).manifest)
-    monkeypatch.setattr("cgwm.pipeline.sg_gs.separate", lambda *_: found)
-    monkeypatch.setattr("cgwm.pipeline.sg_gs_bodies.refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
+    monkeypatch.setattr("cgwm.pipeline.sg_gs.stage.separate", lambda *_: found)
+    monkeypatch.setattr("cgwm.pipeline.sg_gs.bodies.refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
     config = CONFIG.model_copy(update={"iterations": 8})
     fit(root, tmp_path / "model", stage="sg-gs", splat_config=config)
     model = read_model(tmp_path / "model")

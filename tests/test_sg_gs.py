@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.pipeline import sg_gs_bodies
-from cgwm.pipeline.sg_gs import fit_scene
-from cgwm.pipeline.splats.directions import fibonacci_directions
-from cgwm.pipeline.splats.render import render
-from cgwm.pipeline.splats.stereo import Refinement
+from cgwm.datasets.capture.capture import Capture
+from cgwm.pipeline.geometry.directions import fibonacci_directions
+from cgwm.pipeline.rendering.render import render
+from cgwm.pipeline.sg_gs import bodies
+from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.schemas import InputDataError, SplatConfig
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
@@ -101,7 +101,7 @@ def write_manifest(root, shape):
 @pytest.fixture
 def quick(monkeypatch):
     """Leave the hull as the silhouettes have it: comparing photos takes long, and is not what is tested."""
-    monkeypatch.setattr(sg_gs_bodies, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
+    monkeypatch.setattr(bodies, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
 
 
 @pytest.fixture(scope="module")

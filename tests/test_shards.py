@@ -17,14 +17,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.dataset import check_hashes, new_dataset, read_manifest, shard_entry
-from cgwm.datasets.index import INDEX
-from cgwm.datasets.loader import RolloutDataset, RolloutReader
-from cgwm.datasets.shards import shard_name
-from cgwm.pipeline.cluster import synthesize_shards
-from cgwm.pipeline.merge import merge
-from cgwm.pipeline.synthesize import synthesize
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.rollouts.dataset import check_hashes, new_dataset, read_manifest, shard_entry
+from cgwm.datasets.rollouts.index import INDEX
+from cgwm.datasets.rollouts.loader import RolloutDataset, RolloutReader
+from cgwm.datasets.rollouts.shards import shard_name
+from cgwm.pipeline.synthesize import merge, synthesize
+from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.schemas import (
     DamagedShardError,
     DatasetManifest,
@@ -425,7 +424,7 @@ def test_a_disk_that_is_full_at_the_end_is_no_complete_shard(
             raise OSError(errno.ENOSPC, "No space left on device")
         return real(descriptor, data)
 
-    monkeypatch.setattr("cgwm.datasets.guarded_file.os.write", full)
+    monkeypatch.setattr("cgwm.datasets.rollouts.guarded_file.os.write", full)
     with pytest.raises(NotEnoughSpaceError, match=r"no room for rollouts-0000-of-0001.h5: No space left on device"):
         synthesize(model, tmp_path / "out", shard(0, shards=1, rollouts=1))
     assert list(tmp_path.iterdir()) == []
@@ -488,7 +487,7 @@ def test_a_shard_that_fails_does_not_hold_up_the_others(
             raise NotConvergedError("rollout 1 diverged.", todo="look at it.")
         return synthesize(path, out, config, *rest)
 
-    monkeypatch.setattr("cgwm.pipeline.cluster.synthesize", diverging)
+    monkeypatch.setattr("cgwm.pipeline.synthesize.shards.synthesize", diverging)
     with pytest.raises(NotConvergedError) as caught:
         synthesize_shards(model, tmp_path / "out", CONFIG)
     assert str(caught.value) == (

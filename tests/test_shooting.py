@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.pipeline.estimation.least_squares import minimise
-from cgwm.pipeline.estimation.observations import Observations
-from cgwm.pipeline.estimation.shooting import Prior, Shooting, Shot
-from cgwm.pipeline.estimation.trajectory import TrajectoryResiduals, state_prior
-from cgwm.pipeline.estimation.warmup import estimate_states, warmup_frames
+from cgwm.pipeline.geometry.rotation import geodesic_angle
+from cgwm.pipeline.optimization.levenberg_marquardt import minimise
+from cgwm.pipeline.phys_geo.tracks.multiple_shooting import Shooting, ShootingFit, ShootingPrior
 from cgwm.pipeline.physics import State, World, simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
-from cgwm.pipeline.physics.rotation import geodesic_angle
+from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
+from cgwm.pipeline.trajectories.observations import Observations
+from cgwm.pipeline.trajectories.residuals import TrajectoryResiduals, state_prior
 from scipy.spatial.transform import Rotation
 from worlds import F64, box_body, law, state_of, times, world_of
 
 NOISE = (5e-5, 5e-4)
 NAMES = list(CONTACT_PARAMETERS)
 TRUTH = torch.tensor([p.encode(v) for p, v in zip(NAMES, (0.25, 0.004, 0.3), strict=True)], dtype=F64)
-PRIOR = Prior(
+PRIOR = ShootingPrior(
     torch.tensor([p.encode(p.prior[0]) for p in NAMES], dtype=F64),
     torch.tensor([p.prior[1] for p in NAMES], dtype=F64),
     torch.tensor([p.limits for p in NAMES], dtype=F64),
@@ -60,7 +60,7 @@ def tumble(kicked_at: int | None = None) -> Track:
     return noisy(position, quat, grid, NOISE)
 
 
-def shot(track: Track, start: torch.Tensor) -> Shot:
+def shot(track: Track, start: torch.Tensor) -> ShootingFit:
     problem = Shooting.of(box_world(), NAMES, [("0", {"box": track})], [(0.0, 1.0)], NOISE, PRIOR)
     return problem.fit([start], 8, 1)[0]
 

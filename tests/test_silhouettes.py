@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.capture import Capture
-from cgwm.pipeline.imaging.footage import Footage, Video, load_footage
-from cgwm.pipeline.imaging.pose_tracks import PoseTracker
-from cgwm.pipeline.imaging.silhouette_loss import SilhouetteLoss, image_loss
-from cgwm.pipeline.imaging.silhouettes import Outline, body_outlines, covered
-from cgwm.pipeline.imaging.windows import Window
-from cgwm.pipeline.physics.rotation import geodesic_angle, matrix_to_quat, quat_exp, quat_multiply, quat_to_matrix
-from cgwm.pipeline.splats.shapes import shape_mesh
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.capture.capture import Capture
+from cgwm.pipeline.geometry.primitives import shape_mesh
+from cgwm.pipeline.geometry.rotation import geodesic_angle, matrix_to_quat, quat_exp, quat_multiply, quat_to_matrix
+from cgwm.pipeline.phys_geo.images.crops import Window
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker
+from cgwm.pipeline.phys_geo.images.silhouette_loss import SilhouetteLoss, image_loss
+from cgwm.pipeline.phys_geo.images.silhouettes import Outline, body_outlines, covered
+from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video, load_footage
 from cgwm.schemas import BoxShape, InputDataError, Shape, SphereShape
 from small_model import HALF, small_model
 from tiny_capture import CAMERAS, EPISODE, FRAMES, HEIGHT, WIDTH, model_of, thrown, tiny_model, write_tiny_capture
@@ -30,7 +30,14 @@ def view_of(camera: Camera, size: tuple[int, int], covers: torch.Tensor | None =
     camera = camera.resized(*size)
     frames = torch.zeros(count, size[1], size[0], 3, dtype=F64)
     pose = torch.as_tensor(camera.T_cam_world).expand(count, 4, 4)
-    return Video("left", np.arange(count) / 30.0, frames, covers, torch.as_tensor(camera.K), pose)
+    return Video(
+        camera="left",
+        times_s=np.arange(count) / 30.0,
+        frames=frames,
+        covers=covers,
+        K=torch.as_tensor(camera.K),
+        viewmats=pose,
+    )
 
 
 def whole(video: Video, count: int = 1) -> Window:

@@ -10,10 +10,10 @@ from cgwm.schemas import (
     DoctorReport,
     ErrorSummary,
     EvalResult,
+    FittedParameter,
     ImportResult,
     Missing,
     ModelFile,
-    Parameter,
     Provenance,
     ValidationReport,
 )
@@ -47,8 +47,8 @@ def test_fit() -> None:
         name="cube", motion="free", mass_kg=0.37, inertia_kg_m2=(1e-3, 1e-3, 1e-3, 0, 0, 0), com_m=(0, 0, 0)
     )
     parameters = (
-        Parameter(name="friction", unit="1", estimate=0.1812, interval_95=(0.16, 0.2)),
-        Parameter(name="contact_time_s", unit="s", estimate=0.0042, state="on_bound"),
+        FittedParameter(name="friction", unit="1", estimate=0.1812, interval_95=(0.16, 0.2)),
+        FittedParameter(name="contact_time_s", unit="s", estimate=0.0042, state="on_bound"),
     )
     model = ModelFile(
         bodies=(body,),
@@ -65,7 +65,7 @@ def test_fit() -> None:
         "warning: the contact time is on its bound",
     ]
     bare = ModelFile(bodies=(body,), provenance=Provenance(capture="capture"))
-    assert fit._summary(bare, Path("m")) == "Fitted m: cube (free); shape and looks only: no physics yet."
+    assert fit._summary(bare, Path("m")) == "Fitted m: cube (free); shape and appearance only, without physics."
 
 
 def test_synthesize() -> None:

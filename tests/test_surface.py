@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cgwm.pipeline.splats.collision import distil
-from cgwm.pipeline.splats.directions import fibonacci_directions
-from cgwm.pipeline.splats.mesh import Mesh, mesh_volume
-from cgwm.pipeline.splats.surface import Union, union_surface
+from cgwm.pipeline.geometry.directions import fibonacci_directions
+from cgwm.pipeline.geometry.mesh import Mesh, mesh_volume
+from cgwm.pipeline.geometry.surface_distance import Union, union_surface
+from cgwm.pipeline.sg_gs.collision_spheres import distil
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 

@@ -8,25 +8,28 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.dataset import read_manifest
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.models import read_model, write_model
-from cgwm.pipeline import labels as labels_module
-from cgwm.pipeline import rollout_batches as batches
-from cgwm.pipeline.label_reach import Box
-from cgwm.pipeline.labels import LabelRenderer
-from cgwm.pipeline.posterior import draw_parameters, with_parameter
-from cgwm.pipeline.sampling import draw_start, extent, look_at_cameras, resolve_plan, rotation_matrix
-from cgwm.pipeline.splats.render import render
-from cgwm.pipeline.synthesize import shard_indices, synthesize
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.models.model import read_model, write_model
+from cgwm.datasets.rollouts.dataset import read_manifest
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.pipeline.geometry.viewpoint import rotation_matrix
+from cgwm.pipeline.rendering import label_renderer as labels_module
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
+from cgwm.pipeline.rendering.render import render
+from cgwm.pipeline.rendering.screen_bounds import Box
+from cgwm.pipeline.synthesize import simulator as batches
+from cgwm.pipeline.synthesize.parameters import draw_parameters, with_parameter
+from cgwm.pipeline.synthesize.plan import extent, resolve_plan
+from cgwm.pipeline.synthesize.stage import shard_indices, synthesize
+from cgwm.pipeline.synthesize.start_states import draw_start
+from cgwm.pipeline.synthesize.viewpoints import look_at_cameras
 from cgwm.schemas import (
     EffectModel,
     Exposure,
+    FittedParameter,
     InputDataError,
     Light,
     NotConvergedError,
-    Parameter,
     SamplingPlan,
     SynthesizeConfig,
     UsageError,
@@ -358,8 +361,8 @@ def test_parameters_follow_the_posterior() -> None:
 
 
 def test_parameters_stay_within_their_bounds() -> None:
-    tight = Parameter(name="friction", unit="1", estimate=0.4, std_error=5.0, bounds=(0.3, 0.5))
-    signed = Parameter(name="ground_offset_m", unit="m", estimate=0.0, std_error=1.0, bounds=(-0.01, 0.02))
+    tight = FittedParameter(name="friction", unit="1", estimate=0.4, std_error=5.0, bounds=(0.3, 0.5))
+    signed = FittedParameter(name="ground_offset_m", unit="m", estimate=0.0, std_error=1.0, bounds=(-0.01, 0.02))
     file = small_model().file.model_copy(update={"parameters": (tight, signed)})
     values = np.array(
         [[entry.value for entry in draw_parameters(file, 1.0, np.random.default_rng(seed))[1]] for seed in range(200)]

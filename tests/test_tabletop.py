@@ -9,11 +9,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 from cgwm.datasets import Capture
-from cgwm.datasets.check import check_capture
-from cgwm.datasets.meshes import Mesh, mass_properties
-from cgwm.datasets.scenes import read_truth
-from cgwm.datasets.scenes.dynamics import STEPS_PER_S, ContactTruth, build_model, matrix_from_quat, simulate
-from cgwm.datasets.scenes.objects import extrude
+from cgwm.datasets.capture.check import check_capture
+from cgwm.datasets.shapes.meshes import Mesh, mass_properties
+from cgwm.datasets.synthetic import read_truth
+from cgwm.datasets.synthetic.dynamics import STEPS_PER_S, ContactTruth, build_model, matrix_from_quat, simulate
+from cgwm.datasets.synthetic.objects import extrude
 from cgwm.schemas import InputDataError, UsageError
 from scipy.spatial import ConvexHull
 
@@ -99,11 +99,11 @@ def test_the_true_model_can_be_built_again(tabletop: ModuleType, fall: Path) -> 
     solid, truth = tabletop.read_solid(fall), read_truth(fall)
     law = truth.contact
     assert tabletop.MATERIALS["wood"] == ContactTruth(
-        law.friction,
-        tabletop.MATERIALS["wood"].friction_fingertip,
-        law.natural_time_s,
-        law.damping_ratio,
-        law.impedance,
+        friction=law.friction,
+        friction_fingertip=tabletop.MATERIALS["wood"].friction_fingertip,
+        natural_time=law.natural_time_s,
+        damping_ratio=law.damping_ratio,
+        impedance=law.impedance,
     )
     assert truth.object.mass_kg == solid.mass and sum(map(len, solid.parts)) == 8
     motion = truth.episodes["001"]

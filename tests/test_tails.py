@@ -1,7 +1,7 @@
 """Tail probabilities against `scipy.stats`."""
 
 import pytest
-from cgwm.pipeline.tails import chi2_tail, f_tail, normal_tail, student_quantile
+from cgwm.pipeline.optimization.uncertainty import chi2_tail, f_tail, normal_tail, student_quantile
 from scipy import stats
 
 

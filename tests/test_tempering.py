@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.estimation.shooting import Prior, Shot
-from cgwm.pipeline.estimation.tempering import tempered
+from cgwm.pipeline.phys_geo.tracks.multiple_shooting import ShootingFit, ShootingPrior
+from cgwm.pipeline.phys_geo.tracks.tempered_posterior import tempered
 from cgwm.pipeline.physics.world import State
 
 F64 = torch.float64
 EXCESS = 20.0
-PRIOR = Prior(
+PRIOR = ShootingPrior(
     torch.tensor([0.0, 1.0], dtype=F64),
     torch.tensor([0.5, 0.6], dtype=F64),
     torch.tensor([[-9.0, 9.0]] * 2, dtype=F64),
@@ -20,23 +20,23 @@ DATA = np.array([[400.0, 5.0], [5.0, 0.5]])  # the second number hardly shows
 SEEN = np.array([0.3, -2.0])
 
 
-def ended(information: np.ndarray, misfit: float, chi2: float = 1.0) -> Shot:
+def ended(information: np.ndarray, misfit: float, chi2: float = 1.0) -> ShootingFit:
     """Where a fit of Gaussian data with this information about `SEEN` ends."""
     own = np.diag(1 / PRIOR.std.numpy() ** 2)
     covariance = np.linalg.inv(information + own)
     estimate = covariance @ (information @ SEEN + own @ PRIOR.mean.numpy())
     nothing = torch.zeros(1, 1, 3, dtype=F64)
-    shot = Shot(
-        torch.tensor(estimate),
-        torch.tensor(covariance),
-        State(nothing, torch.zeros(1, 1, 4, dtype=F64), nothing, nothing),
-        1.0,
-        [1.0],
-        misfit,
-        chi2,
-        True,
+    shot = ShootingFit(
+        shared=torch.tensor(estimate),
+        covariance=torch.tensor(covariance),
+        state=State(nothing, torch.zeros(1, 1, 4, dtype=F64), nothing, nothing),
+        cost=1.0,
+        costs=[1.0],
+        misfit=misfit,
+        chi2=chi2,
+        converged=True,
     )
-    return Shot(**{**vars(shot), "covariance": shot.scale * shot.covariance})
+    return ShootingFit(**{**vars(shot), "covariance": shot.scale * shot.covariance})
 
 
 def test_data_that_the_model_explains_keep_their_weight() -> None:
@@ -71,5 +71,5 @@ def test_data_without_information_leave_the_prior() -> None:
 
 
 def test_bounds_hold() -> None:
-    tight = Prior(PRIOR.mean, PRIOR.std, torch.tensor([[-9.0, 9.0], [0.97, 9.0]], dtype=F64))
+    tight = ShootingPrior(PRIOR.mean, PRIOR.std, torch.tensor([[-9.0, 9.0], [0.97, 9.0]], dtype=F64))
     assert tempered(ended(DATA, misfit=1.0), tight, EXCESS)[0][1] >= 0.97

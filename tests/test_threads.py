@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from cgwm.pipeline.threads import kernel_threads, one_torch_thread
+from cgwm.pipeline.runtime.resources import kernel_threads, one_torch_thread
 
 
 @pytest.fixture(autouse=True)

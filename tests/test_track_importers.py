@@ -24,7 +24,7 @@ from cgwm.datasets import (
     import_rosbag,
     import_tum,
 )
-from cgwm.datasets.jugglebot import flight
+from cgwm.datasets.importers.jugglebot import flight
 from cgwm.schemas import InputDataError, UsageError
 from typer.testing import CliRunner
 
@@ -378,8 +378,8 @@ def test_the_command(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["episodes"] == 1
     same(track_of(tmp_path / "out", "a", "cup"), quats=False)
     for words, said in (
-        (["--columns", "time", "--overwrite"], "--columns: 'time' is no KEY=NAME."),
-        (["--topic", "/pose"], "--topic with csv: it means nothing there."),
+        (["--columns", "time", "--overwrite"], "--columns: 'time' is not KEY=NAME."),
+        (["--topic", "/pose"], "--topic does not apply to csv."),
         (["--columns", "time=zeit", "--overwrite"], "hardly seconds"),
     ):
         failed = CliRunner().invoke(app, [*run, *words])
@@ -389,4 +389,4 @@ def test_the_command(tmp_path: Path) -> None:
     run = ["import", "balldrops", str(tmp_path / "in"), "--out", str(tmp_path / "balls"), "--json"]
     assert CliRunner().invoke(app, [*run, "--only", "golf-ball"]).exit_code == 0
     failed = CliRunner().invoke(app, [*run, "--seed", "1", "--overwrite"])
-    assert failed.exit_code == 2 and "--seed with balldrops" in failed.stderr
+    assert failed.exit_code == 2 and "--seed does not apply to balldrops" in failed.stderr

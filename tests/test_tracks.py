@@ -19,7 +19,13 @@ def random_track(seed: int, count: int = 5, full: bool = True) -> Track:
     time_s, position_m = np.cumsum(rng.uniform(0.001, 0.1, count)), rng.normal(size=(count, 3))
     if not full:
         return Track(time_s, position_m)
-    return Track(time_s, position_m, quat_wxyz, rng.normal(size=(count, 3)), rng.normal(size=(count, 3)))
+    return Track(
+        time_s=time_s,
+        position_m=position_m,
+        quat_wxyz=quat_wxyz,
+        velocity_m_s=rng.normal(size=(count, 3)),
+        omega_body_rad_s=rng.normal(size=(count, 3)),
+    )
 
 
 def write(path: Path, *lines: str) -> Path:

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.compared import ComparedModel
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.compare.model_comparison import ComparedModel
+from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.diagnose import diagnose
-from cgwm.pipeline.diagnosis.cuts import whole_episodes
-from cgwm.pipeline.diagnosis.prepared import prepare
-from cgwm.pipeline.diagnosis.usable import refuse_blind, refuse_strange
-from cgwm.pipeline.estimation.warmup import clearance
 from cgwm.pipeline.fit import fit
+from cgwm.pipeline.geometry.rotation import quat_multiply, quat_to_matrix
 from cgwm.pipeline.physics import World
-from cgwm.pipeline.physics.rotation import quat_multiply, quat_to_matrix
-from cgwm.pipeline.short_errors import short_errors
+from cgwm.pipeline.segments.input_checks import check_observability, check_units_and_geometry
+from cgwm.pipeline.segments.prepare import prepare
+from cgwm.pipeline.trajectories.initial_state import clearance
+from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.schemas import InputDataError
 from diagnosis_data import NOISE, tosses, world_with, write_capture
 
@@ -43,16 +43,16 @@ def test_episodes_that_are_one_motion_prove_nothing() -> None:
 
     episodes = changed([(f"{k}", {"ball": one}) for k in range(4)], shake)
     with pytest.raises(InputDataError, match="are one motion"):
-        refuse_blind(world, prepare(world, episodes), "here")
+        check_observability(world, prepare(world, episodes), "here")
     others = tosses(world, 3, count=4, duration_s=0.4)
-    refuse_blind(world, prepare(world, others), "here")
+    check_observability(world, prepare(world, others), "here")
 
 
 def test_noise_that_hides_everything_is_told() -> None:
     world = world_with("ball")
     episodes = tosses(world, 3, count=4, duration_s=0.3, noise=(0.3, 0.5), height_m=(3.0, 4.0))
-    with pytest.raises(InputDataError, match=r"noise of \d+ mm.*could be seen"):
-        refuse_blind(world, prepare(world, episodes), "here")
+    with pytest.raises(InputDataError, match=r"noise of \d+ mm.*could be detected"):
+        check_observability(world, prepare(world, episodes), "here")
 
 
 def test_a_body_that_never_moves_is_told() -> None:
@@ -60,18 +60,18 @@ def test_a_body_that_never_moves_is_told() -> None:
     place = np.array([0, 0, 0.04]) + rng.normal(0, 5e-4, (40, 3))
     still = Track(np.arange(40) / 100, place, np.tile([1.0, 0, 0, 0], (40, 1)))
     with pytest.raises(InputDataError, match="nothing moves"):
-        refuse_blind(world, prepare(world, [(f"{k}", {"ball": still}) for k in range(3)]), "here")
+        check_observability(world, prepare(world, [(f"{k}", {"ball": still}) for k in range(3)]), "here")
 
 
 def test_a_body_of_another_shape_is_told() -> None:
     world = world_with("cube")
     episodes = tosses(world, 3, count=3, duration_s=1.0)
-    refuse_strange(world, episodes, "here")
+    check_units_and_geometry(world, episodes, "here")
     with pytest.raises(InputDataError, match="under the ground"):
-        refuse_strange(shaped(world, 3.0), episodes, "here")
+        check_units_and_geometry(shaped(world, 3.0), episodes, "here")
     small = shaped(world, 0.3)
     with pytest.raises(InputDataError, match="above the ground and does not fall"):
-        refuse_blind(small, prepare(small, episodes), "here")
+        check_observability(small, prepare(small, episodes), "here")
 
 
 def test_a_tilted_frame_is_no_other_shape() -> None:
@@ -89,26 +89,26 @@ def test_a_tilted_frame_is_no_other_shape() -> None:
 
     away = [(n, {name: seen(t[name], 0.2 + 0.1 * k, 0.0)}) for k, (n, t) in enumerate(episodes)]
     assert float(clearance(world, whole_episodes(world, away)).min()) < -0.012
-    refuse_strange(world, away, "here")
+    check_units_and_geometry(world, away, "here")
     lower = [(n, {name: seen(t[name], 0.2 + 0.1 * k, 0.03)}) for k, (n, t) in enumerate(episodes)]
     with pytest.raises(InputDataError, match="under the ground"):
-        refuse_strange(world, lower, "here")
+        check_units_and_geometry(world, lower, "here")
 
 
 def test_a_mass_and_an_inertia_that_no_such_body_has_are_told() -> None:
     world = world_with("cube")
     body, episodes = world.bodies[0], tosses(world, 3, count=3, duration_s=0.3)
     with pytest.raises(InputDataError, match="osmium"):
-        refuse_strange(world.with_body(0, mass=1e6 * body.mass, inertia=1e6 * body.inertia), episodes, "here")
+        check_units_and_geometry(world.with_body(0, mass=1e6 * body.mass, inertia=1e6 * body.inertia), episodes, "here")
     with pytest.raises(InputDataError, match="moments of inertia"):
-        refuse_strange(world.with_body(0, inertia=100 * body.inertia), episodes, "here")
+        check_units_and_geometry(world.with_body(0, inertia=100 * body.inertia), episodes, "here")
 
 
 def test_one_kind_of_motion_alone_is_said_in_the_verdict(tmp_path: Path) -> None:
     truth = world_with("ball", {"magnus_lift": {"s": 0.04}})
     model = write_capture(tmp_path / "high", truth, tosses(truth, 3, count=5, duration_s=0.35, height_m=(2.0, 3.0)))
     found = diagnose(model, tmp_path / "high")
-    assert found.sentence.endswith("Only flight was seen: this says nothing about contact.")
+    assert found.sentence.endswith("Only flight was measured, so the verdict does not cover contact.")
 
 
 def test_milliseconds_are_told_before_a_fit_as_well(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_noise_that_was_given_is_not_talked_down() -> None:
     episodes = tosses(world, 3, count=4, duration_s=0.4)
     told = prepare(world, episodes, (10 * NOISE[0], 10 * NOISE[1]))
     assert told.noise == (10 * NOISE[0], 10 * NOISE[1])
-    assert any("What is given counts" in warning for warning in told.warnings)
+    assert any("The given value is used" in warning for warning in told.warnings)
     # what is more than was given is measured
     assert prepare(world, episodes, (0.1 * NOISE[0], None)).noise[0] == pytest.approx(NOISE[0], rel=0.2)
 
@@ -141,5 +141,7 @@ def test_what_was_not_measured_is_no_degree_of_freedom() -> None:
     assert prepared.flight.dof.tolist() == [len(episodes[0][1]["ball"]) - 2] * 3
     short = short_errors(world, episodes, prepared, ["ball"]).errors["000"]
     assert np.isfinite(short.sigmas[:, 0]).any(0).tolist() == [False, False, True, False, False, False]
-    one = ComparedModel("m", "m", None, None, prepared.noise, {"000": short})  # pyright: ignore[reportArgumentType]
+    one = ComparedModel(
+        name="m", short_name="m", model=None, evaluation=None, noise=prepared.noise, short={"000": short}
+    )  # pyright: ignore[reportArgumentType]
     assert one.episode_chi2("000") == pytest.approx(1.0, abs=0.6)

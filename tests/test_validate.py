@@ -9,10 +9,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from cgwm.datasets.atomic import sha256
-from cgwm.datasets.dataset import shard_name
-from cgwm.datasets.models import write_model
-from cgwm.pipeline.sampling import quat_product
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.models.model import write_model
+from cgwm.datasets.rollouts.dataset import shard_name
+from cgwm.pipeline.geometry.viewpoint import quat_product
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import EffectModel, InputDataError, SynthesizeConfig, UsageError
@@ -247,35 +247,41 @@ def lost_parameter(demo: h5py.Group) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (nan_position, "bodies/pos: holds numbers that are not finite"),
-        (long_quaternion, "bodies/quat_wxyz: frame 5: a norm is off 1 by 0.01"),
+        (nan_position, "bodies/pos: contains numbers that are not finite"),
+        (long_quaternion, "bodies/quat_wxyz: frame 5: a norm differs from 1 by 0.01"),
         (backward_time, "time: not increasing at frame 4"),
         (other_impulses, "contacts/impulse_world: body 'cube', frame"),
         (other_mass, "contacts/impulse_world: body 'cube', frame"),
         (pulling_contact, "a contact pulls by"),
         (lost_contacts, "contacts/offsets: they do not divide"),
         (wild_body, "contacts: body indices outside 0 to 0"),
-        (crooked_normal, "row 0: not all of unit length, off by 0.1"),
-        (shifted_camera, "of its mask lies outside the projected body; pose or camera is wrong"),
-        (opengl_camera, "of its mask lies outside the projected body; pose or camera is wrong"),
-        (moved_mask, "of its mask lies outside the projected body; pose or camera is wrong"),
+        (crooked_normal, "row 0: the length differs from 1 by 0.1"),
+        (shifted_camera, "of its mask lies outside the projected body; the pose or the camera is wrong"),
+        (opengl_camera, "of its mask lies outside the projected body; the pose or the camera is wrong"),
+        (moved_mask, "of its mask lies outside the projected body; the pose or the camera is wrong"),
         (unknown_label, "obs/view0_mask, frame 0: label 9; there are 1 bodies"),
-        (depth_in_millimetres, "its depth is off that of its pose by"),
+        (depth_in_millimetres, "its depth differs from that of its pose by"),
         (flipped_quaternion, "body 'cube', frame "),
         (turned_pose, "bodies/omega_body: body 'cube', frame "),
         (shifted_pose, "obs/view0, frame 7, body 'cube': "),
-        (lost_body, "obs/view1, frame 5, body 'cube': mask and projected body overlap by 0.00 (IoU); 0.7 is allowed"),
+        (
+            lost_body,
+            "obs/view1, frame 5, body 'cube': mask and projected body overlap by 0.00 (IoU); at least 0.7 is required",
+        ),
         (masks_of_the_other_camera, "obs/view0, frame "),
-        (nearer_depth, "obs/view0, frame 4, body 'cube': its depth is off that of its pose by 0.0"),
+        (nearer_depth, "obs/view0, frame 4, body 'cube': its depth differs from that of its pose by 0.0"),
         (places_in_the_body_frame, "contacts/pos_world: body 'cube': in half of the"),
         (faster_spin, "bodies/omega_body: body 'cube', frame "),
         (other_inertia, "bodies/omega_body: body 'cube', frame "),
         (miscounted_pixels, "bodies/visible_px: frame 2, camera view1, body 'cube'"),
         (other_object, "obs/object: differs from the bodies"),
-        (wild_parameter, "parameters/friction: 2.5 1; 0.01 to 2 is admissible"),
-        (wrong_force, "bodies/contact_force: frame 7: off the impulses over the time between frames by 0.1 N"),
+        (wild_parameter, "parameters/friction: 2.5 1; 0.01 to 2 is allowed"),
+        (wrong_force, "bodies/contact_force: frame 7: differs from the impulses over the time between frames by 0.1 N"),
         (wrong_row_force, "contacts/force_world: frame "),
-        (wrong_torque, "bodies/contact_torque: frame 5: off the change of angular momentum over that time by 0.001 N"),
+        (
+            wrong_torque,
+            "bodies/contact_torque: frame 5: differs from the change of angular momentum over that time by 0.001 N",
+        ),
         (wrong_fraction, "bodies/visible_fraction: frame 4, camera view0, body 'cube': 0.25; the masks have 1."),
         (other_bit, "bodies/amodal_px: frame 3, camera view1, body 'cube': "),
         (no_unit, "bodies/vel: has no attribute unit"),
@@ -301,11 +307,11 @@ def test_models(good: Path, tmp_path: Path) -> None:
     text["parameters"][0]["estimate"] = 7.0
     (model / "model.json").write_text(json.dumps(text))
     faults = validate(model).faults
-    assert any("body 'cube': no body has the principal moments 0.0001, 0.0001, 0.0009 kg m2" in f for f in faults)
+    assert any("body 'cube': principal moments 0.0001, 0.0001, 0.0009 kg m2 are impossible" in f for f in faults)
     assert any("parameter 'friction' is 7 1, outside its bounds 0.01 to 2" in f for f in faults)
     text["bodies"][0]["collision"] = text["bodies"][0]["splats"] = None
     (model / "model.json").write_text(json.dumps(text))
-    assert any("body 'cube' has no colliding spheres" in fault for fault in validate(model).faults)
+    assert any("body 'cube' has no collision spheres" in fault for fault in validate(model).faults)
 
 
 def test_what_is_none_of_the_three(tmp_path: Path) -> None:
@@ -341,7 +347,7 @@ def test_a_sample_looks_at_some(broken: Path) -> None:
     again = validate(broken, sample=1, seed=0)
     assert again == reports[0] and again.facts["sampled"] == "1 of 2 rollouts, seed 0"
     assert validate(broken, sample=99).facts["rollouts"] == 2
-    with pytest.raises(UsageError, match="--sample 0: no number of rollouts"):
+    with pytest.raises(UsageError, match="--sample 0: not a valid number of rollouts"):
         validate(broken, sample=0)
     with pytest.raises(UsageError, match="is a model, which is checked whole"):
         validate(broken / "model", sample=1)

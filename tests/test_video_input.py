@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.images import read_rgb, write_image
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.first_contacts import bound_warnings, described
-from cgwm.pipeline.imaging.footage import Footage, load_footage
-from cgwm.pipeline.imaging.image_loss import ImageLoss
-from cgwm.pipeline.phys_geo import physics_fit
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.images import read_rgb, write_image
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
+from cgwm.pipeline.phys_geo.images.video_checks import examine_tracks, examine_videos
+from cgwm.pipeline.phys_geo.images.video_frames import Footage, load_footage
+from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, FitRecord, PhysicsFit, physics_fit
 from cgwm.pipeline.physics.effects.effect import ActiveEffect
 from cgwm.pipeline.physics.effects.registry import load_effect
 from cgwm.pipeline.physics.parameters import (
@@ -28,7 +28,7 @@ from cgwm.pipeline.physics.parameters import (
     effect_parameters,
     mass_distribution,
 )
-from cgwm.pipeline.video_checks import examine_tracks, examine_videos
+from cgwm.pipeline.segments.first_contact_fit import bound_warnings, described
 from cgwm.schemas import InputDataError, read_json
 from cgwm.schemas.model import FitFile, ModelFile
 from tiny_capture import (
@@ -238,12 +238,18 @@ def test_a_fit_that_ends_at_a_bound_says_what_it_means(parameter, low: str, high
     names = [*CONTACT_PARAMETERS, GROUND_SHIFT]
     world = world_of(box_body())
     inside = np.array([p.encode(p.prior[0]) for p in names])
-    quiet = physics_fit(world, names, inside, 1e-8 * np.eye(4), (1e-3, 1e-2), {"episodes": 9})
+    record = FitRecord(episodes=9, search_episodes=9, noise_estimated=(1e-3, 1e-2))
+
+    def fit(best: np.ndarray) -> PhysicsFit:
+        estimate = ContactEstimate(parameters=names, values=best, covariance=1e-8 * np.eye(4))
+        return physics_fit(world, estimate, (1e-3, 1e-2), record)
+
+    quiet = fit(inside)
     assert quiet.warnings == ()
     for side, words in zip(("lower", "upper"), (low, high), strict=True):
         best = inside.copy()
         best[names.index(parameter)] = parameter.limits[side == "upper"]
-        found = physics_fit(world, names, best, 1e-8 * np.eye(4), (1e-3, 1e-2), {"episodes": 9})
+        found = fit(best)
         (text,) = found.warnings
         assert text.startswith(f"{parameter.name} ended on its {side} bound (")
         assert words in text and text.endswith(".")

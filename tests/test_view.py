@@ -15,21 +15,14 @@ import numpy as np
 import pytest
 from browser import Page, chromium
 from cgwm.cli import main
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.loader import RolloutReader
-from cgwm.datasets.models import read_model, write_model
-from cgwm.pipeline.sampling import look_at
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.models.model import read_model, write_model
+from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.pipeline.geometry.viewpoint import look_at
 from cgwm.pipeline.synthesize import synthesize
-from cgwm.pipeline.viewing.motions import can_move, own_motion, recorded_motion, still
-from cgwm.pipeline.viewing.scene_at import (
-    LONGEST_ARROW,
-    background_from,
-    radius_m,
-    scene_at,
-    shapes_of,
-    viewpoint,
-)
-from cgwm.pipeline.viewing.viewer import FIELD_OF_VIEW_RAD
+from cgwm.pipeline.view.motions import can_move, own_motion, recorded_motion, still
+from cgwm.pipeline.view.scene_at import LONGEST_ARROW, background_from, radius_m, scene_at, shapes_of, viewpoint
+from cgwm.pipeline.view.viewer import FIELD_OF_VIEW_RAD
 from cgwm.schemas import Light, SamplingPlan, SynthesizeConfig
 from small_model import HALF, small_model, write_small_model
 
@@ -240,7 +233,7 @@ def expected(page: Page, dataset: Path, frame: int) -> tuple[np.ndarray, float]:
     width, height = page.run("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
     focal = 0.5 * height / np.tan(0.5 * FIELD_OF_VIEW_RAD)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    camera = Camera(width, height, K, np.zeros(0), look_at(eye, target, up))
+    camera = Camera(width=width, height=height, K=K, distortion=np.zeros(0), T_world_cam=look_at(eye, target, up))
     pixel, depth = camera.project(motion.position_m[frame, :1])
     return pixel[0], float((2 * HALF * focal / depth[0]) ** 2)
 

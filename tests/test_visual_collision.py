@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import read_model, write_model
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.models.model import read_model, write_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.sg_gs import fit_scene
+from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
 from test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, write_manifest

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
-from cgwm.datasets.atomic import sha256
-from cgwm.pipeline.cluster import synthesize_shards
-from cgwm.pipeline.workers import in_workers, share_of_cores
+from cgwm.datasets.io.atomic import sha256
+from cgwm.pipeline.runtime.processes import in_workers, share_of_cores
+from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.schemas import CgwmError, SynthesizeConfig, UsageError
 from small_model import write_small_model
 
@@ -18,7 +18,7 @@ CONFIG = SynthesizeConfig(rollouts=5, duration_s=0.3, width=32, height=24, devic
 _CLI = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, and so inherited, where tests run in the background
-from cgwm.cli.run import main
+from cgwm.cli.main import main
 main(sys.argv[1:])
 """
 
@@ -86,6 +86,6 @@ def test_shares_of_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_workers_are_no_part_of_a_shard_or_a_cluster(model: Path, tmp_path: Path) -> None:
     words = ["synthesize", str(model), "--out", str(tmp_path / "out"), "--workers=2"]
-    for more, text in ((["--shard=0/2"], "--shard makes one"), (["--ray", "local"], "--ray has workers of its own")):
+    for more, text in ((["--shard=0/2"], "--shard makes one"), (["--ray", "local"], "--ray has its own workers")):
         done = subprocess.run([sys.executable, "-c", _CLI, *words, *more], check=False, capture_output=True, text=True)
         assert (done.returncode, text in done.stderr) == (2, True)

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from cgwm.datasets.cameras import Camera, to_intrinsics
-from cgwm.datasets.images import write_image
-from cgwm.datasets.models import Model
-from cgwm.datasets.tracks import Track, write_tracks
-from cgwm.pipeline.image_errors import expose
-from cgwm.pipeline.labels import LabelRenderer
+from cgwm.datasets.capture.cameras import Camera, to_intrinsics
+from cgwm.datasets.capture.images import write_image
+from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.models.model import Model
+from cgwm.pipeline.evaluate.prediction import Motion
 from cgwm.pipeline.physics import State, World, simulate
-from cgwm.pipeline.prediction import Motion
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
+from cgwm.pipeline.rendering.video_view import expose
 from cgwm.schemas import CamerasFile, Exposure, PosedVideo, Scale, Solver
 from small_model import HALF, small_model
 
@@ -86,7 +86,7 @@ def camera() -> Camera:
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
     pose[:3, 3] = [0.05, -0.55, 0.33]
     K = np.array([[90.0, 0.0, 48.0], [0.0, 90.0, 36.0], [0.0, 0.0, 1.0]])
-    return Camera(96, 72, K, np.zeros(0), pose)
+    return Camera(width=96, height=72, K=K, distortion=np.zeros(0), T_world_cam=pose)
 
 
 def add_video(root: Path, masks: bool = True, episode: str = "000", kind: str = "metric") -> None:

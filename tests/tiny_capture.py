@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from cgwm.datasets.cameras import Camera, to_intrinsics
-from cgwm.datasets.images import read_label, write_image
-from cgwm.datasets.models import Model, write_model
-from cgwm.datasets.tracks import Track, write_tracks
-from cgwm.pipeline.labels import LabelRenderer
+from cgwm.datasets.capture.cameras import Camera, to_intrinsics
+from cgwm.datasets.capture.images import read_label, write_image
+from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.pipeline.geometry.rotation import quat_exp
 from cgwm.pipeline.physics import State, World, simulate
-from cgwm.pipeline.physics.rotation import quat_exp
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from cgwm.schemas import CamerasFile, PosedVideo, Scale, Solver
 from small_model import HALF, MASS, collision_splats, cube_splats, small_model, table_splats
 
@@ -68,7 +68,7 @@ def camera(azimuth_deg: float) -> Camera:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.stack([right, np.cross(forward, right), forward], 1), eye
     K = np.array([[70.0, 0, WIDTH / 2], [0, 70.0, HEIGHT / 2], [0, 0, 1]])
-    return Camera(WIDTH, HEIGHT, K, np.zeros(0), pose)
+    return Camera(width=WIDTH, height=HEIGHT, K=K, distortion=np.zeros(0), T_world_cam=pose)
 
 
 CAMERAS = {"left": camera(20.0), "right": camera(115.0)}

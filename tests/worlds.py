@@ -20,20 +20,28 @@ def box_body(half: tuple[float, float, float] = (0.05, 0.04, 0.03), mass: float 
     squares = extent.square()
     inertia = torch.diag(mass / 3 * (squares.sum() - squares))
     return Body(
-        "box",
-        "free",
-        batch(mass),
-        inertia[None],
-        torch.zeros(1, 3, dtype=F64),
-        (signs * (extent - radius))[None],
-        torch.full((1, 8), radius, dtype=F64),
+        name="box",
+        motion="free",
+        mass=batch(mass),
+        inertia=inertia[None],
+        com=torch.zeros(1, 3, dtype=F64),
+        centers=(signs * (extent - radius))[None],
+        radii=torch.full((1, 8), radius, dtype=F64),
     )
 
 
 def ball_body(radius: float = 0.04, mass: float = 0.2, name: str = "ball", copies: int = 1) -> Body:
     inertia = 0.4 * mass * radius**2 * torch.eye(3, dtype=F64)
     centers, radii = torch.zeros(1, copies, 3, dtype=F64), torch.full((1, copies), radius, dtype=F64)
-    return Body(name, "free", batch(mass), inertia[None], torch.zeros(1, 3, dtype=F64), centers, radii)
+    return Body(
+        name=name,
+        motion="free",
+        mass=batch(mass),
+        inertia=inertia[None],
+        com=torch.zeros(1, 3, dtype=F64),
+        centers=centers,
+        radii=radii,
+    )
 
 
 def world_of(
@@ -41,12 +49,12 @@ def world_of(
 ) -> World:
     up = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
     return World(
-        bodies,
-        batch([0.0, 0.0, -gravity]),
-        up if ground else None,
-        batch(0.0) if ground else None,
-        contact or law(),
-        step_s,
+        bodies=bodies,
+        gravity=batch([0.0, 0.0, -gravity]),
+        ground_normal=up if ground else None,
+        ground_offset=batch(0.0) if ground else None,
+        contact=contact or law(),
+        step_s=step_s,
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from cgwm.datasets.tracks import Track
+from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.world import State
 from numpy.typing import NDArray
 

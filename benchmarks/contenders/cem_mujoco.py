@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.estimation.trajectory import retract
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.pipeline.demo.truth_tables import OBJECT
 from cgwm.pipeline.physics.world import State
-from cgwm.pipeline.reporting.against_truth import OBJECT
+from cgwm.pipeline.trajectories.residuals import retract
 from cgwm.schemas import NotConvergedError
 
 from .base import Array, Cell, Prediction

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cgwm.datasets.models import Model, read_model
-from cgwm.datasets.tracks import Track
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import PhysConfig

@@ -13,14 +13,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from cgwm.datasets.models import read_model
-from cgwm.datasets.scenes import read_truth
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.physics.contact import ContactLaw
-from cgwm.pipeline.physics.distance import plane_contacts
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
+from cgwm.datasets.synthetic import read_truth
+from cgwm.pipeline.demo.truth_tables import OBJECT
+from cgwm.pipeline.physics.contact_law import ContactLaw
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.physics.world import State, World, symmetric
-from cgwm.pipeline.reporting.against_truth import OBJECT
-from cgwm.pipeline.splats.collision import shape_to_spheres
+from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
 from cgwm.schemas import ContactParameters, FileShape, Shape
 
 from .base import Array, Cell, Prediction

@@ -17,19 +17,19 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from cgwm.datasets.cameras import Camera
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.scenes import read_truth
-from cgwm.datasets.scenes.dynamics import ContactTruth, matrix_from_quat
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.exposure import estimate_exposures
-from cgwm.pipeline.filmed import driven_poses
-from cgwm.pipeline.imaging.pose_tracks import PoseTrack
-from cgwm.pipeline.physics.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from cgwm.datasets.capture.cameras import Camera
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.synthetic import read_truth
+from cgwm.datasets.synthetic.dynamics import ContactTruth, matrix_from_quat
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.pipeline.geometry.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from cgwm.pipeline.geometry.spheres import Spheres
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack
+from cgwm.pipeline.phys_geo.images.video_episodes import kinematic_poses
+from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures
 from cgwm.pipeline.physics.world import State, World
-from cgwm.pipeline.splats.render import render
-from cgwm.pipeline.splats.spheres import Spheres
+from cgwm.pipeline.rendering.render import render
 from cgwm.schemas import Exposure, UsageError
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
@@ -115,7 +115,13 @@ class Latent:
         world, times = training.world, np.asarray(_frame_s(training) * np.arange(TEST_FRAMES), np.float64)
         index, pushed = world.free[0], bool(training.drives)
         tip = true.friction if true.friction_fingertip is None else true.friction_fingertip
-        contact = ContactTruth(true.friction, tip, true.natural_time_s, true.damping_ratio, true.impedance)
+        contact = ContactTruth(
+            friction=true.friction,
+            friction_fingertip=tip,
+            natural_time=true.natural_time_s,
+            damping_ratio=true.damping_ratio,
+            impedance=true.impedance,
+        )
         down = -matrix_from_quat(np.asarray(training.model.file.bodies[index].photo_pose.quat_wxyz))[2]
         ways = draw_trajectories(solid, contact, down, pushed, self.trajectories, times, cell.seed)
         return _stacked([_filmed_trajectory(way, world, cameras) for way in ways], cell.device)
@@ -202,7 +208,7 @@ class FittedLatent:
         index = self.world.free[0]
         count = int(np.ceil((times_s[-1] - times_s[0]) / self.frame_s - 1e-6)) + 1
         grid = times_s[0] + self.frame_s * np.arange(max(count, 2))
-        every_position, every_quat = driven_poses(self.world, drives, grid)
+        every_position, every_quat = kinematic_poses(self.world, drives, grid)
         every_position[:, index], every_quat[:, index] = start.position_m[0, index], start.quat_wxyz[0, index]
         first = self.cameras.film(every_position[:1].numpy(), every_quat[:1].numpy())
         rotation = quat_to_matrix(every_quat[:, index])
@@ -220,7 +226,7 @@ class FittedLatent:
             values[0].cpu() for values in predicted(self.model, _stacked([data], self.model.mean_image.device))
         )
         place, quat = _interpolated(grid, position.double(), matrix_to_quat(rotation.double()), times_s)
-        position_m, quat_wxyz = (values.numpy() for values in driven_poses(self.world, drives, times_s))
+        position_m, quat_wxyz = (values.numpy() for values in kinematic_poses(self.world, drives, times_s))
         position_m[:, index], quat_wxyz[:, index] = place, quat
         position_m[0, index], quat_wxyz[0, index] = start.position_m[0, index], start.quat_wxyz[0, index]
         nearest = np.abs(grid[:, None] - times_s).argmin(0)

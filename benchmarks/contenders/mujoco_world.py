@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.physics.driven import Drive
-from cgwm.pipeline.physics.rotation import quat_conjugate, quat_rotate
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.pipeline.geometry.rotation import quat_conjugate, quat_rotate
+from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.physics.world import State, World
 
 from .base import Array

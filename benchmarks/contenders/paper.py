@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.physics.published import PublishedLaw
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.physics.paper_law import PaperLaw
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import InputDataError, NotConvergedError
@@ -174,10 +174,10 @@ class _Form:
         body, c = self.base.bodies[self.index], CONSTANTS
         factor, friction, stiffness, damping = point[0].exp().unbind(0)
         weight = float(body.mass[0]) * float(self.base.gravity.norm())
-        law = PublishedLaw(
-            friction[None],
-            stiffness[None],
-            damping[None],
+        law = PaperLaw(
+            friction=friction[None],
+            stiffness_n_m=stiffness[None],
+            damping_n_s_m=damping[None],
             directions=int(c["directions"]),
             softplus_per_n=c["softplus_times_weight"] * c["rows_in_contact"] / weight,
             sharpness_per_m=c["beta_per_m"],

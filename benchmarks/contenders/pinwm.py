@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.imaging.refinement import ImageObjective
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.phys_geo.images.end_to_end import ImageObjective
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import NotConvergedError
@@ -157,7 +157,13 @@ def _best_start(training: Training, found: Found) -> _Problem:
     problems = []
     for name, state in starts(found).items():
         observations = replace(found.observations, state=state)
-        objective = ImageObjective(training.world, CONTACT_PARAMETERS, observations, [training.loss], [every])
+        objective = ImageObjective(
+            world=training.world,
+            parameters=CONTACT_PARAMETERS,
+            observations=observations,
+            losses=[training.loss],
+            columns=[every],
+        )
         problems.append(_Problem(name, training, objective, torch.as_tensor(found.root)))
     values = [problem.value() for problem in problems]
     if min(values) == float("inf"):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cgwm.datasets.scenes.objects import SolidObject
+from cgwm.datasets.synthetic.objects import SolidObject
 
 from .base import Contender
 from .cem_mujoco import CemMujoco

@@ -11,18 +11,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from cgwm.datasets.capture import Capture
-from cgwm.datasets.models import Model, read_model
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.estimation.observations import START_FRAMES, Observations, first_state
-from cgwm.pipeline.estimation.warmup import estimate_states, flight_frames, warmup_frames
-from cgwm.pipeline.filmed import COARSE_SIZE, commands, driven_poses
-from cgwm.pipeline.imaging.coarse import coarse_model
-from cgwm.pipeline.imaging.footage import Footage, load_footage
-from cgwm.pipeline.imaging.image_loss import ImageLoss
-from cgwm.pipeline.imaging.pose_tracks import PoseTrack, PoseTracker, pose_noise
-from cgwm.pipeline.physics.measured import measure
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import Model, read_model
+from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model
+from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker, pose_noise
+from cgwm.pipeline.phys_geo.images.video_episodes import COARSE_SIZE, commands, kinematic_poses
+from cgwm.pipeline.phys_geo.images.video_frames import Footage, load_footage
+from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_frames, warmup_frames
+from cgwm.pipeline.trajectories.observations import START_FRAMES, Observations, first_state
 from cgwm.schemas import ContactParameters, NotConvergedError, PhysConfig
 from torch import Tensor
 
@@ -88,7 +88,7 @@ def open_training(cell: Cell) -> Training:
     world = World.from_model(model)
     footage = load_footage(capture, TRAIN_EPISODE, PhysConfig().image_size, cell.device)
     drives = commands(world, capture, TRAIN_EPISODE, capture.tracks(TRAIN_EPISODE))
-    position, quat = driven_poses(world, drives, footage.times_s)
+    position, quat = kinematic_poses(world, drives, footage.times_s)
     return Training(model, world, ImageLoss(model, footage, world.free), drives, position, quat)
 
 

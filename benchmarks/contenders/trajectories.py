@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from cgwm.datasets.scenes.dynamics import (
+from cgwm.datasets.synthetic.dynamics import (
     FINGERTIP_RADIUS,
     GRAVITY,
     STEPS_PER_S,
@@ -23,7 +23,7 @@ from cgwm.datasets.scenes.dynamics import (
     simulate,
     smooth_path,
 )
-from cgwm.datasets.scenes.objects import SolidObject
+from cgwm.datasets.synthetic.objects import SolidObject
 
 from .base import Array
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from cgwm.datasets.models import read_model
-from cgwm.datasets.tracks import Track
-from cgwm.pipeline.filmed import driven_poses
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.phys_geo.images.video_episodes import kinematic_poses
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import ContactParameters
 
@@ -53,7 +53,7 @@ class FittedZero:
     def predict(self, start: State, drives: Mapping[str, Track], times_s: Array) -> Prediction:
         """Predict open loop."""
         world = self.world
-        position, quat = (values.numpy() for values in driven_poses(world, drives, times_s))
+        position, quat = (values.numpy() for values in kinematic_poses(world, drives, times_s))
         for index, body in enumerate(world.bodies):
             if body.motion == "driven":
                 continue

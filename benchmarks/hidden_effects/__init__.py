@@ -1,4 +1,4 @@
-"""The captures with hidden effects of `cgwm.datasets.scenes.hidden`, as lists on the command line, and a second truth.
+"""The captures with hidden effects of `cgwm.datasets.synthetic.hidden_effects`, as lists, and a second truth.
 
 From `benchmarks/`:
 
@@ -10,7 +10,7 @@ From `benchmarks/`:
     python -m hidden_effects make OUT --list drake         # the second truth: pip install drake
 """
 
-from cgwm.datasets.scenes.hidden import (
+from cgwm.datasets.synthetic.hidden_effects import (
     EFFECTS,
     ENGINES,
     KNOWN,

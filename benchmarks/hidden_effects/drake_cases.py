@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cgwm.datasets.scenes.hidden import Case
-from cgwm.datasets.scenes.hidden.plan import SIZES, THINGS, Noise, Stage, planned_case
-from cgwm.datasets.scenes.hidden.things import Kind
+from cgwm.datasets.synthetic.hidden_effects import Case
+from cgwm.datasets.synthetic.hidden_effects.plan import SIZES, THINGS, Noise, Stage, planned_case
+from cgwm.datasets.synthetic.hidden_effects.things import Kind
 
 DRAKE: tuple[tuple[Kind, str], ...] = (
     ("cube", "linear_drag"),

@@ -17,9 +17,9 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.scenes.hidden.mechanics import Hidden, Mechanics, Motion, Reader, Start
-from cgwm.datasets.scenes.hidden.rotation import rotation_of
-from cgwm.datasets.scenes.hidden.things import Thing, restitution_of
+from cgwm.datasets.synthetic.hidden_effects.mechanics import Hidden, Mechanics, Motion, Reader, Start
+from cgwm.datasets.synthetic.hidden_effects.rotation import rotation_of
+from cgwm.datasets.synthetic.hidden_effects.things import Thing, restitution_of
 
 COMES_WITH = ("velocity_restitution",)
 NEEDS_MUJOCO = ("rolling_resistance", "torsional_friction", "anisotropic_friction")

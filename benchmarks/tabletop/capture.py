@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from cgwm.datasets.atomic import new_directory
-from cgwm.datasets.scenes import read_truth
-from cgwm.datasets.scenes.dynamics import rest_pose
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.scenes.plan import ScenePlan
-from cgwm.datasets.scenes.record import build_set, record
+from cgwm.datasets.io.atomic import new_directory
+from cgwm.datasets.synthetic import read_truth
+from cgwm.datasets.synthetic.dynamics import rest_pose
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.datasets.synthetic.plan import ScenePlan
+from cgwm.datasets.synthetic.record import build_set, record
 from cgwm.schemas import InputDataError, UsageError, did_you_mean
 
 from .materials import MATERIALS
@@ -92,7 +92,16 @@ def plan_capture(
     contact = MATERIALS[material]
     episodes, rejected = motions(rng, scene_seed, item.solid, item.down, contact, tests)
     fingertip = task == "push"
-    plan = ScenePlan(task, scene_seed, item.solid, contact, photo_qpos, FRAME_RATE, episodes, fingertip)
+    plan = ScenePlan(
+        name=task,
+        seed=scene_seed,
+        solid=item.solid,
+        contact=contact,
+        photo_qpos=photo_qpos,
+        frame_rate=FRAME_RATE,
+        episodes=episodes,
+        fingertip=fingertip,
+    )
     return plan, rejected
 
 
@@ -120,6 +129,6 @@ def read_solid(folder: Path) -> SolidObject:
     with np.load(path) as file:
         parts = np.split(file["parts"], file["part_ends"][:-1])
         return SolidObject(
-            str(file["family"]), file["vertices"], file["faces"], tuple(parts),
-            float(file["mass_kg"]), file["com_m"], file["inertia_kg_m2"],
+            family=str(file["family"]), vertices=file["vertices"], faces=file["faces"], parts=tuple(parts),
+            mass=float(file["mass_kg"]), com=file["com_m"], inertia=file["inertia_kg_m2"],
         )  # fmt: skip

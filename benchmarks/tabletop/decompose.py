@@ -14,8 +14,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from cgwm.datasets.meshes import Mesh, mass_properties, read_mesh
-from cgwm.datasets.scenes.objects import SolidObject
+from cgwm.datasets.shapes.meshes import Mesh, mass_properties, read_mesh
+from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.schemas import InputDataError
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
@@ -58,7 +58,13 @@ def prepare_scan(name: str, raw: Path) -> Scan:
     visible = _union(parts)
     properties = mass_properties(visible, f"union of {name}")
     solid = SolidObject(
-        name, visible.vertices, visible.faces, tuple(parts), mass, properties.com_m, mass * properties.inertia_per_kg
+        family=name,
+        vertices=visible.vertices,
+        faces=visible.faces,
+        parts=tuple(parts),
+        mass=mass,
+        com=properties.com_m,
+        inertia=mass * properties.inertia_per_kg,
     )
     texture = cv2.imread(str(folder / "texture_map.png"))
     assert texture is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from cgwm.datasets.meshes import Mesh
+from cgwm.datasets.shapes.meshes import Mesh
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 

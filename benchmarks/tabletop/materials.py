@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cgwm.datasets.scenes.dynamics import ContactTruth
+from cgwm.datasets.synthetic.dynamics import ContactTruth
 
 MATERIALS: dict[str, ContactTruth] = {
     "acrylic": ContactTruth(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from cgwm.datasets.scenes.objects import FAMILIES, SolidObject, make_object, resting_down
-from cgwm.datasets.scenes.raycast import Material
-from cgwm.datasets.scenes.rig import make_paint
+from cgwm.datasets.synthetic.objects import FAMILIES, SolidObject, make_object, resting_down
+from cgwm.datasets.synthetic.raycast import Material
+from cgwm.datasets.synthetic.rig import make_paint
 from numpy.typing import NDArray
 
 from .paint import make_scan_paint

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from cgwm.datasets.scenes.dynamics import Motion
-from cgwm.datasets.scenes.objects import SolidObject
+from cgwm.datasets.synthetic.dynamics import Motion
+from cgwm.datasets.synthetic.objects import SolidObject
 
 FRAME_RATE = 30.0
 TRAIN_FRAMES, TEST_FRAMES = 15, 60

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 
 import numpy as np
-from cgwm.datasets.scenes.dynamics import (
+from cgwm.datasets.synthetic.dynamics import (
     BODY_GROUP,
     FINGERTIP_RADIUS,
     STEPS_PER_S,
@@ -20,9 +20,9 @@ from cgwm.datasets.scenes.dynamics import (
     simulate,
     smooth_path,
 )
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.scenes.plan import EpisodePlan, stays_in_view, tilted_deg
-from cgwm.datasets.scenes.rig import video_cameras
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.datasets.synthetic.plan import EpisodePlan, stays_in_view, tilted_deg
+from cgwm.datasets.synthetic.rig import video_cameras
 from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from cgwm.datasets.meshes import Mesh
-from cgwm.datasets.scenes.objects import SolidObject
+from cgwm.datasets.shapes.meshes import Mesh
+from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.schemas import InputDataError
 from numpy.typing import NDArray
 
@@ -98,9 +98,14 @@ def read_scan(name: str) -> Scan:
     with np.load(path) as file:
         parts = np.split(file["parts"].astype(np.float64), file["part_ends"][:-1])
         solid = SolidObject(
-            str(file["family"]), file["vertices"].astype(np.float64), file["faces"].astype(np.int64), tuple(parts),
-            float(file["mass_kg"]), file["com_m"], file["inertia_kg_m2"],
-        )  # fmt: skip
+            family=str(file["family"]),
+            vertices=file["vertices"].astype(np.float64),
+            faces=file["faces"].astype(np.int64),
+            parts=tuple(parts),
+            mass=float(file["mass_kg"]),
+            com=file["com_m"],
+            inertia=file["inertia_kg_m2"],
+        )
         scanned = Mesh(file["scan_vertices"].astype(np.float64), file["scan_faces"].astype(np.int64))
         out, back = (Distance(*map(float, row)) for row in file["distances_m"])
         uv = file["scan_uv"].astype(np.float64) / 65535

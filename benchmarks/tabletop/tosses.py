@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from cgwm.datasets.scenes.dynamics import (
+from cgwm.datasets.synthetic.dynamics import (
     GRAVITY,
     STEPS_PER_S,
     ContactTruth,
@@ -17,10 +17,10 @@ from cgwm.datasets.scenes.dynamics import (
     rest_pose,
     simulate,
 )
-from cgwm.datasets.scenes.fall import unpredictability
-from cgwm.datasets.scenes.objects import SolidObject
-from cgwm.datasets.scenes.plan import EXPOSURE_LEAD_S, EpisodePlan, stays_in_view, turned_deg
-from cgwm.datasets.scenes.rig import video_cameras
+from cgwm.datasets.synthetic.fall import unpredictability
+from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.datasets.synthetic.plan import EXPOSURE_LEAD_S, EpisodePlan, stays_in_view, turned_deg
+from cgwm.datasets.synthetic.rig import video_cameras
 from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
 

@@ -1,7 +1,7 @@
-"""Calibrated cameras: one object to project with, and the reader of the files that hold them.
+"""Calibrated cameras: projection, and reading of the files that contain them.
 
-Pixel coordinates put the centre of the top-left pixel at (0.5, 0.5), as COLMAP and nerfstudio do. OpenCV's
-functions put it at (0, 0): take 0.5 off the principal point before `K` is given to them.
+The centre of the top-left pixel is at (0.5, 0.5), as in COLMAP and nerfstudio. OpenCV's functions put it at (0, 0):
+subtract 0.5 from the principal point before passing `K` to them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, PosedVideo, did_you_mean, read_json
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, PosedVideo, did_you_mean, read_json
 from .colmap_model import find_colmap_model, read_colmap_model
 from .transforms import read_transforms
 
@@ -25,21 +25,18 @@ _ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera with its pose; camera axes OpenCV (x right, y down, z forward).
-
-    Attributes:
-        width: Image width [px].
-        height: Image height [px].
-        K: Intrinsic matrix [px], shape (3, 3); the top-left pixel's centre is (0.5, 0.5).
-        distortion: OpenCV's k1, k2, p1, p2 [, k3] [1], shape (4,) or (5,); shape (0,) where there is none.
-        T_world_cam: Pose, camera to world [m where the scale is metric], shape (4, 4).
-    """
+    """A pinhole camera with its pose; camera axes OpenCV (x right, y down, z forward)."""
 
     width: int
+    """Width of the image [px]."""
     height: int
+    """Image height [px]."""
     K: Array
+    """Intrinsic matrix [px], shape (3, 3); the top-left pixel's centre is (0.5, 0.5)."""
     distortion: Array
+    """OpenCV's k1, k2, p1, p2 [, k3] [1], shape (4,) or (5,); shape (0,) without distortion."""
     T_world_cam: Array
+    """Pose, camera to world [m where the scale is metric], shape (4, 4)."""
 
     @property
     def T_cam_world(self) -> Array:
@@ -82,9 +79,9 @@ class Camera:
         return distorted @ self.K[:2, :2].T + self.K[:2, 2], depth
 
     def pixels_of(self, points_world: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-        """Return which points (N, 3), world frame, are in the picture, and the columns and rows of their pixels.
+        """Return which points (N, 3), world frame, are in the image, and the columns and rows of their pixels.
 
-        Each has shape (N,); column and row are 0 for a point that is not in the picture.
+        Each has shape (N,); column and row are 0 for a point outside the image.
         """
         pixel, depth = self.project(points_world)
         inside = (depth > 0) & (pixel >= 0).all(1) & (pixel < [self.width, self.height]).all(1)
@@ -92,7 +89,7 @@ class Camera:
         return inside, column, row
 
     def undistorted(self, image: NDArray[Any], labels: bool = False) -> tuple[NDArray[Any], Camera]:
-        """Return the image that a camera without distortion and with the same K takes, and that camera.
+        """Return the undistorted image, and the camera without distortion and with the same K that takes it.
 
         Args:
             image: Shape (height, width) or (height, width, channels), uint8 or float32.
@@ -132,15 +129,15 @@ def distort(normalised: Array, distortion: Array) -> Array:
 def read_cameras(root: Path | str, metric: bool = False) -> CamerasFile | None:
     """Read the cameras of a capture directory, or None if there are none.
 
-    The first of these counts: `cameras.json`; nerfstudio's `transforms.json`; a COLMAP model, text or binary,
+    The first of these files is used: `cameras.json`; nerfstudio's `transforms.json`; a COLMAP model, text or binary,
     in `sparse/0`, `sparse` or `colmap`. Poses keep their scale; names of photos are relative to `images/`.
 
     Args:
         root: The capture directory.
-        metric: Whether `transforms.json` or the COLMAP model is in metres; `cameras.json` says it itself.
+        metric: Whether `transforms.json` or the COLMAP model is in metres; `cameras.json` contains its unit.
 
     Raises:
-        InputDataError: If the file is wrong, uses a camera model that cannot be represented, or holds a pose
+        InputDataError: If the file is wrong, uses a camera model that cannot be represented, or contains a pose
             that is not a rotation and a translation.
     """
     root = Path(root)
@@ -170,14 +167,14 @@ def camera_of(
     """Return the camera of a photo or of a video frame.
 
     Args:
-        cameras: What :func:`read_cameras` returned.
+        cameras: The cameras that :func:`read_cameras` returned.
         name: The photo, relative to `images/`, or the video camera.
-        frame: Frame number (from 0) for a video camera that moves.
+        frame: Frame number (from 0) for a moving video camera.
         kind: Whether `name` is a photo or a video camera.
-        episode: A video camera that stood elsewhere in this episode is filed under `<camera>/<episode>`.
+        episode: The episode of a video; a pose under `<camera>/<episode>` takes precedence over that of the camera.
 
     Raises:
-        InputDataError: If the photo or video camera has no pose, or has one a frame and `frame` is no such one.
+        InputDataError: If the photo or video camera has no pose, or has one per frame and none for `frame`.
     """
     if kind == "images":
         entry = cameras.images.get(name)
@@ -196,7 +193,12 @@ def camera_of(
 
 
 def posed(cameras: CamerasFile, T_world_cam: Mapping[str, Array]) -> CamerasFile:
-    """Return the cameras with other poses of the photos that are named."""
+    """Return the cameras with new poses of some photos.
+
+    Args:
+        cameras: The cameras.
+        T_world_cam: New poses by photo, camera to world, shape (4, 4).
+    """
     images = dict(cameras.images)
     for name, pose in T_world_cam.items():
         rows = tuple(tuple(float(value) for value in row) for row in pose)
@@ -210,11 +212,17 @@ def from_intrinsics(intrinsics: CameraIntrinsics, T_world_cam: Array) -> Camera:
         [[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]], np.float64
     )
     distortion = np.array(intrinsics.distortion if any(intrinsics.distortion) else (), np.float64)
-    return Camera(intrinsics.width, intrinsics.height, K, distortion, np.asarray(T_world_cam, np.float64))
+    return Camera(
+        width=intrinsics.width,
+        height=intrinsics.height,
+        K=K,
+        distortion=distortion,
+        T_world_cam=np.asarray(T_world_cam, np.float64),
+    )
 
 
 def to_intrinsics(camera: Camera) -> CameraIntrinsics:
-    """Return the intrinsics of a camera as they stand in `cameras.json`."""
+    """Return the intrinsics of a camera in the format of `cameras.json`."""
     distortion = tuple(float(value) for value in camera.distortion)
     return CameraIntrinsics(
         model="OPENCV" if any(distortion) else "PINHOLE",
@@ -229,7 +237,7 @@ def to_intrinsics(camera: Camera) -> CameraIntrinsics:
 
 
 def pose_count(video: PosedVideo) -> int:
-    """Return the number of poses of a video camera; 1 where it stands still."""
+    """Return the number of poses of a video camera; 1 for a static one."""
     return len(_poses(video))
 
 
@@ -263,7 +271,7 @@ def _check_rigid(where: str, pose: Array) -> None:
 
 
 def require_metric(cameras: CamerasFile) -> None:
-    """Refuse cameras whose unit is not the metre: physics on them would fit an arbitrary gravity.
+    """Refuse cameras without a metric scale, with which the fitted physics would have an arbitrary gravity.
 
     Raises:
         InputDataError: If they are unscaled; the message says how to give the scale.

@@ -1,27 +1,23 @@
-"""Checks of a capture: every fault with its place, and the facts that were found."""
+"""Checks of a capture, which return all faults with their places and the facts that were found."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError, did_you_mean
+from ...schemas import InputDataError, did_you_mean
+from ..shapes.meshes import mass_properties, read_mesh
+from ..shapes.ply import read_splats
 from .cameras import pose_count
 from .files import files_under
+from .folder import CaptureFolder
 from .geometry_maps import KINDS, map_names, read_map
 from .images import image_size, read_label
-from .meshes import mass_properties, read_mesh
-from .ply import read_splats
 from .video import VideoInfo, frame_files, video_info
-
-if TYPE_CHECKING:
-    from .capture import Capture
-
 
 _UNREAD_IMAGES = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng", ".raw", ".npy")
 _UNREAD = (
@@ -31,48 +27,45 @@ _UNREAD = (
 )
 
 
-@dataclass
+@dataclass(kw_only=True)
 class CaptureFacts:
-    """What a capture holds.
-
-    Attributes:
-        photos: Number of photos.
-        photos_with_camera: Number of those with a calibrated pose.
-        masks: Number of masks.
-        geometry_maps: Number of depth, normal and feature maps, by kind.
-        mask_coverage: Mean fraction of a mask's pixels that shows a body, by body.
-        scale: "metric", "unscaled" or "none" (no cameras).
-        bodies: Names of the bodies.
-        episodes: Number of episodes.
-        splits: Number of episodes by split.
-        track_samples: Number of poses in all tracks.
-        normalised_quaternions: Number of quaternions off the unit norm within the tolerance.
-        videos: Number of videos.
-        video_frames: Number of their frames.
-        warnings: What is no fault but should be known.
-    """
+    """Contents of a capture."""
 
     photos: int = 0
+    """Number of photos."""
     photos_with_camera: int = 0
+    """Number of those with a calibrated pose."""
     masks: int = 0
+    """Number of masks."""
     geometry_maps: dict[str, int] = field(default_factory=dict)
+    """Number of depth, normal and feature maps, by kind."""
     mask_coverage: dict[str, float] = field(default_factory=dict)
+    """Mean fraction of a mask's pixels that shows a body, by body."""
     scale: str = "none"
+    """"metric", "unscaled" or "none" (no cameras)."""
     bodies: list[str] = field(default_factory=list)
+    """Names of the bodies."""
     episodes: int = 0
+    """Number of episodes."""
     splits: dict[str, int] = field(default_factory=dict)
+    """Number of episodes by split."""
     track_samples: int = 0
+    """Number of poses in all tracks."""
     normalised_quaternions: int = 0
+    """Number of quaternions whose norm differs from 1 within the tolerance."""
     videos: int = 0
+    """Number of videos."""
     video_frames: int = 0
+    """Number of their frames."""
     warnings: list[str] = field(default_factory=list)
+    """Warnings about what is not a fault."""
 
 
-def check_capture(capture: Capture) -> CaptureFacts:
+def check_capture(capture: CaptureFolder) -> CaptureFacts:
     """Check a capture and return its facts.
 
     Raises:
-        InputDataError: The first fault; its last line counts the others.
+        InputDataError: For the first fault; its last line counts the others.
     """
     facts, faults = find_faults(capture)
     if faults:
@@ -80,7 +73,7 @@ def check_capture(capture: Capture) -> CaptureFacts:
     return facts
 
 
-def find_faults(capture: Capture) -> tuple[CaptureFacts, list[InputDataError]]:
+def find_faults(capture: CaptureFolder) -> tuple[CaptureFacts, list[InputDataError]]:
     """Check a capture; return the facts and all faults, in the order of the directory's parts."""
     facts = CaptureFacts(
         bodies=capture.body_names, splits={name: len(names) for name, names in capture.manifest.splits.items()}
@@ -133,8 +126,8 @@ def _first(faults: list[InputDataError], root: Path) -> InputDataError:
     return InputDataError(first.found, first.allowed, f"{first.todo} {more}".strip())
 
 
-def _check_names(capture: Capture) -> None:
-    """Check that the names in the manifest are those of things on disk."""
+def _check_names(capture: CaptureFolder) -> None:
+    """Check that the episodes and cameras named in the manifest exist on disk."""
     manifest, path = capture.manifest, capture.root / "capture.toml"
     found = capture.episodes()
     splits = manifest.splits if capture.only_splits is None else {s: capture.episodes(s) for s in capture.only_splits}
@@ -171,8 +164,8 @@ def _listed(names: list[str], noun: str) -> str:
     return f"{shown}, ... ({len(names)} {noun})." if len(names) > 8 else f"{shown}."
 
 
-def _check_formats(capture: Capture) -> None:
-    """Refuse photos and videos in formats that would be passed over in silence."""
+def _check_formats(capture: CaptureFolder) -> None:
+    """Refuse photos and videos in formats that would be silently ignored."""
     for folder, unread, allowed, convert in _UNREAD:
         for name in files_under(capture.root / folder):
             if Path(name).suffix.lower() in unread:
@@ -181,7 +174,7 @@ def _check_formats(capture: Capture) -> None:
                 )
 
 
-def _check_shape(capture: Capture, name: str) -> None:
+def _check_shape(capture: CaptureFolder, name: str) -> None:
     body = capture.body(name)
     path = capture.shape_file(body)
     if path is None or body.shape is None:
@@ -192,12 +185,12 @@ def _check_shape(capture: Capture, name: str) -> None:
         read_splats(path)
 
 
-def _check_photo(capture: Capture, name: str, sizes: dict[str, tuple[int, int]]) -> None:
+def _check_photo(capture: CaptureFolder, name: str, sizes: dict[str, tuple[int, int]]) -> None:
     sizes[name] = image_size(capture.root / "images" / name)
 
 
 def _check_mask(
-    capture: Capture,
+    capture: CaptureFolder,
     name: str,
     by_stem: dict[Path, str],
     sizes: dict[str, tuple[int, int]],
@@ -218,7 +211,7 @@ def _check_mask(
 
 
 def _check_map(
-    capture: Capture,
+    capture: CaptureFolder,
     kind: str,
     name: str,
     by_stem: dict[Path, str],
@@ -242,7 +235,9 @@ def _check_map(
     facts.geometry_maps[kind] = facts.geometry_maps.get(kind, 0) + 1
 
 
-def _check_labels(capture: Capture, path: Path, labels: NDArray[np.uint8], size: tuple[int, int], shown: str) -> None:
+def _check_labels(
+    capture: CaptureFolder, path: Path, labels: NDArray[np.uint8], size: tuple[int, int], shown: str
+) -> None:
     height, width = labels.shape
     if (width, height) != size:
         raise InputDataError(
@@ -261,7 +256,7 @@ def _check_labels(capture: Capture, path: Path, labels: NDArray[np.uint8], size:
         )
 
 
-def _check_cameras(capture: Capture, sizes: dict[str, tuple[int, int]], facts: CaptureFacts) -> None:
+def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], facts: CaptureFacts) -> None:
     cameras = capture.cameras
     if cameras is None:
         return
@@ -293,13 +288,13 @@ def _check_cameras(capture: Capture, sizes: dict[str, tuple[int, int]], facts: C
             )
 
 
-def _check_tracks(capture: Capture, episode: str, facts: CaptureFacts) -> None:
+def _check_tracks(capture: CaptureFolder, episode: str, facts: CaptureFacts) -> None:
     tracks, normalised = capture.tracks_counted(episode)
     facts.track_samples += sum(len(track) for track in tracks.values())
     facts.normalised_quaternions += normalised
 
 
-def _check_video(capture: Capture, camera: str, episode: str, facts: CaptureFacts) -> None:
+def _check_video(capture: CaptureFolder, camera: str, episode: str, facts: CaptureFacts) -> None:
     path = capture.video_path(camera, episode)
     info = video_info(path)
     kept = capture.frames_kept(camera, episode, info.frames)
@@ -327,7 +322,7 @@ def _check_video(capture: Capture, camera: str, episode: str, facts: CaptureFact
             _check_labels(capture, file, read_label(file), (info.width, info.height), f"videos/{camera}/{episode}")
 
 
-def _check_video_camera(capture: Capture, camera: str, episode: str, path: Path, info: VideoInfo) -> None:
+def _check_video_camera(capture: CaptureFolder, camera: str, episode: str, path: Path, info: VideoInfo) -> None:
     if capture.cameras is None:
         return
     videos = capture.cameras.videos

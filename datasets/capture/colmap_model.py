@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
-from ..schemas.cameras import Matrix4
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
+from ...schemas.cameras import Matrix4
 from .transforms import matrix4
 
 MODEL_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
-"""Where a capture may hold a COLMAP model, in the order in which they are looked for."""
+"""Folders of a capture that may contain a COLMAP model, in order of precedence."""
 
 # COLMAP's number of a camera model, and its parameters; None: the parameter has no place in OpenCV's five.
 _MODELS: dict[int, tuple[str, int]] = {
@@ -52,10 +52,10 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
 
     Args:
         folder: The directory with the files.
-        metric: Whether its unit is the metre, which it does not say itself.
+        metric: Whether its unit is the metre, which the files do not contain.
 
     Raises:
-        InputDataError: If a file is cut off or a camera model is no pinhole with OpenCV's distortion.
+        InputDataError: If a file is truncated or a camera model is not a pinhole with OpenCV's distortion.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def files_under(folder: Path) -> list[str]:
-    """Return the names, relative to a directory, of all files under it but hidden ones, sorted; links are followed."""
+    """Return the sorted relative names of all files under a directory except hidden ones; links are followed."""
     names: list[str] = []
     seen: set[str] = set()
     for place, folders, files in os.walk(folder, followlinks=True):

@@ -1,62 +1,34 @@
-"""Captures: the directory that a user fills, opened and read."""
+"""The folder of a capture: manifest, photos, videos, tracks and cameras, read from disk on demand."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean, read_toml
-from .cameras import Camera, camera_of, read_cameras
+from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
+from .cameras import Camera, camera_of
 from .files import files_under
 from .geometry_maps import GeometryMaps, read_maps
 from .images import IMAGE_SUFFIXES, read_label, read_rgb
-from .kinds import refuse_other_kind
 from .tracks import Track, read_tracks
 from .video import VIDEO_SUFFIXES, VideoInfo, read_video, read_video_labels, video_info
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
-    """A capture directory. Make one with :meth:`open`; everything else is read from disk when asked for.
-
-    Attributes:
-        root: The directory.
-        manifest: `capture.toml`.
-        cameras: The calibrated cameras, or None if there are none yet.
-        only_splits: The splits that may be read; None for everything.
-    """
+class CaptureFolder:
+    """A capture directory. Everything except the manifest and the cameras is read from disk on demand."""
 
     root: Path
+    """The directory."""
     manifest: CaptureManifest
+    """`capture.toml`."""
     cameras: CamerasFile | None = None
+    """The calibrated cameras, or None if there are none yet."""
     only_splits: tuple[str, ...] | None = None
-
-    @classmethod
-    def open(cls, path: Path | str, check: bool = True, splits: Sequence[str] | None = None) -> Capture:
-        """Open a capture.
-
-        Args:
-            path: The directory.
-            check: Check everything in it that can be checked without decoding photos or videos.
-            splits: Look at the episodes of these splits only; those of others may be absent or wrong.
-
-        Raises:
-            InputDataError: For the first fault, with file, line or field.
-        """
-        root = Path(path)
-        refuse_other_kind(root, "capture")
-        manifest = read_toml(root / "capture.toml", CaptureManifest)
-        cameras = read_cameras(root, manifest.calibration.supplied_in_metres)
-        capture = cls(root, manifest, cameras, None if splits is None else tuple(splits))
-        if check:
-            from .check import check_capture
-
-            check_capture(capture)
-        return capture
+    """The splits that may be read; None for everything."""
 
     @property
     def body_names(self) -> list[str]:
@@ -111,7 +83,7 @@ class Capture:
         return read_label(path) if path.is_file() else None
 
     def photo_maps(self, name: str) -> GeometryMaps:
-        """Return what is known about a photo's pixels besides their colours: depth, normals, features."""
+        """Return the geometry maps of a photo: depth, normals, features."""
         return read_maps(self.root, name)
 
     def photo_camera(self, name: str) -> Camera:
@@ -121,7 +93,7 @@ class Capture:
     # Episodes
 
     def episodes(self, split: str | None = None) -> list[str]:
-        """Return the episodes of a split, in the manifest's order, or all that lie on disk, sorted.
+        """Return the episodes of a split in the manifest's order, or all episodes on disk, sorted.
 
         Raises:
             UsageError: If there is no such split.
@@ -190,7 +162,7 @@ class Capture:
         return videos[episode]
 
     def video_info(self, camera: str, episode: str) -> VideoInfo:
-        """Return what a video's headers say, before `start_s` and `end_s` cut it."""
+        """Return the properties of a whole video, without the limits `start_s` and `end_s`."""
         return video_info(self.video_path(camera, episode))
 
     def video_frames(self, camera: str, episode: str) -> NDArray[np.uint8]:
@@ -207,7 +179,7 @@ class Capture:
         return labels[self._in_window(camera, episode, len(labels))]
 
     def frame_times(self, camera: str, episode: str) -> NDArray[np.float64]:
-        """Return the times [s] on the tracks' clock of what :meth:`video_frames` returns, shape (frames,)."""
+        """Return the times [s] of the frames of :meth:`video_frames` on the tracks' clock, shape (frames,)."""
         count = video_info(self.video_path(camera, episode), decode=True).frames
         return self._all_times(camera, count)[self._in_window(camera, episode, count)]
 
@@ -221,7 +193,7 @@ class Capture:
         return int(self._in_window(camera, episode, count).sum())
 
     def video_camera(self, camera: str, episode: str, frame: int | None = None) -> Camera:
-        """Return the camera of a video (`frame` from 0, needed where it moves)."""
+        """Return the camera of a video; `frame` (from 0) is needed for a moving camera."""
         return camera_of(self._calibrated(), camera, frame, "videos", episode)
 
     def _all_times(self, camera: str, count: int) -> NDArray[np.float64]:
@@ -259,7 +231,7 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def _videos_in(camera: Path) -> dict[str, Path]:
-    """Return the videos of a camera by episode; one that is there twice is refused."""
+    """Return the videos of a camera by episode; duplicates are refused."""
     found: dict[str, Path] = {}
     for path in sorted(camera.iterdir()):
         if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):

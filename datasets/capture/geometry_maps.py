@@ -1,12 +1,12 @@
-"""Geometry maps beside the photos: depth, normals and features, where something measured or computed them.
+"""Optional geometry maps of the photos: depth, normals and features.
 
     depth/<photo>.npy      float, (H, W): depth along the optical axis [m]; 0 or not finite where unknown
     depth/<photo>.png      16 bits, one channel: the same in millimetres
     normals/<photo>.npy    float, (H, W, 3): outward unit normals in camera axes (OpenCV); zero where unknown
     normals/<photo>.png    8 bits, RGB: 127.5 (n + 1)
-    features/<photo>.npy   float, (h, w, F), any size and number of channels: what a point looks like to a network
+    features/<photo>.npy   float, (h, w, F), any size and number of channels: features of a network
 
-Names are the photos' own without their suffix. Maps belong to the photo as it is, with its camera's distortion.
+Names are those of the photos without their suffix. Maps belong to the photo as taken, with its camera's distortion.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError
+from ...schemas import InputDataError
 from .files import files_under
 
 KINDS = {"depth": (".npy", ".png"), "normals": (".npy", ".png"), "features": (".npy",)}
-"""Folder of each kind of map, and the suffixes that are read there."""
+"""Readable suffixes of each kind of map, by its folder."""
 _MILLIMETRE_M = 1e-3
 _LEAST_NORMAL = 0.5
 Map = NDArray[np.float32]
@@ -30,17 +30,14 @@ Map = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class GeometryMaps:
-    """What is known about a photo's pixels besides their colours; None where there is no such map.
-
-    Attributes:
-        depth_m: Depth along the optical axis [m], 0 where unknown, shape (H, W).
-        normals_cam: Outward unit normals, camera axes (OpenCV), zero where unknown, shape (H, W, 3).
-        features: Shape (h, w, F).
-    """
+    """Geometry maps of a photo; None for a map that does not exist."""
 
     depth_m: Map | None = None
+    """Depth along the optical axis [m], 0 where unknown, shape (H, W)."""
     normals_cam: Map | None = None
+    """Outward unit normals, camera axes (OpenCV), zero where unknown, shape (H, W, 3)."""
     features: Map | None = None
+    """Features, shape (h, w, F)."""
 
 
 def map_names(root: Path, kind: str) -> list[str]:
@@ -67,7 +64,7 @@ def _read(root: Path, kind: str, photo: str) -> Map | None:
 
 
 def read_map(path: Path, kind: str) -> Map:
-    """Return one map, float32, as `GeometryMaps` has it.
+    """Read one map as float32, in the convention of `GeometryMaps`.
 
     Raises:
         InputDataError: If it cannot be read, or its shape or type is wrong.

@@ -1,4 +1,4 @@
-"""Photos and label images: read, written, and measured without decoding them."""
+"""Reading and writing of photos and label images, and their size from the headers."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError
+from ...schemas import InputDataError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-"""Suffixes of the images that are read, in lower case."""
+"""Suffixes of readable images, in lower case."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
@@ -24,10 +24,10 @@ _REPLACE = "replace the file, or remove it."
 def read_rgb(path: Path | str) -> NDArray[np.uint8]:
     """Return a photo as RGB, uint8, shape (height, width, 3).
 
-    An EXIF orientation is not applied: pixel (0, 0) is the file's first one, as for COLMAP and for masks.
+    An EXIF orientation is not applied: pixel (0, 0) is the file's first one, as in COLMAP and in masks.
 
     Raises:
-        InputDataError: If it is missing, truncated or no image.
+        InputDataError: If it is missing, truncated or not an image.
     """
     image = _decode(Path(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
@@ -66,7 +66,7 @@ def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -
     """Write RGB (height, width, 3) or labels (height, width), uint8, as PNG or JPEG by the suffix.
 
     Args:
-        path: Where to; labels must be `.png`, since JPEG changes values.
+        path: The file; labels must be `.png`, because JPEG changes values.
         array: The pixels.
         quality: JPEG quality, 0 to 100.
     """
@@ -85,7 +85,7 @@ def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -
 
 
 def write_depth(path: Path | str, depth: NDArray[np.uint16]) -> None:
-    """Write depth (height, width) in whole steps of a unit of one's own as a PNG of 16 bits."""
+    """Write depth (height, width), uint16 in a unit of the caller's choice, as a 16-bit PNG."""
     done, data = cv2.imencode(".png", depth)
     if depth.dtype != np.uint16 or depth.ndim != 2 or not done:
         raise ValueError(f"depth is uint16 (H, W); found {depth.dtype} {depth.shape}")

@@ -1,4 +1,4 @@
-"""The manifest of a capture, `capture.toml`, written."""
+"""Writing of the manifest of a capture, `capture.toml`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import re
 from pathlib import Path
 from typing import Any
 
-from ..schemas import CaptureManifest
-from .atomic import new_file
+from ...schemas import CaptureManifest
+from ..io.atomic import new_file
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def write_manifest(path: Path | str, manifest: CaptureManifest, overwrite: bool = False) -> None:
-    """Write a manifest as TOML; what has its default value is left out, except the world."""
+    """Write a manifest as TOML; default values are omitted, except those of the world."""
     with new_file(path, overwrite) as temporary:
         temporary.write_text(manifest_toml(manifest), encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""The sparse points on disk: `sparse_points.ply`, which viewers open and the stage sg-gs starts from."""
+"""Reading and writing of `sparse_points.ply`, the sparse points from which the stage sg-gs starts."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
-from .model import Array
+
+Array = NDArray[np.float64]
 
 POINTS_NAME = "sparse_points.ply"
 
+
 _VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
+
+
 _PROPERTIES = [f"property double {axis}" for axis in "xyz"] + [
     f"property uchar {name}" for name in ("red", "green", "blue")
 ]
@@ -22,7 +26,7 @@ def write_points(path: Path, points: Array, colors: NDArray[np.uint8], unit: str
     """Write sparse points as binary PLY.
 
     Args:
-        path: The file; not atomic, so give a temporary one.
+        path: The file; it is not written atomically, so pass a temporary one.
         points: Positions, world frame, shape (point, 3).
         colors: sRGB, shape (point, 3).
         unit: "metre" or "arbitrary", for the header.
@@ -35,7 +39,7 @@ def write_points(path: Path, points: Array, colors: NDArray[np.uint8], unit: str
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
-    """Read what :func:`write_points` wrote.
+    """Read the sparse points that :func:`write_points` wrote.
 
     Args:
         path: `sparse_points.ply` of a capture.
@@ -44,7 +48,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
         Positions, world frame, float64 (point, 3), in the unit of `cameras.json`, and sRGB colours, uint8 (point, 3).
 
     Raises:
-        InputDataError: If it is another kind of file, truncated, or holds a point that is not finite.
+        InputDataError: If it is another kind of file, truncated, or contains a point that is not finite.
     """
     data = path.read_bytes()
     header, found, body = data.partition(b"end_header\n")

@@ -1,4 +1,4 @@
-"""Measured poses, `tracks/<episode>.csv`: one row a time and body."""
+"""Reading and writing of measured poses, `tracks/<episode>.csv`: one row per time and body."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import QUATERNION_NORM_TOLERANCE, InputDataError, did_you_mean
-from .atomic import new_file
+from ...schemas import QUATERNION_NORM_TOLERANCE, InputDataError, did_you_mean
+from ..io.atomic import new_file
 
 Array = NDArray[np.float64]
 
@@ -28,21 +28,18 @@ COLUMNS = (*_REQUIRED, *_QUATERNION, *_VELOCITY, *_OMEGA)
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The measured motion of one body in one episode, in the world frame, sorted by time.
-
-    Attributes:
-        time_s: Times [s], shape (T,), strictly increasing.
-        position_m: Position of the body frame's origin [m], world frame, shape (T, 3).
-        quat_wxyz: Orientation (body to world), unit quaternions, shape (T, 4); None for a centroid.
-        velocity_m_s: Velocity of the body frame's origin [m/s], world frame, shape (T, 3), or None.
-        omega_body_rad_s: Angular velocity [rad/s], BODY frame, shape (T, 3), or None.
-    """
+    """The measured motion of one body in one episode, in the world frame, sorted by time."""
 
     time_s: Array
+    """Times [s], shape (T,), strictly increasing."""
     position_m: Array
+    """Position of the body frame's origin [m], world frame, shape (T, 3)."""
     quat_wxyz: Array | None = None
+    """Orientation (body to world), unit quaternions, shape (T, 4); None for a centroid."""
     velocity_m_s: Array | None = None
+    """Velocity of the body frame's origin [m/s], world frame, shape (T, 3), or None."""
     omega_body_rad_s: Array | None = None
+    """Angular velocity [rad/s], BODY frame, shape (T, 3), or None."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -67,8 +64,8 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
         bodies: Names of the capture's bodies.
 
     Returns:
-        The tracks by body, in the order of first appearance, and the number of quaternions that were off the
-        unit norm by more than rounding (1e-6) but within the tolerance (1e-3), and were normalised.
+        The tracks by body, in the order of first appearance, and the number of quaternions that were normalised
+        because their norm differed from 1 by more than rounding (1e-6) but within the tolerance (1e-3).
 
     Raises:
         InputDataError: With line and column, for an unknown column or body, a value that is missing or not
@@ -111,7 +108,7 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
 
 
 def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = False) -> None:
-    """Write one episode's tracks, complete or not at all; numbers survive the round trip exactly."""
+    """Write the tracks of an episode atomically; reading them back gives exactly the same numbers."""
     with new_file(path, overwrite) as temporary:
         temporary.write_text(tracks_csv(tracks), encoding="utf-8")
 
@@ -119,7 +116,7 @@ def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = F
 def tracks_csv(tracks: dict[str, Track]) -> str:
     """Return the text of a track file, sorted by time.
 
-    Columns that no track has are left out; a track that lacks columns another one has leaves them empty.
+    Columns that no track has are omitted; a track that lacks columns of another one leaves them empty.
     """
     groups = {
         name: columns
@@ -170,7 +167,13 @@ def _track(path: Path, body: str, header: list[str], rows: list[tuple[int, list[
     quat_wxyz, normalised = found["quat_wxyz"], 0
     if quat_wxyz is not None:
         quat_wxyz, normalised = _unit(path, body, quat_wxyz, lines)
-    track = Track(time_s, position_m, quat_wxyz, found["velocity_m_s"], found["omega_body_rad_s"])
+    track = Track(
+        time_s=time_s,
+        position_m=position_m,
+        quat_wxyz=quat_wxyz,
+        velocity_m_s=found["velocity_m_s"],
+        omega_body_rad_s=found["omega_body_rad_s"],
+    )
     if len(track) < 2:
         raise InputDataError(
             f"{path}, line {lines[0]}: body '{body}' has 1 sample.", "at least 2.", "add samples, or remove it."

@@ -1,4 +1,4 @@
-"""Cameras from nerfstudio's (and instant-ngp's) `transforms.json`."""
+"""Reading of cameras from nerfstudio's (and instant-ngp's) `transforms.json`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
-from ..schemas.cameras import Matrix4
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
+from ...schemas.cameras import Matrix4
 from .images import IMAGE_SUFFIXES, image_size
 
 _INTRINSICS = (
@@ -35,13 +35,13 @@ _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
     """Read `transforms.json`: intrinsics common or by frame, poses camera to world with OpenGL axes.
 
-    The axes become OpenCV's (y and z turned round). Principal points need no shift: nerfstudio casts the ray of
-    pixel column i at i + 0.5, so it shares the corner origin used here. `applied_transform` is a record of what
-    was done to the world before, and is not undone.
+    The axes are converted to OpenCV's (y and z reversed). Principal points need no shift: nerfstudio casts the ray of
+    pixel column i at i + 0.5, so it shares the corner origin used here. `applied_transform` records an earlier
+    transformation of the world and is not undone.
 
     Args:
         path: The file.
-        metric: Whether its unit is the metre, which it does not say itself.
+        metric: Whether its unit is the metre, which the file does not contain.
 
     Raises:
         InputDataError: For a field that is missing or wrong, or a camera model that is not a pinhole.
@@ -73,12 +73,12 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
 
 
 def opencv_from_opengl(T_world_cam: np.ndarray) -> np.ndarray:
-    """Turn a camera pose with OpenGL axes (y up, z backward) into one with OpenCV axes, shape (4, 4)."""
+    """Convert a camera pose (4, 4) from OpenGL axes (y up, z backward) to OpenCV axes."""
     return np.asarray(T_world_cam, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def matrix4(pose: np.ndarray) -> Matrix4:
-    """Return a 4x4 matrix as it stands in `cameras.json`."""
+    """Return a 4x4 matrix in the format of `cameras.json`."""
     if pose.shape != (4, 4):
         raise ValueError(f"a pose has the shape (4, 4); found {pose.shape}")
     a, b, c, d = ((float(x), float(y), float(z), float(w)) for x, y, z, w in pose)

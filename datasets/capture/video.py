@@ -1,4 +1,4 @@
-"""Videos: a directory of numbered frames, or an mp4 or webm file."""
+"""Reading and writing of videos: a directory of numbered frames, or an mp4 or webm file."""
 
 from __future__ import annotations
 
@@ -14,35 +14,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError
+from ...schemas import InputDataError
 from .images import IMAGE_SUFFIXES, image_size, read_label, read_rgb
 
 VIDEO_SUFFIXES = (".mp4", ".webm")
-"""Suffixes of the video files that are read."""
+"""Suffixes of readable video files."""
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What the headers of a video say.
-
-    Attributes:
-        frames: Number of frames.
-        width: Image width [px].
-        height: Image height [px].
-        frame_rate_hz: Frame rate of the file [Hz]; None for a directory of frames.
-    """
+    """Properties of a video from its headers."""
 
     frames: int
+    """Number of frames."""
     width: int
+    """Image width [px]."""
     height: int
+    """Image height [px]."""
     frame_rate_hz: float | None = None
+    """Frame rate of the file [Hz]; None for a directory of frames."""
 
 
 def frame_files(folder: Path) -> list[Path]:
     """Return the frames of a directory, frame 0 first.
 
     Raises:
-        InputDataError: If a name is no number, or a number is missing: later frames would get wrong times.
+        InputDataError: If a name is not a number, or a number is missing, which would shift the times of later frames.
     """
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
     numbered: dict[int, Path] = {}
@@ -64,11 +61,11 @@ def frame_files(folder: Path) -> list[Path]:
 
 
 def video_info(path: Path, decode: bool = False) -> VideoInfo:
-    """Return the number and size of the frames; of a directory, each frame's header is checked.
+    """Return the number and size of the frames; in a directory, the header of each frame is checked.
 
     Args:
         path: A directory of frames or a video file.
-        decode: Count the frames of a video file by decoding it; otherwise its header is believed.
+        decode: Count the frames of a video file by decoding it instead of reading its header.
 
     Raises:
         InputDataError: If it does not decode, has no frame, or its frames differ in size.
@@ -123,17 +120,17 @@ def _folder_info(folder: Path) -> VideoInfo:
 
 
 def encoded_video(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float) -> bytes:
-    """Return RGB frames, each (height, width, 3) with even sides, as an MP4 file.
+    """Encode RGB frames, each (height, width, 3) with even sides, as an MP4 file.
 
-    The codec is VP9, which browsers play, where this OpenCV has it; otherwise MPEG-4 part 2, which players play.
+    The codec is VP9, which browsers play, if this OpenCV has it; otherwise MPEG-4 part 2, which players play.
     """
     return _encoded(frames, frame_rate_hz, ".mp4", ("vp09", "mp4v"))
 
 
 def encoded_webm(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float) -> bytes:
-    """Return RGB frames, each (height, width, 3) with even sides, as a WebM file, which browsers play.
+    """Encode RGB frames, each (height, width, 3) with even sides, as a WebM file, which browsers play.
 
-    The codec is VP8: this OpenCV writes it five times faster than VP9, at a third more bytes.
+    The codec is VP8, which OpenCV writes five times faster than VP9, with files a third larger.
 
     Raises:
         InputDataError: If this OpenCV writes neither.
@@ -162,7 +159,7 @@ def _encoded(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float, suffix: 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep from the terminal what OpenCV's writer says of its own choice of a codec's tag, past any log level."""
+    """Suppress the message of OpenCV's writer about the tag of a codec, which ignores log levels."""
     sys.stderr.flush()
     saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

@@ -1,1 +1,1 @@
-"""Writers of other people's formats: one module each. No torch at import."""
+"""Writers of the formats of other tools: one module per format. torch is not imported."""

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import new_directory
-from ..cameras import Camera
-from ..colmap_model import rotation_from_quat_wxyz
-from ..images import write_depth, write_image
-from ..loader import RolloutReader
-from ..progress import progress
+from ..capture.cameras import Camera
+from ..capture.colmap_model import rotation_from_quat_wxyz
+from ..capture.images import write_depth, write_image
+from ..io.atomic import new_directory
+from ..io.progress import progress
+from ..rollouts.loader import RolloutReader
 from .bop_coco import CocoScene
 from .bop_models import ObjectModel, write_models
 from .selection import Picture, Selection

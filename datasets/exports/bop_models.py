@@ -16,19 +16,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """A coloured triangle mesh.
-
-    Attributes:
-        vertices: Corners [m], body frame, shape (V, 3).
-        faces: Indices of the corners, anticlockwise seen from outside, shape (F, 3).
-        colors: uint8 RGB of the corners, shape (V, 3).
-        origin: Where the mesh comes from, in words.
-    """
+    """A coloured triangle mesh."""
 
     vertices: Array
+    """Corners [m], body frame, shape (V, 3)."""
     faces: NDArray[np.int64]
+    """Indices of the corners, anticlockwise seen from outside, shape (F, 3)."""
     colors: NDArray[np.uint8]
+    """uint8 RGB of the corners, shape (V, 3)."""
     origin: str
+    """Where the mesh comes from, in words."""
 
     def normals(self) -> Array:
         """Return the corners' unit normals: of the faces around, weighted by area; shape (V, 3)."""

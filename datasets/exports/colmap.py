@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...schemas import CameraIntrinsics, CamerasFile
-from ..atomic import new_directory
-from ..cameras import camera_of
-from ..ply import Splats
+from ..capture.cameras import camera_of
+from ..io.atomic import new_directory
+from ..shapes.ply import Splats
 
 _PINHOLE, _OPENCV, _FULL_OPENCV = 1, 4, 6
 _CAMERA_SENSOR = 0

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import new_file
-from ..models import Model
-from ..ply import SH_C0, Splats
+from ..io.atomic import new_file
+from ..models.model import Model
+from ..shapes.ply import SH_C0, Splats
 
 EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from ...schemas import UsageError
-from ..atomic import new_directory
-from ..progress import progress
-from ..rollouts import CONVENTION
+from ..io.atomic import new_directory
+from ..io.progress import progress
+from ..rollouts.rollouts import CONVENTION
 from . import lerobot_video
 from .lerobot_files import (
     FILES_PER_CHUNK,

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import UsageError
-from ..atomic import new_directory
-from ..cameras import Camera
-from ..images import write_depth, write_image
-from ..models import read_model
-from ..ply import Splats
-from ..progress import progress
-from ..transforms import opencv_from_opengl
+from ..capture.cameras import Camera
+from ..capture.images import write_depth, write_image
+from ..capture.transforms import opencv_from_opengl
+from ..io.atomic import new_directory
+from ..io.progress import progress
+from ..models.model import read_model
+from ..shapes.ply import Splats
 from .selection import Picture, Selection
 from .splat_files import in_world
 

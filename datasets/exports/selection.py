@@ -10,31 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError, UsageError, did_you_mean
-from ..cameras import Camera
-from ..dataset import missing_shards, read_manifest
-from ..loader import RolloutReader
+from ..capture.cameras import Camera
+from ..rollouts.dataset import missing_shards, read_manifest
+from ..rollouts.loader import RolloutReader
 
 READ_FRAMES = 8
 """Frames read at a time: those of a chunk, which is decoded as a whole."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Picture:
-    """One frame of one camera.
-
-    Attributes:
-        frame: Its number in the rollout.
-        image: uint8 RGB, shape (H, W, 3).
-        depth_m: float32 [m] along the optical axis, 0 = no surface, shape (H, W).
-        mask: uint8, visible instance: 0 background, k the k-th body, shape (H, W).
-        amodal: Whole silhouettes, hidden parts included, bool, shape (B, H, W); None where the dataset has none.
-    """
+    """One frame of one camera."""
 
     frame: int
+    """Index of the frame in the rollout."""
     image: NDArray[np.uint8]
+    """Colour image, uint8 RGB, shape (H, W, 3)."""
     depth_m: NDArray[np.float32]
+    """Depth along the optical axis [m], float32, 0 = no surface, shape (H, W)."""
     mask: NDArray[np.uint8]
+    """Visible instances, uint8: 0 background, k the k-th body, shape (H, W)."""
     amodal: NDArray[np.bool_] | None
+    """Amodal masks, bool, shape (B, H, W); None if the dataset has none."""
 
 
 class Selection:
@@ -106,11 +103,11 @@ class Selection:
         there = f"cameras/{name}"
         pose = self.reader.read(number, f"{there}/T_world_cam")
         return Camera(
-            int(self.reader.read(number, f"{there}/width")),
-            int(self.reader.read(number, f"{there}/height")),
-            self.reader.read(number, f"{there}/K"),
-            self.reader.read(number, f"{there}/dist"),
-            pose if pose.ndim == 2 else pose[frame],
+            width=int(self.reader.read(number, f"{there}/width")),
+            height=int(self.reader.read(number, f"{there}/height")),
+            K=self.reader.read(number, f"{there}/K"),
+            distortion=self.reader.read(number, f"{there}/dist"),
+            T_world_cam=pose if pose.ndim == 2 else pose[frame],
         )
 
     def pictures(self, number: int, camera: str, labels: bool = True) -> Iterator[Picture]:
@@ -132,7 +129,13 @@ class Selection:
             for frame in wanted:
                 image, *others = (block[key][frame - start] for key in keys)
                 depth, mask = others or (np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint8))
-                yield Picture(frame, image, depth, mask, None if amodal is None else amodal[frame - start])
+                yield Picture(
+                    frame=frame,
+                    image=image,
+                    depth_m=depth,
+                    mask=mask,
+                    amodal=None if amodal is None else amodal[frame - start],
+                )
 
     def _amodal(self, number: int, camera: str, start: int, stop: int) -> NDArray[np.bool_] | None:
         """Return the whole silhouettes of a chunk, shape (n, B, H, W); bit k of a pixel is body k's."""

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..atomic import new_directory
-from ..colmap_model import rotation_from_quat_wxyz
-from ..models import Model
-from ..ply import Splats, write_splats
+from ..capture.colmap_model import rotation_from_quat_wxyz
+from ..io.atomic import new_directory
+from ..models.model import Model
+from ..shapes.ply import Splats, write_splats
 
 
 def write_splat_files(path: Path, model: Model, sh_degree: int = 0, overwrite: bool = False) -> dict[str, int]:

@@ -1,15 +1,15 @@
-"""Import of balls that fall 35 m (briandesilva/discovery-of-physics-from-data): heights at 15 Hz, two drops a ball.
+"""Import of balls that fall 35 m (briandesilva/discovery-of-physics-from-data): heights at 15 Hz, two drops per ball.
 
-What the files say: the height above the ground by time, weights and circumferences. What is made of it here:
+The files contain the height above the ground by time, weights and circumferences. They are converted as follows:
 
-- The position is (0, 0, height): nothing was measured sideways. A fit sees no motion there, so that an estimate of the
-  noise from all three coordinates comes out too small by the root of 3.
-- Each ball is a group. Pooled, all drops are one body without a mass: what differs between the balls is for parameters
-  of effects that are shared within a group. Its shape is a sphere of their median radius, which touches nothing: there
-  is no ground, since the tracks end about 12 m above it.
-- One ball alone (`only`) has its own mass and radius, where they were measured.
-- The first drop of each ball is the split "train", the second is "test".
-- The measured velocity is a difference of the heights, and left out.
+- The position is (0, 0, height), because nothing was measured sideways. A fit sees no motion there, so an estimate of
+  the noise from all three coordinates is too small by the square root of 3.
+- Each ball is a group. Together, all drops are one body without a mass; differences between the balls are left to
+  effect parameters that are shared within a group. The shape is a sphere of their median radius. It touches nothing:
+  there is no ground, because the tracks end about 12 m above it.
+- A single ball (`only`) has its measured mass and radius.
+- The first drop of each ball is in the split "train", the second in "test".
+- The measured velocity is a difference of the heights and is omitted.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..schemas import Body, InputDataError, Shape, World
-from ..schemas.capture import SphereShape
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
+from ...schemas import Body, InputDataError, Shape, World
+from ...schemas.capture import SphereShape
+from ...schemas.imports import ImportResult
+from ..io.atomic import new_directory
 from .recordings import Recording, Units, write_recordings
 
 BALL = "ball"
@@ -36,16 +36,16 @@ _TODO = "get the data of github.com/briandesilva/discovery-of-physics-from-data.
 def import_balldrops(
     source: Path | str, out: Path | str, only: str | None = None, overwrite: bool = False
 ) -> ImportResult:
-    """Write the drops as a capture of centroid tracks, one episode a drop, one group a ball.
+    """Write the drops as a capture of centroid tracks, with one episode per drop and one group per ball.
 
     Args:
-        source: `ball_drops.csv`, or the directory that holds it and `balls.txt`.
+        source: `ball_drops.csv`, or the directory that contains it and `balls.txt`.
         out: The capture directory to write.
-        only: One ball, by its name in the capture, for example "bowling-ball".
+        only: Name of a single ball in the capture, for example "bowling-ball".
         overwrite: Replace `out`.
 
     Raises:
-        InputDataError: If the source is not such data, or there is no such ball.
+        InputDataError: If the source is not such data, or the ball does not exist.
         UsageError: If `out` exists, before anything is read.
     """
     source = Path(source)
@@ -97,12 +97,12 @@ def _drops(path: Path) -> list[Recording]:
         values = np.array(samples)
         position = np.c_[np.zeros((len(values), 2)), values[:, 1]]
         track = Units("m").track(f"{path}: {name}, drop {number}", values[:, 0], position)
-        recordings.append(Recording(f"{name}-{number}", {BALL: track}, name))
+        recordings.append(Recording(name=f"{name}-{number}", tracks={BALL: track}, group=name))
     return recordings
 
 
 def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
-    """Return mass [kg] and radius [m] by ball; None where it was not measured ("??")."""
+    """Return mass [kg] and radius [m] by ball; None for a value that was not measured ("??")."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
@@ -123,6 +123,6 @@ def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
 
 
 def _key(name: str) -> str:
-    """Return a ball's name as both files have it: they differ in spelling."""
+    """Return a ball's name in a common spelling, because the two files differ."""
     plain = name.lower().replace("-", "").replace("whiffle", "wiffle")
     return plain.removesuffix("ball") if "wiffle" in plain else plain

@@ -8,20 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import (
-    Body,
-    BoxShape,
-    CaptureManifest,
-    Ground,
-    InputDataError,
-    Shape,
-    World,
-)
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
-from .manifest import write_manifest
-from .progress import note, progress
-from .tracks import Track, tracks_csv
+from ...schemas import Body, BoxShape, CaptureManifest, Ground, InputDataError, Shape, World
+from ...schemas.imports import ImportResult
+from ..capture.manifest import write_manifest
+from ..capture.tracks import Track, tracks_csv
+from ..io.atomic import new_directory
+from ..io.progress import note, progress
 
 Array = NDArray[np.float64]
 
@@ -40,10 +32,12 @@ _NPZ_FIELDS = ("offsets", "pos", "quat_wxyz", "vel", "omega_body", "toss_index",
 
 @dataclass(frozen=True)
 class _Tosses:
-    """Tosses in SI units by number, and the cube that was tossed."""
+    """Tosses of a cube, in SI units."""
 
     tracks: dict[int, Track]
+    """Tracks of the cube by number of the toss."""
     half_width_m: float
+    """Half the edge of the cube [m]."""
 
 
 def import_contactnets(
@@ -54,14 +48,14 @@ def import_contactnets(
     seed: int = 0,
     overwrite: bool = False,
 ) -> ImportResult:
-    """Write the tosses as a capture with tracks, one episode a toss, named by its number.
+    """Write the tosses as a capture with tracks, one episode per toss, named by its number.
 
     The tosses, sorted by number, are permuted with `numpy.random.default_rng(seed)`; the first `n_train` are the
-    split "train", the next `n_test` are "test". Where there are fewer than both together, the first third is
-    "train" and the rest is "test".
+    split "train", the next `n_test` are "test". If there are fewer than both together, the first third is "train" and
+    the rest is "test".
 
     Args:
-        source: A directory of <number>.pt files, or the .npz, or a directory that holds one of the two.
+        source: A directory of <number>.pt files, or the .npz, or a directory that contains one of the two.
         out: The capture directory to write.
         n_train: Number of tosses to fit on.
         n_test: Number of tosses to test on.
@@ -178,10 +172,14 @@ def _read_npz(path: Path) -> _Tosses:
 
 
 def _track(where: str, rows: Array, rate_hz: float) -> Track:
-    """Make a track of rows in SI units: position, quaternion, velocity, angular velocity, ..., shape (T, >= 13)."""
+    """Return the track of rows (T, >= 13) in SI units: position, quaternion, velocity, angular velocity, ..."""
     rows = np.asarray(rows, np.float64)
     if len(rows) < 2 or not np.isfinite(rows).all():
         raise InputDataError(f"{where}: {len(rows)} samples, {np.count_nonzero(~np.isfinite(rows))} values not finite.")
     return Track(
-        np.arange(len(rows)) / rate_hz, rows[:, _POSITION], rows[:, _QUATERNION], rows[:, _VELOCITY], rows[:, _OMEGA]
+        time_s=np.arange(len(rows)) / rate_hz,
+        position_m=rows[:, _POSITION],
+        quat_wxyz=rows[:, _QUATERNION],
+        velocity_m_s=rows[:, _VELOCITY],
+        omega_body_rad_s=rows[:, _OMEGA],
     )

@@ -1,4 +1,4 @@
-"""Import of plain CSV tracks: a file, or a folder with one file an episode, columns by their names."""
+"""Import of plain CSV tracks: a file, or a folder with one file per episode, with columns found by name."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError, did_you_mean
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
+from ...schemas import InputDataError, did_you_mean
+from ...schemas.imports import ImportResult
+from ..capture.tracks import Track
+from ..io.atomic import new_directory
 from .recordings import SI, Units, read_text, track_files, write_tracks
-from .tracks import Track
 
 Array = NDArray[np.float64]
 
 COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz")
-"""What a column may be; `body`, and the four of the orientation, may be absent."""
+"""Quantities that a column may contain; `body` and the four of the orientation are optional."""
 _REQUIRED = ("time", "px", "py", "pz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _NAMES = {
@@ -46,26 +46,26 @@ def import_csv(
     seed: int = 0,
     overwrite: bool = False,
 ) -> ImportResult:
-    """Write CSV tracks as a capture. Shape, mass and ground are for you to add to its manifest.
+    """Write CSV tracks as a capture; the user adds shape, mass and ground to its manifest.
 
-    The first line names the columns; commas, semicolons or tabs separate them. Names are known in several spellings
-    (time, t, timestamp; px, x, tx, pos_x; qw, quat_w, ...), and may end in their unit: `x_mm`, `Time (ms)`.
+    The first line names the columns, separated by commas, semicolons or tabs. Several spellings are recognised
+    (time, t, timestamp; px, x, tx, pos_x; qw, quat_w, ...), and names may end in their unit: `x_mm`, `Time (ms)`.
     Lines without a position are gaps. Each file's times begin at zero.
 
     Args:
         source: A file, or a folder of .csv files, each an episode.
         out: The capture directory to write.
-        columns: From one of `COLUMNS` to the column's name in the file, where it has another.
-        units: Of the numbers, where the columns do not say it.
-        body: Name of the body, where there is no column for it.
-        up: Which axis points up; gravity is set against it, numbers stay.
+        columns: Name in the file of any of `COLUMNS` that is not recognised.
+        units: Units of the numbers, if the column names do not contain them.
+        body: Name of the body, if there is no column for it.
+        up: Axis that points up; gravity is set opposite to it, and the coordinates are kept.
         n_train: Number of episodes to fit on; None: 60 %.
         n_test: Number of episodes to test on; None: the others.
-        seed: Of the permutation.
+        seed: Seed of the permutation.
         overwrite: Replace `out`.
 
     Raises:
-        InputDataError: If a file is no such track, or its numbers cannot be seconds and metres.
+        InputDataError: If a file is not such a track, or its numbers cannot be seconds and metres.
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, overwrite) as directory:
@@ -82,10 +82,12 @@ def import_csv(
 
 @dataclass(frozen=True)
 class _Header:
-    """Where the columns of a file are, and the units that their names tell."""
+    """The header of a file."""
 
     index: dict[str, int]
+    """Index of each column by the quantity in it."""
     units: Units
+    """Units from the column names."""
 
 
 def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> dict[str, Track]:
@@ -139,7 +141,7 @@ def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Uni
 
 
 def _place(path: Path, names: list[str], key: str, columns: Mapping[str, str]) -> int | None:
-    """Return the column that is `key`, or None."""
+    """Return the index of the column with the quantity `key`, or None."""
     if key in columns:
         if columns[key] not in names:
             raise InputDataError(
@@ -157,7 +159,7 @@ def _place(path: Path, names: list[str], key: str, columns: Mapping[str, str]) -
 
 
 def _plain(name: str) -> tuple[str, str]:
-    """Return a column's name in small letters without its unit, and the unit or an empty string."""
+    """Return a column's name in lower case without its unit, and the unit or an empty string."""
     name = name.strip().lower()
     found = _UNIT.match(name)
     return (found[1].strip(" _").replace(" ", "_"), found[2]) if found else (name.replace(" ", "_"), "")

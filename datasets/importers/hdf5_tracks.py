@@ -1,4 +1,4 @@
-"""Import of poses from HDF5: every group with times and positions is an episode."""
+"""Import of poses from HDF5, where every group with times and positions is an episode."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError, did_you_mean
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
+from ...schemas import InputDataError, did_you_mean
+from ...schemas.imports import ImportResult
+from ..capture.tracks import Track
+from ..io.atomic import new_directory
 from .recordings import SI, Units, track_files, write_tracks
-from .tracks import Track
 
 Array = NDArray[np.float64]
 
 SETS = ("time", "position", "quat_wxyz", "quat_xyzw")
-"""What a set may be; at most one of the two orientations."""
+"""Quantities that a dataset may contain; at most one of the two orientations."""
 _NAMES = {
     "time": ("time", "time_s", "t", "timestamp", "timestamps"),
     "position": ("position", "position_m", "positions", "pos", "translation", "p"),
@@ -41,21 +41,21 @@ def import_hdf5(
     seed: int = 0,
     overwrite: bool = False,
 ) -> ImportResult:
-    """Write poses as a capture. Shape, mass and ground are for you to add to its manifest.
+    """Write poses as a capture; the user adds shape, mass and ground to its manifest.
 
-    An episode is a group that holds a set of times (T,) and one of positions (T, 3), and may hold one of quaternions
-    (T, 4), whose order its name must tell. Each episode's times begin at zero.
+    An episode is a group with a dataset of times (T,), one of positions (T, 3), and optionally one of quaternions
+    (T, 4), whose name must contain their order. Each episode's times begin at zero.
 
     Args:
         source: A file, or a folder of .h5 and .hdf5 files.
         out: The capture directory to write.
-        columns: From one of `SETS` to the set's name in a group (or its path, such as `obs/pos`), where it has another.
-        units: Where the numbers are others than metres and seconds.
+        columns: Name in a group (or path, such as `obs/pos`) of any of `SETS` that has another name.
+        units: Units of the numbers, if other than metres and seconds.
         body: Name of the body.
-        up: Which axis points up; gravity is set against it, numbers stay.
+        up: Axis that points up; gravity is set opposite to it, and the coordinates are kept.
         n_train: Number of episodes to fit on; None: 60 %.
         n_test: Number of episodes to test on; None: the others.
-        seed: Of the permutation.
+        seed: Seed of the permutation.
         overwrite: Replace `out`.
 
     Raises:

@@ -1,14 +1,14 @@
 """Import of the throws of Jugglebot (Project-DeepBlue-Juggling/Jugglebot): a machine throws a ball, 300 Hz, centroids.
 
 A session is an export of the capture system (.json, millimetres) or an .npz of it (metres). In each track the machine
-holds the ball, throws it, it flies, hits the floor once and rolls off. Here
+holds and throws the ball, which flies, hits the floor once and rolls away. It is converted as follows:
 
-- an episode begins where the ball has left the machine, which is its time zero, and ends (`end_s`) before it hits the
-  floor; what comes after stays in the track, and moving `end_s` takes it in;
-- both are found in the data: the part around the top of the flight that accelerates like a thrown ball is fitted by a
-  quartic in time, and grown to where the measurement leaves it;
-- there is no ground: the floor is at another height in each session, and what is known of it is where the ball turned;
-- sessions are groups, and each is split by itself.
+- An episode begins when the ball has left the machine, which is its time zero, and ends (`end_s`) before the ball hits
+  the floor. The later samples stay in the track; increase `end_s` to include them.
+- Both times are found in the data: the part around the top of the flight with the acceleration of a thrown ball is
+  fitted by a quartic in time and extended until the measurement deviates from it.
+- There is no ground, because the height of the floor differs between sessions and is known only from the bounces.
+- Sessions are groups, and each is split separately.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import Body, InputDataError, Shape, World
-from ..schemas.capture import SphereShape
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
+from ...schemas import Body, InputDataError, Shape, World
+from ...schemas.capture import SphereShape
+from ...schemas.imports import ImportResult
+from ..capture.tracks import Track
+from ..io.atomic import new_directory
 from .recordings import Recording, drawn_splits, episode_names, write_recordings
-from .tracks import Track
 
 Array = NDArray[np.float64]
 
@@ -35,9 +35,9 @@ RADIUS_M = 0.035
 GRAVITY_M_S2 = 9.81
 
 _HALF_WINDOW_S, _TOLERANCE_M_S2 = 0.05, 2.0
-"""A quadratic over this much to both sides tells flight from everything else, by its acceleration."""
+"""Half width of the window of a quadratic fit whose acceleration distinguishes flight from other motion."""
 _LEAVES_M, _MARGIN = 0.0015, 5
-"""Flight ends where the measurement leaves the fit by so much (noise is 0.4 mm), less some samples."""
+"""Deviation of the measurement from the fit that ends flight (the noise is 0.4 mm), and samples removed before it."""
 _SHORTEST_S = 0.3
 _TODO = "get the recordings of github.com/Project-DeepBlue-Juggling/Jugglebot."
 
@@ -51,15 +51,15 @@ def import_jugglebot(
     seed: int = 0,
     overwrite: bool = False,
 ) -> ImportResult:
-    """Write the throws as a capture of centroid tracks, one episode a throw, one group a session.
+    """Write the throws as a capture of centroid tracks, with one episode per throw and one group per session.
 
     Args:
-        source: A session's .json or .npz, or a directory of them; of two with one name the .npz is read.
+        source: A session's .json or .npz, or a directory of them; if both exist, the .npz is read.
         out: The capture directory to write.
         only: The name of one session.
         n_train: Number of throws to fit on; None: 60 %.
         n_test: Number of throws to test on; None: the others.
-        seed: Of the permutation within each session.
+        seed: Seed of the permutation within each session.
         overwrite: Replace `out`.
 
     Raises:
@@ -87,7 +87,7 @@ def flight(time: Array, position: Array) -> tuple[int, int]:
         position: Positions [m], z up, shape (T, 3).
 
     Raises:
-        ValueError: If nothing there flies for 0.3 s.
+        ValueError: If the flight around the highest point takes less than 0.3 s.
     """
 
     def flies(k: int) -> bool:
@@ -130,7 +130,7 @@ def _throw(where: str, name: str, session: str, time: Array, position: Array) ->
     except ValueError as error:
         raise InputDataError(f"{where}: {error}.", "a ball that is thrown and falls, z up.", _TODO) from None
     track = Track(time[first:] - time[first], position[first:])
-    return Recording(name, {BALL: track}, session, end_s=round(float(time[last] - time[first]), 6))
+    return Recording(name=name, tracks={BALL: track}, group=session, end_s=round(float(time[last] - time[first]), 6))
 
 
 def _sessions(source: Path, only: str | None) -> list[Path]:
@@ -164,7 +164,7 @@ def _read_npz(path: Path) -> list[tuple[Array, Array]]:
 
 
 def _read_json(path: Path) -> list[tuple[Array, Array]]:
-    """Return the same of an export: parts of consecutive frames, positions in millimetres."""
+    """Return times [s] and positions [m] of the throws in an export, whose positions are in millimetres."""
     try:
         data: Any = json.loads(path.read_text(encoding="utf-8-sig"))
         rate = float(data["Timebase"]["Frequency"])

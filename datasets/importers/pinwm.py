@@ -1,14 +1,15 @@
-"""Import of the simulated pushes of PIN-WM (daihangpku/pin-wm): one camera, masks, poses, and a pusher that is told.
+"""Import of the simulated pushes of PIN-WM (daihangpku/pin-wm): one camera, masks, poses, and a commanded pusher.
 
-What the files say: the poses of the block at 24 Hz, camera and masks of each frame, meshes, the mass, and where the
-pusher starts and is sent to in the plane. What they do not say, and is assumed here:
+The files contain the poses of the block at 24 Hz, camera and masks of each frame, meshes, the mass, and start and goal
+of the pusher in the plane. The following is assumed, because the files do not contain it:
 
-- The pusher moves as in the dataset's own `scripts/run.py`: from each frame to the next at `GAIN_HZ` times its distance
-  from the goal, at the height `PUSHER_HEIGHT_M`, without turning. It is in no picture.
-- The simulator (Bullet) keeps `MARGIN_M` of air around every convex part. Two bodies touch at twice that distance; here
-  the ground lies, and the pusher's sides reach, so much further, for the block's own shape is also what is seen.
-- The pusher is the convex hull of its parts: its sides are nearly flat, and what is hollow in it touches nothing.
-- The inertia in the block's URDF (1 kg m2) is a placeholder; it is left out, and comes from the shape.
+- The pusher moves as in the dataset's `scripts/run.py`: from each frame to the next at `GAIN_HZ` times its distance
+  from the goal, at the height `PUSHER_HEIGHT_M`, without rotation. It is in no picture.
+- The simulator (Bullet) keeps a margin of `MARGIN_M` around every convex part, so two bodies touch at twice that
+  distance. Here the ground and the pusher's sides are moved by that distance, because the block's shape is also used
+  for its appearance.
+- The pusher is the convex hull of its parts: its sides are nearly flat, and its hollows touch nothing.
+- The inertia in the block's URDF (1 kg m2) is a placeholder; it is omitted and computed from the shape.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..schemas import (
+from ...schemas import (
     Body,
     CamerasFile,
     CaptureManifest,
@@ -35,16 +36,16 @@ from ..schemas import (
     World,
     read_json,
 )
-from ..schemas.base import FileModel
-from ..schemas.capture import FileShape, Video
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
-from .cameras import Camera, to_intrinsics
-from .images import image_size, read_alpha, read_rgb, write_image
-from .manifest import write_manifest
-from .meshes import Mesh, read_mesh
-from .progress import progress
-from .tracks import Track, tracks_csv
+from ...schemas.base import FileModel
+from ...schemas.capture import FileShape, Video
+from ...schemas.imports import ImportResult
+from ..capture.cameras import Camera, to_intrinsics
+from ..capture.images import image_size, read_alpha, read_rgb, write_image
+from ..capture.manifest import write_manifest
+from ..capture.tracks import Track, tracks_csv
+from ..io.atomic import new_directory
+from ..io.progress import progress
+from ..shapes.meshes import Mesh, read_mesh
 
 Array = NDArray[np.float64]
 Row = tuple[float, float, float, float]
@@ -55,14 +56,14 @@ PUSHER_HEIGHT_M = 0.05
 MARGIN_M = 0.001
 BLOCK, PUSHER, CAMERA = "block", "pusher", "cam"
 FIRST = "-first"
-"""Ending of the name of the episode that holds the first frames of a push alone."""
+"""Suffix of the name of the episode that contains only the first frames of a push."""
 _BLOCK_URDF = "envs/asset/cube_t/cube_t_mesh.urdf"
 _PUSHER_URDF = "envs/asset/ee/ee.urdf"
 _TODO = "get dataset/ and envs/ of github.com/daihangpku/pin-wm."
 
 
 class _Frame(FileModel, extra="ignore"):
-    """A picture of a push: where it lies, and from where it was taken (OpenGL's camera axes)."""
+    """A picture of a push: its file and its camera pose (OpenGL axes)."""
 
     file_path: str
     c2w: tuple[Row, Row, Row]
@@ -76,21 +77,25 @@ class _Push(FileModel, extra="ignore"):
     ee_goal_position: tuple[float, float]
     image_datas: tuple[_Frame, ...]
     pose_datas: Annotated[tuple[tuple[float, float, float, float, float, float, float], ...], Field(min_length=2)]
-    """Position [m] and quaternion (x, y, z, w) of the block, one a frame."""
+    """Position [m] and quaternion (x, y, z, w) of the block in each frame."""
 
 
 @dataclass(frozen=True)
 class _Recording:
-    """A push: its name, what its file says, and its frames with masks by number; none where there are no pictures."""
+    """A push and its pictures."""
 
     name: str
+    """Name of the push."""
     push: _Push
+    """Content of its file."""
     folder: Path
+    """Folder of its file and pictures."""
     frames: tuple[_Frame, ...]
+    """Frames with masks, by number; empty without pictures."""
 
     @property
     def tracks(self) -> dict[str, Track]:
-        """The block's poses, and the pusher's as it is told to move."""
+        """Measured poses of the block and commanded ones of the pusher."""
         poses = np.array(self.push.pose_datas)
         times = np.arange(len(poses)) / RATE_HZ
         block = Track(times, poses[:, :3], poses[:, [6, 3, 4, 5]])
@@ -100,11 +105,11 @@ class _Recording:
 def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwrite: bool = False) -> ImportResult:
     """Write the pushes as a capture: block, pusher, camera, frames, masks and tracks.
 
-    Every push is an episode of the split "test", with its track; one whose pictures are there has them as well, and
-    its first frames make another episode, `<push>-first`, of the split "train".
+    Every push is an episode of the split "test" with its track. A push with pictures has them as well, and its first
+    frames make another episode, `<push>-first`, of the split "train".
 
     Args:
-        source: The directory that holds `dataset/` and `envs/`.
+        source: The directory that contains `dataset/` and `envs/`.
         out: The capture directory to write.
         n_train: Number of frames in each episode of "train".
         overwrite: Replace `out`.
@@ -150,11 +155,11 @@ def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwri
 
 
 def pusher_track(start_m: tuple[float, float], goal_m: tuple[float, float], count: int) -> Track:
-    """Return where the pusher is at the frames: each takes the same share of the way that is left.
+    """Return the track of the pusher, which covers the same share of the remaining distance in each frame.
 
     Args:
-        start_m: Where it begins, x and y [m].
-        goal_m: Where it is sent to.
+        start_m: Start, x and y [m].
+        goal_m: Goal, x and y [m].
         count: Number of frames.
     """
     left = (1 - GAIN_HZ / RATE_HZ) ** np.arange(count)[:, None]
@@ -179,7 +184,7 @@ def hull(mesh: Mesh) -> Mesh:
 
 
 def widened(mesh: Mesh, by_m: float) -> Mesh:
-    """Return a mesh stretched about the middle of its box, so that its sides lie further out in x and y by `by_m`."""
+    """Stretch a mesh about the middle of its bounding box so that its sides move outwards by `by_m` in x and y."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     factor = np.array([(half[0] + by_m) / half[0], (half[1] + by_m) / half[1], 1.0])
@@ -234,7 +239,7 @@ def _number(file: Path, frame: _Frame) -> int:
 
 
 def _link(urdf: Path) -> tuple[Mesh, float, tuple[float, float, float]]:
-    """Return the mesh that collides, the mass [kg] and the centre of mass [m] of the first link that has a mesh."""
+    """Return the collision mesh, the mass [kg] and the centre of mass [m] of the first link with a mesh."""
     try:
         root = ElementTree.parse(urdf).getroot()
     except (OSError, ElementTree.ParseError) as error:
@@ -260,7 +265,7 @@ def _cameras(filmed: list[_Recording]) -> CamerasFile:
     width, height = image_size(filmed[0].folder / first.file_path)
     pose = np.eye(4)
     pose[:3] = np.array(first.c2w) * [1.0, -1.0, -1.0, 1.0]  # OpenGL's y and z point the other way
-    camera = Camera(width, height, np.array(first.intrinsic), np.zeros(0), pose)
+    camera = Camera(width=width, height=height, K=np.array(first.intrinsic), distortion=np.zeros(0), T_world_cam=pose)
     rows = [tuple(float(value) for value in row) for row in pose]
     return CamerasFile(
         scale=Scale(kind="metric", source="simulated"),

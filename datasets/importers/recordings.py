@@ -1,4 +1,4 @@
-"""What importers of tracks share: recordings on the way to a capture, their units, and how they are split."""
+"""Common parts of the importers of tracks: recordings, their units, their split and the capture that is written."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import QUATERNION_NORM_TOLERANCE, Body, CaptureManifest, InputDataError, World
-from ..schemas.capture import Episode
-from ..schemas.imports import ImportResult
-from .manifest import write_manifest
-from .progress import note, progress
-from .tracks import Track, tracks_csv
+from ...schemas import QUATERNION_NORM_TOLERANCE, Body, CaptureManifest, InputDataError, World
+from ...schemas.capture import Episode
+from ...schemas.imports import ImportResult
+from ..capture.manifest import write_manifest
+from ..capture.tracks import Track, tracks_csv
+from ..io.progress import note, progress
 
 Array = NDArray[np.float64]
 LengthUnit = Literal["m", "cm", "mm", "in"]
@@ -26,48 +26,48 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 _LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
-"""Beyond these, numbers without a stated unit are not believed to be seconds and metres."""
+"""Largest time step and largest extent of a path for which numbers without a unit count as seconds and metres."""
 _TRAIN_SHARE = 0.6
+"""Default share of the episodes in the split "train"."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """One episode on its way to a capture: its tracks by body, and what the manifest says of it.
-
-    Attributes:
-        name: Of the episode.
-        tracks: By body.
-        group: The session that it belongs to.
-        start_s: Ignore what was measured before [s].
-        end_s: Ignore what was measured after [s].
-    """
+    """One imported episode, before it is written to a capture."""
 
     name: str
+    """Name of the episode."""
     tracks: dict[str, Track]
+    """Tracks by body."""
     group: str | None = None
+    """Session that it belongs to."""
     start_s: float | None = None
+    """Time before which samples are ignored [s]."""
     end_s: float | None = None
+    """Time after which samples are ignored [s]."""
 
     @property
     def entry(self) -> Episode:
-        """What the manifest says of the episode."""
+        """Entry of the episode in the manifest."""
         return Episode(group=self.group, start_s=self.start_s, end_s=self.end_s)
 
 
 @dataclass(frozen=True)
 class Units:
-    """The units of recorded numbers; None: metres and seconds, unless that cannot be.
+    """The units of recorded numbers; None: metres and seconds, unless the numbers rule that out.
 
-    Quaternions are brought to unit length where their norm is off by no more than the tolerance.
+    Quaternions are normalised if their norm differs from 1 by no more than the tolerance.
     """
 
     length: LengthUnit | None = None
+    """Unit of positions."""
     time: TimeUnit | None = None
+    """Unit of times."""
 
     def track(self, where: str, time: Array, position: Array, quat_wxyz: Array | None = None) -> Track:
-        """Return a track in metres and seconds, its times as they are (in seconds).
+        """Return a track in metres and seconds, without a shift of its times.
 
-        Samples without a position (not finite) are left out, as gaps are allowed.
+        Samples without a finite position are omitted, as gaps are allowed.
 
         Args:
             where: What the numbers come from, for messages.
@@ -177,7 +177,7 @@ def write_tracks(
     up: Literal["z", "y"],
     splits: tuple[int | None, int | None, int],
 ) -> ImportResult:
-    """Write tracks of one's own as a capture, each an episode that begins at zero, with splits that are drawn.
+    """Write custom tracks as a capture, each an episode that begins at zero, with splits that are drawn.
 
     Args:
         directory: To write into.
@@ -187,7 +187,9 @@ def write_tracks(
         up: Which axis points up.
         splits: Episodes to fit on, to test on, and the seed of the permutation: see `drawn_splits`.
     """
-    recordings = [Recording(name, from_zero(own)) for name, own in zip(episode_names(stems), tracks, strict=True)]
+    recordings = [
+        Recording(name=name, tracks=from_zero(own)) for name, own in zip(episode_names(stems), tracks, strict=True)
+    ]
     bodies = dict.fromkeys(name for recording in recordings for name in recording.tracks)
     drawn = drawn_splits(recordings, *splits)
     return write_recordings(directory, out, upright(up), (Body(name=name) for name in bodies), recordings, drawn)

@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..schemas import InputDataError, UsageError, did_you_mean
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
-from .progress import note
+from ...schemas import InputDataError, UsageError, did_you_mean
+from ...schemas.imports import ImportResult
+from ..capture.tracks import Track
+from ..io.atomic import new_directory
+from ..io.progress import note
 from .recordings import Units, write_tracks
-from .tracks import Track
 
 POSES = {
     "geometry_msgs/msg/PoseStamped": "pose",

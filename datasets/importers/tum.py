@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..schemas import InputDataError
-from ..schemas.imports import ImportResult
-from .atomic import new_directory
+from ...schemas import InputDataError
+from ...schemas.imports import ImportResult
+from ..capture.tracks import Track
+from ..io.atomic import new_directory
 from .recordings import SI, Units, read_text, track_files, write_tracks
-from .tracks import Track
 
 
 def import_tum(

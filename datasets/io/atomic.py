@@ -1,7 +1,7 @@
 """Directories and files that appear under their final name only when they are complete.
 
-What is being written stands beside its final place under `.<name>.partial-<pid>-<host>-<random>`. A process that
-is killed leaves that name behind and nothing else; the next one that writes the same output removes it.
+Unfinished output has the name `.<name>.partial-<pid>-<host>-<random>` in the same folder. A killed process leaves only
+that behind, and the next process that writes the same output removes it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..schemas import UsageError
+from ...schemas import UsageError
 
 _PARTIAL = "partial"
 _REPLACED = "replaced"
@@ -27,12 +27,12 @@ def new_directory(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """Yield an empty directory that takes the name `path` when the block ends without an exception.
 
     Args:
-        path: Final place; parent directories are made.
-        overwrite: Replace what is there. The old one disappears only after the new one is complete.
+        path: Final path; parent directories are made.
+        overwrite: Replace an existing directory. It disappears only after the new one is complete.
 
     Raises:
-        UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or if it is no
-            directory that one would want to lose (home, the working directory or one above it, a git work tree).
+        UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or if replacing it would
+            remove a protected directory (home, the working directory or one above it, a git work tree).
     """
     path = Path(path)
     _clean_stale(path)
@@ -52,7 +52,7 @@ def new_directory(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """Yield the path of a file to write, which takes the name `path` when the block ends without an exception.
 
-    The temporary name ends with the suffix of `path`, so that writers which look at it choose the same format.
+    The temporary name ends with the suffix of `path`, for writers that choose their format by it.
 
     Raises:
         UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or is a directory.
@@ -77,9 +77,9 @@ def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def scratch_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a file to write beside `path`, which is removed at the end unless it was moved meanwhile.
+    """Yield the path of a temporary file next to `path`, which is removed at the end unless it was moved before.
 
-    For what becomes complete in more than one step: :func:`move_into_place` gives it its name.
+    For output that takes several steps to complete: :func:`move_into_place` gives the file its final name.
     """
     _clean_stale(path)
     temporary = _temporary(path, path.suffix)
@@ -90,7 +90,7 @@ def scratch_file(path: Path) -> Iterator[Path]:
 
 
 def move_into_place(temporary: Path, path: Path) -> None:
-    """Give a complete file its name; what stood there is replaced in the same instant."""
+    """Give a complete file its final name, replacing an existing file atomically."""
     _sync(temporary)
     os.replace(temporary, path)
     _sync(path.parent)
@@ -99,7 +99,7 @@ def move_into_place(temporary: Path, path: Path) -> None:
 def leftovers(folder: Path, names: re.Pattern[str]) -> tuple[list[Path], list[Path]]:
     """Find unfinished outputs in a folder whose names match: those of dead processes, and those that may be alive.
 
-    Only the processes of this machine are known: what another one of a cluster left may be in use.
+    Only the processes of this machine are known; output of other machines of a cluster may be in use.
     """
     dead: list[Path] = []
     unknown: list[Path] = []
@@ -111,7 +111,7 @@ def leftovers(folder: Path, names: re.Pattern[str]) -> tuple[list[Path], list[Pa
 
 
 def sha256(path: Path | str) -> str:
-    """Return the SHA-256 (hex) of a file; of a directory, that of its files' sorted relative names and hashes."""
+    """Return the SHA-256 (hex) of a file, or of the sorted relative names and hashes of the files in a directory."""
     path = Path(path)
     digest = hashlib.sha256()
     if path.is_dir():
@@ -152,7 +152,7 @@ def _sibling(path: Path, kind: str, suffix: str = "") -> Path:
 
 
 def _host() -> str:
-    """Return where process numbers mean the same: the machine, and the container where it counts its own."""
+    """Return the scope in which process numbers are unique: the machine, and the container if it has its own."""
     try:
         counted = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -161,7 +161,7 @@ def _host() -> str:
 
 
 def _clean_stale(path: Path) -> None:
-    """Remove what dead processes of this machine left of `path`; put back an old one that lost its name."""
+    """Remove unfinished outputs of dead processes of this machine for `path`, and restore a displaced old output."""
     name = path.name or path.resolve().name
     pattern = re.compile(rf"\.{re.escape(name)}\.({_PARTIAL}|{_REPLACED})-(\d+)-(?:([0-9a-f]{{8}})-)?[^-]*")
     for entry in sorted(path.parent.glob(f".{_glob_escape(name)}.*-*")):

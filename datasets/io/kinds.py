@@ -1,11 +1,11 @@
-"""What a directory is: a capture, a model or a dataset."""
+"""Detection of the kind of a directory: capture, model or dataset."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Literal
 
-from ..schemas import CAPTURE_FORMAT, InputDataError
+from ...schemas import CAPTURE_FORMAT, InputDataError
 
 Kind = Literal["capture", "model", "dataset"]
 
@@ -18,7 +18,7 @@ _USED_BY: dict[Kind, str] = {
 
 
 def kind_of(path: Path | str) -> Kind | None:
-    """Return what a directory is by the files in it, or None if it is none of the three."""
+    """Return the kind of a directory from the files in it, or None if it is none of the three."""
     path = Path(path)
     return next((kind for kind, mark in _MARKS.items() if path.is_dir() and any(path.glob(mark))), None)
 

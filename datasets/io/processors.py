@@ -1,4 +1,4 @@
-"""How many processors there are to work with."""
+"""Number of available processors."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import os
 
 
 def processors() -> int:
-    """Return how many processors this process may use: fewer than the machine has, where a batch system says so."""
+    """Return the number of processors that this process may use, which a batch system may limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Progress bars on stderr, silent where nobody watches."""
+"""Progress bars on stderr, only if it is a terminal."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def progress(
 ) -> tqdm:
     """Iterate with a tqdm bar on stderr; no bar if stderr is no terminal or a dumb one, or CGWM_QUIET is set.
 
-    `initial` is where the bar begins, of work that was taken up again. The bar's `set_postfix_str` takes a physical
-    number to show beside the rate ("rms 1.8 mm"). Without an iterable, call `update(n)` on what is returned.
+    `initial` is the start of the bar for resumed work. The bar's `set_postfix_str` shows a physical quantity after the
+    rate ("rms 1.8 mm"). Without an iterable, call `update(n)` on the returned bar.
     """
     return tqdm(
         iterable,
@@ -30,7 +30,7 @@ def progress(
 
 
 def note(text: str) -> None:
-    """Write a line on stderr, above the bars that are running; under the same condition as a bar."""
+    """Write a line on stderr above the running bars, under the same condition as a bar."""
     if _watched():
         tqdm.write(text, file=sys.stderr)
 

@@ -1,4 +1,4 @@
-"""Room on the disk, for what appears complete or not at all."""
+"""Errors of a full disk while output is written."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..schemas import NotEnoughSpaceError
+from ...schemas import NotEnoughSpaceError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
 def enough_room(place: Path, what: str) -> Iterator[None]:
-    """Turn a full disk, quota or size limit into the error that says what was being made.
+    """Convert the error of a full disk, quota or size limit to one that names the output.
 
     Args:
         place: The output.
-        what: What is written of it.
+        what: The part of it that is written.
 
     Raises:
-        NotEnoughSpaceError: If there was no room. The block has removed what was unfinished by then.
+        NotEnoughSpaceError: If the disk is full; the block has removed unfinished output by then.
     """
     try:
         yield

@@ -1,7 +1,7 @@
-"""A fitted model as MJCF, so that MuJoCo (and robomimic's attribute `model_file`) can simulate it.
+"""Conversion of a fitted model to MJCF, for simulation in MuJoCo (and robomimic's attribute `model_file`).
 
-The mapping is approximate by nature: MuJoCo's contacts are soft in another way than ours. `solref = (tau / zeta, zeta)`
-gives the same restitution and contact time; the rest depth is MuJoCo's own.
+The conversion is approximate, because MuJoCo's soft contacts follow another law. `solref = (tau / zeta, zeta)` gives
+the same restitution and contact time; the penetration at rest differs.
 """
 
 from __future__ import annotations
@@ -12,33 +12,30 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ..schemas import BodyModel, ContactParameters, ModelFile
-from .cameras import Camera
-from .models import Model
+from ...schemas import BodyModel, ContactParameters, ModelFile
+from ..capture.cameras import Camera
+from .model import Model
 
 MIN_DAMPING_RATIO = 1e-3
-"""MuJoCo's solref has the damping ratio in a quotient; smaller ones are written as this."""
+"""Minimum damping ratio that is written, because MuJoCo's solref divides by it."""
 IMPEDANCE = 0.99
-"""solimp's d: rest depth in MuJoCo is (1 - d) g tau^2 / number of contacts."""
+"""d of solimp; the penetration at rest in MuJoCo is (1 - d) g tau^2 / number of contacts."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Keyframe:
-    """Poses and velocities of all bodies, to be written as a `key`. B bodies.
-
-    Attributes:
-        name: Its name.
-        position_m: Body frame origins [m], world, shape (B, 3).
-        quat_wxyz: T_world_body, shape (B, 4).
-        velocity_m_s: Of the origins, world axes, shape (B, 3).
-        omega_body_rad_s: Body axes, shape (B, 3).
-    """
+    """Poses and velocities of all B bodies, to be written as a `key`."""
 
     name: str
+    """Name of the keyframe."""
     position_m: np.ndarray
+    """Body frame origins [m], world frame, shape (B, 3)."""
     quat_wxyz: np.ndarray
+    """Orientations T_world_body, shape (B, 4)."""
     velocity_m_s: np.ndarray
+    """Velocities of the origins [m/s], world axes, shape (B, 3)."""
     omega_body_rad_s: np.ndarray
+    """Angular velocities [rad/s], body axes, shape (B, 3)."""
 
 
 def write_mjcf(
@@ -46,15 +43,15 @@ def write_mjcf(
 ) -> str:
     """Return the model as MJCF text.
 
-    Free bodies get a free joint, driven ones are mocap bodies, fixed ones stand at their photo pose. Collision spheres
-    are `sphere` geoms; where the model has none, the shape that the capture gave (box or ball) is the geom. Masses,
-    inertia, friction and the contact time and damping are the model's.
+    Free bodies get a free joint, driven ones are mocap bodies, fixed ones are at their photo pose. Collision spheres
+    are `sphere` geoms; without them, the shape from the capture (box or ball) is the geom. Masses, inertia, friction
+    and the contact time and damping are those of the model.
 
     Args:
         model: A model with fitted physics.
-        cameras: Cameras to add, by name; without distortion, which MJCF cannot say.
+        cameras: Cameras to add, by name; MJCF cannot represent their distortion.
         keyframe: A start to add.
-        source: Where the model comes from, to stand in the file.
+        source: Origin of the model, which the file mentions.
     """
     file = model.file
     root = ET.Element("mujoco", model="cgwm")
@@ -86,7 +83,7 @@ def mujoco_states(file: ModelFile, time_s: np.ndarray, pose: tuple[np.ndarray, .
 
     Args:
         file: The model.
-        time_s: Shape (T,).
+        time_s: Times [s], shape (T,).
         pose: position_m (T, B, 3), quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) of the body origin in world axes, and
             omega_body_rad_s (T, B, 3): a free joint's own convention.
 

@@ -1,49 +1,47 @@
-"""Model directories: `model.json`, the spheres of each body, and `fit.json`."""
+"""Reading and writing of model directories: `model.json`, the spheres of each body, and `fit.json`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..schemas import BodyModel, CamerasFile, FitFile, InputDataError, ModelFile, read_json
-from .atomic import new_directory
-from .kinds import refuse_other_kind
-from .ply import Splats, read_splats, write_splats
-from .tracks import Track, read_tracks, write_tracks
+from ...schemas import BodyModel, CamerasFile, FitFile, InputDataError, ModelFile, read_json
+from ..capture.tracks import Track, read_tracks, write_tracks
+from ..io.atomic import new_directory
+from ..io.kinds import refuse_other_kind
+from ..shapes.ply import Splats, read_splats, write_splats
 
 CAMERAS = "cameras.json"
 POSE_TRACKS = "pose_tracks"
 PICTURES = ("held_out.png", "separation.png", "turntable.mp4")
-"""What a model's directory may hold to look at: photos that the fit did not see, their renders and the error; how
-bodies were told from the scene where no masks did; and a film around what was fitted."""
+"""Optional pictures of a model: held-out photos with their renders and errors; the separation of bodies from the scene
+without masks; and a turntable video of the fitted bodies."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
-    """A fitted world model in memory.
-
-    Attributes:
-        root: Its directory, or None if it was not read from one.
-        file: `model.json`.
-        body_splats: Visual spheres by body, body frame; a body without photos has none.
-        collision: Colliding spheres by body, body frame; only centres and scales count. The visual ones where
-            the model has no others.
-        scene: Background spheres, world frame, or None.
-        fit: `fit.json`.
-        cameras: The photos' cameras, where the fit refined them (`cameras.json`), or None.
-        pictures: Contents of the files among `PICTURES` that there are, by name.
-        tracks: Poses that the fit found in videos, by episode and body (`pose_tracks/<episode>.csv`).
-    """
+    """A fitted world model in memory."""
 
     root: Path | None
+    """Directory of the model, or None if it was not read from one."""
     file: ModelFile
+    """`model.json`."""
     body_splats: dict[str, Splats] = field(default_factory=dict)
+    """Visual spheres by body, body frame; a body without photos has none."""
     collision: dict[str, Splats] = field(default_factory=dict)
+    """Collision spheres by body, body frame, of which only centres and scales are used; the visual spheres if the model
+    has no others.
+    """
     scene: Splats | None = None
+    """Background spheres, world frame, or None."""
     fit: FitFile = field(default_factory=FitFile)
+    """`fit.json`."""
     cameras: CamerasFile | None = None
+    """Cameras of the photos if the fit refined them (`cameras.json`), or None."""
     pictures: dict[str, bytes] = field(default_factory=dict)
+    """Contents of the existing files among `PICTURES`, by name."""
     tracks: dict[str, dict[str, Track]] = field(default_factory=dict)
+    """Poses that the fit found in videos, by episode and body (`pose_tracks/<episode>.csv`)."""
 
     def body(self, name: str) -> BodyModel:
         """Return the entry of a body in `model.json`."""
@@ -59,7 +57,7 @@ def read_model(path: Path | str) -> Model:
     """Read a model directory.
 
     Raises:
-        InputDataError: If it is no model (a capture, a dataset, ...), or a file is missing or wrong.
+        InputDataError: If it is not a model (a capture, a dataset, ...), or a file is missing or wrong.
     """
     root = Path(path)
     refuse_other_kind(root, "model")
@@ -77,14 +75,24 @@ def read_model(path: Path | str) -> Model:
     cameras = read_json(root / CAMERAS, CamerasFile) if (root / CAMERAS).is_file() else None
     names = [body.name for body in file.bodies]
     tracks = {path.stem: read_tracks(path, names)[0] for path in sorted((root / POSE_TRACKS).glob("*.csv"))}
-    return Model(root, file, body_splats, collision, scene, fit, cameras, pictures, tracks)
+    return Model(
+        root=root,
+        file=file,
+        body_splats=body_splats,
+        collision=collision,
+        scene=scene,
+        fit=fit,
+        cameras=cameras,
+        pictures=pictures,
+        tracks=tracks,
+    )
 
 
 def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
-    """Write a model directory, complete or not at all; return the model as it now lies there.
+    """Write a model directory atomically, and return the model as written.
 
-    The names of the .ply files in `model.json` are set here: `<body>.ply`, `<body>.collision.ply` where the
-    colliding spheres are not the visual ones, and `scene.ply`.
+    The names of the .ply files in `model.json` are set here: `<body>.ply`, `<body>.collision.ply` if the collision
+    spheres are not the visual ones, and `scene.ply`.
     """
     taken = {"scene.ply"}
     bodies, files = [], []

@@ -1,6 +1,6 @@
-"""Chunks of images as HDF5's own filters make them, ready before they reach HDF5, which works in one thread.
+"""Compression of image chunks in the formats of HDF5's filters, outside HDF5, which works in one thread.
 
-Each function here may run in many threads at once: zstd, zlib and OpenCV let go of the interpreter while they work.
+Each function here may run in many threads at once: zstd, zlib and OpenCV release the interpreter lock.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import cv2
 import h5py
 import numpy as np
 
-from ..schemas import InputDataError
+from ...schemas import InputDataError
 
 Compression = Literal["zstd", "gzip", "none", "jpeg"]
 
 CHUNK_FRAMES = 8
-"""Frames in a chunk of images: with zstd-1 the best of size, writing and random reading that was measured."""
+"""Number of frames in a chunk of images: the best measured compromise of size, writing and random reading (zstd-1)."""
 ZSTD_FILTER = 32015
-"""HDF5's registered number of the zstd filter, which hdf5plugin brings."""
+"""HDF5's registered number of the zstd filter, which hdf5plugin provides."""
 ZSTD_LEVEL, GZIP_LEVEL = 1, 4
 JPEG_QUALITY = 95
 """Of JPEG images, colours at half the resolution: errors of about 1.5 grey levels on average."""
@@ -34,11 +34,11 @@ _of_thread = threading.local()
 def chunked(compression: Compression, dtype: np.dtype[Any], chunk: tuple[int, ...]) -> Any:
     """Return the creation properties of a dataset of chunks as :func:`encoded` makes them; jpeg is zstd here.
 
-    Numbers of several bytes are shuffled first: the first bytes of all, then the second ones. Measured for depth, a
-    quarter to a third less for twice the time.
+    Numbers of several bytes are shuffled first: the first bytes of all, then the second ones. For depth this reduces
+    the size by a quarter to a third and doubles the time.
 
     Raises:
-        InputDataError: If zstd is asked for and hdf5plugin is not installed.
+        InputDataError: If zstd is requested and hdf5plugin is not installed.
     """
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_obj_track_times(False)
@@ -74,15 +74,15 @@ def require_zstd(what: str) -> None:
 
 
 def encoded(frames: np.ndarray, compression: Compression, chunk_frames: int) -> bytes | memoryview:
-    """Return a chunk as it stands in the file.
+    """Return a chunk as it is stored in the file.
 
-    Memory that a thread needs on the way is kept for its next chunk: new memory of megabytes is mapped and cleared by
-    the system each time, in which threads wait for each other.
+    Each thread keeps its working memory for its next chunk, because the system maps and clears new memory of this size
+    each time, for which threads wait for each other.
 
     Args:
         frames: The frames of the chunk, C-contiguous, shape (n, H, W, ...) with n <= chunk_frames.
-        compression: Of the dataset.
-        chunk_frames: Frames in a chunk; what lacks is filled with zeros, as HDF5 does at the end of a dataset.
+        compression: Compression of the dataset.
+        chunk_frames: Frames in a chunk; missing ones are filled with zeros, as HDF5 does at the end of a dataset.
     """
     raw = np.ascontiguousarray(frames).reshape(-1).view(np.uint8)
     size = chunk_frames * (raw.size // len(frames))
@@ -102,7 +102,7 @@ def encoded(frames: np.ndarray, compression: Compression, chunk_frames: int) -> 
 
 
 def _shuffled(raw: np.ndarray, itemsize: int) -> np.ndarray:
-    """Return the first bytes of all numbers, then the second ones and so on, in memory that the thread uses again."""
+    """Return the first bytes of all numbers, then the second ones and so on, in memory that the thread reuses."""
     planes = _scratch("planes", raw.size).reshape(itemsize, -1)
     rows = max(row for row in range(1, 65) if planes.shape[1] % row == 0)  # OpenCV wants a picture; its rows are free
     cv2.split(raw.reshape(rows, -1, itemsize), [plane.reshape(rows, -1) for plane in planes])
@@ -110,7 +110,7 @@ def _shuffled(raw: np.ndarray, itemsize: int) -> np.ndarray:
 
 
 def _scratch(name: str, size: int) -> np.ndarray:
-    """Return bytes of this thread, as they were left."""
+    """Return working memory of this thread, with its last content."""
     kept: dict[str, np.ndarray] = _of_thread.__dict__
     if name not in kept or kept[name].size < size:
         kept[name] = np.empty(size, np.uint8)

@@ -1,7 +1,7 @@
 """The directory of a dataset: its manifest, its shards, and a copy of the model that made it.
 
-With one shard the directory appears complete. With several (`--shard I/N`, in any order and from any machine that
-sees the directory) the first shard that is ready makes the directory, and each adds itself.
+With one shard the directory appears complete. With several (`--shard I/N`, in any order and from any machine with
+access to the directory) the first finished shard creates the directory, and each adds itself.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError, read_json
-from .atomic import move_into_place, new_directory, new_file, scratch_file, sha256
+from ...schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError, read_json
+from ..io.atomic import move_into_place, new_directory, new_file, scratch_file, sha256
+from ..io.kinds import refuse_other_kind
+from ..io.room import enough_room
 from .index import index_fault
-from .kinds import refuse_other_kind
-from .room import enough_room
 from .shards import gathered, shard_fault, shard_name, tidied, write_entry
 
 MANIFEST = "dataset.json"
@@ -40,7 +40,7 @@ def write_manifest(path: Path, manifest: DatasetManifest) -> None:
 
 
 def settings_text(manifest: DatasetManifest) -> str:
-    """Return the settings as the shards carry them."""
+    """Return the settings in the form in which shards store them."""
     return json.dumps(manifest.config, sort_keys=True)
 
 
@@ -61,16 +61,16 @@ def shard_entry(
 
 
 def finished_shard(path: Path, manifest: DatasetManifest, index: int, overwrite: bool) -> ShardEntry | None:
-    """Return the entry of a shard that is there and whole, or None if it is to be made (again).
+    """Return the entry of a complete shard, or None if it has to be made (again).
 
     Args:
         path: DATASET, which need not exist.
-        manifest: The manifest of what would be written, without shards.
+        manifest: The manifest of the dataset that would be written, without shards.
         index: Number of the shard, from 0.
-        overwrite: A damaged shard is to be made again.
+        overwrite: Make a damaged shard again.
 
     Raises:
-        UsageError: If `path` is no dataset, or one of other rollouts.
+        UsageError: If `path` is not a dataset, or one of other rollouts.
         DamagedShardError: If the shard is damaged and `overwrite` is not set.
     """
     if not path.exists():
@@ -103,12 +103,12 @@ def new_dataset(
         manifest: The manifest without shards.
         model: The model's directory, which is copied along.
         index: Number of the shard, from 0.
-        overwrite: Replace what is there: the whole dataset where it has one shard, else the shard.
+        overwrite: Replace the existing output: the whole dataset if it has one shard, else the shard.
 
     Raises:
-        UsageError: Before anything is written, if the output exists and `overwrite` is not set, or if the shard
-            belongs to another dataset than the one that is there.
-        NotEnoughSpaceError: If there is no room; what was complete before is still there.
+        UsageError: Before anything is written, if the output exists and `overwrite` is not set, or if the shard does
+            not belong to the existing dataset.
+        NotEnoughSpaceError: If the disk is full; earlier complete output is kept.
     """
     entries: list[ShardEntry] = []
     name = shard_name(index, manifest.shard_count)
@@ -151,7 +151,7 @@ def _publish(
 
 
 def _appears(file: Path, seconds: float = 10.0) -> bool:
-    """Tell whether a file is there, where its directory is; a network file system may show it some seconds late."""
+    """Return whether a file of an existing directory exists; a network file system may show it some seconds late."""
     end = time.monotonic() + seconds
     while not file.is_file():
         if not os.path.lexists(file.parent) or time.monotonic() > end:
@@ -167,10 +167,10 @@ def _stamped(entries: list[ShardEntry], manifest: DatasetManifest) -> tuple[Shar
 
 
 def refuse_existing_shards(path: Path, count: int) -> None:
-    """Refuse to make shards of which one is there already; called before long work starts.
+    """Refuse to make shards if one of them exists; called before long work starts.
 
     Raises:
-        UsageError: With the first that exists.
+        UsageError: For the first shard that exists.
     """
     for index in range(count):
         if (path / shard_name(index, count)).exists():
@@ -184,10 +184,10 @@ def _exists(path: Path) -> UsageError:
 
 
 def refuse_other_dataset(path: Path, manifest: DatasetManifest) -> None:
-    """Refuse to add a shard to a directory that is no dataset, or a dataset of other rollouts.
+    """Refuse to add a shard to a directory that is not a dataset, or to a dataset of other rollouts.
 
     Raises:
-        UsageError: With the first thing that differs.
+        UsageError: For the first difference.
     """
     if not (path / MANIFEST).is_file():
         raise UsageError(f"{path} exists and is no dataset.", todo="choose another name.")
@@ -202,7 +202,7 @@ def refuse_other_dataset(path: Path, manifest: DatasetManifest) -> None:
 
 
 def difference(found: DatasetManifest, wanted: DatasetManifest) -> tuple[str, Any, Any] | None:
-    """Return the first thing in which two datasets differ, other than by their shards: its name, and both values."""
+    """Return name and both values of the first field in which two datasets differ, except for their shards."""
     for field in ("format", "model_sha256", "config", "rollouts", "shard_count", "versions"):
         pair = getattr(found, field), getattr(wanted, field)
         if pair[0] != pair[1]:
@@ -229,12 +229,12 @@ def missing_shards(manifest: DatasetManifest) -> list[int]:
 
 
 def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] | None = None) -> list[str]:
-    """Compare the shards, their index and the model's copy with the manifest; return one sentence a fault.
+    """Compare the shards, their index and the copy of the model with the manifest; return one sentence per fault.
 
     Args:
         path: DATASET.
         manifest: Its manifest.
-        files: Names of the shards to read for their hash, of the others the size is compared; all where left out.
+        files: Names of the shards whose hash is compared, or None for all; for others only the size is compared.
     """
     faults = [
         f"{shard_name(index, manifest.shard_count)}: this shard is missing." for index in missing_shards(manifest)

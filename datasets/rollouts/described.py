@@ -1,7 +1,7 @@
-"""Arrays of HDF5 that say what they are, made fast: a rollout has about 70 of them with five attributes each.
+"""Fast creation of HDF5 arrays with descriptions: a rollout has about 70 arrays with five attributes each.
 
-h5py's high level takes 18 ms for them, in which a GPU renders as many frames as they describe; its low level takes 12.
-So an array is made once, empty, with its attributes, in a file in memory, and copied from there by HDF5 itself.
+h5py's high level needs 18 ms for them, as long as a GPU needs to render the frames that they describe; its low level
+needs 12 ms. So an array is made once, empty, with its attributes, in a file in memory, from which HDF5 copies it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def put(
     text: str,
     in_chunks: bool = True,
 ) -> Any:
-    """Write an array, say what it is, and return its DatasetID; in one chunk with a checksum, or as it is."""
+    """Write an array with its description, in one chunk with a checksum or contiguously, and return its DatasetID."""
     values = np.asarray(data)
     texts = (unit, frame, order, shape, text)
     properties = checked(values.shape if in_chunks else ())
@@ -60,14 +60,14 @@ def checked(shape: tuple[int, ...]) -> Any:
 def new_dataset(
     group: Node, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], properties: Any, *texts: str
 ) -> Any:
-    """Make an empty array that says what it is, and return its DatasetID.
+    """Make an empty array with its description, and return its DatasetID.
 
     Args:
-        group: Where.
-        name: Its name.
-        dtype: Of its numbers.
-        shape: Its shape.
-        properties: Its creation properties; the same object for arrays of one kind.
+        group: Group of the array.
+        name: Name of the array.
+        dtype: Type of its numbers.
+        shape: Shape of the array.
+        properties: Creation properties; the same object for arrays of one kind.
         texts: Unit, frame, order, meaning of the shape, description.
     """
     return _prototypes().copy(group, name, dtype, shape, properties, texts)

@@ -1,6 +1,6 @@
-"""A file for HDF5 that never fails: what goes wrong is kept, for the writer to tell, instead of told to HDF5.
+"""A file for HDF5 whose errors are kept for the writer instead of being reported to HDF5.
 
-HDF5 cannot close a file that it could not write to the end: on a full disk h5py 3.16 crashes the process at its exit.
+HDF5 cannot close a file after a failed write: on a full disk h5py 3.16 crashes the process at its exit.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 
 
 class GuardedFile(io.RawIOBase):
-    """The file object that h5py's driver `fileobj` asks for.
+    """A file object for h5py's driver `fileobj`.
 
     Attributes:
-        error: The first write that failed; what is written after it is lost, and the file is worth nothing.
+        error: Error of the first failed write; later data are lost, and the file is invalid.
     """
 
     def __init__(self, path: Path) -> None:
@@ -24,7 +24,7 @@ class GuardedFile(io.RawIOBase):
         self.error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write all of the data at the current place."""
+        """Write all data at the current position."""
         view = memoryview(data).cast("B")
         size = len(view)
         try:
@@ -37,7 +37,7 @@ class GuardedFile(io.RawIOBase):
         return size
 
     def readinto(self, buffer: Any) -> int:
-        """Read at the current place; zeros where the file ends."""
+        """Read at the current position; zeros after the end of the file."""
         view = memoryview(buffer).cast("B")
         os.lseek(self._descriptor, self._place, os.SEEK_SET)
         done = 0
@@ -49,18 +49,18 @@ class GuardedFile(io.RawIOBase):
         return len(view)
 
     def seek(self, place: int, origin: int = os.SEEK_SET) -> int:
-        """Go to a place of the file."""
+        """Move to a position of the file."""
         if origin == os.SEEK_END:
             place += os.fstat(self._descriptor).st_size
         self._place = place + (self._place if origin == os.SEEK_CUR else 0)
         return self._place
 
     def tell(self) -> int:
-        """Return the current place."""
+        """Return the current position."""
         return self._place
 
     def truncate(self, size: int | None = None) -> int:
-        """Make the file so long."""
+        """Set the length of the file."""
         length = self._place if size is None else size
         try:
             os.ftruncate(self._descriptor, length)

@@ -1,8 +1,8 @@
-"""All shards of a dataset as one HDF5 file, by virtual datasets: nothing is copied.
+"""Index of a dataset: all shards as one HDF5 file of virtual datasets, without copies.
 
-The file has the skeleton of a shard, so that every reader of shards reads it. Paths are relative to it, and nothing
-in it depends on when or where it was made. HDF5 itself reads a shard that is not there as if it held the fill value:
-NaN for numbers with a fraction, the largest value of integers. `open_shard` refuses such an index.
+The file has the structure of a shard, so that every reader of shards can read it. Paths are relative to it, and its
+content does not depend on when or where it was made. HDF5 itself would read a missing shard as the fill value: NaN for
+floating-point numbers, the largest value for integers. `open_shard` refuses such an index.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ..schemas import DatasetManifest, ShardEntry
-from .atomic import sha256
+from ...schemas import DatasetManifest, ShardEntry
+from ..io.atomic import sha256
+from ..io.progress import progress
 from .guarded_file import GuardedFile
-from .progress import progress
 from .rollouts import SHARDS, Node, demo_names, open_shard
 
 INDEX = "index.h5"
@@ -26,8 +26,8 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
     """Write the index of some shards.
 
     Args:
-        path: The file to write; give a temporary one.
-        shards: For each shard where it lies, its path relative to the index's final place, and its entry.
+        path: The file to write; pass a temporary one.
+        shards: For each shard its path, its path relative to the final index, and its entry.
 
     Raises:
         InputDataError: If a shard cannot be read.
@@ -60,7 +60,7 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
 
 
 def index_fault(file: Path, manifest: DatasetManifest) -> str | None:
-    """Say in one sentence why the index of a dataset is not what the manifest says, or return None."""
+    """Return one sentence on how the index of a dataset differs from the manifest, or None if it agrees."""
     assert manifest.index is not None
     if not file.is_file():
         return f"{file.name}: listed in dataset.json, but no such file."
@@ -80,7 +80,7 @@ def _check(file: GuardedFile) -> None:
 
 
 def _mirror(source: Node, target: Node, file: bytes) -> None:
-    """Give a group what another has: groups and attributes as they are, arrays as views of those in `file`."""
+    """Copy groups and attributes of one group to another, and add its arrays as views of those in `file`."""
     _copy_attributes(source, target)
     for name, item in source.items():
         if isinstance(item, h5py.Group):
@@ -105,7 +105,7 @@ def _view(source: Node, target: Node, name: str, file: bytes) -> h5py.Dataset:
 
 
 def _lost(dtype: np.dtype) -> np.ndarray | None:
-    """Return what stands where a shard is lost: a value that nobody takes for a measurement."""
+    """Return the fill value for a missing shard, which cannot be mistaken for a measurement."""
     if dtype.kind == "f":
         return np.array(np.nan, dtype)
     return np.array(np.iinfo(dtype).max, dtype) if dtype.kind in "iu" else None

@@ -1,4 +1,4 @@
-"""Reading of datasets: random access to rollouts and to windows of frames, in plain numpy."""
+"""Reading of datasets: random access to rollouts and to windows of frames, as numpy arrays."""
 
 from __future__ import annotations
 
@@ -11,28 +11,32 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..schemas import InputDataError, UsageError, did_you_mean
-from .cameras import Camera
+from ...schemas import InputDataError, UsageError, did_you_mean
+from ..capture.cameras import Camera
+from ..io.kinds import refuse_other_kind
 from .chunks import image_of
-from .kinds import refuse_other_kind
 from .rollouts import Node, demo_names, open_shard
 
 
 @dataclass(frozen=True)
 class RolloutInfo:
-    """Where a rollout lies."""
+    """Location of a rollout."""
 
     file: Path
+    """Shard or index that contains it."""
     demo: str
+    """Name of its group."""
     index: int
+    """Global index of the rollout."""
     frames: int
+    """Number of frames."""
 
 
 INDEX = "index.h5"
-"""The file that `cgwm merge` writes: all shards as one, by virtual datasets."""
+"""Name of the file of virtual datasets that `cgwm merge` writes."""
 MOST_OPEN = 64
-"""Shards that a process keeps open: of more, the one that was opened first is closed. Systems allow about a thousand
-files, and each has a cache of decoded chunks."""
+"""Maximum number of shards that a process keeps open; the one opened first is closed for another. Systems allow about a
+thousand files, and each open shard has a cache of decoded chunks."""
 
 
 def shard_files(path: Path) -> list[Path]:
@@ -54,7 +58,13 @@ def shard_files(path: Path) -> list[Path]:
 def camera_of(group: Node) -> Camera:
     """Read a camera from its group in a rollout, `cameras/<name>`."""
     read = {name: np.asarray(item[()]) for name, item in group.items()}
-    return Camera(int(read["width"]), int(read["height"]), read["K"], read["dist"], read["T_world_cam"])
+    return Camera(
+        width=int(read["width"]),
+        height=int(read["height"]),
+        K=read["K"],
+        distortion=read["dist"],
+        T_world_cam=read["T_world_cam"],
+    )
 
 
 class RolloutReader:
@@ -65,7 +75,7 @@ class RolloutReader:
 
     Args:
         path: DATASET, or one of its shards.
-        split: Only the rollouts of `mask/<split>`, for example ``train``; all where left out.
+        split: Only the rollouts of `mask/<split>`, for example ``train``; None for all.
     """
 
     def __init__(self, path: Path | str, split: str | None = None):
@@ -91,7 +101,7 @@ class RolloutReader:
         self._files.clear()
 
     def group(self, number: int) -> Node:
-        """Return the HDF5 group of the rollout at place `number` of this reader."""
+        """Return the HDF5 group of the rollout at index `number` of this reader."""
         info = self.rollouts[number]
         key = (os.getpid(), info.file)  # a handle that a fork inherits is not safe to use
         if key not in self._files:
@@ -121,7 +131,7 @@ class RolloutReader:
         return {name: float(item[()]) for name, item in self.group(number)["parameters"].items()}
 
     def read(self, number: int, key: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return an array of a rollout, its first axis cut to `start:stop` (frames, for what has a time axis)."""
+        """Return an array of a rollout, with its first axis (usually frames) restricted to `start:stop`."""
         group = self.group(number)
         try:
             data = group[key]
@@ -135,7 +145,7 @@ class RolloutReader:
         return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
-        """Return the contacts of one frame: the arrays of the group `contacts` but `offsets`, cut to it."""
+        """Return the contacts of one frame: its rows of the arrays of the group `contacts`, except `offsets`."""
         group = self.group(number)["contacts"]
         first, last = group["offsets"][frame : frame + 2]
         return {name: item[first:last] for name, item in group.items() if name != "offsets"}
@@ -143,7 +153,7 @@ class RolloutReader:
     def window(
         self, number: int, start: int, length: int, keys: Iterable[str], every: int = 1
     ) -> dict[str, np.ndarray]:
-        """Return `length` frames of some arrays with a time axis: successive ones, or each `every`-th."""
+        """Return `length` frames of arrays with a time axis: successive ones, or every `every`-th."""
         frames, stop = self.rollouts[number].frames, start + (length - 1) * every + 1
         if start < 0 or length < 1 or every < 1 or stop > frames:
             raise UsageError(f"frames {start} to {stop} of rollout {number}, which has {frames}.")

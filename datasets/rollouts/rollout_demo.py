@@ -1,4 +1,4 @@
-"""One rollout in its file: its images chunk by chunk, and what is known of them at the end."""
+"""Writing of one rollout into its file: images chunk by chunk, and summaries at the end."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .cameras import Camera
+from ..capture.cameras import Camera
 from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked
 from .described import new_dataset, new_group, put, write_number, write_text
 from .rollout_tables import link_next_observations, write_tables
@@ -36,19 +36,26 @@ _JPEG = (
 
 @dataclass(frozen=True)
 class Chunk:
-    """A block on its way: what it is, and its images as they will stand in the file, by name."""
+    """A block of images that waits for compression and writing."""
 
     camera: str
+    """Name of the camera."""
     start: int
+    """First frame."""
     count: int
+    """Number of frames."""
     size: int
+    """Size of the uncompressed images [bytes]."""
     visible_px: np.ndarray
+    """Visible pixels of each body, shape (count, B)."""
     amodal_px: np.ndarray
+    """Pixels of each body including occluded ones, shape (count, B)."""
     images: Future[dict[str, Any]]
+    """The images as they are stored in the file, by name."""
 
 
 def chunk_frames_of(frames: int) -> int:
-    """Return how many frames a chunk has, of a rollout of so many."""
+    """Return the number of frames in a chunk of a rollout with `frames` frames."""
     return min(CHUNK_FRAMES, frames)
 
 
@@ -57,8 +64,8 @@ class Demo:
 
     Args:
         data: The group of all rollouts.
-        labels: All but its images, which is written at once.
-        compression: Of its images.
+        labels: Everything except its images; it is written at once.
+        compression: Compression of its images.
     """
 
     def __init__(self, data: Node, labels: RolloutLabels, compression: Compression) -> None:
@@ -91,7 +98,7 @@ class Demo:
         return made
 
     def write(self, chunk: Chunk) -> None:
-        """Put a chunk's images in their place."""
+        """Write the images of a chunk."""
         stop = chunk.start + chunk.count
         for key, data in chunk.images.result().items():
             if key == "jpeg":
@@ -102,7 +109,7 @@ class Demo:
         self._counts[chunk.camera][:, chunk.start : stop] = chunk.visible_px, chunk.amodal_px
 
     def finish(self) -> None:
-        """Write what needs all frames.
+        """Write the arrays that need all frames.
 
         Raises:
             ValueError: If some frames were not written.

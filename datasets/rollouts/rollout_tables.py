@@ -1,4 +1,4 @@
-"""The arrays of one rollout in HDF5, all but its images; each with its unit, frame, order, shape and description."""
+"""Arrays of one rollout in HDF5 except its images, each with unit, frame, order, shape and description."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import h5py
 import numpy as np
 
-from ..schemas import Exposure
-from .cameras import Camera
+from ...schemas import Exposure
+from ..capture.cameras import Camera
 from .described import new_group, put, write_number, write_text
 from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
 
@@ -17,7 +17,7 @@ TORQUE = "Mean torque on free bodies about the centre of mass since the frame be
 
 
 def write_tables(demo: Node, labels: RolloutLabels) -> Node:
-    """Write all of a rollout but what belongs to its images into its group, and return the group of observations."""
+    """Write everything of a rollout except its images into its group, and return the group of observations."""
     _write_attributes(demo, labels, len(labels.time_s))
     _write_timeline(demo, labels)
     _write_bodies(demo, labels)

@@ -1,7 +1,7 @@
-"""Writing of rollouts: chunks of images are compressed in many threads, and one thread puts them into the file.
+"""Writing of rollouts: many threads compress chunks of images, and one thread writes them to the file.
 
-HDF5 does one thing at a time, so that it gets chunks that are ready (`write_direct_chunk`). They are written in the
-order in which they were given, whatever thread was first, so that equal content gives equal bytes.
+HDF5 is single-threaded, so it receives compressed chunks (`write_direct_chunk`). They are written in the order in which
+they were given, whichever thread finished first, so that equal content gives equal bytes.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import Any, Self
 import h5py
 import numpy as np
 
-from ..schemas import ROLLOUTS_FORMAT, NotEnoughSpaceError
+from ...schemas import ROLLOUTS_FORMAT, NotEnoughSpaceError
+from ..io.processors import processors
 from .chunks import Compression, encoded, jpeg_of, require_zstd, zstd_module
 from .guarded_file import GuardedFile
-from .processors import processors
 from .rollout_demo import Chunk, Demo, chunk_frames_of
 from .rollouts import CONVENTION, VALID_EVERY, FrameBlock, Node, RolloutLabels
 
@@ -42,15 +42,15 @@ class _End:
 class RolloutWriter:
     """Writes rollouts into one HDF5 file, one after the other, in memory that does not grow with them.
 
-    The path is written to directly: give the temporary path of :func:`datasets.atomic.new_file` or `new_directory`.
+    The path is written directly: pass the temporary path of :func:`datasets.io.atomic.new_file` or `new_directory`.
 
     Args:
         path: The file to write.
         seed: Root seed.
         config_json: The resolved settings.
         creator: Program and version.
-        compression: Of images, depth and masks. jpeg: images in JPEG, lossy, the others in zstd.
-        threads: That compress; as many as there are processors where left out. They change no byte.
+        compression: Compression of images, depth and masks. jpeg: images in JPEG, lossy, the others in zstd.
+        threads: Number of threads that compress, by default the number of processors. It does not change the bytes.
     """
 
     def __init__(
@@ -109,19 +109,19 @@ class RolloutWriter:
             self._check()
 
     def _drop(self, error: BaseException) -> None:
-        """Write no more: what still waits is dropped."""
+        """Stop writing and discard everything that still waits."""
         self._error = self._error or error
         self._room.open()
 
     def write(self, labels: RolloutLabels, frames: Iterable[FrameBlock] = ()) -> None:
         """Write one rollout; `frames` may be a generator, and is consumed block by block.
 
-        It returns before all is on the disk. What goes wrong there is raised by the next call, or at the end of the
+        It returns before everything is on disk. Errors of writing are raised by the next call, or at the end of the
         `with` block.
 
         Raises:
             NotEnoughSpaceError: If the disk is full.
-            ValueError: If the blocks of the rollout before were not all of its frames.
+            ValueError: If the blocks of the previous rollout did not contain all of its frames.
         """
         self._check()
         self._queue.put(labels)
@@ -131,8 +131,16 @@ class RolloutWriter:
             self._room.take(size)
             self._check()
             images = self._pool.submit(_encoded_images, block, self._compression, chunk_frames)
-            counts = (block.visible_px, block.amodal_px)
-            self._queue.put(Chunk(block.camera, block.start, len(block.image), size, *counts, images))
+            chunk = Chunk(
+                camera=block.camera,
+                start=block.start,
+                count=len(block.image),
+                size=size,
+                visible_px=block.visible_px,
+                amodal_px=block.amodal_px,
+                images=images,
+            )
+            self._queue.put(chunk)
         self._queue.put(_End())
 
     def _check(self) -> None:
@@ -149,10 +157,10 @@ class RolloutWriter:
         raise error
 
     def _work(self) -> None:
-        """Do all that HDF5 does, from opening the file to closing it.
+        """Run all calls of HDF5, from opening the file to closing it.
 
-        In this thread, for Python interrupts only the main one: HDF5 cannot close a file after a call that an interrupt
-        left, and the process would crash at its end.
+        This happens in a thread because Python interrupts only the main one: HDF5 cannot close a file after an
+        interrupted call, and the process would crash at its end.
         """
         item = self._queue.get()
         try:
@@ -172,7 +180,7 @@ class RolloutWriter:
         self._error = self._error or self._guarded.error
 
     def _write_all(self, data: Node, item: RolloutLabels | Chunk | _End | None) -> None:
-        """Take things from the queue until the end, and write them as long as nothing goes wrong."""
+        """Write the items of the queue until its end; after an error, discard them."""
         demo: Demo | None = None
         while item is not None:
             try:
@@ -209,7 +217,7 @@ class RolloutWriter:
 
 
 def _encoded_images(block: FrameBlock, compression: Compression, chunk_frames: int) -> dict[str, Any]:
-    """Return the images of a block as they stand in the file; with jpeg the colours as a list of files, "jpeg"."""
+    """Return the images of a block as they are stored in the file; with jpeg the colours as a list of files, "jpeg"."""
     if block.ready is not None:
         block.ready()
     data: dict[str, Any] = {}
@@ -222,7 +230,7 @@ def _encoded_images(block: FrameBlock, compression: Compression, chunk_frames: i
 
 
 class _Room:
-    """Bytes that may be taken until they are given back; one taker at least gets in."""
+    """A budget of bytes that can be taken and given back; it always admits at least one taker."""
 
     def __init__(self, size: int) -> None:
         self._free, self._size = size, size
@@ -230,19 +238,19 @@ class _Room:
         self._open = False
 
     def take(self, size: int) -> None:
-        """Wait until there is room."""
+        """Wait until the budget allows it, and take."""
         with self._changed:
             self._changed.wait_for(lambda: self._open or self._free >= min(size, self._size))
             self._free -= size
 
     def give(self, size: int) -> None:
-        """Give back what was taken."""
+        """Give back bytes."""
         with self._changed:
             self._free += size
             self._changed.notify_all()
 
     def open(self) -> None:
-        """Let everybody in: nothing is written any more."""
+        """Admit all takers, because nothing is written any more."""
         with self._changed:
             self._open = True
             self._changed.notify_all()

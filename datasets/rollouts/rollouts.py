@@ -1,7 +1,7 @@
-"""Labelled rollouts in HDF5: robomimic's skeleton plus the cameras, contacts and parameters that it lacks.
+"""Labelled rollouts in HDF5: robomimic's structure plus the cameras, contacts and parameters that it lacks.
 
-The bytes depend on the content alone (no times, no host names inside), so equal seeds give equal files. A demo is
-named after the global index of its rollout, whatever the shard, so joining shards renames nothing.
+The bytes depend only on the content (without times and host names), so equal seeds give equal files. A demo is named
+after the global index of its rollout, whatever the shard, so joining shards renames nothing.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..schemas import ROLLOUTS_FORMAT, Exposure, InputDataError, Light
-from .cameras import Camera
+from ...schemas import ROLLOUTS_FORMAT, Exposure, InputDataError, Light
+from ..capture.cameras import Camera
 from .chunks import require_zstd
 
 Node = Any
-"""A group of an HDF5 file; h5py's own types do not tell what a path in it leads to."""
+"""A group of an HDF5 file; h5py's types do not specify what a path in it leads to."""
 
 SHARDS = "shards"
-"""Group of an index: the files that it looks into (`file`, relative to it), with their `bytes` and `sha256`."""
+"""Group of an index with the files that it refers to (`file`, relative to it), with their `bytes` and `sha256`."""
 
 VALID_EVERY = 5
 """Every n-th rollout (by global index, the last of each group) belongs to `mask/valid`, the others to `mask/train`."""
@@ -35,9 +35,9 @@ CONVENTION = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ContactTable:
-    """The contacts of a rollout, frame after frame; N rows in all."""
+    """The contacts of a rollout, ordered by frame; N rows in total."""
 
     offsets: np.ndarray
     """Rows `offsets[t]:offsets[t + 1]` belong to frame t; shape (T + 1,), int64."""
@@ -57,95 +57,114 @@ class ContactTable:
     """1 where the friction is at its limit, 0 where it sticks; shape (N,), uint8."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutParameter:
-    """A physical number of one rollout, and the fit's distribution that it was drawn from."""
+    """A physical parameter of one rollout, and the fitted distribution that it was drawn from."""
 
     name: str
+    """Name of the parameter."""
     unit: str
+    """Its unit."""
     value: float
+    """Value in this rollout."""
     estimate: float
+    """Estimate of the fit."""
     std_error: float | None
+    """Standard error of the fit; None if there is none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutLabels:
-    """All of one rollout except its images. T frames, B bodies."""
+    """Everything of one rollout of T frames and B bodies except its images."""
 
     episode_index: int
     """Global index of the rollout."""
     seed: int
     """Root seed: the rollout is drawn from `numpy.random.SeedSequence(seed, spawn_key=(episode_index,))`."""
     model_mjcf: str
+    """MJCF text of the model with the parameters of this rollout."""
     time_s: np.ndarray
+    """Times of the frames [s], shape (T,)."""
     states: np.ndarray
     """MuJoCo's state of `model_mjcf`: time, qpos, qvel; shape (T, D)."""
     actions: np.ndarray
     """Normalised commands in [-1, 1], shape (T, A)."""
     action_meaning: str
+    """Meaning of the actions, in words."""
     bodies: tuple[str, ...]
+    """Names of the bodies."""
     motions: tuple[str, ...]
     """free, driven or fixed, for each body."""
     mass_kg: np.ndarray
-    """Shape (B,)."""
+    """Masses [kg], shape (B,)."""
     com_m: np.ndarray
     """Centre of mass in the body frame [m], shape (B, 3)."""
     inertia_kg_m2: np.ndarray
-    """xx yy zz xy xz yz about the centre of mass, body axes; shape (B, 6)."""
+    """Inertia xx yy zz xy xz yz about the centre of mass [kg m2], body axes, shape (B, 6)."""
     position_m: np.ndarray
+    """Body frame origins [m], world frame, shape (T, B, 3)."""
     quat_wxyz: np.ndarray
+    """Orientations T_world_body, shape (T, B, 4)."""
     velocity_m_s: np.ndarray
+    """Velocities of the origins [m/s], world axes, shape (T, B, 3)."""
     omega_body_rad_s: np.ndarray
+    """Angular velocities [rad/s], body axes, shape (T, B, 3)."""
     gravity_m_s2: np.ndarray
-    """World frame, shape (3,)."""
+    """Gravity [m/s2], world frame, shape (3,)."""
     contacts: ContactTable
+    """The contacts of all frames."""
     contact_force_n: np.ndarray
     """Mean force of all contacts on each body since the frame before [N], world frame, (T, B, 3); 0 at frame 0."""
     contact_torque_n_m: np.ndarray
     """Mean torque on each free body about its centre of mass since the frame before [N m], world frame, (T, B, 3)."""
     parameters: tuple[RolloutParameter, ...] = ()
+    """The physical parameters of this rollout."""
     effects: Mapping[str, Mapping[str, float]] | None = None
+    """Parameters of the active effects, by effect; None without effects."""
     cameras: Mapping[str, Camera] | None = None
+    """Cameras by name; None without images."""
     attempt: int = 0
-    """How often the rollout was drawn before and rejected; from 1 on the spawn key is (episode_index, attempt)."""
+    """Number of rejected earlier draws of this rollout; from 1 on the spawn key is (episode_index, attempt)."""
     exposures: Mapping[str, Exposure] | None = None
-    """Of each camera; none: the pictures are as the model has them."""
+    """Exposure of each camera; None: that of the model."""
     light_gain_rgb: np.ndarray | None = None
     """Brightness of the light relative to the photos [1], shape (3,)."""
     light: Light | None = None
-    """The lamp and the sky of this rollout, where the model has them."""
+    """Lamp and sky of this rollout, if the model has them."""
 
 
 @dataclass(frozen=True)
 class FrameBlock:
-    """Successive labelled images of one camera; n <= CHUNK_FRAMES frames."""
+    """Labelled images of n <= CHUNK_FRAMES successive frames of one camera."""
 
     camera: str
+    """Name of the camera."""
     start: int
+    """First frame."""
     image: np.ndarray
-    """uint8 RGB, shape (n, H, W, 3)."""
+    """Colour images, uint8 RGB, shape (n, H, W, 3)."""
     depth: np.ndarray
-    """float32 [m] along the optical axis, 0 = no surface; shape (n, H, W)."""
+    """Depth along the optical axis [m], float32, 0 = no surface; shape (n, H, W)."""
     mask: np.ndarray
-    """uint8: 0 background, k the k-th body; shape (n, H, W)."""
+    """Labels, uint8: 0 background, k the k-th body; shape (n, H, W)."""
     amodal: np.ndarray
-    """Of the smallest unsigned type with a bit for each body: bit k - 1 is set where the k-th body would be seen alone,
-    or is; shape (n, H, W)."""
+    """Amodal masks in the smallest unsigned type with a bit for each body, shape (n, H, W): bit k - 1 is set where the
+    k-th body is visible or would be without occlusion."""
     visible_px: np.ndarray
-    """Pixels of each body in the mask, int32, shape (n, B)."""
+    """Number of pixels of each body in the mask, int32, shape (n, B)."""
     amodal_px: np.ndarray
-    """Pixels of each body alone, whatever hides it, int32, shape (n, B)."""
+    """Number of pixels of each body in its amodal mask, int32, shape (n, B)."""
     ready: Callable[[], None] | None = None
-    """To be called before the arrays are read: waits for the device that still fills them. None: they are ready."""
+    """Function that waits for the device that fills the arrays, to be called before reading them; None: not needed."""
 
     @property
     def images(self) -> dict[str, np.ndarray]:
-        """The arrays that are images, by the ending of their name in the file."""
+        """The arrays of images, by the ending of their name in the file."""
         return {"image": self.image, "depth": self.depth, "mask": self.mask, "amodal": self.amodal}
 
 
 MOST_BODIES = 64
-"""An amodal mask has a bit for each body."""
+"""Maximum number of bodies, because an amodal mask has a bit for each."""
 
 
 def amodal_dtype(bodies: int) -> np.dtype[Any]:
@@ -168,7 +187,7 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
         cache_bytes: Chunk cache of a dataset; at least one chunk, or random access decodes each chunk again.
 
     Raises:
-        InputDataError: If it is missing, damaged, no file of rollouts, or needs a filter that is not there.
+        InputDataError: If it is missing, damaged, not a file of rollouts, or needs a missing filter.
     """
     if not path.is_file():
         raise InputDataError(f"{path}: no such file.")
@@ -191,7 +210,7 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
 
 
 def _refuse_lost(path: Path, shards: Node) -> None:
-    """Refuse an index whose shards are not all there: HDF5 would read fill values, and say nothing."""
+    """Refuse an index with missing shards, for which HDF5 would silently read fill values."""
     for name, size in zip(shards["file"][()], shards["bytes"][()], strict=True):
         shard = path.resolve().parent / name.decode()
         if not shard.is_file() or shard.stat().st_size != size:

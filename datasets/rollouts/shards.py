@@ -1,8 +1,8 @@
-"""The shards of a dataset: their names, their rollouts, their entries, and whether they are still what they were.
+"""The shards of a dataset: names, rollouts, entries, and checks of their integrity.
 
-Each shard has an entry file beside it, `rollouts-0003-of-0064.json`, with its sha256, which is written first. So
-shards that end at the same moment on many machines change no file together, and need no lock: every file appears by
-a rename, which network file systems do at once too. `cgwm merge` gathers the entries in `dataset.json`.
+Each shard has an entry file next to it, `rollouts-0003-of-0064.json`, with its sha256, which is written first. So
+shards that finish at the same time on many machines never write the same file and need no lock: every file appears by
+a rename, which is atomic on network file systems, too. `cgwm merge` collects the entries in `dataset.json`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import h5py
 
-from ..schemas import DatasetManifest, InputDataError, ShardEntry, read_json
-from .atomic import leftovers, new_file, sha256
+from ...schemas import DatasetManifest, InputDataError, ShardEntry, read_json
+from ..io.atomic import leftovers, new_file, sha256
 from .rollouts import Node, demo_names, open_shard
 
 SHARD = re.compile(r"rollouts-(\d{4,})-of-(\d{4,})\.h5")
@@ -35,7 +35,7 @@ def shard_range(rollouts: int, count: int, index: int) -> range:
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Write numbers as SLURM's --array takes them.
+    """Write numbers in the format of SLURM's --array.
 
     >>> ranges([0, 1, 2, 5, 7, 8])
     '0-2,5,7-8'
@@ -50,20 +50,20 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 def entry_file(path: Path, shard: str) -> Path:
-    """Return where the entry of a shard lies until the shards are merged."""
+    """Return the path of the entry of a shard before the shards are merged."""
     return (path / shard).with_suffix(".json")
 
 
 def write_entry(path: Path, entry: ShardEntry) -> None:
-    """Write the entry of a shard that is about to get its name."""
+    """Write the entry of a shard just before the shard gets its final name."""
     with new_file(entry_file(path, entry.file), overwrite=True) as temporary:
         temporary.write_text(entry.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
 def gathered(path: Path, listed: DatasetManifest) -> DatasetManifest:
-    """Return a manifest with the shards that came since it was written; an entry of its own says more than the list.
+    """Return a manifest with the shards that were added since it was written; entry files override its list.
 
-    An entry whose shard is not there is that of a task that was killed between the two: the shard is missing.
+    An entry without its shard was left by a task that was killed between the two writes; the shard is missing.
     """
     entries = {entry.index: entry for entry in listed.shards}
     for file in sorted(path.glob("rollouts-*-of-*.json")):
@@ -74,12 +74,12 @@ def gathered(path: Path, listed: DatasetManifest) -> DatasetManifest:
 
 
 def shard_fault(file: Path, entry: ShardEntry, hashes: bool = True) -> str | None:
-    """Say in one sentence why a shard is not what was written, or return None.
+    """Return one sentence on how a shard differs from what was written, or None if it is intact.
 
     Args:
-        file: Where the shard lies.
+        file: Path of the shard.
         entry: Its entry in the manifest.
-        hashes: Compare its bytes too, not only their number.
+        hashes: Compare its hash, not only its size.
     """
     if not file.is_file():
         return f"{file.name}: listed in dataset.json, but no such file."
@@ -125,13 +125,13 @@ def contact_count(file: Path) -> int:
 
 
 def foreign(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_json: str) -> str | None:
-    """Say in one sentence why a whole shard does not belong to a dataset, or return None.
+    """Return one sentence on why an intact shard does not belong to a dataset, or None if it does.
 
     Args:
         file: The shard.
         entry: Its entry.
-        manifest: The dataset's.
-        config_json: The dataset's settings, as the shards carry them.
+        manifest: Manifest of the dataset.
+        config_json: Settings of the dataset in the form in which shards store them.
     """
     return next(_strange(file, entry, manifest, config_json), None)
 
@@ -157,7 +157,7 @@ def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_js
 
 
 def tidied(path: Path) -> list[str]:
-    """Remove what dead processes of this machine left of a dataset's shards; return what may be in use elsewhere."""
+    """Remove unfinished shards of dead processes of this machine; return those that may be in use elsewhere."""
     beside = re.compile(rf"{re.escape(path.name)}\.{SHARD.pattern}")
     inside = re.compile(r"rollouts-\d+-of-\d+\.json|index\.h5|dataset\.json")
     kept: list[str] = []

@@ -8,37 +8,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError
+from ...schemas import InputDataError
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh.
-
-    Attributes:
-        vertices: Corners [m], body frame, shape (V, 3).
-        faces: Indices of each triangle's corners, anticlockwise seen from outside, shape (F, 3).
-    """
+    """A triangle mesh."""
 
     vertices: Array
+    """Corners [m], body frame, shape (V, 3)."""
     faces: NDArray[np.int64]
+    """Indices of each triangle's corners, anticlockwise seen from outside, shape (F, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolidProperties:
-    """A solid of uniform density.
-
-    Attributes:
-        volume_m3: Volume [m3].
-        com_m: Centre of mass [m], in the frame of the solid, shape (3,).
-        inertia_per_kg: Inertia tensor about the centre of mass per kilogram [m2], shape (3, 3).
-    """
+    """A solid of uniform density."""
 
     volume_m3: float
+    """Volume [m3]."""
     com_m: Array
+    """Centre of mass [m], in the frame of the solid, shape (3,)."""
     inertia_per_kg: Array
+    """Inertia tensor about the centre of mass per kilogram [m2], shape (3, 3)."""
 
 
 def read_mesh(path: Path | str) -> Mesh:

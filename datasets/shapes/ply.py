@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import InputDataError
-from .atomic import new_file
+from ...schemas import InputDataError
+from ..io.atomic import new_file
 
 Array = NDArray[np.floating]
 
@@ -29,25 +29,24 @@ _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "s
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Spherical Gaussians; isotropic and of one colour from all sides, so that turning a body turns them exactly.
-
-    Attributes:
-        means: Centres [m], shape (N, 3), in the frame of the body or of the world.
-        scales: Standard deviations s [m], shape (N,), not their logarithms.
-        opacities: Peak opacities in (0, 1), shape (N,).
-        colors: sRGB values as stored in images, in [0, 1], shape (N, 3).
-        normals: Outward unit normals of the surface that the spheres show, in the frame of `means`, shape (N, 3), or
-            None where they are not known.
-        harmonics: Only of what never turns (a scene): coefficients of the spherical harmonics of degree 1 to 3 that add
-            to the colours, 3DGS's signs, shape (N, K, 3) with K = 3, 8 or 15; None: the same from all sides.
-    """
+    """Spherical Gaussians; isotropic and of one colour from all sides, so that turning a body turns them exactly."""
 
     means: Array
+    """Centres [m], shape (N, 3), in the frame of the body or of the world."""
     scales: Array
+    """Standard deviations s [m], shape (N,), not their logarithms."""
     opacities: Array
+    """Peak opacities in (0, 1), shape (N,)."""
     colors: Array
+    """sRGB values as stored in images, in [0, 1], shape (N, 3)."""
     normals: Array | None = None
+    """Outward unit normals of the surface that the spheres show, in the frame of `means`, shape (N, 3), or None where
+    they are not known.
+    """
     harmonics: Array | None = None
+    """Only of what never turns (a scene): coefficients of the spherical harmonics of degree 1 to 3 that add to the
+    colours, 3DGS's signs, shape (N, K, 3) with K = 3, 8 or 15; None: the same from all sides.
+    """
 
     def __post_init__(self) -> None:
         count = len(self.means)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...schemas import UsageError, did_you_mean
-from ..atomic import new_directory
+from ..io.atomic import new_directory
 from .truth import TRUTH_FILE, TRUTH_MESH, TruthFile, read_truth
 
 if TYPE_CHECKING:

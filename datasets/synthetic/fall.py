@@ -38,7 +38,16 @@ def plan_fall(seed: int) -> ScenePlan:
         split, frames = ("train", TRAIN_FRAMES) if name == "000" else ("test", TEST_FRAMES)
         others = [episode.motion.qpos[0, 3:7] for episode in episodes]
         episodes.append(EpisodePlan(name, split, frames, _toss(rng, seed, model, solid, contact, split, others)))
-    return ScenePlan("fall", seed, solid, contact, photo_qpos, FRAME_RATE, tuple(episodes), fingertip=False)
+    return ScenePlan(
+        name="fall",
+        seed=seed,
+        solid=solid,
+        contact=contact,
+        photo_qpos=photo_qpos,
+        frame_rate=FRAME_RATE,
+        episodes=tuple(episodes),
+        fingertip=False,
+    )
 
 
 def _toss(

@@ -14,7 +14,7 @@ FAMILIES = ("box", "wedge", "l_block", "hexagonal_prism", "t_block")
 MASS_RANGE_KG = (0.1, 0.5)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SolidObject:
     """A solid of uniform density in its body frame, whose origin is the mean of the corners.
 
@@ -61,7 +61,7 @@ def make_object(seed: int) -> SolidObject:
     volume, com, second = volume_moments(vertices, faces)
     inertia = mass / volume * (np.trace(second) * np.eye(3) - second)
     inertia -= mass * (com @ com * np.eye(3) - np.outer(com, com))
-    return SolidObject(family, vertices, faces, parts, mass, com, inertia)
+    return SolidObject(family=family, vertices=vertices, faces=faces, parts=parts, mass=mass, com=com, inertia=inertia)
 
 
 def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Camera
+from ..capture.cameras import Camera
 from .dynamics import STEPS_PER_S, ContactTruth, Motion, matrix_from_quat
 from .objects import SolidObject
 
@@ -35,7 +35,7 @@ class EpisodePlan:
     motion: Motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScenePlan:
     """A scene.
 

@@ -43,7 +43,16 @@ def plan_push(seed: int) -> ScenePlan:
     for name in ("000", "001", "002", "003"):
         split, frames = ("train", TRAIN_FRAMES) if name == "000" else ("test", TEST_FRAMES)
         episodes.append(EpisodePlan(name, split, frames, _push(rng, seed, model, solid, down, split)))
-    return ScenePlan("push", seed, solid, contact, photo_qpos, FRAME_RATE, tuple(episodes), fingertip=True)
+    return ScenePlan(
+        name="push",
+        seed=seed,
+        solid=solid,
+        contact=contact,
+        photo_qpos=photo_qpos,
+        frame_rate=FRAME_RATE,
+        episodes=tuple(episodes),
+        fingertip=True,
+    )
 
 
 def _push(rng: np.random.Generator, seed: int, model: MjModel, solid: SolidObject, down: Array, split: str) -> Motion:

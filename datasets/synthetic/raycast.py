@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Camera
+from ..capture.cameras import Camera
 from .dynamics import BODY_GROUP, MjModel, mujoco
 from .textures import Sheet
 

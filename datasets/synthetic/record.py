@@ -28,11 +28,11 @@ from ...schemas import (
     Video,
     World,
 )
-from ..cameras import Camera
-from ..images import write_image
-from ..manifest import write_manifest
-from ..progress import progress
-from ..tracks import Track, write_tracks
+from ..capture.cameras import Camera
+from ..capture.images import write_image
+from ..capture.manifest import write_manifest
+from ..capture.tracks import Track, write_tracks
+from ..io.progress import progress
 from .dynamics import (
     BODY_GROUP,
     FINGERTIP,
@@ -75,7 +75,7 @@ _AWAY = -100.0  # height at which a body is out of sight, below the mat
 _JPEG_QUALITY_PHOTO, _JPEG_QUALITY_VIDEO = 95, 92
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Set:
     """Everything that is in front of and behind the cameras while a scene is filmed."""
 
@@ -126,12 +126,22 @@ def build_set(
         tip = model.geom(FINGERTIP).id
         materials[tip], labels[tip] = Plain((0.16, 0.55, 0.28)), 2
     assert all(model.geom_group[geom] == BODY_GROUP for geom in labels)
-    caster = Raycaster(model, materials, labels, lamp, (0.62, 0.64, 0.66), parts if smooth else ())
+    caster = Raycaster(model, materials, labels, lamp=lamp, backdrop=(0.62, 0.64, 0.66), smooth=parts if smooth else ())
     gains = {"photos": draw_gain(rng, 1.0), "left": draw_gain(rng, rng.uniform(0.84, 0.94))}
     gains["right"] = draw_gain(rng, rng.uniform(1.06, 1.16))
     cameras = photo_cameras(photos, photo_size, np.random.default_rng([plan.seed, 7]))
     films = video_cameras(plan.seed, video_size)
-    return Set(plan, caster, lamp, markers, cameras, films, gains, samples, still)
+    return Set(
+        plan=plan,
+        caster=caster,
+        lamp=lamp,
+        markers=markers,
+        photos=cameras,
+        videos=films,
+        gains=gains,
+        samples=samples,
+        still=still,
+    )
 
 
 def record(scene: Set, out: Path) -> None:
@@ -272,9 +282,23 @@ def measure_tracks(plan: ScenePlan, episode: EpisodePlan) -> dict[str, Track]:
     for quat_wxyz, turn in zip(rows[:, 3:7], ROTATION_STD * rng.standard_normal((len(rows), 3)), strict=True):
         quats.append(_turned(quat_wxyz, turn))
     position = rows[:, :3] + POSITION_STD * rng.standard_normal((len(rows), 3))
-    tracks = {OBJECT: Track(times, np.round(position, 7), np.asarray(quats, np.float64).round(9), None, None)}
+    tracks = {
+        OBJECT: Track(
+            time_s=times,
+            position_m=np.round(position, 7),
+            quat_wxyz=np.asarray(quats, np.float64).round(9),
+            velocity_m_s=None,
+            omega_body_rad_s=None,
+        )
+    }
     if plan.fingertip:
-        tracks[FINGERTIP] = Track(times, rows[:, 7:10], np.tile([1.0, 0, 0, 0], (len(rows), 1)), None, None)
+        tracks[FINGERTIP] = Track(
+            time_s=times,
+            position_m=rows[:, 7:10],
+            quat_wxyz=np.tile([1.0, 0, 0, 0], (len(rows), 1)),
+            velocity_m_s=None,
+            omega_body_rad_s=None,
+        )
     return tracks
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Camera
+from ..capture.cameras import Camera
 from .objects import SolidObject, facet_normals
 from .raycast import Faceted, Lamp
 from .textures import Colour, Sheet, make_sheet, paint, paste_marker
@@ -167,4 +167,4 @@ def _camera(size: tuple[int, int], focal_per_width: float, T_world_cam: Array) -
     width, height = size
     focal_px = focal_per_width * width
     K = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
-    return Camera(width, height, K, np.zeros(0), T_world_cam)
+    return Camera(width=width, height=height, K=K, distortion=np.zeros(0), T_world_cam=T_world_cam)

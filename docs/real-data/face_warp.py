@@ -1,4 +1,4 @@
-"""An effect of one's own: a box whose faces are not flat, so that it rocks on them (docs/real-data.md)."""
+"""A custom effect: a box whose faces are not flat, so that it rocks on them (docs/real-data.md)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class FaceWarp(Effect):
     summary = "Faces of a box whose corners do not lie in one plane: it rocks about a diagonal."
     formula = "the corners of face x+ with y z > 0 move out by x_plus_even, those with y z < 0 by x_plus_odd; and so on"
     parameters = tuple(
-        EffectParameter(f"{'xyz'[axis]}_{side}_{diagonal}", "m", scale=0.0001, limit=0.01, nonnegative=True)
+        EffectParameter(name=f"{'xyz'[axis]}_{side}_{diagonal}", unit="m", scale=0.0001, limit=0.01, nonnegative=True)
         for axis, side in FACES
         for diagonal in DIAGONALS
     )

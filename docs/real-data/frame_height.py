@@ -1,4 +1,4 @@
-"""An effect of one's own: a tracking frame that is higher or lower than it is said to be (docs/real-data.md)."""
+"""A custom effect: a tracking frame that is higher or lower than it is said to be (docs/real-data.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class FrameHeight(Effect):
     name = "frame_height"
     summary = "A tracking system whose origin is not at the height that it is said to be."
     formula = "p_measured = p_true + h up"
-    parameters = (EffectParameter("h", "m", scale=0.001, limit=0.05),)
+    parameters = (EffectParameter(name="h", unit="m", scale=0.001, limit=0.05),)
     phase = "measurement"
     reveals = "rest on the ground"
     source = "definition"

@@ -1,11 +1,11 @@
-"""An effect of one's own: markers that are glued on turned against the body's faces (docs/real-data.md)."""
+"""A custom effect: markers that are glued on turned against the body's faces (docs/real-data.md)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects import Effect, EffectParameter, Poses, Values, vector
-from cgwm.pipeline.physics.rotation import quat_exp, quat_multiply
 
 
 class MarkerRotation(Effect):
@@ -14,7 +14,7 @@ class MarkerRotation(Effect):
     name = "marker_rotation"
     summary = "A tracked frame that is turned against the body's shape."
     formula = "R_measured = R exp(turn_x, turn_y, turn_z), in the body frame"
-    parameters = tuple(EffectParameter(f"turn_{axis}", "rad", scale=0.01, limit=0.3) for axis in "xyz")
+    parameters = tuple(EffectParameter(name=f"turn_{axis}", unit="rad", scale=0.01, limit=0.3) for axis in "xyz")
     phase = "measurement"
     needs = ("spin",)
     reveals = "rest on different faces"

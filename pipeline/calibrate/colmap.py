@@ -1,7 +1,7 @@
-"""The one module that talks to pycolmap: features, matches and mapping, repeatable bit for bit.
+"""Adapter of pycolmap: features, matches and mapping, repeatable bit for bit.
 
 Every seed is set and extraction, matching and mapping run on one thread each: with automatic thread counts two runs
-on the same photos differ. pycolmap is released often and renames things, so nothing else imports it.
+on the same photos differ. pycolmap is released often with renamed functions, so no other module imports it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 
-from ...datasets.progress import progress
-from .model import SfmCamera, SfmModel, VerifiedPair
+from ...datasets.io.progress import progress
+from .reconstruction import SfmCamera, SfmModel, VerifiedPair
 
 ResultT = TypeVar("ResultT")
 
@@ -27,11 +27,11 @@ _MATCHING_BLOCK = 25
 _MIN_MODEL_IMAGES = 3
 _POLL_S = 0.2
 
-pycolmap.logging.minloglevel = 3  # COLMAP's own log would drown ours; its outcomes are read from the database
+pycolmap.logging.minloglevel = 3  # COLMAP's log would drown ours; its results are read from the database
 
 
 def _keep_sigterm() -> None:
-    """Give SIGTERM back to Python: on import, COLMAP's log library takes it, and would end us without a clean-up."""
+    """Restore Python's handler of SIGTERM: the import of COLMAP replaces it by one that exits without a clean-up."""
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)
@@ -47,45 +47,47 @@ class SfmImage:
     name: str
     """Path relative to the image root, with forward slashes."""
     camera: str
-    """Images of one camera share their intrinsics and their size."""
+    """Name of the camera; images of one camera share their intrinsics and their size."""
     model: str = "OPENCV"
     """COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
     mask: Path | None = None
-    """Folder of masks, `<name>.png`, 0 where no features are wanted."""
+    """Folder of masks, `<name>.png`, 0 where features are excluded; None uses the whole images."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmSettings:
     """Settings of one attempt."""
 
     seed: int = 0
+    """Seed of matching and mapping."""
     max_features: int = 4096
+    """Maximum number of features per image."""
     max_image_size: int = 1600
-    """Images are reduced to this longer side [px]; keypoints are given in original pixels."""
+    """Maximum longer side of the reduced images [px]; keypoints are given in original pixels."""
     peak_threshold: float = 0.0067
-    """Smallest contrast of a SIFT feature; lower for weak texture."""
+    """Minimum contrast of a SIFT feature; lower for weak texture."""
     guided_matching: bool = False
     """Match again along the epipolar lines of the first verification."""
     max_ratio: float = 0.8
-    """Largest ratio of nearest to second-nearest descriptor distance; lower for repeated texture."""
+    """Maximum ratio of nearest to second-nearest descriptor distance; lower for repeated texture."""
 
     verification_trials: int = 2000
-    """Most hypotheses per pair. Pairs without true matches use them all and take most of the time: on 20 photos of a
-    small scene 2000 kept 4848 inliers of the 4849 that COLMAP's 10000 find, in half the time."""
+    """Maximum number of hypotheses per pair. Pairs without true matches use them all and take most of the time: on 20
+    photos of a small scene 2000 kept 4848 inliers of the 4849 that COLMAP's 10000 find, in half the time."""
 
     @property
     def features(self) -> tuple[int, int, float]:
-        """What the features depend on."""
+        """The settings that determine the features."""
         return self.max_features, self.max_image_size, self.peak_threshold
 
     @property
     def matches(self) -> tuple[object, ...]:
-        """What the verified matches depend on; the mapping depends on the seed as well."""
+        """The settings that determine the verified matches; the mapping depends on the seed as well."""
         return (*self.features, self.guided_matching, self.max_ratio, self.verification_trials)
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that the result depends on."""
+    """Return the versions of the libraries that determine the result."""
     return {"pycolmap": pycolmap.__version__}
 
 
@@ -93,7 +95,7 @@ def build_database(database: Path, root: Path, images: Sequence[SfmImage], setti
     """Extract and match the features of all images into a new COLMAP database.
 
     Args:
-        database: The file to make.
+        database: The file to create.
         root: Folder of the images.
         images: The images.
         settings: Settings of the attempt.
@@ -103,7 +105,7 @@ def build_database(database: Path, root: Path, images: Sequence[SfmImage], setti
 
 
 def map_database(database: Path, root: Path, seed: int) -> list[SfmModel]:
-    """Estimate cameras and points; return all connected models, that with most images first."""
+    """Estimate cameras and points; return all connected models, the one with most images first."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
     options.random_seed = seed
@@ -219,7 +221,7 @@ def _match(database: Path, names: Sequence[str], settings: SfmSettings) -> None:
 
 
 def _pair_blocks(names: Sequence[str]) -> list[list[tuple[str, str]]]:
-    """Return all pairs in square blocks: COLMAP indexes the features of an image anew in every call."""
+    """Return all pairs in square blocks, because COLMAP indexes the features of an image again in every call."""
     groups = list(_chunks(names, _MATCHING_BLOCK))
     blocks = [list(combinations(group, 2)) for group in groups]
     blocks += [list(product(a, b)) for a, b in combinations(groups, 2)]
@@ -227,7 +229,7 @@ def _pair_blocks(names: Sequence[str]) -> list[list[tuple[str, str]]]:
 
 
 def _run(function: Callable[..., ResultT], seed: int, **arguments: Any) -> ResultT:
-    """Call pycolmap in a thread of its own, so that Ctrl-C cancels it instead of waiting for its end.
+    """Call pycolmap in a separate thread, so that Ctrl-C cancels it instead of waiting for its end.
 
     COLMAP's generator belongs to the thread, so it is seeded there.
     """
@@ -238,7 +240,7 @@ def _run(function: Callable[..., ResultT], seed: int, **arguments: Any) -> Resul
         try:
             pycolmap.set_random_seed(seed)
             outcome["value"] = function(**arguments, cancellation_token=token)
-        except BaseException as error:  # handed to the caller's thread
+        except BaseException as error:  # raised in the thread of the caller
             outcome["error"] = error
 
     thread = threading.Thread(target=call, daemon=True)
@@ -328,4 +330,6 @@ def _plain_camera(camera: pycolmap.Camera) -> SfmCamera:
     cx, cy = (float(value) for value in camera.params[camera.principal_point_idxs()])
     extra = [float(value) for value in camera.params[camera.extra_params_idxs()]]
     k1, k2, p1, p2 = [*extra, 0.0, 0.0, 0.0, 0.0][:4]
-    return SfmCamera(camera.width, camera.height, focal[0], focal[-1], cx, cy, (k1, k2, p1, p2))
+    return SfmCamera(
+        width=camera.width, height=camera.height, fx=focal[0], fy=focal[-1], cx=cx, cy=cy, distortion=(k1, k2, p1, p2)
+    )

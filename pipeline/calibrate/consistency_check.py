@@ -1,7 +1,7 @@
-"""The self-check of a structure-from-motion model: do its cameras agree with the matches they came from?
+"""Self-check of a structure-from-motion model against the verified matches that it was estimated from.
 
-A model may have every image registered and a low reprojection error and still be bent or folded: the mapper drops the
-observations that disagree. The verified matches of image pairs are independent of the mapper, so they reveal it.
+A model may register every image with a low reprojection error and still be bent or folded: the mapper drops the
+observations that disagree. The verified matches of image pairs are independent of the mapper, so they reveal this.
 """
 
 from __future__ import annotations
@@ -12,39 +12,42 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .model import Array, SfmModel, VerifiedPair
+from .reconstruction import Array, SfmModel, VerifiedPair
 
 CONSISTENT_BELOW_PX = 4.0
-"""An inlier agrees with the model when its Sampson error is below this."""
+"""Threshold on the Sampson error [px], below which an inlier agrees with the model."""
 PAIR_MIN_INLIERS = 50
-"""Pairs with fewer inliers are not looked at."""
+"""Minimum number of inliers of a pair that is checked."""
 STRONG_PAIR_INLIERS = 200
-"""Pairs with as many inliers are evidence enough to reject a model."""
+"""Minimum number of inliers of a strong pair, which is sufficient evidence to reject a model."""
 MIN_CONSISTENT_FRACTION = 0.5
-"""A strong pair whose inliers agree less than this rejects the model."""
+"""Minimum fraction of consistent inliers of a strong pair; below it the model is rejected."""
 _NO_BASELINE = 1e-9
-"""Below this fraction of the model's extent two cameras coincide and E vanishes."""
+"""Baseline below which two cameras coincide and E vanishes, as a fraction of the model's extent."""
 
 
 @dataclass(frozen=True)
 class PairCheck:
-    """How a verified pair agrees with the model."""
+    """Agreement of a verified pair with the model."""
 
     image_a: str
+    """Name of the first image."""
     image_b: str
+    """Name of the second image."""
     inliers: int
+    """Number of verified matches."""
     consistent: float
     """Fraction of the inliers that agree with the model's relative pose."""
 
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """The verdict on a model."""
+    """Result of the self-check of a model."""
 
     pairs: tuple[PairCheck, ...]
     """All registered pairs with at least `PAIR_MIN_INLIERS` inliers."""
     images_without_strong_pair: tuple[str, ...]
-    """Registered images that no strong pair vouches for."""
+    """Registered images that are in no strong pair."""
 
     @property
     def strong(self) -> tuple[PairCheck, ...]:
@@ -64,20 +67,20 @@ class SelfCheck:
 
     @property
     def worst(self) -> PairCheck | None:
-        """The least consistent strong pair, or the least consistent one where no pair is strong."""
+        """The least consistent strong pair, or the least consistent pair if no pair is strong."""
         pairs = self.strong or self.pairs
         return min(pairs, key=lambda pair: (pair.consistent, -pair.inliers)) if pairs else None
 
 
 def check_model(model: SfmModel, pairs: Iterable[VerifiedPair]) -> SelfCheck:
-    """Compare a model's relative poses with the verified matches.
+    """Compare the relative poses of a model with the verified matches.
 
     Rule and thresholds: a model is rejected if any pair with >= 200 verified inliers is less than 50 % consistent,
     an inlier being consistent below 4 px (Sampson).
 
     Args:
         model: The model.
-        pairs: Verified pairs, also of images that are not registered (those are skipped).
+        pairs: Verified pairs; those of unregistered images are skipped.
     """
     extent = float(np.ptp(model.centers(), axis=0).max()) if model.T_cam_world else 0.0
     checks = []
@@ -105,12 +108,12 @@ def _check_pair(model: SfmModel, pair: VerifiedPair, extent: float) -> PairCheck
 
 
 def consistent_inliers(rays_a: Array, rays_b: Array, R_b_a: Array, t_b_a: Array, focal_px: float) -> NDArray[np.bool_]:
-    """Tell which matches agree with a relative pose.
+    """Return whether each match agrees with a relative pose.
 
     A match agrees if its Sampson error is below 4 px and, where its parallax is beyond that noise, the point lies in
-    front of both cameras (the Sampson error alone cannot tell t from -t). A short baseline needs no exception: the
-    epipolar line runs through the image of the infinitely far point, so the error is at most the parallax. Only
-    where the baseline is zero does E vanish; there the displacement from the rotated ray is taken instead.
+    front of both cameras (the Sampson error alone cannot distinguish t from -t). A short baseline needs no exception:
+    the epipolar line runs through the image of the infinitely far point, so the error is at most the parallax. E
+    vanishes only for a baseline of zero; the displacement from the rotated ray replaces it there.
 
     Args:
         rays_a: Ray slopes (x/z, y/z) in camera a [1], shape (match, 2).
@@ -156,13 +159,13 @@ def sampson_error(rays_a: Array, rays_b: Array, R_b_a: Array, t_b_a: Array) -> A
 
 
 def _behind(a: Array, b: Array, t: Array, min_parallax: float) -> NDArray[np.bool_]:
-    """Tell which points triangulate behind a camera, with a parallax [rad] above the noise.
+    """Return whether each point triangulates behind a camera, with a parallax [rad] above the noise.
 
     Derived: z_a and z_b minimise |z_a a + t - z_b b|^2, both rays in the axes of camera b.
     """
     aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
     at, bt = a @ t, b @ t
-    determinant = aa * bb - ab**2  # (|a| |b| sin(parallax))^2: positive but for equal rays
+    determinant = aa * bb - ab**2  # (|a| |b| sin(parallax))^2: positive unless the rays are equal
     z_a, z_b = ab * bt - bb * at, aa * bt - ab * at
     return (determinant > aa * bb * min_parallax**2) & ((z_a < 0) | (z_b < 0))
 

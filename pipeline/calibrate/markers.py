@@ -1,4 +1,4 @@
-"""ArUco markers in photos."""
+"""Detection of ArUco markers in photos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError, did_you_mean
-from .model import Array
+from .reconstruction import Array
 
 _PREFIX = "DICT_"
 
@@ -16,7 +16,7 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
     """Return OpenCV's predefined dictionary by its name without the prefix `DICT_`.
 
     Raises:
-        InputDataError: If there is none of that name; with the nearest one.
+        InputDataError: If no dictionary has that name; the message has the nearest one.
     """
     legal = sorted(key.removeprefix(_PREFIX) for key in dir(cv2.aruco) if key.startswith(_PREFIX))
     if name not in legal:
@@ -28,7 +28,7 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def marker_corners(side_m: float) -> Array:
-    """Return a marker's corners in its own frame [m], shape (4, 3).
+    """Return the corners of a marker in the marker frame [m], shape (4, 3).
 
     The frame: origin at the centre, x right and y up as printed, z out of the paper. The order is OpenCV's: top
     left, top right, bottom right, bottom left.
@@ -38,15 +38,15 @@ def marker_corners(side_m: float) -> Array:
 
 
 def detect_markers(image: NDArray[np.uint8], aruco: cv2.aruco.Dictionary) -> dict[int, Array]:
-    """Find markers in a photo.
+    """Detect markers in a photo.
 
     Args:
         image: RGB, shape (height, width, 3), as stored (not undistorted).
         aruco: The dictionary.
 
     Returns:
-        Marker id to corner pixels, shape (4, 2), refined below a pixel; the centre of the top-left pixel is at
-        (0.5, 0.5), where OpenCV itself says (0, 0). An id that is seen twice is left out: which one is meant?
+        Corner pixels by marker id, shape (4, 2), with subpixel accuracy; the centre of the top-left pixel is at
+        (0.5, 0.5), where OpenCV has (0, 0). An id that occurs twice is omitted as ambiguous.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

@@ -1,4 +1,4 @@
-"""Metric scale and the world frame: from markers, a known distance, or a known distance between two cameras."""
+"""Metric scale and world frame: from markers, a known distance, or a known distance between two cameras."""
 
 from __future__ import annotations
 
@@ -9,35 +9,36 @@ import numpy as np
 
 from ...schemas import InputDataError, KnownCameraDistance, KnownDistance, Marker, NotConvergedError
 from .markers import marker_corners
-from .model import Array, SfmModel, Similarity
-from .triangulate import TriangulatedPoint, center_std, triangulate
+from .reconstruction import Array, SfmModel, Similarity
+from .triangulation import TriangulatedPoint, center_std, triangulate
 
 Sightings = Mapping[int, Mapping[str, Array]]
-"""Marker id to image to corner pixels (4, 2)."""
+"""Corner pixels (4, 2) by marker id and image."""
 
 CORNER_NOISE_PX = 0.1
-"""Least standard deviation of a refined marker corner [px]."""
+"""Minimum standard deviation of a refined marker corner [px]."""
 CORNER_BIAS_PX = 0.1
-"""Error that all corners of a marker may share (blur and exposure move its edges) [px], standard deviation."""
+"""Standard deviation of the error that all corners of a marker share (blur and exposure move its edges) [px]."""
 CLICK_NOISE_PX = 0.5
-"""Least standard deviation of a point that was marked by hand [px]."""
+"""Minimum standard deviation of a point that was marked by hand [px]."""
 MAX_MARKER_MISFIT = 0.05
-"""Posed markers that disagree by more than this fraction of their extent were measured wrongly."""
+"""Maximum disagreement of posed markers, as a fraction of their extent; above it a pose or size is wrong."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MetricFrame:
     """The transform from the model's frame to metres."""
 
     similarity: Similarity
+    """Transform from the model frame to the metric frame."""
     source: str
-    """What the scale comes from, in words."""
+    """Description of the source of the scale."""
     relative_std: float
     """Standard error of the scale, as a fraction."""
     fixes_frame: bool
-    """Whether it gives the world's axes and origin too; otherwise it only scales."""
+    """Whether the transform defines the axes and origin of the world too; otherwise it only scales."""
     residual_m: float | None = None
-    """Root mean square distance of the marker corners from where they should be [m]."""
+    """Root mean square distance of the marker corners from their given positions [m]."""
 
 
 def umeyama(source: Array, target: Array) -> Similarity:
@@ -47,7 +48,7 @@ def umeyama(source: Array, target: Array) -> Similarity:
 
     Args:
         source: Points, shape (point, 3), at least 3 that are not on one line.
-        target: Where they belong, shape (point, 3).
+        target: Matched target points, shape (point, 3).
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     a, b = source - source_mean, target - target_mean
@@ -61,11 +62,11 @@ def umeyama(source: Array, target: Array) -> Similarity:
 def from_markers(model: SfmModel, markers: Sequence[Marker], sightings: Sightings) -> MetricFrame:
     """Return scale and world frame from ArUco markers of known size.
 
-    Markers with a pose fix scale, axes and origin together. Where none has one, the scale comes from all sides
-    and diagonals and the world frame is that of the first marker: origin at its centre, z out of it.
+    Markers with a pose fix scale, axes and origin together. Without any pose, the scale comes from all sides
+    and diagonals, and the world frame is that of the first marker: origin at its centre, z out of it.
 
     Raises:
-        NotConvergedError: If none of the markers is seen well enough in two registered photos.
+        NotConvergedError: If no marker is visible well enough in two registered photos.
         InputDataError: If posed markers contradict each other.
     """
     corners = {marker.id: _triangulated_corners(model, sightings.get(marker.id, {})) for marker in markers}
@@ -83,7 +84,7 @@ def from_markers(model: SfmModel, markers: Sequence[Marker], sightings: Sighting
 
 
 def from_known_distance(model: SfmModel, known: KnownDistance) -> MetricFrame:
-    """Return the scale from two points whose distance is known.
+    """Return the scale from two marked points at a known distance.
 
     Raises:
         InputDataError: If a point is not marked consistently in two registered photos.
@@ -94,7 +95,9 @@ def from_known_distance(model: SfmModel, known: KnownDistance) -> MetricFrame:
     direction = offset / length
     std = float(np.sqrt(direction @ (a.covariance + b.covariance) @ direction)) / length
     source = f"known distance of {known.distance_m:g} m between two marked points"
-    return MetricFrame(_scaling(known.distance_m / length), source, std, fixes_frame=False)
+    return MetricFrame(
+        similarity=_scaling(known.distance_m / length), source=source, relative_std=std, fixes_frame=False
+    )
 
 
 def from_camera_distance(model: SfmModel, known: KnownCameraDistance) -> MetricFrame:
@@ -118,11 +121,13 @@ def from_camera_distance(model: SfmModel, known: KnownCameraDistance) -> MetricF
     stds = [center_std(model, name, offset / length, noise) for name in known.images]
     source = f"known distance of {known.distance_m:g} m between the cameras of {known.images[0]} and {known.images[1]}"
     std = float(np.linalg.norm(stds)) / length
-    return MetricFrame(_scaling(known.distance_m / length), source, std, fixes_frame=False)
+    return MetricFrame(
+        similarity=_scaling(known.distance_m / length), source=source, relative_std=std, fixes_frame=False
+    )
 
 
 def _triangulated_corners(model: SfmModel, sightings: Mapping[str, Array]) -> list[TriangulatedPoint]:
-    """Return the four corners of a marker, or nothing where one of them fails."""
+    """Return the four triangulated corners of a marker, or an empty list if one of them fails."""
     corners = []
     for index in range(4):
         pixels = {image: (float(xy[index, 0]), float(xy[index, 1])) for image, xy in sightings.items()}
@@ -164,7 +169,13 @@ def _from_posed(
     bias = float((centered * outward * shift[:, None]).sum()) / spread
     std = float(np.sqrt(max(misfit_variance, noise_variance) / spread + bias**2))
     names = ", ".join(str(marker.id) for marker in posed)
-    return MetricFrame(similarity, f"ArUco marker(s) {names} of known size and pose", std, True, residual)
+    return MetricFrame(
+        similarity=similarity,
+        source=f"ArUco marker(s) {names} of known size and pose",
+        relative_std=std,
+        fixes_frame=True,
+        residual_m=residual,
+    )
 
 
 def _from_sizes(
@@ -193,11 +204,11 @@ def _from_sizes(
     std = float(np.hypot(1.0 / np.sqrt(weights.sum()), spread / scale / np.sqrt(max(len(scales) - 1, 1))))
     names = ", ".join(str(marker.id) for marker in usable)
     source = f"ArUco marker(s) {names} of known size; the world frame is that of marker {first.id}"
-    return MetricFrame(similarity, source, std, True, residual)
+    return MetricFrame(similarity=similarity, source=source, relative_std=std, fixes_frame=True, residual_m=residual)
 
 
 def _metres_per_pixel(marker: Marker, corners: Sequence[TriangulatedPoint], model: SfmModel) -> float:
-    """Return what a pixel is worth at a marker in its nearest views [m]: side over projected side."""
+    """Return the size of a pixel at a marker in its nearest views [m]: side over projected side."""
     side = np.linalg.norm(corners[1].position - corners[0].position)
     middle = np.mean([corner.position for corner in corners], axis=0)
     widths = [

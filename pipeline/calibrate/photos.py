@@ -1,4 +1,4 @@
-"""What goes into structure from motion: the photos, and the first frame of each video camera that stands still."""
+"""Input images of structure from motion: the photos, and the first frame of each static video camera."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.capture import Capture
-from ...datasets.images import image_size, write_image
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.images import image_size, write_image
 from .colmap import SfmImage
 
 STILL_BELOW_PX = 2.0
-"""Median displacement of the background, per 1000 px of image width, below which a video camera stands still."""
+"""Threshold on the median displacement of the background per 1000 px of image width [px], for a static camera."""
 _EPISODES_LOOKED_AT = 4
 _FEW_PHOTOS = 6
-"""With fewer photos of one camera, four lens parameters are not determined; one (k1) is estimated then."""
+"""Minimum number of photos of a camera for four lens parameters; with fewer only k1 is estimated."""
 _MASK_MARGIN_PX = 5
 
 
 @dataclass(frozen=True)
 class Source:
-    """An image for structure from motion, and where it comes from."""
+    """An image for structure from motion and its origin."""
 
     label: str
     """The photo's name, or `video:<camera>`."""
     image: SfmImage
+    """The image in the working folder."""
 
 
 @dataclass(frozen=True)
@@ -38,24 +39,26 @@ class Inputs:
     """All images of a capture, laid out for COLMAP."""
 
     root: Path
+    """Folder of the images."""
     sources: tuple[Source, ...]
+    """The images."""
     notes: tuple[str, ...]
-    """What the user should know: moving video cameras, photos of several sizes."""
+    """Messages for the user: moving video cameras, photos of several sizes."""
     moving: dict[str, str]
-    """Video cameras that were left out, with the reason."""
+    """Omitted video cameras, with the reason."""
 
 
 def video_label(camera: str) -> str:
-    """Return the label of a video camera's frame; no photo has a colon and no suffix in its name."""
+    """Return the label of the frame of a video camera, which is distinct from all names of photos."""
     return f"video:{camera}"
 
 
 def gather(capture: Capture, folder: Path) -> Inputs:
-    """Lay out a capture's images in a working folder, under names that COLMAP can read.
+    """Collect the images of a capture in a working folder, under names that COLMAP can read.
 
     Args:
         capture: The capture.
-        folder: An empty folder, for the time of the calibration.
+        folder: An empty folder, kept for the duration of the calibration.
     """
     root = folder / "images"
     sources, notes = _photos(capture, root)
@@ -81,7 +84,7 @@ def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray
 
     Args:
         frames: RGB frames of one camera, each (height, width, 3).
-        masks: Their labels (height, width), 0 background, or None.
+        masks: Labels of the frames (height, width), 0 background, or None.
     """
     first = cv2.cvtColor(frames[0], cv2.COLOR_RGB2GRAY)
     mask = None if masks[0] is None else (masks[0] == 0).astype(np.uint8)
@@ -107,7 +110,7 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str]]:
     same = capture.manifest.calibration.same_camera
     sources = []
     for index, name in enumerate(names):
-        # Numbers instead of names: COLMAP's lists are separated by blanks.
+        # Numbers replace the names, because COLMAP separates lists by blanks.
         inside = f"photos/{index:06d}{Path(name).suffix.lower()}"
         _link(capture.root / "images" / name, root / inside)
         width, height = sizes[name]
@@ -118,7 +121,7 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str]]:
     notes = []
     if same and len(distinct) > 1:
         listed = ", ".join(f"{width}x{height}" for width, height in distinct)
-        notes.append(f"photos of {len(distinct)} sizes ({listed}): each size has intrinsics of its own")
+        notes.append(f"photos of {len(distinct)} sizes ({listed}): each size has separate intrinsics")
     return sources, notes
 
 
@@ -130,18 +133,18 @@ def _video_source(
     write_image(root / inside, frame)
     masks = None
     if mask is not None:
-        # The bodies are elsewhere in the photos: their features would be matches that contradict the scene.
+        # The bodies are at other places in the photos, so matches of their features would contradict the scene.
         masks = folder / "masks"
         (masks / "videos").mkdir(parents=True, exist_ok=True)
         kernel = np.ones((2 * _MASK_MARGIN_PX + 1, 2 * _MASK_MARGIN_PX + 1), np.uint8)
         keep = np.where(cv2.dilate((mask > 0).astype(np.uint8), kernel) > 0, 0, 255).astype(np.uint8)
         write_image(masks / f"{inside}.png", keep)
-    # A lens cannot be told from one frame: focal length only.
+    # One frame does not determine a lens: only the focal length is estimated.
     return Source(video_label(camera), SfmImage(inside, f"video-{camera}", "SIMPLE_PINHOLE", masks))
 
 
 def _probe_frames(capture: Capture, camera: str) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8] | None]]:
-    """Return the first frame of a camera, then the last ones and those of other episodes, with their masks."""
+    """Return the first frame of a camera, then the last ones and those of other episodes, with masks."""
     splits = capture.manifest.splits
     wanted = capture.episodes("train") if "train" in splits else capture.episodes()
     episodes = [episode for episode in wanted if camera in capture.videos(episode)][:_EPISODES_LOOKED_AT]
@@ -159,5 +162,5 @@ def _probe_frames(capture: Capture, camera: str) -> tuple[list[NDArray[np.uint8]
 def _link(source: Path, target: Path) -> None:
     try:
         os.symlink(source.resolve(), target)
-    except OSError:  # file systems and systems without links
+    except OSError:  # file systems and operating systems without links
         shutil.copyfile(source, target)

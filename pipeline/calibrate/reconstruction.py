@@ -1,4 +1,4 @@
-"""A structure-from-motion model as plain arrays, so that everything but the adapter is free of COLMAP."""
+"""Structure-from-motion model as plain arrays, independent of COLMAP."""
 
 from __future__ import annotations
 
@@ -13,18 +13,24 @@ Array = NDArray[np.float64]
 _UNDISTORT_STEPS = 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmCamera:
     """Intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
 
     width: int
+    """Width of the image [px]."""
     height: int
+    """Height of the image [px]."""
     fx: float
+    """Focal length along x [px]."""
     fy: float
+    """Focal length along y [px]."""
     cx: float
+    """Column of the principal point [px]."""
     cy: float
+    """Row of the principal point [px]."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2 as in OpenCV."""
+    """Lens parameters k1, k2, p1, p2 of OpenCV."""
 
     @property
     def focal_px(self) -> float:
@@ -73,17 +79,18 @@ class Similarity:
     """A similarity transform: p_world = scale * rotation @ p + translation."""
 
     scale: float
+    """Scale [1]."""
     rotation: Array
-    """Shape (3, 3)."""
+    """Rotation matrix, shape (3, 3)."""
     translation: Array
-    """Shape (3,), world units."""
+    """Translation [world unit], shape (3,)."""
 
     def points(self, points: Array) -> Array:
         """Map points, shape (..., 3)."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def pose(self, T_cam_world: Array) -> Array:
-        """Map a camera pose, so that the camera sees the mapped world as it saw the old one; shape (4, 4)."""
+        """Map a camera pose (4, 4), so that images of the mapped world are those of the original one."""
         rotation = T_cam_world[:3, :3] @ self.rotation.T
         pose = np.eye(4)
         pose[:3, :3] = rotation
@@ -92,16 +99,16 @@ class Similarity:
 
     @staticmethod
     def identity() -> Similarity:
-        """Return the transform that changes nothing."""
+        """Return the identity transform."""
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmModel:
     """Registered cameras and sparse points of one connected model."""
 
     cameras: dict[str, SfmCamera]
-    """By camera name."""
+    """Intrinsics by camera name."""
     image_camera: dict[str, str]
     """Name of the camera of each registered image."""
     T_cam_world: dict[str, Array]
@@ -109,11 +116,11 @@ class SfmModel:
     points: Array
     """Sparse points, world frame, shape (point, 3)."""
     colors: NDArray[np.uint8]
-    """Their sRGB colours, shape (point, 3)."""
+    """Colours of the points, sRGB, shape (point, 3)."""
     observations: dict[str, tuple[Array, NDArray[np.int64]]]
-    """Of each image: pixels (observation, 2) and indices (observation,) of the points seen there."""
+    """Pixels (observation, 2) and point indices (observation,) of the observations in each image."""
     reprojection_error_px: float
-    """Mean over the points; says nothing about whether the model is right."""
+    """Mean reprojection error of the points [px]; a wrong model may have a low one."""
 
     def camera(self, image: str) -> SfmCamera:
         """Return the intrinsics of an image."""
@@ -151,7 +158,9 @@ class VerifiedPair:
     """Two images and their matches that passed COLMAP's two-view verification."""
 
     image_a: str
+    """Name of the first image."""
     image_b: str
+    """Name of the second image."""
     xy_a: Array
     """Pixels in the first image [px], shape (inlier, 2)."""
     xy_b: Array

@@ -1,4 +1,4 @@
-"""The stage calibrate: photos and video frames to cameras, checked, with a metric scale where one is given."""
+"""The stage calibrate: estimate and check cameras from photos and video frames, with a metric scale if given."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datasets.atomic import new_file
-from ..datasets.capture import Capture
-from ..datasets.check import check_capture
-from ..datasets.kinds import refuse_other_kind
-from ..datasets.progress import progress
-from ..schemas import (
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.check import check_capture
+from ...datasets.capture.sparse_points import POINTS_NAME, write_points
+from ...datasets.io.atomic import new_file
+from ...datasets.io.kinds import refuse_other_kind
+from ...datasets.io.progress import progress
+from ...schemas import (
     CalibrateConfig,
     CameraIntrinsics,
     CamerasFile,
@@ -29,58 +30,57 @@ from ..schemas import (
     UsageError,
     read_toml,
 )
-from ..schemas.calibration import (
-    CalibrationAttempt,
-    CalibrationReport,
-    ImageVerdict,
-    PairFigures,
-    SelfCheckFigures,
-)
-from .sfm import colmap
-from .sfm.frame import dominant_plane, ground_frame
-from .sfm.inputs import Inputs, gather, video_label
-from .sfm.markers import detect_markers, dictionary
-from .sfm.model import Array, SfmCamera, SfmModel, Similarity, VerifiedPair, world_from_cam
-from .sfm.points import POINTS_NAME, write_points
-from .sfm.scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
-from .sfm.selfcheck import SelfCheck, check_model
+from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict, PairFigures, SelfCheckFigures
+from . import colmap
+from .consistency_check import SelfCheck, check_model
+from .markers import detect_markers, dictionary
+from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
+from .photos import Inputs, gather, video_label
+from .reconstruction import Array, SfmCamera, SfmModel, Similarity, VerifiedPair, world_from_cam
+from .world_frame import dominant_plane, ground_frame
 
 CAMERAS_NAME = "cameras.json"
 REPORT_NAME = "calibration.json"
 
 MIN_PHOTOS = 3
 MIN_REGISTERED_FRACTION = 0.5
-"""With fewer photos registered, the calibration has failed."""
+"""Minimum fraction of registered photos; below it the calibration fails."""
 _LOW_PEAK_THRESHOLD = 0.002  # conventions: worked for weak texture
 _THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
 _TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
 _MANY_WITHOUT_STRONG = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Candidate:
-    """The outcome of an attempt."""
+    """Result of an attempt."""
 
     model: SfmModel
+    """The largest connected model."""
     check: SelfCheck
+    """Self-check of that model."""
     models: tuple[SfmModel, ...]
+    """All connected models."""
     pairs: tuple[VerifiedPair, ...]
+    """Verified pairs of images."""
     features: dict[str, int]
+    """Number of features by image."""
     attempt: int
+    """Number of the attempt."""
 
 
 def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = False) -> CalibrationReport:
-    """Estimate the cameras of a capture, and write `cameras.json`, `sparse_points.ply` and `calibration.json`.
+    """Estimate the cameras of a capture and write `cameras.json`, `sparse_points.ply` and `calibration.json`.
 
-    Photos (and the first frame of each video camera that stands still) go through COLMAP's incremental mapping.
-    A model that contradicts its own verified matches is rejected and estimated anew, first with other seeds, then
-    with other matching and more features; a wrong one is never written. The same capture, settings, versions and
-    kind of machine give the same bytes of `cameras.json`.
+    COLMAP's incremental mapping registers the photos and the first frame of each static video camera. A model that
+    contradicts its verified matches is rejected and estimated again, first with other seeds, then with other matching
+    and more features; a rejected model is never written. The same capture, settings, versions and kind of machine give
+    the same bytes of `cameras.json`.
 
     Args:
         capture_root: The capture's directory.
         config: Settings.
-        overwrite: Replace cameras that are there.
+        overwrite: Replace existing cameras.
 
     Returns:
         The verdict on every image, the self-check, the attempts and the scale.
@@ -113,7 +113,7 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
 
 def _open(root: Path, overwrite: bool) -> Capture:
     if overwrite:
-        # The old cameras may name photos that are gone: that is a reason to replace them, not to refuse.
+        # The old cameras may name deleted photos: that is a reason to replace them, not an error.
         refuse_other_kind(root, "capture")
         capture = Capture(root, read_toml(root / "capture.toml", CaptureManifest))
         check_capture(capture)
@@ -138,7 +138,7 @@ def _open(root: Path, overwrite: bool) -> Capture:
 
 def _plan(config: CalibrateConfig) -> list[colmap.SfmSettings]:
     """Return the settings of the attempts: other seeds first, then other matching, then more features."""
-    base = colmap.SfmSettings(config.seed, config.max_features, config.max_image_size)
+    base = colmap.SfmSettings(seed=config.seed, max_features=config.max_features, max_image_size=config.max_image_size)
     more = replace(
         base,
         max_features=2 * config.max_features,
@@ -169,7 +169,7 @@ def _search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[_Can
             break
         incomplete = bool(passed) or (built is not None and (last is None or last.check.passed))
         if incomplete and built is not None and settings.features == built.features:
-            continue  # another seed finds no more images; more features may
+            continue  # Another seed registers no more images, but more features may.
         second_try = bool(passed)
         candidate, attempt = _attempt(folder, inputs, settings, built, len(attempts))
         attempts.append(attempt)
@@ -204,7 +204,14 @@ def _attempt(
     candidate = None
     if models:
         features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
-        candidate = _Candidate(models[0], check_model(models[0], pairs), models, pairs, features, number)
+        candidate = _Candidate(
+            model=models[0],
+            check=check_model(models[0], pairs),
+            models=models,
+            pairs=pairs,
+            features=features,
+            attempt=number,
+        )
     return candidate, _attempt_figures(settings, candidate)
 
 
@@ -273,7 +280,7 @@ def _not_converged(
             f"All {len(rejected)} camera models contradict their own matches ({len(attempts)} attempts).{where}",
             "models in which every pair of images with 200 or more verified matches is at least 50 % consistent.",
             "remove blurred photos and those in which something moved; repeated or symmetric texture can cause this: "
-            "put an object or printed pattern with unique texture beside it, and photograph in steps of 10 degrees.",
+            "put an object or printed pattern with unique texture next to it, and photograph in steps of 10 degrees.",
         )
     candidate = best or last
     registered = _photo_count(candidate.model, inputs) if candidate else 0
@@ -318,7 +325,7 @@ def _verdict(label: str, candidate: _Candidate) -> ImageVerdict:
 
 
 def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Similarity, str, list[str]]:
-    """Return the metric frame if there is one, the transform into the world, what fixes the world, and warnings."""
+    """Return the metric frame (or None), the transform into the world, what fixes the world, and warnings."""
     calibration, ground = capture.manifest.calibration, capture.manifest.world.ground
     frame, warnings = None, []
     if calibration.markers:
@@ -450,7 +457,7 @@ def _warnings(best: _Candidate) -> list[str]:
 
 
 def _ground_check(capture: Capture, model: SfmModel, scale: Scale) -> tuple[float | None, float | None]:
-    """Compare the dominant plane with the manifest's ground: tilt [deg] and height at the origin [m]."""
+    """Return tilt [deg] and height at the origin [m] of the dominant plane relative to the manifest's ground."""
     ground = capture.manifest.world.ground
     if ground is None:
         return None, None
@@ -468,7 +475,7 @@ def _ground_check(capture: Capture, model: SfmModel, scale: Scale) -> tuple[floa
 
 
 def _write(root: Path, cameras: CamerasFile, model: SfmModel, report: CalibrationReport, overwrite: bool) -> None:
-    """Write the three files; `cameras.json` takes its name last, so what has it is complete."""
+    """Write the three files; `cameras.json` is renamed last, so its presence means that all are complete."""
     with ExitStack() as stack:
         cameras_path = stack.enter_context(new_file(root / CAMERAS_NAME, overwrite))
         report_path = stack.enter_context(new_file(root / REPORT_NAME, overwrite=True))

@@ -1,4 +1,4 @@
-"""A point from its images in many registered photos, robust against false sightings, with its covariance."""
+"""Robust triangulation of a point from its images in many registered photos, with its covariance."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from .model import Array, SfmModel
+from .reconstruction import Array, SfmModel
 
 MAX_ERROR_PX = 4.0
-"""A sighting farther than this from the point's image is left out (the bound COLMAP filters by)."""
+"""Maximum reprojection error of an inlier [px], the bound of COLMAP's filter."""
 _MAX_PAIRS = 300
 _GAUSS_NEWTON_STEPS = 10
 _PARALLEL = 1e-4
-"""Rays that differ by a smaller angle [rad] make no hypothesis."""
+"""Minimum angle between the two rays of a hypothesis [rad]."""
 
 
 @dataclass(frozen=True)
@@ -24,30 +24,30 @@ class TriangulatedPoint:
     """A triangulated point."""
 
     position: Array
-    """Shape (3,), the model's frame."""
+    """Position [model unit], model frame, shape (3,)."""
     covariance: Array
-    """Shape (3, 3), model unit squared, from the measurement noise alone; the cameras are taken as exact."""
+    """Covariance from the measurement noise alone, with exact cameras [model unit squared], shape (3, 3)."""
     images: tuple[str, ...]
-    """The images that agree."""
+    """Names of the images that agree."""
     rms_px: float
-    """Root mean square distance to the sightings in those images [px]."""
+    """Root mean square reprojection error in those images [px]."""
 
 
 def triangulate(
     model: SfmModel, sightings: Mapping[str, tuple[float, float]], noise_px: float
 ) -> TriangulatedPoint | None:
-    """Triangulate one point.
+    """Triangulate one point robustly.
 
-    Every pair of views (evenly chosen, up to 300) makes a hypothesis by the midpoint of its rays;
-    the one with most agreeing views wins and is refined by Gauss-Newton on the reprojection error.
+    Each pair of views (at most 300, evenly chosen) gives a hypothesis, the midpoint of its rays. The one with most
+    agreeing views is refined by Gauss-Newton on the reprojection error.
 
     Args:
         model: The registered cameras.
-        sightings: Image name to the point's pixel; images that are not registered are passed over.
-        noise_px: Standard deviation of a pixel coordinate [px], a lower bound for the covariance.
+        sightings: Pixel of the point by image name; unregistered images are ignored.
+        noise_px: Standard deviation of a pixel coordinate [px], a lower bound of the residual noise.
 
     Returns:
-        The point, or None if no two views agree on one in front of them.
+        The point, or None if no two views agree on a point in front of them.
     """
     images = [name for name in sightings if name in model.T_cam_world]
     if len(images) < 2:
@@ -82,12 +82,12 @@ def triangulate(
 def center_std(model: SfmModel, image: str, direction: Array, noise_px: float) -> float:
     """Return the standard deviation of an optical centre along a direction, by resection on the sparse points.
 
-    The points are taken as exact, so this is a lower bound; derived from the normal equations of the pose.
+    The points are assumed exact, so this is a lower bound; derived from the normal equations of the pose.
 
     Args:
         model: The model.
         image: A registered image.
-        direction: Unit vector, the model's frame, shape (3,).
+        direction: Unit vector, model frame, shape (3,).
         noise_px: Standard deviation of a pixel coordinate [px].
 
     Returns:
@@ -122,7 +122,7 @@ def _best_hypothesis(poses: Array, rays: Array, focal: Array) -> Array | None:
 
 
 def _midpoints(centers: Array, directions: Array) -> Array:
-    """Return the points nearest to two lines each, shape (pair, 3), without pairs of parallel lines.
+    """Return the points nearest to each pair of lines, shape (pair, 3), without pairs of parallel lines.
 
     Args:
         centers: A point on each line, shape (pair, 2, 3).

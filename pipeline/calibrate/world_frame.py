@@ -1,24 +1,24 @@
-"""A world frame for cameras that nothing ties to the world: the dominant plane becomes the ground."""
+"""World frame for cameras without a reference to the world: the dominant plane becomes the ground."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from .model import Array, SfmModel, Similarity
+from .reconstruction import Array, SfmModel, Similarity
 
 _TRIALS = 500
 _THICKNESS = 0.005
 """Half thickness of the plane, as a fraction of the median distance between camera and point."""
 _MIN_SHARE = 0.1
-"""The plane holds at least this share of the sparse points."""
+"""Minimum share of the sparse points on the plane."""
 _MAX_BELOW = 0.05
-"""And at most this share lies below it: nothing is under the ground."""
+"""Maximum share of the sparse points below the plane."""
 
 
 def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similarity | None:
-    """Return the rigid motion that puts the dominant plane at the ground's orientation, cameras above it.
+    """Return the rigid motion that aligns the dominant plane with the ground, with the cameras above it.
 
-    The origin becomes the plane's point below what the cameras look at; x runs along the first camera's right.
+    The origin is the point of the plane below the focus of the cameras; x is along the first camera's right.
 
     Args:
         model: The model, in any frame.
@@ -26,7 +26,7 @@ def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similar
         seed: Seed of the search.
 
     Returns:
-        The transform, of scale 1, or None where no plane holds a tenth of the points with nothing below it.
+        The transform, of scale 1, or None if no plane has a tenth of the points on it and nearly none below it.
     """
     plane = dominant_plane(model.points, model.centers(), _view_distance(model), seed)
     if plane is None:
@@ -41,7 +41,7 @@ def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similar
 
 
 def dominant_plane(points: Array, centers: Array, distance: float, seed: int = 0) -> tuple[Array, float] | None:
-    """Find the plane with most points that has all cameras, and nearly all other points, on its upper side.
+    """Return the plane with most points that has all cameras and nearly all other points above it.
 
     Args:
         points: Sparse points, shape (point, 3).
@@ -83,7 +83,7 @@ def _refined(points: Array, centers: Array, plane: tuple[Array, float], thicknes
 
 
 def _oriented(normal: Array, point: Array, centers: Array) -> tuple[Array, float] | None:
-    """Return the plane with its normal towards the cameras, or None where they are on both sides."""
+    """Return the plane with its normal towards the cameras, or None if they are on both sides."""
     length = np.linalg.norm(normal)
     if length == 0.0:
         return None
@@ -106,7 +106,7 @@ def _basis(normal: Array, forward: Array) -> Array:
 
 
 def _focus(model: SfmModel) -> Array:
-    """Return the point nearest to all optical axes, shape (3,); the points' median for parallel axes."""
+    """Return the point nearest to all optical axes, shape (3,); the median of the points for parallel axes."""
     axes = np.array([pose[2, :3] for pose in model.T_cam_world.values()])
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     matrix = projectors.sum(axis=0)

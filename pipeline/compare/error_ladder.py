@@ -1,4 +1,4 @@
-"""The error ladder: the errors of all episodes from model to model, as inline SVG."""
+"""The error ladder: a chart of the errors of all episodes from model to model, as inline SVG."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...schemas import CompareResult, ErrorSummary
-from .charts import decades
+from ..report.charts import decades
 
 _WIDTH, _HEIGHT = 1060, 360
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60, 150, 28, 44
@@ -22,20 +22,24 @@ _Scale = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Rung:
-    """One model: name; errors by episode [mm]; floor and state-fitted residual, medians [mm], where known."""
+    """One model of the ladder."""
 
     name: str
+    """Name of the model."""
     errors_mm: Mapping[str, float]
+    """Translation error by episode [mm]."""
     floor_mm: float | None = None
+    """Median error due to the noise of the start alone [mm]; None where unknown."""
     fitted_mm: float | None = None
+    """Median state-fitted residual [mm]; None where unknown."""
 
 
 LADDER_WORDS = (
     "Each model sees the first 0.1 s of an episode; the rest is one uninterrupted prediction. State-fitted: the "
-    "start is fitted to the whole episode, so what is left is what the model cannot follow even from the best "
-    "start. Noise of the start alone: the error that the uncertainty of the start would bring to a perfect model."
+    "start is fitted to the whole episode, so the residual is what the model cannot follow even from the best "
+    "start. Noise of the start alone: the error of a perfect model due to the uncertainty of the start."
 )
-"""What the ladder shows, for those who read a page for the first time."""
+"""Explanation of the ladder on the page."""
 _LEGEND = (
     ("median", "median over the episodes"),
     ("episode", "one episode"),
@@ -46,7 +50,7 @@ _LEGEND = (
 
 
 def error_ladder(result: CompareResult, names: Sequence[str]) -> tuple[str, str]:
-    """Return the ladder of a comparison and its legend, as HTML; the style is `replay_script.REPLAY_STYLE`."""
+    """Return the ladder of a comparison and its legend, as HTML; their style is `player.REPLAY_STYLE`."""
     rungs = [
         Rung(
             name,
@@ -70,11 +74,11 @@ def _median_mm(summary: ErrorSummary | None) -> float | None:
 
 
 def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:
-    """Return the ladder: a column for each model, a thin line for each episode, a thick one for the medians.
+    """Return the ladder: a column for each model, a thin line for each episode, a thick line for the medians.
 
     Args:
         rungs: The models, in order.
-        zeros_mm: Medians of what needs no model, by name (a frozen object, a ballistic one) [mm].
+        zeros_mm: Median errors of the baselines (frozen object, ballistic object) by name [mm].
     """
     extra = [value for rung in rungs for value in (rung.floor_mm, rung.fitted_mm) if value]
     values = [value for rung in rungs for value in rung.errors_mm.values()]
@@ -120,7 +124,7 @@ def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:
 
 
 def _zeros(zeros_mm: Mapping[str, float], y: _Scale, right: float) -> list[str]:
-    """Return dashed lines for what needs no model, their names beside them and not on each other."""
+    """Return dashed lines for the baselines, with labels that do not overlap."""
     parts, last = [], math.inf
     for name, value in sorted(zeros_mm.items(), key=lambda item: item[1]):
         at = y(value)

@@ -1,4 +1,4 @@
-"""Frames of videos for a comparison: recorded, and as each model renders its prediction; as sheets of small tiles."""
+"""Contact sheets of video frames for a comparison: recorded, and rendered from the prediction of each model."""
 
 from __future__ import annotations
 
@@ -8,36 +8,39 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets.capture import Capture
-from ..compared import ComparedModel
-from ..eval import EpisodeEvaluation
-from ..image_errors import VideoErrors
-from ..prediction import MODEL
-from ..sg_gs import resolve_device
-from .episodes import strips_of
-from .pictures import FrameStrip, Image, jpeg_uri, tiles
+from ...datasets.capture.capture import Capture
+from ..evaluate.frame_strips import strips_of
+from ..evaluate.image_errors import VideoErrors
+from ..evaluate.prediction import MODEL
+from ..evaluate.stage import EpisodeEvaluation
+from ..rendering.contact_sheets import FrameStrip, Image, jpeg_uri, tiles
+from ..runtime.device import resolve_device
+from .model_comparison import ComparedModel
 
 MOST_EPISODES = 6
+"""Maximum number of episodes with frames."""
 MOST_FRAMES = 48
-"""Of a video; of a longer one every so manyth."""
+"""Maximum number of frames per video; longer videos are subsampled."""
 MOST_BYTES = 5_000_000
-"""Of all sheets together, as text in the page."""
+"""Maximum size of all sheets together, as text in the page [bytes]."""
 COLUMNS = 8
+"""Number of tiles in a row of a sheet."""
 WIDTH = 240
-"""Of a tile [px]."""
+"""Width of a tile [px]."""
 QUALITY = 70
+"""JPEG quality of a sheet."""
 
 
 def footage_of(models: Sequence[ComparedModel], capture: Capture, device: str) -> dict[str, list[dict[str, Any]]]:
-    """Return the sheets of the filmed episodes, by episode, for the player; empty where nothing is filmed.
+    """Return the player's sheets of the filmed episodes, by episode; empty if no episode was filmed.
 
-    The episodes that the last model predicts worst come first, one camera of each before the second of any, as long
-    as there is room.
+    Episodes are ordered by the error of the last model, worst first. The first camera of every episode comes before
+    the second camera of any, until `MOST_BYTES` is reached.
 
     Args:
-        models: The models; frames are those whose errors their evaluations have.
-        capture: With the videos.
-        device: Where to render.
+        models: The models; frames are taken where their evaluations have image errors.
+        capture: Capture with the videos.
+        device: Device to render on.
     """
     filmed = {
         (one.prediction.episode, video.camera): None
@@ -86,14 +89,16 @@ def _sheets(
 
 
 def _strip(one: ComparedModel, capture: Capture, device: str, episode: str, camera: str) -> FrameStrip | None:
-    """Return the frames of one episode and camera beside the model's; None where the model has no picture of them."""
+    """Return the recorded and rendered frames of one episode and camera; None if the model was not rendered there."""
     for evaluated in one.evaluation.episodes:
         prediction = evaluated.prediction
         if prediction.episode != episode or camera not in [video.camera for video in evaluated.videos]:
             continue
         count = next(len(video.time_s) for video in evaluated.videos if video.camera == camera)
         alone = replace(prediction, motions={MODEL: prediction.motions[MODEL]})
-        videos = VideoErrors(one.model, capture, device, keep_frames=True, every=-(-count // MOST_FRAMES))
+        videos = VideoErrors(
+            model=one.model, capture=capture, device=device, keep_frames=True, every=-(-count // MOST_FRAMES)
+        )
         compared = videos.compare(alone, camera)
         if compared is not None:
             return strips_of([EpisodeEvaluation(alone, (compared,), evaluated.errors)], capture)[0]
@@ -101,7 +106,7 @@ def _strip(one: ComparedModel, capture: Capture, device: str, episode: str, came
 
 
 def _sheet(frames: Image) -> Image:
-    """Return tiles (F, H, W, 3) in rows of `COLUMNS`, the last row filled up with black."""
+    """Arrange tiles (F, H, W, 3) in rows of `COLUMNS`; the last row is padded with black."""
     count, height, width = frames.shape[:3]
     rows = -(-count // COLUMNS)
     sheet = np.zeros((rows * COLUMNS, height, width, 3), np.uint8)

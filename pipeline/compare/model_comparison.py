@@ -1,4 +1,4 @@
-"""One model of a comparison: its open-loop predictions, its short ones in units of the noise, and their figures."""
+"""One model of a comparison: open-loop predictions, short predictions in units of the noise, and their figures."""
 
 from __future__ import annotations
 
@@ -8,43 +8,40 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.models import Model
-from ..schemas import PHASES, ModelComparison, Organiser, Phase, PhaseFigures, WorstMoment
-from .eval import Evaluation
-from .short_errors import FREEDOMS, ShortErrors
-from .wrench_points import WrenchPoint
+from ...datasets.models.model import Model
+from ...schemas import PHASES, CovariateShare, ModelComparison, Phase, PhaseFigures, WorstMoment
+from ..evaluate.stage import Evaluation
+from .residual_wrenches import WrenchPoint
+from .short_horizon_errors import FREEDOMS, ShortErrors
 
 Array = NDArray[np.float64]
 
 WORST = 12
-"""Moments that are listed for a model."""
+"""Number of the worst moments that are listed for a model."""
 LEAST_FREEDOM = 6.0
-"""Degrees of freedom below which a phase has no reduced chi-square."""
+"""Minimum number of degrees of freedom for a reduced chi-square of a phase."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ComparedModel:
-    """A model with all that a comparison knows about it.
-
-    Attributes:
-        name: As the user gave it.
-        short_name: What the page calls it.
-        model: The model.
-        evaluation: Open loop.
-        noise: Standard deviations in which short predictions are measured (position [m], rotation [rad]).
-        short: Short predictions by episode.
-        wrenches: What is missing, segment by segment.
-        organisers: What orders it.
-    """
+    """A model with its predictions, their errors and its residual wrenches."""
 
     name: str
+    """Name as the user gave it."""
     short_name: str
+    """Name on the page."""
     model: Model
+    """The model."""
     evaluation: Evaluation
+    """The open-loop evaluation."""
     noise: tuple[float, float]
+    """Standard deviations of the measurement that scale short predictions (position [m], rotation [rad])."""
     short: Mapping[str, ShortErrors] = field(default_factory=dict)
+    """Short predictions by episode."""
     wrenches: Sequence[WrenchPoint] = ()
-    organisers: Sequence[Organiser] = ()
+    """Residual wrenches and misfits of the segments."""
+    covariates: Sequence[CovariateShare] = ()
+    """Coordinates that explain the residual wrench in flight."""
 
     @property
     def errors_m(self) -> dict[str, float]:
@@ -52,7 +49,7 @@ class ComparedModel:
         return {e.episode: e.translation_error_m for e in self.evaluation.result.per_episode}
 
     def figures(self) -> ModelComparison:
-        """Return what `--json` prints of the model."""
+        """Return the figures of the model that `--json` prints."""
         result = self.evaluation.result
         everything = _figures(list(self.short.values()), None, self.noise)
         return ModelComparison(
@@ -69,7 +66,7 @@ class ComparedModel:
             reduced_chi2=None if everything is None else everything.reduced_chi2,
             by_phase={phase: _figures(list(self.short.values()), phase, self.noise) for phase in PHASES},
             worst=tuple(_worst(self.short.values())),
-            wrench=tuple(self.organisers),
+            wrench=tuple(self.covariates),
             per_episode=result.per_episode,
             warnings=result.warnings,
         )
@@ -82,9 +79,10 @@ class ComparedModel:
 
 
 def _figures(short: Sequence[ShortErrors], phase: Phase | None, noise: tuple[float, float]) -> PhaseFigures | None:
-    """Return the figures of one phase, or of all; None where no frame is in it.
+    """Return the figures of one phase, or of all phases; None if it has no frame.
 
-    Flight is that of segments without contact: what a contact segment cannot fit shows in its flight too.
+    Flight includes only segments without contact, because the misfit of a contact segment spreads to its frames in
+    flight.
     """
     sigmas, freedom = [], []
     for one in short:

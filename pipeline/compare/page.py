@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...schemas import PHASES, CompareResult, ErrorSummary, ModelComparison, PairedDifference
-from ..compared import ComparedModel
-from ..diagnosis.cuts import CONTACT_S, FLIGHT_S
-from ..paired import LEAST_EPISODES
-from ..short_errors import FREEDOMS
-from .ladder import LADDER_WORDS, error_ladder
-from .page import facts, fixed, number, page, paragraph, section, table, text
-from .replay import Replay, replay_of
-from .replay_script import REPLAY_SCRIPT, REPLAY_STYLE
+from ..report.page import facts, fixed, number, page, paragraph, section, table, text
+from ..trajectories.segmentation import CONTACT_S, FLIGHT_S
+from .error_ladder import LADDER_WORDS, error_ladder
+from .model_comparison import ComparedModel
+from .paired_difference import LEAST_EPISODES
+from .player import REPLAY_SCRIPT, REPLAY_STYLE, Replay, replay_of
+from .short_horizon_errors import FREEDOMS
 from .wrench_chart import wrench_data, wrench_section
 
 _MM = 1e3
@@ -27,18 +26,18 @@ _TINTS = {
     "rest": "#e3e5e9",
 }
 HOTTEST = 5.0
-"""A residual of so many times the noise has the full colour."""
+"""Residual, in units of the noise, that is drawn in full colour."""
 
 
 def comparison_html(
     result: CompareResult, models: Sequence[ComparedModel], footage: Mapping[str, list[dict[str, Any]]]
 ) -> str:
-    """Return the page.
+    """Return the HTML page of a comparison.
 
     Args:
         result: The figures.
-        models: The models behind them, in the same order.
-        footage: Sheets of frames by episode, see `footage.footage_of`.
+        models: The models that they come from, in the same order.
+        footage: Sheets of frames by episode, see `frames.footage_of`.
     """
     names = [one.short_name for one in models]
     replay = replay_of(models, _by_interest(result, footage))
@@ -62,24 +61,24 @@ def comparison_html(
 
 
 def _embedded(data: object) -> str:
-    """Return JSON that no browser takes for the end of its script element."""
+    """Return JSON that cannot end the script element that holds it."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def _by_interest(result: CompareResult, footage: Mapping[str, object]) -> list[str]:
-    """Return the episodes: filmed ones, those with the worst moments, then the rest."""
+    """Order the episodes: filmed ones first, then those with the worst moments, then the others."""
     everything = [e.episode for model in result.models for e in model.per_episode]
     worst = [moment.episode for model in result.models for moment in model.worst]
     return list(dict.fromkeys([*footage, *worst, *everything]))
 
 
 def _warned(result: CompareResult, names: Sequence[str]) -> list[str]:
-    """Return the warnings of the evaluations; what all models have in common once."""
+    """Return the warnings of the evaluations; a warning that all models share appears once, without their names."""
     found: dict[str, list[str]] = {}
     for model, name in zip(result.models, names, strict=True):
         for words in model.warnings:
             found.setdefault(words, []).append(name)
-    return [words if len(own) == len(names) else f"{', '.join(own)}: {words}" for words, own in found.items()]
+    return [words if len(warned) == len(names) else f"{', '.join(warned)}: {words}" for words, warned in found.items()]
 
 
 def _card(model: ModelComparison, name: str) -> str:
@@ -159,8 +158,8 @@ def _pairs(result: CompareResult, names: Sequence[str]) -> str:
     ]
     words = (
         "Difference of the translation error, episode by episode; negative is better. The interval is that of the "
-        "median, by resampling episodes; it takes them for independent draws of what one wants to predict, and with "
-        "few of them it is somewhat too short."
+        "median, from resampling the episodes (bootstrap). It assumes that the episodes are independent draws of the "
+        "motions to be predicted, and is somewhat too short if they are few."
     )
     header = ["paired", "better in", "median difference [mm]", "95 % interval [mm]"]
     return table(header, rows, numeric=(1, 2, 3)) + paragraph(words, "soft")
@@ -190,15 +189,15 @@ def _player(replay: Replay, filmed: bool) -> str:
     )
     left_out = ""
     if replay.left_out:
-        left_out = f"To keep the page small the player lacks the episodes {', '.join(replay.left_out)}."
+        left_out = f"To keep the page small, the player omits the episodes {', '.join(replay.left_out)}."
     words = (
-        "Black: measured. In colour: predicted, open loop from the warm-up (shaded). The lower curve is of short "
-        f"predictions: pieces of at most {CONTACT_S:g} s in contact and {FLIGHT_S:g} s in flight, each from the start "
-        "that fits it best; "
+        "Black: measured. In colour: predicted, open loop from the warm-up (shaded). The lower curve shows the "
+        f"residuals of short predictions: segments of at most {CONTACT_S:g} s in contact and {FLIGHT_S:g} s in flight, "
+        "each from the start that fits it best; "
         "the dashed line is the noise. Click or drag on a curve to move in time."
     )
     if filmed:
-        words += " Below, frames of the videos after the warm-up; the difference is shown four times as bright."
+        words += " Below: video frames after the warm-up; the difference is amplified four times."
     return section(
         "Motion, measured and predicted",
         paragraph(words),
@@ -217,7 +216,7 @@ def _player(replay: Replay, filmed: bool) -> str:
 
 
 def _go(episode: str, time_s: float) -> str:
-    """Return a button that brings the player to a moment."""
+    """Return a button that moves the player to a moment."""
     place = f'data-episode="{text(episode)}" data-time="{time_s:.6g}"'
     return f'<button type="button" class="go" {place}>show</button>'
 
@@ -244,7 +243,7 @@ def _worst(result: CompareResult, names: Sequence[str]) -> str:
     if not rows:
         return ""
     words = (
-        "The pieces of the motion with the largest residuals of short predictions. x, y, z: position in the world "
+        "The segments of the motion with the largest residuals of short predictions. x, y, z: position in the world "
         "frame; rx, ry, rz: rotation about the body's axes. Click a heading to sort."
     )
     return section("Worst moments", paragraph(words), _sortable(header, rows, (3, 4, 7)))
@@ -274,17 +273,18 @@ def _phases(result: CompareResult, names: Sequence[str]) -> str:
     noise = result.measurement_std
     words = (
         "Short predictions by phase, in units of the noise "
-        f"({fixed(noise['position_m'], 2, _MM)} mm and {number(noise['rotation_rad'] * 57.29578, 2)} deg an axis). "
-        "Reduced χ² is the mean square, allowing for the fitted starts: about 1 where the model explains the data. "
-        "Residuals of one impact hang together: their χ² is no test. The last columns are the root mean square "
-        "residuals of each degree of freedom; fitted starts make them smaller than 1 where nothing is missing. Noise "
-        "that the manifest does not give is estimated from the roughness of the tracks: smoothed tracks err by more."
+        f"({fixed(noise['position_m'], 2, _MM)} mm and {number(noise['rotation_rad'] * 57.29578, 2)} deg per axis). "
+        "Reduced χ² is the mean square, corrected for the fitted starts: about 1 where the model explains the data. "
+        "Residuals of one impact are correlated, so their χ² is not a test. The last columns are the root mean square "
+        "residuals of each degree of freedom; because the starts are fitted, they are below 1 where the model is "
+        "complete. Noise that the manifest does not give is estimated from the roughness of the tracks, which "
+        "underestimates it for smoothed tracks."
     )
     return section("By phase and degree of freedom", paragraph(words), _sortable(header, rows, range(2, len(header))))
 
 
 def _heat(value: float | None) -> str:
-    """Return a cell's number with the strength of its colour, which the script of the page's style reads."""
+    """Return a cell's number with the strength of its colour, a variable of the style sheet."""
     if value is None:
         return "–"
     strength = min(max((value - 1) / (HOTTEST - 1), 0.0), 1.0) * 0.6
@@ -298,18 +298,18 @@ def _episodes(result: CompareResult, models: Sequence[ComparedModel]) -> str:
         header += [f"{name} [mm]", f"{name} [deg]", f"{name} χ²"]
     errors = [{e.episode: e for e in model.per_episode} for model in result.models]
     rows = []
-    for episode in dict.fromkeys(name for own in errors for name in own):
-        first = next(own[episode] for own in errors if episode in own)
+    for episode in dict.fromkeys(name for by_episode in errors for name in by_episode):
+        first = next(by_episode[episode] for by_episode in errors if episode in by_episode)
         row = [_go(episode, 0.0), text(episode), f"{first.duration_s:.2f}"]
-        for own, model in zip(errors, models, strict=True):
-            one = own.get(episode)
+        for by_episode, model in zip(errors, models, strict=True):
+            one = by_episode.get(episode)
             row += [
                 fixed(one.translation_error_m if one else None, 2, _MM),
                 fixed(one.rotation_error_deg if one else None, 2),
                 number(model.episode_chi2(episode)),
             ]
         rows.append(row)
-    words = "Open loop, averaged over the frames after the warm-up; χ²: reduced, of short predictions."
+    words = "Open-loop errors, averaged over the frames after the warm-up; χ²: reduced χ² of the short predictions."
     return section("By episode", paragraph(words), _sortable(header, rows, range(2, len(header))))
 
 

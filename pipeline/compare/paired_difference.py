@@ -1,4 +1,4 @@
-"""Two models on the same episodes: differences episode by episode, and how sure they are."""
+"""Paired difference of two models on the same episodes, with a confidence interval."""
 
 from __future__ import annotations
 
@@ -6,29 +6,31 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..schemas import PairedDifference
+from ...schemas import PairedDifference
 
 LEAST_EPISODES = 6
-"""With fewer, no distribution-free statement of 95 % is possible: five episodes that agree have odds of 1 in 16."""
+"""Minimum number of episodes for a 95 % interval: with five episodes, even complete agreement of the signs has a
+probability of 1 in 16 by chance."""
 RESAMPLES = 4000
+"""Number of bootstrap samples."""
 
 
 def paired_difference(
     model: str, than: str, error_m: Mapping[str, float], other_m: Mapping[str, float]
 ) -> PairedDifference | None:
-    """Return how the translation error of a model differs from another's on the episodes that both have.
+    """Compare the translation errors of two models on the episodes that both have.
 
     The interval is the percentile bootstrap over episodes (Efron 1979) of the median difference. It assumes that the
-    episodes are independent draws of what one wants to predict, and is somewhat too short with few of them.
+    episodes are independent draws of the motions to be predicted, and is somewhat too short if they are few.
 
     Args:
         model: Name of the model.
-        than: Name of the other one.
-        error_m: Its error by episode [m].
-        other_m: The other's.
+        than: Name of the other model.
+        error_m: Errors of the model by episode [m].
+        other_m: Errors of the other model by episode [m].
 
     Returns:
-        The difference, or None if they share no episode.
+        The difference, or None if the models share no episode.
     """
     shared = [name for name in error_m if name in other_m]
     if not shared:

@@ -1,4 +1,4 @@
-"""What the player of a comparison shows, as numbers for its script: motions, errors and phases by episode."""
+"""Data of the player of a comparison: motions, errors and phases by episode, as numbers for its script."""
 
 from __future__ import annotations
 
@@ -10,45 +10,53 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from ...datasets.models import Model
+from ...datasets.models.model import Model
 from ...schemas import PHASES
-from ..compared import ComparedModel
-from ..prediction import MODEL, EpisodePrediction
-from ..splats.directions import fibonacci_directions
+from ..evaluate.prediction import MODEL, EpisodePrediction
+from ..geometry.directions import fibonacci_directions
+from ..report.page import read_asset
+from .model_comparison import ComparedModel
 
 Array = NDArray[np.float64]
 
+REPLAY_STYLE = read_asset(__name__, "player.css")
+"""Style rules of the page of a comparison, in addition to those of every page."""
+REPLAY_SCRIPT = read_asset(__name__, "player.js")
+"""Script of the player, the sortable tables and the chart of residual wrenches."""
 LENGTH_UNIT_M = 1e-4
-"""Positions are whole numbers of this."""
+"""Resolution of positions in the page [m]; they are written as integers."""
 QUAT_UNIT = 1e-4
+"""Resolution of quaternions in the page; they are written as integers."""
 DIRECTIONS = 96
-"""Directions in which the outermost point of a body is sought."""
+"""Number of directions in which the outermost point of a body is computed."""
 MOST_EDGES = 40
-"""A body with more edges is round: it is drawn as an outline with its axes."""
+"""Maximum number of edges that are drawn; a body with more counts as round and is drawn as an outline with axes."""
 MOST_NUMBERS = 900_000
-"""In all episodes that the player has; a number takes about five bytes of the page."""
+"""Maximum number of values in all episodes of the player; a value takes about five bytes of the page."""
 
 
 @dataclass(frozen=True)
 class Replay:
-    """The data of the player, and the names of the episodes that are not in it, to keep the page small."""
+    """The data of the player."""
 
     data: dict[str, Any]
+    """Models, bodies, ground and episodes, as the script reads them."""
     left_out: tuple[str, ...]
+    """Names of the episodes that were omitted to keep the page small."""
 
 
 def replay_of(models: Sequence[ComparedModel], first: Sequence[str]) -> Replay:
     """Return the player's data.
 
     Args:
-        models: The models, in order; the motions measured are those of the first one's evaluation.
-        first: Episodes in the order in which they are taken, as long as there is room.
+        models: The models, in order; the measured motions are those in the evaluation of the first one.
+        first: Episodes in the order in which they are included, until `MOST_NUMBERS` is reached.
     """
     predictions = [{e.prediction.episode: e.prediction for e in one.evaluation.episodes} for one in models]
     chosen, left_out, numbers = [], [], 0
     for name in first:
-        own = [found[name] for found in predictions if name in found]
-        size = sum(len(p.time_s) * len(p.bodies) * 12 for p in own) + len(own[0].grid_s) * 7
+        known = [found[name] for found in predictions if name in found]
+        size = sum(len(p.time_s) * len(p.bodies) * 12 for p in known) + len(known[0].grid_s) * 7
         if chosen and numbers + size > MOST_NUMBERS:
             left_out.append(name)
             continue
@@ -120,7 +128,7 @@ def _model(one: EpisodePrediction, compared: ComparedModel) -> dict[str, Any]:
 
 
 def _body(model: Model, name: str, motion: str) -> dict[str, Any]:
-    """Return outermost points (P, 3) of a body in its frame, and its edges where they are few."""
+    """Return the outermost points (P, 3) of a body in its frame, and its edges if there are few."""
     spheres = model.collision[name]
     radii = np.asarray(spheres.scales) * model.body(name).radius_factor
     directions = fibonacci_directions(DIRECTIONS)
@@ -145,7 +153,7 @@ _CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(
 
 
 def _edges(points: Array) -> list[list[int]]:
-    """Return pairs of points between which the convex hull has an edge, not those within a flat side."""
+    """Return the edges of the convex hull as pairs of points, without the diagonals of its flat sides."""
     try:
         hull = ConvexHull(points)
     except QhullError:
@@ -169,9 +177,9 @@ def _up(model: Model) -> Array:
 
 
 def _view(one: EpisodePrediction, up: Array) -> tuple[Array, Array, float]:
-    """Return the horizontal direction in which most of the motion lies, the one across, and its bearing [deg].
+    """Return the horizontal principal direction of the motion, the direction across it, and its bearing [deg].
 
-    The bearing is measured from the world's x axis, or from y where up is x.
+    The bearing is measured from the world's x axis, or from the y axis if x points up.
     """
     reference = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
     x = reference - up * (up @ reference)
@@ -190,7 +198,7 @@ def _view(one: EpisodePrediction, up: Array) -> tuple[Array, Array, float]:
 
 
 def _mean(values: Array, decimals: int) -> list[float | None]:
-    """Return the mean over bodies (T,) of values (T, nf); None where nothing is known."""
+    """Return the mean over bodies (T,) of values (T, nf); None where no value is known."""
     known = np.isfinite(values)
     count = known.sum(1)
     total = np.where(known, values, 0.0).sum(1)

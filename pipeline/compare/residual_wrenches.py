@@ -1,4 +1,4 @@
-"""What a model lacks in each piece of the motion, as points of a chart, and which coordinate orders it in flight."""
+"""Residual wrench of a model in each segment of the motion, and the coordinates that explain it in flight."""
 
 from __future__ import annotations
 
@@ -8,57 +8,57 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas import Organiser, Phase
-from .diagnosis.cuts import Segment
-from .diagnosis.prepared import Prepared
-from .diagnosis.wrench import coordinates_of, organisers, wrench_windows
-from .physics.world import World
-from .short_errors import ShortErrors, ShortFit
+from ...schemas import CovariateShare, Phase
+from ..physics.world import World
+from ..segments.prepare import Prepared
+from ..segments.residual_wrench import coordinates_of, covariates_of, wrench_windows
+from ..trajectories.segmentation import Segment
+from .short_horizon_errors import ShortErrors, ShortFit
 
 Array = NDArray[np.float64]
 
 LEAST_SHARE = 0.05
-"""A coordinate that takes away less of the excess orders nothing."""
+"""Minimum share of the excess that a coordinate has to explain to be reported."""
 LEAST_WINDOWS = 8
-"""Of fewer windows of flight, four bins are not told apart."""
+"""Minimum number of windows of flight for a comparison of four bins."""
 SIGNIFICANT = 0.01
+"""Largest p-value at which a coordinate is reported."""
 KNOWN_STD = 1e3
-"""A component with a larger standard error [m/s2, rad/s2] was not measured."""
+"""Standard error above which a component counts as not measured [m/s2, rad/s2]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WrenchPoint:
-    """One piece of the motion: how badly it is fitted, what is missing in it, and where the body was.
-
-    Attributes:
-        episode: Of the piece.
-        span_s: Its start and end, from the episode's first measured frame [s].
-        phase: What its residuals are due to.
-        misfit: Root of the reduced chi-square of its short prediction, in units of the noise.
-        acceleration: Residual acceleration [m/s2] (3,) and angular acceleration [rad/s2] (3,), world frame, shape (6,);
-            NaN in contact, where the ground answers every force.
-        std: Standard errors, same shape; NaN where nothing was measured.
-        coordinates: Of its middle: time [s], x, y, height [m], heading [deg], speed [m/s], spin [rad/s].
-    """
+    """Misfit, residual wrench and coordinates of one segment of the motion."""
 
     episode: str
+    """Name of the episode."""
     span_s: tuple[float, float]
+    """Start and end of the segment, from the episode's first measured frame [s]."""
     phase: Phase
+    """Phase to which its residuals are attributed."""
     misfit: float
+    """Root of the reduced chi-square of its short prediction, in units of the noise."""
     acceleration: Array
+    """Residual acceleration [m/s2] (3,) and angular acceleration [rad/s2] (3,), world frame, shape (6,); NaN in
+    contact, where the ground balances every force.
+    """
     std: Array
+    """Standard errors of `acceleration`, same shape; NaN where nothing was measured."""
     coordinates: Mapping[str, float]
+    """Coordinates at its middle: time [s], x, y, height [m], heading [deg], speed [m/s], spin [rad/s]."""
 
 
-def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list[WrenchPoint], list[Organiser]]:
-    """Return the pieces of the motion as points, and what orders the wrench of flight; nothing for several free bodies.
+def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list[WrenchPoint], list[CovariateShare]]:
+    """Return the segments of the motion as points, and the coordinates that explain the residual wrench in flight.
 
-    Flights are looked at in half-overlapping windows, contacts in the segments that were fitted.
+    Flight is divided into half-overlapping windows; in contact the fitted segments are used. Both lists are empty for
+    several free bodies.
 
     Args:
-        world: The model's.
-        fit: Its short predictions.
-        prepared: How the episodes were cut.
+        world: The world of the model.
+        fit: The short predictions of the model.
+        prepared: The episodes, cut into segments.
     """
     if len(world.free) != 1:
         return [], []
@@ -75,8 +75,8 @@ def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list
         points += _points(fit.contact.items, coordinates_of(fit.contact)[0], nothing, nothing, fit.errors, episodes)
     if flight is None or len(flight.segments) < LEAST_WINDOWS:
         return points, []
-    ordered = [one for one in organisers(flight) if one.share >= LEAST_SHARE and one.p_value < SIGNIFICANT]
-    return points, [Organiser(coordinate=one.coordinate, share=one.share) for one in ordered]
+    ordered = [one for one in covariates_of(flight) if one.share >= LEAST_SHARE and one.p_value < SIGNIFICANT]
+    return points, [CovariateShare(coordinate=one.coordinate, share=one.share) for one in ordered]
 
 
 def _points(
@@ -101,13 +101,13 @@ def _points(
         place["heading"] = float(np.degrees(place["heading"]))
         points.append(
             WrenchPoint(
-                one.episode,
-                (float(times[segment.first]), float(times[segment.last])),
-                one.phase_name(int(one.cause[middle])),
-                float(np.sqrt(np.nansum(np.square(one.sigmas[rows])) / left)),
-                wrench[k],
-                std[k],
-                place,
+                episode=one.episode,
+                span_s=(float(times[segment.first]), float(times[segment.last])),
+                phase=one.phase_name(int(one.cause[middle])),
+                misfit=float(np.sqrt(np.nansum(np.square(one.sigmas[rows])) / left)),
+                acceleration=wrench[k],
+                std=std[k],
+                coordinates=place,
             )
         )
     return points

@@ -1,4 +1,7 @@
-"""Short predictions of a model in units of the noise: segments with fitted states, frame by frame, phase by phase."""
+"""Residuals of short predictions of a model in units of the noise, by frame and by phase.
+
+A short prediction starts from the state that fits its segment best.
+"""
 
 from __future__ import annotations
 
@@ -11,51 +14,50 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..schemas import PHASES, Phase
-from .diagnosis.cuts import whole_episodes
-from .diagnosis.phases import phases_of
-from .diagnosis.prepared import Prepared
-from .diagnosis.segment_states import fit_states
-from .diagnosis.segments import Segments
-from .estimation.observations import Observations
-from .estimation.trajectory import state_prior
-from .physics.world import World
+from ...schemas import PHASES, Phase
+from ..physics.world import World
+from ..segments.contact_phases import phases_of
+from ..segments.prepare import Prepared
+from ..segments.segment_states import fit_states
+from ..segments.segments import Segments
+from ..trajectories.observations import Observations
+from ..trajectories.residuals import state_prior
+from ..trajectories.segmentation import whole_episodes
 
 if TYPE_CHECKING:
-    from .prediction import Episode
+    from ..evaluate.prediction import Episode
 
 Array = NDArray[np.float64]
 
 FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
-"""Of a residual: position in the world frame, rotation vector in the body frame."""
+"""Components of a residual: position in the world frame, rotation vector in the body frame."""
 DIVERGED = 1e4
-"""Residual of a short prediction that diverged, in units of the noise."""
+"""Residual that a diverged short prediction is given, in units of the noise."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ShortErrors:
-    """Short predictions of one episode against its measurements, frame by frame.
-
-    Attributes:
-        episode: Its name.
-        bodies: Names of the free bodies (nf).
-        time_s: Times of the measured frames on the track's clock [s], shape (T,).
-        sigmas: Residuals in units of the noise, shape (T, nf, 6), in the order of `FREEDOMS`; NaN where not measured.
-        freedom: What the fitted states leave of each residual's variance, shape (T, nf, 6), 0 to 1.
-        phase: Place in `PHASES`, -1 where no segment has the frame, shape (T,).
-        cause: The same for the segment that a frame's residuals are of: impact where it holds one, else what most of
-            its frames in contact do. Before and after a contact there is flight that its segment cannot fit either.
-        span_s: Start and end of the segment that a frame's residuals are of [s], shape (T, 2).
-    """
+    """Residuals of the short predictions of one episode, by frame."""
 
     episode: str
+    """Name of the episode."""
     bodies: tuple[str, ...]
+    """Names of the free bodies (nf)."""
     time_s: Array
+    """Times of the measured frames on the track's clock [s], shape (T,)."""
     sigmas: Array
+    """Residuals in units of the noise, shape (T, nf, 6), in the order of `FREEDOMS`; NaN where not measured."""
     freedom: Array
+    """Share of each residual's variance that remains after the fit of the states, shape (T, nf, 6), 0 to 1."""
     phase: NDArray[np.int64]
+    """Index into `PHASES`, shape (T,); -1 for frames outside all segments."""
     cause: NDArray[np.int64]
+    """Index into `PHASES` of the phase to which the residuals of the frame's segment are attributed, shape (T,): impact
+    if the segment contains one, else the most frequent phase of its frames in contact. A misfit in contact also spreads
+    to the segment's frames in flight.
+    """
     span_s: Array
+    """Start and end of the segment that gives a frame's residuals [s], shape (T, 2)."""
 
     @staticmethod
     def phase_name(place: int) -> Phase:
@@ -63,7 +65,7 @@ class ShortErrors:
         return PHASES[place]
 
     def largest(self) -> Array:
-        """Return the largest residual of any body and degree of freedom (T,), in units of the noise; NaN without."""
+        """Return the largest residual over bodies and degrees of freedom (T,), in units of the noise; NaN if none."""
         size = np.abs(self.sigmas).reshape(len(self.time_s), -1)
         known = np.isfinite(size)
         return np.where(known.any(1), np.where(known, size, 0.0).max(1), np.nan)
@@ -71,24 +73,24 @@ class ShortErrors:
 
 @dataclass(frozen=True, eq=False)
 class ShortFit:
-    """Short predictions of one model.
-
-    whole: the episodes, without outliers; contact: its fitted segments, None where there are none; errors by episode.
-    """
+    """Short predictions of one model."""
 
     whole: Observations
+    """The full episodes, without outliers."""
     contact: Segments | None
+    """The fitted segments with contact; None if no segment has contact."""
     errors: dict[str, ShortErrors]
+    """The residuals by episode."""
 
 
 def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, bodies: Sequence[str]) -> ShortFit:
-    """Fit the states of all segments to their frames by a model, and return what is left.
+    """Fit the states of all segments to their frames with a model, and return the residuals.
 
     Args:
-        world: The model's.
-        episodes: Names, and tracks of all that moves.
-        prepared: The same episodes as they were cut, the same way for all models that are compared.
-        bodies: The free bodies in the order that `prepared` has them in.
+        world: The world of the model.
+        episodes: Names of the episodes and tracks of their bodies.
+        prepared: The same episodes, cut into segments in the same way for all compared models.
+        bodies: Names of the free bodies in the order of `prepared`.
     """
     whole = whole_episodes(world, episodes)
     columns = [list(bodies).index(world.bodies[k].name) for k in whole.free]
@@ -101,21 +103,21 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
         contact = fit_states(Segments.of("contact", world, whole, prepared.contact_items, noise), thorough=True)
     names = [name for name, _ in episodes]
     phases = phases_of(names, whole, prepared.clear, contact)
-    own = tuple(world.bodies[k].name for k in whole.free)
+    free = tuple(world.bodies[k].name for k in whole.free)
     found = {
         one.episode: ShortErrors(
-            one.episode,
-            own,
-            one.time_s,
-            np.full((len(one.time_s), len(own), 6), np.nan),
-            np.zeros((len(one.time_s), len(own), 6)),
-            np.full(len(one.time_s), -1),
-            np.full(len(one.time_s), -1),
-            np.full((len(one.time_s), 2), np.nan),
+            episode=one.episode,
+            bodies=free,
+            time_s=one.time_s,
+            sigmas=np.full((len(one.time_s), len(free), 6), np.nan),
+            freedom=np.zeros((len(one.time_s), len(free), 6)),
+            phase=np.full(len(one.time_s), -1),
+            cause=np.full(len(one.time_s), -1),
+            span_s=np.full((len(one.time_s), 2), np.nan),
         )
         for one in phases
     }
-    # contact segments begin and end in flight: there the flight's own, longer ones count
+    # contact segments begin and end in flight; in those frames the longer flight segments take precedence
     for segments in (contact, flight):
         if segments is not None:
             _fill(segments, whole, names, found)
@@ -128,12 +130,15 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
 
 
 def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: dict[str, ShortErrors]) -> None:
-    """Write residuals and their freedom into the frames of the episodes; a shared frame keeps the larger freedom."""
+    """Write residuals and their freedom into the frames of the episodes.
+
+    A frame that several segments of contact share keeps the residuals with the larger freedom.
+    """
     nothing = torch.zeros(0).to(segments.world.gravity)
     rows, jacobian = segments.residuals((), nothing)
     assert jacobian is not None
     bodies = len(segments.observations.free)
-    left = _freedom(jacobian, bodies).unflatten(1, (-1, bodies)).numpy()
+    freedom = _freedom(jacobian, bodies).unflatten(1, (-1, bodies)).numpy()
     residuals = (
         torch.nan_to_num(rows, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED).unflatten(1, (-1, bodies)).numpy()
     )
@@ -147,19 +152,19 @@ def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: 
         count = segment.last - segment.first + 1
         places = np.arange(segment.first, segment.last + 1)
         times = whole.times_s[segment.episode, places].numpy()
-        known, own = measured[item, :count], left[item, :count]
-        total = np.where(known, own, 0.0).sum((1, 2))
+        known, free = measured[item, :count], freedom[item, :count]
+        total = np.where(known, free, 0.0).sum((1, 2))
         better = (total >= one.freedom[places].sum((1, 2))) | (segments.kind == "flight")
         at = places[better]
         one.sigmas[at] = np.where(known, residuals[item, :count], np.nan)[better]
-        one.freedom[at] = np.where(known, own, 0.0)[better]
+        one.freedom[at] = np.where(known, free, 0.0)[better]
         one.span_s[at] = times[0], times[-1]
 
 
 def _placed(places: NDArray[np.int64], covered: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the phase (T,) of each frame, -1 where it is unknown.
 
-    Of a long rest only the first segments are fitted: what stays in contact after a rest goes on resting.
+    Only the first segments of a long rest are fitted; later frames in contact count as rest, too.
     """
     found = np.where(covered, places, -1)
     rest = PHASES.index("rest")
@@ -170,7 +175,7 @@ def _placed(places: NDArray[np.int64], covered: NDArray[np.bool_], clear: NDArra
 
 
 def _causes(one: ShortErrors) -> NDArray[np.int64]:
-    """Return the phase (T,) that the residuals of each frame's segment are due to."""
+    """Return the phase (T,) to which the residuals of each frame's segment are attributed."""
     causes = one.phase.copy()
     flight, impact = PHASES.index("flight"), PHASES.index("impact")
     for span in np.unique(one.span_s[np.isfinite(one.span_s).all(1)], axis=0):
@@ -182,7 +187,7 @@ def _causes(one: ShortErrors) -> NDArray[np.int64]:
 
 
 def _freedom(jacobian: Tensor, bodies: int) -> Tensor:
-    """Return what a fit of the state leaves of each residual's variance (B, F, 6): 1 less its leverage.
+    """Return the share of each residual's variance that remains after the fit of the state (B, F, 6): 1 - leverage.
 
     The leverage of row j is j (J'J + P)^-1 j', with P the information of the weak prior on states.
     """

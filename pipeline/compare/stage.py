@@ -1,4 +1,4 @@
-"""`cgwm compare`: where and when each model fails, side by side, on the same episodes."""
+"""The stage compare (`cgwm compare`): where and when each model fails, on the same episodes."""
 
 from __future__ import annotations
 
@@ -7,36 +7,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..datasets.atomic import new_file, refuse_existing, sha256
-from ..datasets.capture import Capture
-from ..datasets.models import Model, read_model
-from ..datasets.progress import note, progress
-from ..schemas import CompareResult, InputDataError, PairedDifference, UsageError
-from .compared import ComparedModel
-from .diagnosis.prepared import prepare
-from .diagnosis.releases import after_release
-from .eval import check_bodies, evaluate_model
-from .own_worlds import with_fitted_numbers
-from .paired import paired_difference
-from .physics.world import World
-from .prediction import Episode
-from .reporting.compared_verdict import compared_verdict
-from .reporting.comparison import comparison_html
-from .reporting.footage import footage_of
-from .sg_gs import resolve_device
-from .short_errors import short_errors
-from .threads import one_torch_thread
-from .wrench_points import wrench_points
+from ...datasets.capture.capture import Capture
+from ...datasets.io.atomic import new_file, refuse_existing, sha256
+from ...datasets.io.progress import note, progress
+from ...datasets.models.model import Model, read_model
+from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
+from ..evaluate.prediction import Episode
+from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
+from ..physics.world import World
+from ..runtime.device import resolve_device
+from ..runtime.resources import one_torch_thread
+from ..segments.prepare import Prepared, prepare
+from ..segments.random_effects import with_fitted_groups
+from ..segments.release_detection import after_release
+from .frames import footage_of
+from .model_comparison import ComparedModel
+from .page import comparison_html
+from .paired_difference import paired_difference
+from .residual_wrenches import wrench_points
+from .short_horizon_errors import short_errors
+from .verdict import comparison_verdict
 
 REPORT_HTML = "compare.html"
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What `cgwm compare` prints, and the models with their predictions behind it."""
+    """The figures of a comparison and the models and predictions that they come from."""
 
     result: CompareResult
+    """The figures that `cgwm compare` prints."""
     models: tuple[ComparedModel, ...]
+    """The compared models, in the order given."""
 
 
 def compare(
@@ -52,11 +54,11 @@ def compare(
 
     Args:
         models: MODEL directories with fitted physics, the base first.
-        capture: With tracks.
-        split: The episodes.
+        capture: CAPTURE with tracks.
+        split: Split whose episodes are compared.
         out: The page to write; None writes none.
         warmup_s: Length of the start of an episode that the models may see [s].
-        device: Where images are rendered: auto, cpu or cuda.
+        device: Device that renders images: auto, cpu or cuda.
         overwrite: Replace what is at `out`.
 
     Raises:
@@ -64,7 +66,7 @@ def compare(
         InputDataError: If a model has other bodies than the capture, or no episode can be predicted.
         NotConvergedError: If a rollout diverges.
     """
-    resolve_device(device)  # a wrong device is better told now than after minutes
+    resolve_device(device)  # refuse a wrong device now, not after minutes
     if out is not None:
         refuse_existing(out, overwrite)
     _refuse_twice(models)
@@ -103,24 +105,12 @@ def compare_models(
         evaluations.append(evaluate_model(model, capture, split, warmup_s, device))
     shared = [name for name in names if all(any(e.errors.episode == name for e in ev.episodes) for ev in evaluations)]
     if not shared:
-        raise InputDataError("there is no episode that all models can predict.", todo="look at 'cgwm eval' of each.")
+        raise InputDataError("no episode can be predicted by all models.", todo="run 'cgwm eval' with each model.")
     episodes: list[Episode] = [(name, capture.tracks(name)) for name in shared]
     first, given = World.from_model(models[0][1]), capture.manifest.measurement
     prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
     bodies = [first.bodies[k].name for k in first.free]
-    compared = []
-    with one_torch_thread(), progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
-        for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
-            # of an episode's own numbers a short prediction knows as much as of its state
-            world = World.from_model(model)
-            flown = after_release(episodes, prepared.released_s)
-            world = with_fitted_numbers(world, flown, model.file, capture.groups, prepared.noise)
-            fit = short_errors(world, episodes, prepared, bodies)
-            points, organisers = wrench_points(world, fit, prepared)
-            compared.append(
-                ComparedModel(name, short_name, model, evaluation, prepared.noise, fit.errors, points, organisers)
-            )
-            bar.update(1)
+    compared = _with_short_predictions(models, evaluations, capture, episodes, prepared, bodies)
     figures = tuple(one.figures() for one in compared)
     best = min(figures, key=lambda one: one.translation_error_m.median)
     result = CompareResult(
@@ -138,8 +128,51 @@ def compare_models(
             *prepared.warnings,
         ),
     )
-    verdict = compared_verdict(result, {one.name: one.short_name for one in compared})
+    verdict = comparison_verdict(result, {one.name: one.short_name for one in compared})
     return Comparison(result.model_copy(update={"verdict": verdict}), tuple(compared))
+
+
+def _with_short_predictions(
+    models: Sequence[tuple[str, Model]],
+    evaluations: Sequence[Evaluation],
+    capture: Capture,
+    episodes: Sequence[Episode],
+    prepared: Prepared,
+    bodies: Sequence[str],
+) -> list[ComparedModel]:
+    """Return the models with their short predictions and residual wrenches.
+
+    Args:
+        models: Names and models.
+        evaluations: The open-loop evaluation of each.
+        capture: The capture, for the groups of its episodes.
+        episodes: The episodes that all models can predict.
+        prepared: The same episodes, cut into segments once for all models.
+        bodies: Names of the free bodies of the first model.
+    """
+    compared = []
+    with one_torch_thread(), progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
+        for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
+            # group-specific parameters come from the fit or from the same frames as the fitted states
+            world = World.from_model(model)
+            flown = after_release(episodes, prepared.released_s)
+            world = with_fitted_groups(world, flown, model.file, capture.groups, prepared.noise)
+            fit = short_errors(world, episodes, prepared, bodies)
+            points, covariates = wrench_points(world, fit, prepared)
+            compared.append(
+                ComparedModel(
+                    name=name,
+                    short_name=short_name,
+                    model=model,
+                    evaluation=evaluation,
+                    noise=prepared.noise,
+                    short=fit.errors,
+                    wrenches=points,
+                    covariates=covariates,
+                )
+            )
+            bar.update(1)
+    return compared
 
 
 def _refuse_twice(models: Sequence[Path]) -> None:
@@ -150,7 +183,7 @@ def _refuse_twice(models: Sequence[Path]) -> None:
 
 
 def _check(name: str, model: Model, capture: Capture) -> None:
-    """Refuse a model that does not fit the capture, by its name: there are several of them."""
+    """Raise InputDataError with the model's name if its bodies or physics do not fit the capture."""
     try:
         check_bodies(model, capture.body_names, str(capture.root))
         World.from_model(model)
@@ -160,7 +193,7 @@ def _check(name: str, model: Model, capture: Capture) -> None:
 
 
 def _short_names(models: Sequence[tuple[str, Model]]) -> list[str]:
-    """Return the shortest ends of the models' paths that tell them apart.
+    """Return the shortest ends of the models' paths that distinguish them.
 
     >>> _short_names([("a/m0", None), ("b/m1", None)]), _short_names([("a/m", None), ("b/m", None)])
     (['m0', 'm1'], ['a/m', 'b/m'])
@@ -174,7 +207,7 @@ def _short_names(models: Sequence[tuple[str, Model]]) -> list[str]:
 
 
 def _pairs(models: Sequence[ComparedModel]) -> list[PairedDifference]:
-    """Return each model against the one before it, and against the first."""
+    """Return the differences of each model from the one before it and from the first."""
     wanted = [(k, k - 1) for k in range(1, len(models))] + [(k, 0) for k in range(2, len(models))]
     found = [
         paired_difference(models[a].name, models[b].name, models[a].errors_m, models[b].errors_m) for a, b in wanted
@@ -183,15 +216,15 @@ def _pairs(models: Sequence[ComparedModel]) -> list[PairedDifference]:
 
 
 def _fitted_to_them(models: Sequence[ComparedModel], capture: Capture, episodes: Sequence[str]) -> list[str]:
-    """Return a message on each model that was fitted to episodes on which it is now judged, told by their hashes."""
+    """Return a warning for each model that was fitted to compared episodes, recognised by their tracks' hashes."""
     found = []
     for one in models:
         seen = one.model.file.provenance.input_sha256
         tracks = {name: capture.root / "tracks" / f"{name}.csv" for name in episodes}
-        own = [name for name, path in tracks.items() if seen.get(f"tracks/{name}.csv") == sha256(path)]
-        if own:
-            share = f"{len(own)} of the {len(episodes)} episodes"
-            found.append(f"{one.name} was fitted to {share}: its errors there are no predictions.")
+        fitted = [name for name, path in tracks.items() if seen.get(f"tracks/{name}.csv") == sha256(path)]
+        if fitted:
+            share = f"{len(fitted)} of the {len(episodes)} episodes"
+            found.append(f"{one.name} was fitted to {share}; its errors there are not predictions.")
     return found
 
 
@@ -200,4 +233,4 @@ def _left_out(names: Sequence[str], shared: Sequence[str]) -> list[str]:
     if not left_out:
         return []
     listed = ", ".join(f"'{name}'" for name in left_out)
-    return [f"not all models can predict {listed}: short predictions are compared on the other episodes."]
+    return [f"not all models can predict {listed}; short predictions are compared on the other episodes."]

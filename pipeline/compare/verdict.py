@@ -1,37 +1,37 @@
-"""The verdict on a comparison in words: what the figures say, and whether there are enough of them to say it."""
+"""The verdict of a comparison in words, including whether there are enough episodes for one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 from ...schemas import CompareResult, ModelComparison, PairedDifference
-from ..paired import LEAST_EPISODES
+from .paired_difference import LEAST_EPISODES
 
 EXPLAINED = 1.2
-"""Short predictions whose errors are below so many times the noise are explained."""
+"""Largest error of short predictions, in units of the noise, that counts as explained by the model."""
 LEAST_FRAMES = 10
-"""A phase with fewer frames is not spoken of."""
+"""Minimum number of frames of a phase that the verdict mentions."""
 
 
-def compared_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
-    """Return one or two sentences on a comparison.
+def comparison_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
+    """Return the verdict of a comparison in one to three sentences.
 
     Args:
         result: The figures.
-        names: What a model is called, by its name in the figures.
+        names: Short name of each model, by its name in the figures.
     """
     last = result.models[-1]
     subject = next(model for model in result.models if model.model == result.best)
     if len(result.models) == 1:
         sentences = [_alone(last, result, names)]
     else:
-        # against the first model, or where that is the best one, what came after it
+        # the best model against the first; if the first is the best, against the last
         other = result.models[0] if subject is not result.models[0] else last
         pair = _pair(result, subject.model, other.model)
         sentences = [_versus(pair, subject, other, result, names)] if pair else [_alone(subject, result, names)]
     if result.episodes < LEAST_EPISODES:
         sentences.append(
-            f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} too few to tell whether a "
+            f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} too few to decide whether a "
             "difference is more than chance."
             if len(result.models) > 1
             else f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} few to judge a model by."
@@ -41,7 +41,7 @@ def compared_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
 
 
 def _pair(result: CompareResult, model: str, than: str) -> PairedDifference | None:
-    """Return the difference of two models, turned round where it is there the other way."""
+    """Return the paired difference of two models, with the sign reversed if it is stored in the other order."""
     for pair in result.pairs:
         if (pair.model, pair.than) == (model, than):
             return pair
@@ -68,10 +68,10 @@ def _alone(model: ModelComparison, result: CompareResult, names: Mapping[str, st
     if not known:
         return words + "."
     name, nearest = min(known, key=lambda pair: pair[1])
-    guess = "that it stands still" if name == "frozen" else "free flight"
+    guess = "a body at rest" if name == "frozen" else "free flight"
     if nearest <= median:
-        return f"{words}, no better than to guess {guess} ({_mm(nearest)})."
-    return f"{words}; to guess {guess} would err by {_mm(nearest)}."
+        return f"{words}, no better than assuming {guess} ({_mm(nearest)})."
+    return f"{words}; assuming {guess} gives {_mm(nearest)}."
 
 
 def _zero(model: ModelComparison, name: str) -> float | None:
@@ -92,14 +92,14 @@ def _versus(
     if pair.interval_95_m is None:
         return words + "."
     if pair.interval_95_m[0] <= 0 <= pair.interval_95_m[1]:
-        return words + ", which may be chance: the 95 % interval of the difference holds zero."
+        return words + ", which may be chance: the 95 % interval of the difference contains zero."
     return words + "."
 
 
 def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
-    """Return where short predictions miss most, in units of the noise."""
+    """Return the phase in which short predictions have the largest error, in units of the noise, as a sentence."""
     if model.reduced_chi2 is None:
-        return "Nothing is said of short predictions: too few frames follow each other where they can be made."
+        return "Short predictions are not judged: too few consecutive frames allow one."
     known = [
         (phase, figures.reduced_chi2**0.5, figures.position_rms_m)
         for phase, figures in model.by_phase.items()
@@ -111,7 +111,7 @@ def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
         return f"Short predictions of {name} are within the noise in all phases."
     phase, times, size = missed[0]
     within = [other for other, multiple, _ in known if multiple <= EXPLAINED]
-    words = f"Short predictions of {name} still err by {times:.1f} times the noise {_during(phase)}"
+    words = f"Short predictions of {name} still have errors of {times:.1f} times the noise {_during(phase)}"
     words += f" ({_mm(size)})" if size is not None else ""
     return words + (f"; they are within the noise {' and '.join(map(_during, within))}." if within else ".")
 

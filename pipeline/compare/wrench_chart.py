@@ -1,4 +1,4 @@
-"""The section with what is missing, segment by segment, against time, place, height, heading, speed and spin."""
+"""Section with the residual wrench of each segment against time, place, height, heading, speed and spin."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 
 from ...schemas import PHASES
-from ..compared import ComparedModel
-from ..wrench_points import LEAST_WINDOWS, WrenchPoint
-from .page import number, paragraph, section, table, text
+from ..report.page import number, paragraph, section, table, text
+from .model_comparison import ComparedModel
+from .residual_wrenches import LEAST_WINDOWS, WrenchPoint
 
 UNITS = {"time": "s", "x": "m", "y": "m", "height": "m", "heading": "deg", "speed": "m/s", "spin": "rad/s"}
+"""Units of the coordinates, in the order in which they are offered."""
 _MISFIT = 6
-"""Place of the misfit after force and torque."""
+"""Index of the misfit after the components of force and torque."""
 MOST_POINTS = 1500
-"""Of one model; of more, every so manyth is drawn."""
+"""Maximum number of points per model; more are subsampled."""
 
 
 def wrench_data(models: Sequence[ComparedModel]) -> dict[str, Any] | None:
-    """Return the points of the chart for its script; None where no model has any."""
+    """Return the points of the chart for its script; None if no model has any."""
     if not any(one.wrenches for one in models):
         return None
     known = {name for one in models for point in one.wrenches for name in point.coordinates}
@@ -33,7 +34,7 @@ def wrench_data(models: Sequence[ComparedModel]) -> dict[str, Any] | None:
 
 
 def wrench_section(models: Sequence[ComparedModel]) -> str:
-    """Return the section with the chart and what orders the residual wrench of each model; empty without points."""
+    """Return the section with the chart and the coordinates that explain each residual wrench; empty without points."""
     if not any(one.wrenches for one in models):
         return ""
     picks = "".join(
@@ -41,25 +42,25 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
         for name, label in (("model", "model"), ("kind", "what"), ("coordinate", "against"), ("phase", "in"))
     )
     words = (
-        "Each dot is a piece of the motion and leads to its moment. Misfit: the residual of its short prediction in "
-        "units of the noise. In flight also the constant force over mass, and torque over inertia, that it would need "
-        "on top of the model (one standard error each way; world frame); in contact the ground answers every force, so "
-        "that none is told. The black line joins weighted means of four equally filled bins; what exceeds the scale "
-        "runs along its rim."
+        "Each dot is a segment of the motion; click it to see that moment. Misfit: the residual of its short "
+        "prediction in units of the noise. In flight, the chart also shows the constant force over mass, and torque "
+        "over inertia, that is missing from the model (± one standard error; world frame); in contact the ground "
+        "balances every force, so none can be estimated. The black line joins weighted means of four bins with equal "
+        "numbers of segments; values beyond the scale are drawn at its edge."
     )
     rows = [
-        [text(one.short_name), text(organiser.coordinate), number(100 * organiser.share, 2)]
+        [text(one.short_name), text(covariate.coordinate), number(100 * covariate.share, 2)]
         for one in models
-        for organiser in one.organisers
+        for covariate in one.covariates
     ]
-    header = ["model", "in flight ordered by", "share of the excess over the noise [%]"]
-    silent = [one.short_name for one in models if one.wrenches and not one.organisers]
+    header = ["model", "in flight explained by", "share of the excess over the noise [%]"]
+    silent = [one.short_name for one in models if one.wrenches and not one.covariates]
     windows = sum(point.phase == "flight" for point in models[0].wrenches)
     none = ""
     if silent and windows < LEAST_WINDOWS:
-        none = f"{windows} windows of flight are too few to tell what orders the missing force."
+        none = f"{windows} windows of flight are too few to decide which coordinate explains the missing force."
     elif silent:
-        none = f"In flight nothing orders what is missing in {', '.join(silent)}: it is noise, or no pattern of these."
+        none = f"In flight no coordinate explains the residual wrench of {', '.join(silent)}: it may be noise."
     return section(
         "What is missing, and where",
         paragraph(words),
@@ -74,8 +75,12 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
 
 
 def _first(models: Sequence[ComparedModel], names: Sequence[str]) -> list[int]:
-    """Return the quantity and the coordinate that are shown first: the force that is most ordered, or the misfit."""
-    ordered = [o.coordinate for o in models[0].organisers if o.coordinate in names]
+    """Return the indices of the quantity and the coordinate to show first.
+
+    These are the component with the largest excess and the coordinate that explains most, or else the misfit and the
+    first coordinate.
+    """
+    ordered = [o.coordinate for o in models[0].covariates if o.coordinate in names]
     excess = np.array([np.square(p.acceleration / p.std) for p in models[0].wrenches if p.phase == "flight"])
     if not ordered or not np.isfinite(excess).any():
         return [_MISFIT, 0]

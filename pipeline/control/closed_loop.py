@@ -1,8 +1,8 @@
-"""A fitted model as one environment of a controller: a command in, a frame and the state out, step by step.
+"""Closed-loop simulation of a fitted model: each step takes a command and returns a frame and the state.
 
 On CUDA a step is one replay of a CUDA graph: the fused kernel over all sub-steps of the control interval, then the
 renderer over all spheres. On the CPU the torch engine and renderer do the same, slowly. The steps are those of one
-open-loop rollout under the same commands: the impulses of contacts go on from one control step to the next.
+open-loop rollout under the same commands: the contact impulses persist from one control step to the next.
 """
 
 from __future__ import annotations
@@ -14,58 +14,58 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..datasets.models import Model
-from ..schemas import InputDataError, NotConvergedError, UsageError
-from .physics.checks import require_apart
-from .physics.driven import Drive
-from .physics.fused.stepping import FusedStepper
-from .physics.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
-from .physics.stepping import Stepper, TorchStepper
-from .physics.world import State, World
-from .picture import Picture
+from ...datasets.capture.cameras import Camera
+from ...datasets.models.model import Model
+from ...schemas import InputDataError, NotConvergedError, UsageError
+from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from ..physics.checks import require_apart
+from ..physics.fused.stepping import FusedStepper
+from ..physics.kinematic import Drive
+from ..physics.stepping import Stepper, TorchStepper
+from ..physics.world import State, World
+from .frame_renderer import FrameRenderer
 
 ROOM, LEAST_ROOM = 2, 65_536
-"""The renderer's kernels get room for so many times the pairs of tiles and spheres that were last counted, and at least
-for so many."""
+"""Capacity for pairs of tiles and spheres in the renderer's kernels: factor of the last count, and minimum number."""
 _SIZES = {"position_m": 3, "quat_wxyz": 4, "velocity_m_s": 3, "omega_body_rad_s": 3}
 
 
 @dataclass(frozen=True)
 class Velocity:
-    """Command of a driven body: velocities [m/s], [rad/s] that hold over the control interval, world frame."""
+    """Command of a driven body: constant velocities over the control interval."""
 
     velocity_m_s: ArrayLike | Tensor
+    """Velocity of the origin of the body frame [m/s], world frame, shape (3,)."""
     omega_world_rad_s: ArrayLike | Tensor = (0.0, 0.0, 0.0)
+    """Angular velocity [rad/s], world frame, shape (3,)."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Command of a driven body: the pose at the end of the control interval, reached at constant velocities.
-
-    position_m: of the body frame's origin, world [m]; quat_wxyz: None keeps the orientation.
-    """
+    """Command of a driven body: the pose at the end of the control interval, reached at constant velocities."""
 
     position_m: ArrayLike | Tensor
+    """Position of the origin of the body frame [m], world frame, shape (3,)."""
     quat_wxyz: ArrayLike | Tensor | None = None
+    """Orientation (body to world), shape (4,); None keeps the present one."""
 
 
 Command = Velocity | Reach
 
 
 class ClosedLoop:
-    """A model's world and spheres on a device, stepped by a controller.
+    """A fitted model as the environment of a controller.
 
     Args:
         model: A model with fitted physics and visual spheres.
         camera: The camera of the frames.
-        control_dt_s: Length of a control interval [s]; the physics takes sub-steps in it.
+        control_dt_s: Length of a control interval [s]; the physics divides it into sub-steps.
         device: cpu or cuda.
-        dtype: Of the physics; frames are rendered in single precision.
+        dtype: Data type of the physics; frames are rendered in single precision.
 
     Raises:
-        InputDataError: If the model has no fitted physics or nothing to see, or cannot be simulated.
-        UsageError: If the interval is not positive, or the kernels on CUDA cannot take the model.
+        InputDataError: If the model has no fitted physics or no visual spheres, or cannot be simulated.
+        UsageError: If the interval is not positive, or the CUDA kernels do not support the model.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class ClosedLoop:
         self._times = torch.tensor([[0.0, control_dt_s]], dtype=torch.float64)
         stepper: Stepper = (FusedStepper if self._cuda else TorchStepper)(world, control_dt_s)
         self._stepper = stepper
-        self._picture = Picture(model, camera, device)
+        self._picture = FrameRenderer(model, camera, device)
         self._poses: dict[str, tuple[Tensor, Tensor]] | None = None
         self._steps = 0
         self._graph: _Graph | None = None
@@ -95,13 +95,13 @@ class ClosedLoop:
 
     @torch.no_grad()
     def reset(self, state: State) -> Tensor:
-        """Start anew, and return the frame of the start, uint8 RGB (H, W, 3), on the device.
+        """Set the state, and return its frame, uint8 RGB (H, W, 3), on the device.
 
         Args:
-            state: Of all bodies (1, nb, ...); driven and fixed ones are at rest where it puts them.
+            state: State of all bodies (1, nb, ...); driven and fixed bodies are at rest at the given poses.
 
         Raises:
-            InputDataError: If it has another shape, is not finite, or bodies begin deep inside each other.
+            InputDataError: If the state has another shape, is not finite, or bodies interpenetrate deeply.
         """
         world, count = self._world, len(self.body_names)
         for name, size in _SIZES.items():
@@ -120,7 +120,7 @@ class ClosedLoop:
         frame, pairs = self._picture.of(start)
         if self._cuda and self._graph is None:
             capacity = _room(int(pairs))
-            self._advanced(capacity)  # compiles and loads all kernels, which a capture cannot
+            self._advanced(capacity)  # compiles and loads all kernels, which is impossible during a capture
             self._stepper.reset(start, at_rest)
             self._graph = self._captured(start, capacity)
         if self._cuda:
@@ -129,18 +129,18 @@ class ClosedLoop:
 
     @torch.no_grad()
     def step(self, command: Mapping[str, Command] | None = None) -> tuple[Tensor, State]:
-        """Take the environment on by one control interval.
+        """Advance the environment by one control interval.
 
         Args:
-            command: One for every driven body, by name.
+            command: Command of every driven body, by name.
 
         Returns:
-            The frame at its end, uint8 RGB (H, W, 3), and the state there (1, nb, ...). Both lie on the device, are
-            complete, and stay as they are in later steps.
+            Frame at the end of the interval, uint8 RGB (H, W, 3), and state there (1, nb, ...). Both are on the device,
+            complete, and unchanged by later steps.
 
         Raises:
-            UsageError: If there was no reset, a command is missing, or it is for no driven body.
-            NotConvergedError: If the state does not stay finite.
+            UsageError: Before the first reset, if a command is missing, or if one is for a body that is not driven.
+            NotConvergedError: If the state is no longer finite.
         """
         if self._poses is None:
             raise UsageError("a step before the first reset.", todo="call reset(state) first.")
@@ -165,7 +165,7 @@ class ClosedLoop:
     def _commanded(
         self, poses: Mapping[str, tuple[Tensor, Tensor]], command: Mapping[str, Command]
     ) -> dict[str, Drive]:
-        """Return the commands of an interval that begins at the poses, float64 on the CPU."""
+        """Return the motions of the driven bodies over an interval that starts at the poses, float64 on the CPU."""
         if set(command) != set(poses):
             wrong = sorted(set(command) ^ set(poses))[0]
             found = f"a command for '{wrong}', which is not driven" if wrong in command else f"no command for '{wrong}'"
@@ -177,7 +177,7 @@ class ClosedLoop:
         return drives
 
     def _typed(self, drives: Mapping[str, Drive]) -> dict[str, Drive]:
-        """Return the commands in the type of the physics."""
+        """Return the motions in the data type of the physics."""
         dtype = self._world.gravity.dtype
 
         def typed(value: Tensor) -> Tensor:
@@ -186,7 +186,7 @@ class ClosedLoop:
         return {name: Drive(*map(typed, vars(drive).values())) for name, drive in drives.items()}
 
     def _velocities(self, name: str, command: Command, position: Tensor, quat: Tensor) -> tuple[Tensor, Tensor]:
-        """Return velocity and angular velocity of a command (1, 3), world frame."""
+        """Return velocity [m/s] and angular velocity [rad/s] of a command, world frame, shape (1, 3)."""
         if isinstance(command, Velocity):
             return _row(name, command.velocity_m_s, 3), _row(name, command.omega_world_rad_s, 3)
         length = self._times[:, 1:]
@@ -197,7 +197,7 @@ class ClosedLoop:
         return velocity, quat_rotate(quat, turn) / length
 
     def _advanced(self, capacity: int | None) -> _Outcome:
-        """Take physics and picture on by one interval."""
+        """Advance physics and frame by one interval."""
         state = self._stepper.advance()
         numbers = torch.cat([getattr(state, name) for name in _SIZES], -1)
         frame, pairs = self._picture.of(state, capacity)
@@ -205,7 +205,7 @@ class ClosedLoop:
         return _Outcome(frame, numbers, checks)
 
     def _captured(self, state: State, capacity: int) -> _Graph:
-        """Capture an interval as a CUDA graph; nothing moves meanwhile."""
+        """Capture an interval as a CUDA graph, without advancing the state."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -220,11 +220,14 @@ class ClosedLoop:
 
 @dataclass(frozen=True)
 class _Outcome:
-    """Of an interval: frame (H, W, 3); numbers (1, nb, 13): the state; checks (2,): pairs, and whether it is finite."""
+    """Result of a control interval."""
 
     frame: Tensor
+    """Frame at its end, shape (H, W, 3)."""
     numbers: Tensor
+    """State at its end: position, orientation, velocity, angular velocity; shape (1, nb, 13)."""
     checks: Tensor
+    """Number of pairs of tiles and spheres, and whether the state is finite, shape (2,)."""
 
     def state(self) -> State:
         return State(*self.numbers.clone().split(list(_SIZES.values()), -1))
@@ -232,11 +235,14 @@ class _Outcome:
 
 @dataclass(frozen=True)
 class _Graph:
-    """An interval as a CUDA graph, which writes its outcome to the same place at each replay."""
+    """A control interval as a CUDA graph, which writes its result to the same tensors at each replay."""
 
     graph: torch.cuda.CUDAGraph
+    """The graph."""
     outcome: _Outcome
+    """Tensors that the graph writes to."""
     capacity: int
+    """Number of pairs of tiles and spheres that fit."""
 
     def replayed(self) -> _Outcome:
         self.graph.replay()
@@ -248,7 +254,7 @@ def _room(pairs: int) -> int:
 
 
 def _row(name: str, values: ArrayLike | Tensor, size: int) -> Tensor:
-    """Return the numbers of a command as a row (1, size) on the CPU."""
+    """Return the values of a command as a row (1, size), float64 on the CPU."""
     row = torch.as_tensor(values, dtype=torch.float64, device="cpu").detach()
     if row.shape != (size,) or not bool(torch.isfinite(row).all()):
         raise UsageError(f"the command of '{name}' has {row.tolist()}.", f"{size} finite numbers.")

@@ -1,7 +1,7 @@
-"""The frame that a camera takes of a model in a given state, as a call that a CUDA graph can capture.
+"""Renderer of single frames of a model in a given state, which a CUDA graph can capture.
 
-`LabelRenderer` renders whole rollouts with depth and masks, to the host; this renders one state's colours, and leaves
-them on the device.
+`LabelRenderer` renders whole rollouts with depth and masks to the host; this renders the colours of one state and
+keeps them on the device.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..datasets.models import Model
-from ..schemas import InputDataError, UsageError
-from .physics.rotation import quat_to_matrix
-from .physics.world import State
-from .splats.relighting import Relighting
-from .splats.render import render
-from .splats.spheres import Spheres
+from ...datasets.capture.cameras import Camera
+from ...datasets.models.model import Model
+from ...schemas import InputDataError, UsageError
+from ..geometry.rotation import quat_to_matrix
+from ..geometry.spheres import Spheres
+from ..physics.world import State
+from ..rendering.relighting import Relighting
+from ..rendering.render import render
 
 
-class Picture:
-    """All spheres of a model before one camera; the background stands still, bodies are where a state puts them.
+class FrameRenderer:
+    """Renderer of all spheres of a model for one camera: static background, bodies at the poses of a state.
 
     Args:
         model: A model with visual spheres.
         camera: The camera.
-        device: Where to render.
+        device: Device of the renderer.
 
     Raises:
         InputDataError: If no body has visual spheres.
@@ -59,14 +59,15 @@ class Picture:
         self._distortion = tensor(camera.distortion) if camera.distortion.any() else None
 
     def of(self, state: State, capacity: int | None = None) -> tuple[Tensor, Tensor]:
-        """Return the frame of a state, uint8 RGB (H, W, 3), and the pairs () that the kernels found; 0 without them.
+        """Render a state; return the frame, uint8 RGB (H, W, 3), and the number of pairs (), 0 without the kernels.
 
         Args:
-            state: Of all bodies (1, nb, ...), on the device.
-            capacity: Room for pairs: with it nothing waits for the device, and pairs beyond it are lost.
+            state: State of all bodies (1, nb, ...), on the device.
+            capacity: Maximum number of pairs of tiles and spheres: with it the call does not wait for the device, and
+                further pairs are lost.
 
         Raises:
-            UsageError: If the kernels are not there on a CUDA device.
+            UsageError: If the kernels are missing on a CUDA device.
         """
         positions, rotations = state.position_m[0].float(), quat_to_matrix(state.quat_wxyz[0]).float()
         means, colors = [], []

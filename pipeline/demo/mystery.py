@@ -1,4 +1,4 @@
-"""`cgwm demo --scene mystery`: fit, compare, diagnose, add, compare again; and only then, what had been hidden."""
+"""The mystery (`cgwm demo --scene mystery`): find a hidden effect by fit, compare and diagnose, then reveal it."""
 
 from __future__ import annotations
 
@@ -6,45 +6,48 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..datasets.atomic import new_directory
-from ..datasets.capture import Capture
-from ..datasets.models import read_model
-from ..datasets.scenes.hidden import draw_mystery, make_mystery, open_sealed
-from ..schemas import (
+from ...datasets.capture.capture import Capture
+from ...datasets.io.atomic import new_directory
+from ...datasets.models.model import read_model
+from ...datasets.synthetic.hidden_effects import draw_mystery, make_mystery, open_sealed
+from ...schemas import (
     ComparedParameter,
     CompareResult,
     DiagnoseResult,
+    FittedParameter,
     HiddenEffect,
     ModelFile,
     MysteryResult,
     Outcome,
-    Parameter,
     PhysConfig,
 )
-from .compare import REPORT_HTML as COMPARE_HTML
-from .compare import compare_models
-from .diagnose import diagnose
-from .fit import fit
-from .reporting.comparison import comparison_html
-from .reporting.footage import footage_of
-from .reporting.mystery import REPORT_HTML, REPORT_JSON, mystery_html
-from .sg_gs import resolve_device
-from .staged import StagedRun
+from ..compare.frames import footage_of
+from ..compare.page import comparison_html
+from ..compare.stage import REPORT_HTML as COMPARE_HTML
+from ..compare.stage import compare_models
+from ..diagnose.stage import diagnose
+from ..fit import fit
+from ..runtime.device import resolve_device
+from ..runtime.timing import StagedRun
+from .mystery_page import REPORT_HTML, REPORT_JSON, mystery_html
 
 SEALED, DIAGNOSIS = "sealed.json", "diagnosis.json"
 BASE, CHILD = "m0", "m1"
 SPLIT = "test"
 STEP_S = 0.002
-"""Twice the step of `cgwm fit`, for half the time."""
+"""Time step of the simulation [s]: twice that of `cgwm fit`, which halves the run time."""
 
 
 @dataclass(frozen=True)
 class _Mystery(StagedRun):
-    """A run of the mystery, with what its stages share."""
+    """A run of the mystery and the settings that its stages share."""
 
     physics: PhysConfig
+    """Settings of both fits."""
     seed: int
+    """Seed of the capture and of the fits."""
     device: str
+    """auto, cpu or cuda."""
 
 
 def run_mystery(
@@ -54,23 +57,23 @@ def run_mystery(
     overwrite: bool = False,
     physics: PhysConfig | None = None,
 ) -> MysteryResult:
-    """Make a capture with something hidden in it, or nothing; find it by the commands of the loop; open the seal.
+    """Make a capture with a hidden effect or none, search for it with the commands of the loop, and open the seal.
 
     Args:
-        out: The directory to write; it appears when all of it is complete.
-        seed: Draws the body, what is hidden, the throws and the noise.
+        out: The directory to write; it appears once it is complete.
+        seed: Seed that draws the body, the hidden effect, the throws and the noise.
         device: auto, cpu or cuda.
         overwrite: Replace what is at `out`.
         physics: Settings of both fits, default those of `cgwm fit` with steps of 2 ms; seed and device are filled in.
 
     Returns:
-        What stands in `report.json`.
+        The content of `report.json`.
 
     Raises:
         UsageError: If `out` exists, or the seed is negative.
         NotConvergedError: If a stage fails; its message names the stage, and nothing is written.
     """
-    resolve_device(device)  # a wrong device is better told now than after minutes
+    resolve_device(device)  # refuse a wrong device now, not after minutes
     case = draw_mystery(seed)
     settings = (physics or PhysConfig(step_s=STEP_S)).model_dump() | {"seed": seed, "device": device}
     with new_directory(Path(out), overwrite) as folder:
@@ -102,7 +105,7 @@ def _solve(run: _Mystery) -> MysteryResult:
 
 
 def _compare(run: _Mystery, names: Sequence[str]) -> CompareResult:
-    """Compare on the test split, as `cgwm compare` does, with names that hold when the directory has its own."""
+    """Compare on the test split, as `cgwm compare` does, with names relative to the directory that is written."""
     source = Capture.open(run.folder / "capture", splits=(SPLIT,))
     found = compare_models([(name, read_model(run.folder / name)) for name in names], source, SPLIT, device=run.device)
     result = found.result.model_copy(update={"capture": "capture", "report": COMPARE_HTML})
@@ -122,7 +125,7 @@ def _result(
     outcome, sentence = judged(diagnosis, hidden)
     paths = {"report": REPORT_HTML, "figures": REPORT_JSON, "comparison": COMPARE_HTML, "diagnosis": DIAGNOSIS}
     paths |= {"capture": "capture", "sealed": SEALED, "model": BASE}
-    own = [p for p in files[-1].parameters if any(p.name.startswith(f"{name}.") for name in diagnosis.selected)]
+    added = [p for p in files[-1].parameters if any(p.name.startswith(f"{name}.") for name in diagnosis.selected)]
     return MysteryResult(
         seed=run.seed,
         device=str(resolve_device(run.device)),
@@ -131,7 +134,7 @@ def _result(
         test_episodes=len(capture.episodes(SPLIT)),
         settings=" ".join(f"--set phys-geo.{name}={value}" for name, value in _changed(run.physics).items()),
         diagnosis=diagnosis,
-        parameters=tuple(_compared(parameter, hidden) for parameter in own),
+        parameters=tuple(_compared(parameter, hidden) for parameter in added),
         comparison=comparison,
         hidden=hidden,
         outcome=outcome,
@@ -147,12 +150,12 @@ def _result(
 
 
 def _changed(physics: PhysConfig) -> dict[str, object]:
-    """Return what differs from the settings of `cgwm fit`, the device aside."""
+    """Return the settings that differ from the defaults of `cgwm fit`, without device and effects."""
     usual = PhysConfig().model_dump()
     return {k: v for k, v in physics.model_dump().items() if v != usual[k] and k not in ("device", "effects")}
 
 
-def _compared(parameter: Parameter, hidden: Sequence[HiddenEffect]) -> ComparedParameter:
+def _compared(parameter: FittedParameter, hidden: Sequence[HiddenEffect]) -> ComparedParameter:
     true = {f"{effect.name}.{key}": value for effect in hidden for key, value in effect.values.items()}
     value, span = true.get(parameter.name), parameter.interval_95
     if value is None or isinstance(value, list):
@@ -162,36 +165,40 @@ def _compared(parameter: Parameter, hidden: Sequence[HiddenEffect]) -> ComparedP
 
 
 def judged(diagnosis: DiagnoseResult, hidden: Sequence[HiddenEffect]) -> tuple[Outcome, str]:
-    """Return how the diagnosis did against what was hidden, and the same in words."""
+    """Judge the diagnosis by the hidden effects: the outcome, and the same as a sentence."""
     names = {effect.name for effect in hidden}
     if diagnosis.selected:
         return _named(diagnosis, names)
     unnamed = diagnosis.verdict == "unexplained"
     if not names:
         if unnamed:
-            return "wrong", "Nothing was hidden, and something was said to be missing: a false alarm."
+            return "wrong", "Nothing was hidden, but the diagnosis reported a missing effect: a false alarm."
         return "right", "Nothing was hidden, and nothing was found: right."
     if unnamed:
-        return "unnamed", f"Hidden was {_and(sorted(names))}. That something is missing was found, but not what."
-    return "silent", f"Hidden was {_and(sorted(names))}, and nothing was found: it was missed."
+        return "unnamed", f"{_were_hidden(names)}. The diagnosis found that something is missing, but did not name it."
+    return "silent", f"{_were_hidden(names)}, and nothing was found: missed."
+
+
+def _were_hidden(names: set[str]) -> str:
+    return f"{_and(sorted(names))} {'was' if len(names) == 1 else 'were'} hidden"
 
 
 def _named(diagnosis: DiagnoseResult, names: set[str]) -> tuple[Outcome, str]:
     selected = list(diagnosis.selected)
     if not names:
-        return "wrong", f"Nothing was hidden, and {_and(selected)} was named: a false alarm."
-    told = f"Hidden was {_and(sorted(names))}"
+        return "wrong", f"Nothing was hidden, but {_and(selected)} was named: a false alarm."
+    hidden = _were_hidden(names)
     classes = [next((group for group in diagnosis.aliases if name in group), (name,)) for name in selected]
     if not names <= {name for group in classes for name in group}:
-        return "wrong", f"{told}, and {_and(selected)} was named: wrong."
+        return "wrong", f"{hidden}, but {_and(selected)} was named: wrong."
     extra = [name for name, group in zip(selected, classes, strict=True) if not names & set(group)]
     if extra:
-        return "partly", f"{told}, and it was found; but {_and(extra)} was named beside it, and was not hidden."
+        return "partly", f"{hidden} and found, but {_and(extra)}, which was not hidden, was named, too."
     wide = next((group for group in classes if len(group) > 1), None)
     if wide is None:
-        return "right", f"{told}, and {_and(selected)} was named: right."
-    listed = f"one of {_and(wide)}, which these data cannot tell apart"
-    return "right_class", f"{told}. What was named is {listed}: right, as a class."
+        return "right", f"{hidden}, and {_and(selected)} was named: right."
+    listed = f"one of {_and(wide)}, which these data cannot distinguish"
+    return "right_class", f"{hidden}. The diagnosis named {listed}: right, as a class."
 
 
 def _and(names: Sequence[str]) -> str:

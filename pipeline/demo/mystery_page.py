@@ -1,4 +1,4 @@
-"""The page of the mystery: five steps from a model to what it lacked, and last what had been hidden."""
+"""The page of the mystery: five steps from a model to its missing effect, and at the end what was hidden."""
 
 from __future__ import annotations
 
@@ -6,23 +6,19 @@ import math
 from collections.abc import Sequence
 
 from ...schemas import ComparedParameter, HiddenEffect, ModelComparison, MysteryResult, RankedEffect
-from .charts import interval_svg
-from .ladder import LADDER_WORDS, error_ladder
-from .page import fixed, number, page, paragraph, section, table, text
-from .replay_script import REPLAY_STYLE
+from ..compare.error_ladder import LADDER_WORDS, error_ladder
+from ..compare.player import REPLAY_STYLE
+from ..report.charts import interval_svg
+from ..report.page import fixed, number, page, paragraph, read_asset, section, table, text
 
 REPORT_HTML = "report.html"
 REPORT_JSON = "report.json"
 
 SHOWN = 8
-"""So many candidates are listed."""
+"""Number of candidates that are listed."""
 _LEAST_P = 1e-300
-_STYLE = """
-.told { border: 1px solid var(--line); border-radius: 8px; padding: 6px 20px 14px; margin: 16px 0; }
-.told .verdict { margin: 10px 0; }
-pre { background: var(--wash); border-radius: 8px; padding: 10px 14px; overflow-x: auto; margin: 12px 0; }
-"""
-_LINK = '<p>Predicted beside measured motion, and every figure: <a href="compare.html">compare.html</a>.</p>'
+_STYLE = read_asset(__name__, "mystery.css")
+_LINK = '<p>Predicted and measured motion, and all figures: <a href="compare.html">compare.html</a>.</p>'
 _GOOD = ("right", "right_class")
 
 
@@ -47,8 +43,8 @@ def mystery_html(result: MysteryResult) -> str:
 def _opening(result: MysteryResult) -> str:
     return (
         f"A {result.body} was thrown, pushed and dropped {result.train_episodes + result.test_episodes} times in "
-        "another simulator, perhaps with something in its physics or in its measurement that a textbook leaves out. "
-        "What, if anything? The answer lay in a sealed file until all of this had been computed."
+        "another simulator, perhaps with something in its physics or in its measurement that a textbook omits. "
+        "What, if anything? The answer was in a sealed file until all of this had been computed."
     )
 
 
@@ -68,8 +64,9 @@ def _fit(result: MysteryResult) -> str:
         "1. Fit a model",
         _commands(f"cgwm fit capture --out m0 {result.settings}"),
         paragraph(
-            f"From {result.train_episodes} tracked episodes: a rigid body that flies freely and touches the ground by "
-            "a spring, a damper and Coulomb friction. Nothing else is in it. (The setting halves the time of the demo.)"
+            f"From {result.train_episodes} tracked episodes: a rigid body with free flight and with contacts modelled "
+            "as a spring, a damper and Coulomb friction, without further effects. (The setting halves the time of the "
+            "demo.)"
         ),
     )
 
@@ -80,10 +77,10 @@ def _fails(result: MysteryResult) -> str:
         "2. Compare it with the measurement",
         _commands("cgwm compare m0 capture"),
         paragraph(
-            f"On {result.test_episodes} episodes that the fit has not seen it errs by "
+            f"On {result.test_episodes} episodes that the fit has not seen, its error is "
             f"{_mm(base.translation_error_m.median)} (median). Short predictions, each from the start that fits it "
-            "best, tell where: their errors in units of the measurement noise, about 1 where the model explains the "
-            "data."
+            "best, show where the model fails: their errors in units of the measurement noise are about 1 where the "
+            "model explains the data."
         ),
         _phases([base], ["m0"]),
         "" if result.diagnosis.selected else _LINK,
@@ -103,26 +100,26 @@ def _diagnosis(result: MysteryResult) -> str:
         _commands("cgwm diagnose m0 capture"),
         paragraph(found.sentence, "verdict"),
         paragraph(
-            "Each candidate is asked whether the training episodes would rather have it than not; the best few are "
-            "fitted and proved on episodes that their numbers were not fitted to. The test episodes stay closed. "
-            f"{len(found.ranking)} were asked; these fit best:"
+            "Each candidate effect is tested on the training episodes; the best few are fitted and cross-validated on "
+            "episodes that were held out from their fit. The test episodes are not used. "
+            f"{len(found.ranking)} candidates were tested; these fit best:"
         ),
         table(header, rows, strong=chosen),
         paragraph(
-            "p: of one candidate alone against a model without it. Where something large is missing, many candidates "
-            "look better than none; the choice is between them.",
+            "p: p-value of one candidate alone against the model without it. If a large effect is missing, many "
+            "candidates improve the model; the diagnosis chooses between them.",
             "soft",
         ),
     ]
     if found.aliases:
         groups = "; ".join(", ".join(group) for group in found.aliases)
-        pieces.append(paragraph(f"These data cannot tell apart: {groups}."))
+        pieces.append(paragraph(f"These data cannot distinguish: {groups}."))
     before, after = found.flight_before, found.flight_after
     if before is not None and after is not None:
         pieces.append(
             paragraph(
-                f"A force that is missing in flight shows as a mean χ² above 1; it is {number(before.statistic)}"
-                + (f", and {number(after.statistic)} with what was named." if found.selected else ".")
+                f"A force that is missing in flight raises the mean χ² above 1; it is {number(before.statistic)}"
+                + (f", and {number(after.statistic)} with the named effects." if found.selected else ".")
             )
         )
     return section("3. Diagnose: what is missing?", *pieces)
@@ -133,7 +130,7 @@ def _candidate(entry: RankedEffect) -> list[str]:
         f"<code>{text(p.name)}</code> = {number(p.estimate)} ± {number(p.std_error, 2)}{_unit(p.unit)}"
         for p in entry.parameters[:3]
     )
-    # number() takes what is below 1e-12 for a zero; a p-value may be that small
+    # number() writes magnitudes below 1e-12 as zero; a p-value may be that small
     p = "< 1e-300" if entry.score_p < _LEAST_P else f"{entry.score_p:.1g}"
     before, after = entry.cv_error_before_m, entry.cv_error_after_m
     gain = "" if before is None or after is None else f"{fixed(before, 2, 1e3)} → {fixed(after, 2, 1e3)} mm"
@@ -156,7 +153,7 @@ def _added(result: MysteryResult) -> str:
     if not selected:
         return section(
             "4. Add it",
-            paragraph("Nothing was named, so nothing is added, and there is no second model to compare."),
+            paragraph("The diagnosis named no effect, so nothing is added and no second model is compared."),
         )
     rows = [
         [f"<code>{text(p.name)}</code>", number(p.estimate), _span(p.interval_95), text(p.unit)]
@@ -165,8 +162,8 @@ def _added(result: MysteryResult) -> str:
     return section(
         "4. Add it",
         _commands(f"cgwm fit capture --from m0 --effects {','.join(selected)} --out m1 {result.settings}"),
-        paragraph("A child of m0 with the effect in it, and all numbers fitted anew."),
-        table(["number", "estimate", "95 % interval", "unit"], rows, numeric=(1, 2)),
+        paragraph("A child of m0 with the named effects; all parameters are fitted again."),
+        table(["parameter", "estimate", "95 % interval", "unit"], rows, numeric=(1, 2)),
     )
 
 
@@ -184,7 +181,7 @@ def _compared(result: MysteryResult) -> str:
 
 
 def _phases(models: Sequence[ModelComparison], names: Sequence[str]) -> str:
-    """Return a table of short predictions by phase, in units of the noise, a bar for each."""
+    """Return a table of the errors of short predictions by phase, in units of the noise, with a bar for each."""
     known = [
         (phase, [model.by_phase[phase] for model in models])
         for phase in models[0].by_phase
@@ -212,14 +209,16 @@ def _hidden(result: MysteryResult) -> str:
     mark = "good" if result.outcome in _GOOD else "bad"
     pieces = [paragraph(result.sentence, f"verdict {mark}")]
     pieces += [_truth(effect) for effect in result.hidden]
-    told = [compared for compared in result.parameters if compared.true_value is not None]
-    if told:
-        rows = [_beside(compared) for compared in told]
-        header = ["number", "found", "95 % interval", "", "true", "unit", ""]
+    known = [compared for compared in result.parameters if compared.true_value is not None]
+    if known:
+        rows = [_with_truth(compared) for compared in known]
+        header = ["parameter", "found", "95 % interval", "", "true", "unit", ""]
         pieces.append(table(header, rows, numeric=(1, 2, 4)))
     if result.outcome == "silent":
         pieces.append(
-            paragraph("An effect is not named where it moves the body by less than what the contact model may err by.")
+            paragraph(
+                "An effect is not named if it moves the body by less than the possible error of the contact model."
+            )
         )
     return section("What was hidden", f'<div class="told">{"".join(pieces)}</div>')
 
@@ -233,7 +232,7 @@ def _value(value: float | list[float]) -> str:
     return f"({', '.join(map(number, value))})" if isinstance(value, list) else number(value)
 
 
-def _beside(compared: ComparedParameter) -> list[str]:
+def _with_truth(compared: ComparedParameter) -> list[str]:
     p = compared.parameter
     drawn = interval_svg(p.estimate, p.interval_95, compared.true_value) if p.interval_95 else ""
     word = {True: "in the interval", False: '<span class="bad">outside the interval</span>', None: ""}

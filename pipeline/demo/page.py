@@ -1,4 +1,4 @@
-"""The report of a demo: one self-contained HTML page, and the same content as JSON."""
+"""The report of a demo: a self-contained HTML page, and its figures as JSON."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..schemas import ComparedParameter, DemoResult, DemoTarget, EvalResult
-from .reporting.charts import interval_svg
-from .reporting.curves import curves_section
-from .reporting.film import film_section
-from .reporting.page import facts, fixed, number, page, paragraph, section, table, text
-from .reporting.pictures import FrameStrip, RolloutTile, depth_colors, jpeg_uri, label_colors, png_uri
-from .reporting.verdict import shown
+from ...schemas import ComparedParameter, DemoResult, DemoTarget, EvalResult
+from ..rendering.contact_sheets import FrameStrip, RolloutTile, depth_colors, jpeg_uri, label_colors, png_uri
+from ..report.charts import interval_svg
+from ..report.page import facts, fixed, number, page, paragraph, section, table, text
+from .episode_section import curves_section, film_section
+from .verdict import shown
 
 REPORT_HTML = "report.html"
 REPORT_JSON = "report.json"
@@ -25,31 +24,28 @@ _MM = 1e3
 
 @dataclass(frozen=True)
 class ReportPictures:
-    """What the page shows besides numbers.
-
-    Attributes:
-        strips: Test episodes, real and predicted, by camera.
-        rollouts: One moment of each synthesized rollout.
-    """
+    """Pictures of the page."""
 
     strips: Sequence[FrameStrip] = ()
+    """Test episodes, real and predicted, by camera."""
     rollouts: Sequence[RolloutTile] = ()
+    """One moment of each synthesized rollout."""
 
 
 def write_report(folder: Path, result: DemoResult, pictures: ReportPictures) -> None:
     """Write `report.html` and `report.json` into a directory.
 
     Args:
-        folder: Where; it exists.
-        result: The numbers.
-        pictures: The pictures, which only the page holds.
+        folder: The directory, which exists.
+        result: The figures.
+        pictures: The pictures, which only the page contains.
     """
     (folder / REPORT_JSON).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
     (folder / REPORT_HTML).write_text(report_html(result, pictures), encoding="utf-8")
 
 
 def report_html(result: DemoResult, pictures: ReportPictures) -> str:
-    """Return the whole page."""
+    """Return the HTML page of the report."""
     film, style = film_section(pictures.strips)
     body = [
         f"<h1>cgwm demo · scene {text(result.scene)} · seed {result.seed}</h1>",
@@ -113,8 +109,8 @@ def _errors(evaluation: EvalResult, selection: str) -> str:
     rows += [_summary_row(f"{name} object, median", figures) for name, figures in evaluation.baselines.items()]
     words = (
         "Errors are averaged over the frames after the warm-up. State-fitted: the start is fitted to the whole "
-        "episode, so what is left is what the model cannot follow. Start's noise: the error that the uncertainty of "
-        "the start alone would bring."
+        "episode, so the residual is what the model cannot follow. Start's noise: the error of a perfect model due to "
+        "the uncertainty of the start."
     )
     return section(
         "Errors by episode",
@@ -149,11 +145,11 @@ def _parameters(parameters: Sequence[ComparedParameter]) -> str:
     judged = [p.covered for p in parameters if p.covered is not None]
     words = (
         "True values are known only because the scene is simulated; the fit never sees them. The simulator's "
-        "contact law (MuJoCo's soft constraints) is not the model's own, so that even a perfect fit need not return "
-        "its numbers."
+        "contact law (MuJoCo's soft constraints) differs from the model's, so even a perfect fit need not return its "
+        "parameters."
     )
     if judged:
-        words += f" {sum(judged)} of {len(judged)} intervals hold the true value."
+        words += f" {sum(judged)} of {len(judged)} intervals contain the true value."
     return section("Parameters", _parameter_table(parameters), paragraph(words, "soft"))
 
 
@@ -185,8 +181,8 @@ def _images_only(result: DemoResult) -> str:
     fit = result.images_only
     title = "Physics from the video frames alone"
     intro = (
-        "The same model fitted without the pose track, by comparing rendered with recorded frames of the training "
-        "video. No target is set for it."
+        "The same model fitted without the pose track, by comparing rendered and recorded frames of the training "
+        "video. It has no target."
     )
     if fit.evaluation is None:
         return section(title, paragraph(intro), paragraph(f"It did not converge: {fit.message}", "bad"))
@@ -241,10 +237,10 @@ def _splats(result: DemoResult) -> str:
         rows += [
             (
                 f"spheres of '{body.body}'",
-                f"{body.visual_spheres} that are seen, {body.collision_spheres} that collide",
+                f"{body.visual_spheres} visual, {body.collision_spheres} for collision",
             ),
             (
-                f"colliding surface of '{body.body}' against the true one",
+                f"collision surface of '{body.body}' against the true one",
                 f"mean {fixed(body.surface_error_mean_m, 2, _MM)} mm, 95 % within "
                 f"{fixed(body.surface_error_95_m, 2, _MM)} mm; signed mean {fixed(-body.surface_bias_m, 2, _MM)} mm "
                 f"({'too small' if body.surface_bias_m > 0 else 'too large'})",
@@ -292,7 +288,7 @@ def _timings(result: DemoResult) -> str:
 
 def _files(result: DemoResult) -> str:
     rows = [(name, f"<code>{text(path)}</code>") for name, path in result.paths.items()]
-    words = "Beside this page. The commands that would make them one by one stand in the README."
+    words = "In the same directory as this page. The README has the command that makes each of them."
     return section("Files", paragraph(words), facts(rows))
 
 

@@ -1,4 +1,4 @@
-"""`cgwm demo`: every stage one after the other, on a scene that it makes itself, with a report at the end."""
+"""The demo (`cgwm demo`): make a scene, run every stage on it and write a report."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..datasets.atomic import new_directory
-from ..datasets.capture import Capture
-from ..datasets.loader import RolloutReader
-from ..datasets.models import read_model
-from ..datasets.scenes import TRUTH_MESH, make_scene, read_truth
-from ..schemas import (
+from ...datasets.capture.capture import Capture
+from ...datasets.io.atomic import new_directory
+from ...datasets.models.model import read_model
+from ...datasets.rollouts.loader import RolloutReader
+from ...datasets.synthetic import TRUTH_MESH, make_scene, read_truth
+from ...schemas import (
     CalibrateConfig,
     CalibrationReport,
     DatasetSummary,
@@ -27,58 +27,72 @@ from ..schemas import (
     SplatConfig,
     SynthesizeConfig,
 )
-from .calibrate import calibrate
-from .eval import Evaluation, evaluate_model
-from .fit import fit
-from .report import REPORT_HTML, REPORT_JSON, ReportPictures, write_report
-from .reporting.against_truth import check_calibration, check_splats, compare_parameters
-from .reporting.episodes import curves_of, strips_of
-from .reporting.pictures import RolloutTile, contact_sheet, small_png, telling, tiles
-from .reporting.verdict import targets_of, verdict_text
-from .sg_gs import resolve_device
-from .staged import StagedRun
-from .synthesize import synthesize
+from ..calibrate.stage import calibrate
+from ..evaluate.frame_strips import strips_of
+from ..evaluate.stage import Evaluation, evaluate_model
+from ..fit import fit
+from ..rendering.contact_sheets import RolloutTile, contact_sheet, small_png, telling, tiles
+from ..runtime.device import resolve_device
+from ..runtime.timing import StagedRun
+from ..synthesize.stage import synthesize
+from .episode_section import curves_of
+from .page import REPORT_HTML, REPORT_JSON, ReportPictures, write_report
+from .truth_tables import check_calibration, check_splats, compare_parameters
+from .verdict import targets_of, verdict_text
 
 ConfigT = TypeVar("ConfigT", CalibrateConfig, SplatConfig, PhysConfig, SynthesizeConfig)
 
 SELECTION = {
-    "fall": "The tosses are drawn so that what can be measured decides their outcome: the simulator itself, restarted "
+    "fall": "The tosses are selected so that the measurement determines their outcome: the simulator itself, restarted "
     "with the errors of 0.1 s of measurement and with friction and damping off by a fifth and a tenth, repeats each of "
-    "them closely. A toss that balances on an edge before it falls to either side is not among them."
+    "them closely. Tosses that balance on an edge before they fall to either side are excluded."
 }
-"""How the scenes choose their episodes, where that makes them easier than any motion: the report says it."""
+"""Explanation, for the report, of how a scene selects its episodes, if that makes them easier than arbitrary motion."""
 WARMUP_S = 0.1
+"""Length of the start of an episode that the model may see [s]."""
 SPLIT = "test"
 PICTURE = "demo.png"
 _PICTURE_COLUMNS = 5
 _PICTURE_TILE = 236
+"""Width of a tile of the picture [px]."""
 _ROLLOUTS_SHOWN = 8
-# Of the seconds of a rollout, when its picture is taken: late enough that most have touched the ground.
 _SHOWN_AT = 0.5
+"""Fraction of a rollout at which its picture is taken: late enough that most have touched the ground."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DemoSettings:
-    """Sizes and settings of the stages; seed and device are filled in by the demo."""
+    """Sizes and settings of the stages; the demo fills in seed and device."""
 
     photos: int = 48
+    """Number of photos of the scene."""
     photo_size: tuple[int, int] = (640, 480)
+    """Width and height of a photo [px]."""
     video_size: tuple[int, int] = (480, 360)
+    """Width and height of a video frame [px]."""
     calibrate: CalibrateConfig = field(default_factory=lambda: CalibrateConfig(max_features=2048))
+    """Settings of `calibrate`."""
     splats: SplatConfig = field(default_factory=SplatConfig)
+    """Settings of the stage sg-gs."""
     physics: PhysConfig = field(default_factory=PhysConfig)
+    """Settings of the stage phys-geo."""
     images: PhysConfig = field(default_factory=lambda: PhysConfig(population=48, generations=5, iterations=6))
-    """A shorter search than by default: tracks from images are too rough for a longer one."""
+    """Settings of phys-geo from video frames alone: a shorter search than the default, because tracks from images are
+    too noisy for a longer one to pay."""
     synthesize: SynthesizeConfig = field(default_factory=lambda: SynthesizeConfig(rollouts=8))
+    """Settings of `synthesize`."""
 
 
 @dataclass(frozen=True)
 class _Demo(StagedRun):
-    """A run of the demo, with what its stages share."""
+    """A run of the demo and the settings that its stages share."""
 
     settings: DemoSettings
+    """Sizes and settings of the stages."""
     seed: int
+    """Seed of the scene and of every stage."""
     device: str
+    """auto, cpu or cuda."""
 
 
 def run_demo(
@@ -90,25 +104,25 @@ def run_demo(
     overwrite: bool = False,
     settings: DemoSettings | None = None,
 ) -> DemoResult:
-    """Make a scene, calibrate, fit, synthesize, evaluate and report; each by the function that its command calls.
+    """Make a scene, calibrate, fit, synthesize, evaluate and report, each by the function that its command calls.
 
     Args:
-        out: The directory to write; it appears when all of it is complete.
-        scene: One of `datasets.scenes.SCENES`.
-        seed: Of the scene and of every stage.
-        renderer: One of `datasets.scenes.RENDERERS`.
+        out: The directory to write; it appears once it is complete.
+        scene: One of `datasets.synthetic.SCENES`.
+        seed: Seed of the scene and of every stage.
+        renderer: One of `datasets.synthetic.RENDERERS`.
         device: auto, cpu or cuda.
         overwrite: Replace what is at `out`.
         settings: Sizes and settings of the stages.
 
     Returns:
-        What stands in `report.json`.
+        The content of `report.json`.
 
     Raises:
         UsageError: If `out` exists, or a name is not allowed.
         NotConvergedError: If a stage fails; its message names the stage, and nothing is written.
     """
-    resolve_device(device)  # a wrong device is better told now than after minutes
+    resolve_device(device)  # refuse a wrong device now, not after minutes
     settings = settings or DemoSettings()
     with new_directory(Path(out), overwrite) as folder:
         demo = _Demo(folder, Path(out), settings, seed, device)
@@ -151,7 +165,7 @@ def _fit(demo: _Demo) -> ModelFile:
 
 
 def _fit_from_images(demo: _Demo) -> ImagesOnlyFit:
-    """Fit the physics from the video frames alone; that this may fail is a result, and no reason to stop."""
+    """Fit the physics from the video frames alone; a failure is a result and does not stop the demo."""
     config = _seeded(demo.settings.images, seed=demo.seed, device=demo.device, supervise="images")
     try:
         model = fit(
@@ -217,7 +231,7 @@ def _result(
 
 
 def _write(demo: _Demo, result: DemoResult, evaluation: Evaluation) -> None:
-    """Write the report, its JSON and the picture that a README can show."""
+    """Write the report, its JSON and the picture for a README."""
     strips = strips_of(evaluation.episodes, Capture.open(demo.folder / "capture", check=False))
     write_report(demo.folder, result, ReportPictures(strips, _rollout_tiles(demo.folder / "dataset")))
     if strips:
@@ -238,7 +252,15 @@ def _rollout_tiles(dataset: Path) -> list[RolloutTile]:
         image, depth, mask = (
             reader.read(number, f"obs/{cameras[0]}_{kind}", frame, frame + 1)[0] for kind in ("image", "depth", "mask")
         )
-        shown.append(RolloutTile(reader.rollouts[number].index, float(time_s[frame]), image, depth, mask))
+        shown.append(
+            RolloutTile(
+                rollout=reader.rollouts[number].index,
+                time_s=float(time_s[frame]),
+                image=image,
+                depth_m=depth,
+                mask=mask,
+            )
+        )
     reader.close()
     return shown
 

@@ -1,4 +1,4 @@
-"""What a simulated scene allows: estimates next to what is truly so. Nothing that is fitted sees any of this."""
+"""Comparison of estimates with the true values of a simulated scene, which no fit sees."""
 
 from __future__ import annotations
 
@@ -9,33 +9,34 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datasets.models import Model
-from ...datasets.scenes import TruthFile
+from ...datasets.models.model import Model
+from ...datasets.synthetic import TruthFile
 from ...schemas import (
     BodyCheck,
     CalibrationCheck,
     CalibrationReport,
     CamerasFile,
     ComparedParameter,
-    Parameter,
+    FittedParameter,
     SplatCheck,
 )
-from ..physics.contact import restitution
-from ..sfm.scale import umeyama
-from ..splats.mesh import read_mesh, sample_surface
+from ..calibrate.metric_scale import umeyama
+from ..geometry.mesh import read_mesh, sample_surface
+from ..physics.contact_law import restitution
 
 Array = NDArray[np.float64]
 
 OBJECT = "object"
-"""The scenes' name of the free body that `truth.json` describes."""
+"""Name of the free body that `truth.json` of a scene describes."""
 _SURFACE_SPACING_M = 0.003
+"""Distance between the points that are sampled on the true surface [m]."""
 
 
 def check_calibration(report: CalibrationReport, cameras: CamerasFile, truth: TruthFile) -> CalibrationCheck:
-    """Return how far the cameras are from the true ones.
+    """Compare the calibrated cameras with the true ones.
 
-    Centres are compared as they are, in metres in the world frame; the scale is that of the similarity transform that
-    fits the estimated centres to the true ones best.
+    Centres are compared in metres in the world frame, without alignment; the scale is that of the similarity transform
+    that fits the estimated centres to the true ones best.
     """
     estimated, true = _centers(cameras, truth.cameras)
     error = np.linalg.norm(estimated - true, axis=1)
@@ -55,7 +56,7 @@ def check_calibration(report: CalibrationReport, cameras: CamerasFile, truth: Tr
 
 
 def check_splats(model: Model, mesh: Path) -> SplatCheck:
-    """Return the held-out figures of the stage sg-gs, and the object's colliding surface against its true one.
+    """Return the held-out figures of the stage sg-gs, and the errors of the object's collision surface.
 
     Args:
         model: The fitted model.
@@ -93,7 +94,7 @@ def check_splats(model: Model, mesh: Path) -> SplatCheck:
 def sphere_distance(points: Array, centers: Array, radii: Array) -> Array:
     """Return the signed distance of points to a union of spheres, positive outside [m], shape (P,).
 
-    Exact outside; inside it is that of the sphere in which a point lies deepest.
+    The distance is exact outside; inside it is that to the sphere in which a point lies deepest.
 
     Args:
         points: Shape (P, 3) [m].
@@ -103,8 +104,8 @@ def sphere_distance(points: Array, centers: Array, radii: Array) -> Array:
     return (np.linalg.norm(points[:, None] - centers[None], axis=2) - radii).min(1)
 
 
-def compare_parameters(parameters: Sequence[Parameter], truth: TruthFile) -> tuple[ComparedParameter, ...]:
-    """Put the true values next to a model's parameters, where the truth has such a number."""
+def compare_parameters(parameters: Sequence[FittedParameter], truth: TruthFile) -> tuple[ComparedParameter, ...]:
+    """Pair a model's parameters with their true values, where these are known."""
     true = true_parameters(truth)
     return tuple(
         ComparedParameter(parameter=parameter, true_value=true.get(parameter.name), covered=_covered(parameter, true))
@@ -115,8 +116,8 @@ def compare_parameters(parameters: Sequence[Parameter], truth: TruthFile) -> tup
 def true_parameters(truth: TruthFile) -> dict[str, float]:
     """Return the true values by the names of a model's parameters.
 
-    MuJoCo has no restitution, stiffness or damping of a contact; those are derived from its natural time and damping
-    ratio by the formulas of this package's own contact law, with the object's mass.
+    MuJoCo has no restitution, stiffness or damping of a contact; these are derived from its natural time and damping
+    ratio by the formulas of this package's contact law, with the object's mass.
     """
     contact, mass = truth.contact, truth.object.mass_kg
     tau, zeta = contact.natural_time_s, contact.damping_ratio
@@ -125,7 +126,7 @@ def true_parameters(truth: TruthFile) -> dict[str, float]:
         "friction": contact.friction,
         "contact_time_s": tau,
         "damping_ratio": zeta,
-        "ground_offset_m": 0.0,  # the scenes stand on z = 0
+        "ground_offset_m": 0.0,  # the ground of the scenes is z = 0
         "restitution": float(restitution(torch.tensor(zeta, dtype=torch.float64))),
         "stiffness_n_m": mass / tau**2,
         "damping_n_s_m": 2 * zeta * mass / tau,
@@ -134,7 +135,7 @@ def true_parameters(truth: TruthFile) -> dict[str, float]:
     }
 
 
-def _covered(parameter: Parameter, true: dict[str, float]) -> bool | None:
+def _covered(parameter: FittedParameter, true: dict[str, float]) -> bool | None:
     if parameter.interval_95 is None or parameter.name not in true:
         return None
     low, high = parameter.interval_95
@@ -142,7 +143,7 @@ def _covered(parameter: Parameter, true: dict[str, float]) -> bool | None:
 
 
 def _centers(estimated: CamerasFile, true: CamerasFile) -> tuple[Array, Array]:
-    """Return the centres of the cameras that both files have [m], each of shape (N, 3)."""
+    """Return the centres of the estimated and the true cameras [m], each of shape (N, 3)."""
     pairs = [(estimated.images[name].T_world_cam, true.images[name].T_world_cam) for name in estimated.images]
     pairs += [(estimated.videos[name].T_world_cam, true.videos[name].T_world_cam) for name in estimated.videos]
     poses = np.array(pairs, np.float64)

@@ -1,4 +1,4 @@
-"""The verdict on a demo: its figures, what they ought to be, and one or two sentences that say what they mean."""
+"""The verdict of a demo: its figures, their targets, and a summary in words."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ TRANSLATION_TARGET_M = 0.015
 ROTATION_TARGET_DEG = 15.0
 PSNR_TARGET_DB = 20.0
 FAR_BETTER = 2.0
-"""The model's error has to be below that of both baselines by this factor, or the verdict says so."""
+"""Minimum ratio of the errors of both baselines to that of the model; below it the verdict says so."""
 
 
 def targets_of(evaluation: EvalResult) -> tuple[DemoTarget, ...]:
-    """Return the figures of the verdict: medians over the episodes, open loop, with the baselines' beside."""
+    """Return the figures of the verdict: open-loop medians over the episodes, of the model and of the baselines."""
     return (
         _target(evaluation, "translation error", "translation_error_m", "m", TRANSLATION_TARGET_M, below=True),
         _target(evaluation, "rotation error", "rotation_error_deg", "deg", ROTATION_TARGET_DEG, below=True),
@@ -24,7 +24,7 @@ def targets_of(evaluation: EvalResult) -> tuple[DemoTarget, ...]:
 
 
 def shown(target: DemoTarget, value: float | None) -> str:
-    """Write a value of a target in the unit that people read: lengths in millimetres.
+    """Write a value of a target with its unit, lengths in millimetres.
 
     >>> shown(DemoTarget(name="a", unit="m", value=0.1, target=0.015, better="below", met=False), 0.0123)
     '12.3 mm'
@@ -62,7 +62,7 @@ def _episodes(evaluation: EvalResult) -> str:
 
 def _missed(target: DemoTarget) -> str:
     wanted = "below" if target.better == "below" else "at least"
-    return f"{target.name} {shown(target, target.value)} ({wanted} {shown(target, target.target)} is wanted)"
+    return f"{target.name} {shown(target, target.value)} (target: {wanted} {shown(target, target.target)})"
 
 
 def _against_baselines(move: DemoTarget) -> str:
@@ -70,10 +70,10 @@ def _against_baselines(move: DemoTarget) -> str:
     if not others or move.value is None:
         return ""
     name, nearest = min(others, key=lambda pair: pair[1])
-    what = "stands still" if name == "frozen" else "flies on without contact"
+    what = "does not move" if name == "frozen" else "flies on without contact"
     if nearest < FAR_BETTER * move.value:
-        return f"That is hardly better than to guess that the object {what}, which errs by {shown(move, nearest)}."
-    return f"To guess that the object {what} would err by {shown(move, nearest)}."
+        return f"This is hardly better than assuming that the object {what}, with an error of {shown(move, nearest)}."
+    return f"Assuming that the object {what} gives an error of {shown(move, nearest)}."
 
 
 def _target(evaluation: EvalResult, name: str, key: str, unit: str, target: float, below: bool) -> DemoTarget:

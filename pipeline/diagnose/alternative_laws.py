@@ -1,7 +1,7 @@
-"""Laws that nobody offers: does an effect that was found follow another law than its own?
+"""Alternative functional forms of selected effects that are no candidates themselves.
 
-A damping of spin is taken for one that grows with the spin, for lack of another candidate, though it may grow with its
-square. What no candidate has is no name to give, but it can be told that the name found is the wrong one.
+For lack of another candidate, a spin damping is taken to be linear in the spin, though it may be quadratic. A law that
+is no candidate cannot be selected, but a better fit shows that the selected effect has the wrong law.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import torch
 
 from ..physics.effects.effect import ActiveEffect, BodyMotion, Effect, EffectParameter, Values, Wrench
 from ..physics.world import World
-from .candidates import base_parameters, base_values, without_effect
-from .refit import refit
-from .segments import Segments
+from ..segments.candidates import base_parameters, base_values, without_effect
+from ..segments.segment_fit import refit
+from ..segments.segments import Segments
 
 BETTER_CHI2 = 12.0
-"""Another law explains the flights better where chi2 is lower by this, as odds of 400; equally, where by less."""
+"""Minimum difference of chi2 with which one law explains the flights better than another: odds of 400. Below it, both
+explain them equally well."""
 
 
 class QuadraticSpinDamping(Effect):
@@ -27,7 +28,7 @@ class QuadraticSpinDamping(Effect):
     name = "quadratic_spin_damping"
     summary = "Resistance of turbulent air to spinning."
     formula = "alpha = -q |omega| omega"
-    parameters = (EffectParameter("q", "1/rad", scale=0.02, limit=5.0, nonnegative=True),)
+    parameters = (EffectParameter(name="q", unit="1/rad", scale=0.02, limit=5.0, nonnegative=True),)
     phase = "flight"
     needs = ("spin",)
     reveals = "long free flight, with fast spin and with slow"
@@ -41,38 +42,41 @@ class QuadraticSpinDamping(Effect):
 
 @dataclass(frozen=True)
 class OtherLaw:
-    """By how much chi2 is lower under another law of a found effect; better: clearly so; as_good: neither is."""
+    """Comparison of a selected effect with an alternative law."""
 
     effect: str
+    """Name of the effect."""
     formula: str
+    """The alternative law."""
     gain: float
+    """Fall of chi2 under the alternative law, in units of the dispersion."""
 
     @property
     def better(self) -> bool:
-        """Whether the flights follow the other law."""
+        """Whether the alternative law explains the flights clearly better."""
         return self.gain > BETTER_CHI2
 
     @property
     def as_good(self) -> bool:
-        """Whether the flights do not tell the two apart."""
+        """Whether the flights do not separate the two laws."""
         return abs(self.gain) <= BETTER_CHI2
 
 
 def other_laws(flight: Segments, world: World, names: Sequence[str], dispersion: float) -> list[OtherLaw]:
-    """Return how another law does in the place of each effect of which one is known.
+    """Compare each selected effect that has an alternative law with this law.
 
     Args:
         flight: Segments with states fitted by the world.
-        world: With the effects at their fitted numbers.
-        names: Of the effects that were found.
-        dispersion: By what factor variances exceed those of the noise.
+        world: The world with the effects at their fitted parameters.
+        names: Names of the selected effects.
+        dispersion: Factor by which variances exceed those of the noise.
     """
     if "spin_damping" not in names:
         return []
     law, name = QuadraticSpinDamping(), "spin_damping"
     own = next(active for active in world.effects if active.effect.name == name)
     spin = flight.observations.state.omega_body_rad_s[:, list(flight.observations.free)].norm(dim=-1)
-    weight = spin.square()  # where the spin is, the damping is told
+    weight = spin.square()  # the damping is estimated from frames with spin
     usual = float((spin * weight).sum() / weight.sum().clamp_min(1e-9))
     active = ActiveEffect.of(law, {"q": float(own.values["d"][0]) / max(usual, 0.1)}, world.gravity[0, :1])
     other = without_effect(world, name)

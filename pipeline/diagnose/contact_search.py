@@ -1,7 +1,8 @@
-"""The search in contact: which of several equals in flight it leaves, and which effect of contact is missing.
+"""Search for a missing effect in contact, and separation of flight equals by the contact data.
 
-The stages come in the order of what they take for granted: glides, where the law of contact hardly matters; impacts of
-a ball, without any; glides against impacts; and the segments of contact under the model's law, last.
+The tests run in the order of what they assume: sliding segments, where the contact law hardly matters; impacts of a
+ball, which need no contact law; friction in sliding against friction in impacts; and last the contact segments under
+the model's contact law.
 """
 
 from __future__ import annotations
@@ -13,167 +14,271 @@ from typing import Literal
 from ..physics.effects.effect import ActiveEffect
 from ..physics.effects.registry import CONTACT_ALIASES
 from ..physics.world import World
-from .candidates import Candidate, base_parameters, base_values, without_effect
-from .contact_limits import ContactLimit, contact_limits
-from .contact_stage import ContactEvidence, contact_evidence, fitted_contact, separated
-from .glide_stage import GlideEvidence, StartedGlides, glide_evidence, with_effect
-from .grip_stage import grip_evidence, named_by_grip
-from .impact_stage import ImpactEvidence, impact_evidence, named_by_impacts, with_impact_effect
-from .prepared import Prepared
-from .refit import refit
-from .segments import Segments
-from .slots import Evidence, Slot
+from ..segments.candidates import Candidate, base_parameters, base_values, without_effect
+from ..segments.prepare import Prepared
+from ..segments.segment_fit import refit
+from ..segments.segments import Segments
+from ..segments.sliding_fit import StartedSliding
+from .contact_tests.friction_consistency import friction_consistency_evidence, selected_by_friction_consistency
+from .contact_tests.impact import ImpactEvidence, impact_evidence, selected_in_impacts, with_impact_effect
+from .contact_tests.segments import ContactEvidence, contact_evidence, fitted_contact, refitted_contact, separated
+from .contact_tests.sliding import SlidingEvidence, sliding_evidence, with_effect
+from .detection_limits import DetectionLimit, detection_limits
+from .effect_selection import Evidence, SelectionStep
 
 GLIDE_SCORE, GLIDE_EXPLAINED = 220.0, 0.5
-"""An effect in glides is named above this score, if it explains at least this share of what the noise does not ..."""
+"""Thresholds of the sliding test: minimum score, and minimum share of the excess of chi2 over the noise that the effect
+explains. They hold for an effect of one parameter where no effect was selected in flight."""
 FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 1, 400.0
-"""... one of more numbers, or beside an effect of flight, above that, as it fits more by chance ..."""
+"""Maximum number of parameters for which `GLIDE_SCORE` applies, and the minimum score of effects with more parameters,
+or of any effect after one was selected in flight: these fit more by chance."""
 GLIDE_SURE, GLIDE_SHARE_SURE = 80.0, 0.78
-"""... or above this, if it leaves next to nothing: what stands in for something else explains a part. On development
-seeds what was not there reached a score of 165 at a share of 0.69, and any share up to a score of 50; friction by
-direction 179 at 0.94 beside a drag in wind, so that beside effects of flight this does not count for more numbers."""
+"""Lower minimum score in the sliding test for an effect that explains at least this share of the excess. On the
+development cases absent effects reached a score of 165 at a share of 0.69, any share up to a score of 50, and
+(directional friction with a drag in wind) a score of 179 at a share of 0.94. For this last reason the lower score does
+not apply to effects of several parameters after one was selected in flight."""
 MANY_NUMBERS = 4
-"""That holds for none of more numbers than this: a map fits about anything."""
+"""Maximum number of parameters for which `GLIDE_SURE` applies. A friction map has more and fits almost anything."""
 GLIDE_LEAST = 0.3
-"""No effect is named whose numbers all are below this share of their usual sizes: engines differ by as much."""
+"""Minimum size in the sliding test: an effect is not selected if all its parameters are below this share of their usual
+sizes. Simulators differ by as much."""
 GLIDE_OTHERS = 80.0
-"""Beside an effect of flight chi2 falls by this much in other episodes than the one that says most, too: along a single
-slide the law of what was found in flight may be off. Balls in wind had false friction by direction with scores of 823
-and 1044, of which the others say 33 and 18; of true ones 114 to 34,000, but for one that fell silent (26)."""
+"""Minimum fall of chi2 without the episode that contributes most, required where an effect was selected in flight,
+because the law of that effect may be slightly wrong along a single slide. On balls in wind, false directional friction
+had scores of 823 and 1044, of which 33 and 18 came from the other episodes; true effects had 114 to 34,000, except for
+one at 26, which is no longer detected."""
 GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
-"""Another one within this score of it, or this share of it, leaves the two unseparated ..."""
+"""Another effect counts as equal in the sliding test if its score is lower by less than the first value, or by less
+than this share of the best score."""
 MISLED, RIVAL_SHARE = 165.0, 0.5
-"""... and so does one behind by less than what a wrong one has reached, if it explains this share of what the best one
-does: how friction falls with the speed, how it grows and where it changes are much the same along a single slide."""
+"""Another effect also counts as equal if its score is lower by less than the first value, the largest score that an
+absent effect reached, and if it explains at least this share of what the best one explains. Friction that falls with
+the speed, that grows, and that changes with the place are nearly the same along a single slide."""
 BRAKED_OTHERWISE = ("torsional_friction",)
-"""What a map of friction explains as well is the spin of a sliding body that engines brake otherwise, below the score
-of maps: of four such names on report4 to report6 three were false (101 to 260), the fourth stood beside a drag."""
+"""Effects that are not selected where a friction map fits equally well and the score is below `GLIDE_SCORE_FLEXIBLE`.
+The simulators disagree about the spin of a sliding body: of four such detections three were false (scores 101 to 260),
+and the fourth came with a drag."""
 CONTACT_SCORE, CONTACT_T = 22.0, 1.0
-"""Under the law of contact an effect is named above this score, where the mean gain of held-out episodes is above so
-many of its standard errors ..."""
+"""Thresholds of the test in contact segments: minimum score, and minimum mean gain of held-out episodes in its standard
+errors."""
 AGREED_SCORE = 40.0
-"""... one that glides could have seen above this, and only where it is the first in glides, too, with as much ..."""
+"""Minimum score in contact segments of an effect that sliding segments can show. It must also have the highest score in
+the sliding test, above this value."""
 ALONE_SCORE = 120.0
-"""... or above this where there are no glides to ask: friction by direction has reached 113 where there was none."""
+"""Minimum score in contact segments where sliding segments are missing. Directional friction has reached 113 where it
+was absent."""
 IN_IMPACTS_ALONE = ("velocity_restitution",)
-"""What glides cannot see."""
+"""Effects that sliding segments cannot show."""
 CONTACT_LEAD = 0.5
-"""Another effect in contact with this share of the best one's score leaves the two unseparated."""
+"""Another effect counts as equal in contact segments if its score is at least this share of the best score."""
 CONFIRMED = 2.0
-"""And where a refit leaves it this many standard errors away from nothing."""
+"""Minimum distance of a parameter from zero after the refit, in its standard errors, for an effect to be confirmed in
+contact segments."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """An effect that was selected, and its equals (itself the first); where: which motion its evidence is from."""
+    """Selected effect and its equals."""
 
     evidence: Evidence
+    """Evidence of the selected effect."""
     equals: tuple[Evidence, ...]
+    """Effects that explain the data equally well, the selected one first."""
     where: Literal["flight", "contact"]
+    """Motion that the evidence comes from."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ContactFindings:
-    """What flight and contact say together.
-
-    chosen: the selected effects, those of flight first; evidence: of contact; world: with them; chi2: per degree of
-    freedom of the segments of contact, None without contact; segments: those; limits: what contact could have shown,
-    where it shows nothing.
-    """
+    """Result of the searches in flight and contact together."""
 
     chosen: list[Chosen]
+    """Selected effects, those of flight first."""
     evidence: list[ContactEvidence]
+    """Evidence of the candidates in contact."""
     world: World
+    """World with the selected effects."""
     chi2: float | None = None
+    """Chi2 per degree of freedom of the contact segments; None without contact."""
     segments: Segments | None = None
-    limits: tuple[ContactLimit, ...] = ()
+    """Contact segments with fitted states; None without contact."""
+    limits: tuple[DetectionLimit, ...] = ()
+    """Detection limits of the contact effects, where contact selected none."""
 
 
 def with_contact(
     prepared: Prepared,
     world: World,
     after_flight: World,
-    slots: Sequence[Slot],
+    steps: Sequence[SelectionStep],
     candidates: Sequence[Candidate],
     flight: Segments | None,
     explained: bool,
 ) -> ContactFindings:
-    """Return what contact leaves of the equals of flight, and what it names itself."""
-    filled = [slot for slot in slots if slot.flagged]
-    open_slots = [slot for slot in filled if len(slot.equals) > 1]
-    clear_world = after_flight
-    for slot in open_slots:
-        clear_world = without_effect(clear_world, slot.best.name)
-    fitted = fitted_contact(prepared, clear_world)
+    """Resolve the flight equals with the contact data, then return the first contact effect that a test selects.
+
+    The tests run in the order of what they assume: sliding segments, impacts, friction consistency, and last the
+    contact segments under the model's contact law. The first that selects an effect ends the search.
+
+    Args:
+        prepared: The episodes.
+        world: The model's world.
+        after_flight: The world with the effects selected in flight.
+        steps: Selection steps of the flight search.
+        candidates: All candidates.
+        flight: Flight segments with fitted states; None without flight.
+        explained: Whether the flight segments are explained down to the noise.
+    """
+    data = _resolved_flight(prepared, after_flight, steps)
+    if data is None:
+        chosen = [Chosen(step.best, step.equals, "flight") for step in steps if step.flagged]
+        return ContactFindings(chosen=chosen, evidence=[], world=after_flight)
+    started = StartedSliding.of(prepared, data.world, flight)
+    sliding = sliding_evidence(prepared, data.world, candidates, GLIDE_SURE, started)
+    found = _by_sliding(data, sliding, explained)
+    if found is not None:
+        return found
+    impacts = impact_evidence(prepared, data.world, candidates)
+    found = _by_impacts(data, impacts)
+    if found is not None:
+        return found
+    friction = friction_consistency_evidence(prepared, data.world, data.segments, candidates, started)
+    found = _by_friction_consistency(data, friction)
+    if found is not None:
+        return found
+    evidence = contact_evidence(data.segments, data.world, candidates, prepared.groups, prepared.turned)
+    found = _by_segments(data, evidence, sliding)
+    if found is not None:
+        return found
+    # effects that only impacts show are left out where impacts were measured
+    asked = [c for c in candidates if not impacts or c.effect.name not in IN_IMPACTS_ALONE]
+    scores = (GLIDE_SCORE, GLIDE_SCORE_FLEXIBLE)
+    limits = detection_limits(started, data.world, asked, scores, prepared.turned, IN_IMPACTS_ALONE)
+    final = replace(data.after_flight, contact=data.world.contact)
+    return ContactFindings(
+        chosen=data.chosen, evidence=evidence, world=final, chi2=data.chi2, segments=data.segments, limits=tuple(limits)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ContactData:
+    """Inputs of the contact tests, after the flight equals are resolved."""
+
+    chosen: list[Chosen]
+    """Effects selected in flight, with the equals that contact leaves."""
+    after_flight: World
+    """World with these effects."""
+    world: World
+    """The same with the contact parameters refitted."""
+    segments: Segments
+    """Contact segments with states fitted by `world`."""
+    chi2: float
+    """Chi2 per degree of freedom of the contact segments."""
+
+    def found(
+        self,
+        equals: Sequence[SlidingEvidence | ImpactEvidence | ContactEvidence],
+        evidence: list[ContactEvidence],
+        world: World,
+    ) -> ContactFindings:
+        """Return the findings with an effect selected in contact.
+
+        Args:
+            equals: The selected effect and its equals, the selected one first.
+            evidence: Evidence of all candidates in the test that selected it.
+            world: World with the selected effect.
+        """
+        every = tuple(one.evidence for one in equals)
+        return ContactFindings(
+            chosen=[*self.chosen, Chosen(every[0], every, "contact")],
+            evidence=evidence,
+            world=world,
+            chi2=self.chi2,
+            segments=self.segments,
+        )
+
+
+def _resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[SelectionStep]) -> _ContactData | None:
+    """Fit the contact segments and keep the flight equals that they admit; None without contact."""
+    flagged = [step for step in steps if step.flagged]
+    ambiguous = [step for step in flagged if len(step.equals) > 1]
+    neutral = after_flight
+    for step in ambiguous:
+        neutral = without_effect(neutral, step.best.name)
+    fitted = fitted_contact(prepared, neutral)
     if fitted is None:
-        chosen = [Chosen(slot.best, slot.equals, "flight") for slot in filled]
-        return ContactFindings(chosen, [], after_flight)
+        return None
     base, contact = fitted
     final, chosen = after_flight, []
-    for slot in filled:
-        equals = list(slot.equals)
+    for step in flagged:
+        equals = list(step.equals)
         if len(equals) > 1:
             kept, _ = separated(equals, contact, base.world, prepared.groups)
             equals = _with_aliases(kept, equals)
-            final = _replaced(final, slot.best, equals[0])
+            final = _replaced(final, step.best, equals[0])
         chosen.append(Chosen(equals[0], tuple(equals), "flight"))
     final = replace(final, contact=base.world.contact)
-    if filled and open_slots:
-        again = fitted_contact(prepared, final, contact)
-        assert again is not None  # there was contact before
-        base, contact = again
+    if ambiguous:
+        base, contact = refitted_contact(contact, final)
     rows = contact.residuals([], contact.observations.times_s.new_zeros(0), jacobian=False)[0]
     chi2 = float(rows.square().sum() / contact.dof.sum())
-    started = StartedGlides.of(prepared, base.world, flight)
-    glides = glide_evidence(prepared, base.world, candidates, GLIDE_SURE, started)
-    alike = equal_in_glides(glides, explained, bool(chosen))
-    if alike:
-        told = [ContactEvidence(one.evidence, one.score, None, None) for one in glides]
-        return ContactFindings([*chosen, _chosen(alike)], told, with_effect(base.world, alike[0]), chi2, contact)
-    impacts = impact_evidence(prepared, base.world, candidates)
-    struck = named_by_impacts(impacts)
-    if struck:
-        told = [ContactEvidence(one.evidence, one.score, one.gain, one.t) for one in impacts]
-        found = with_impact_effect(base.world, struck[0])
-        return ContactFindings([*chosen, _chosen(struck)], told, found, chi2, contact)
-    gripped = named_by_grip(grip_evidence(prepared, base.world, contact, candidates, started))
-    if gripped:
-        told = [ContactEvidence(one.evidence, one.score, None, None) for one in gripped]
-        return ContactFindings([*chosen, _chosen(gripped)], told, with_effect(base.world, gripped[0]), chi2, contact)
-    evidence = contact_evidence(contact, base.world, candidates, prepared.groups, prepared.turned)
-    named = _named(evidence, glides)
-    if named:
-        found, numbers = _added(base.world, contact, named[0].evidence)
-        if any(abs(value) > CONFIRMED * error for value, error in numbers.values()):
-            first = replace(named[0], evidence=replace(named[0].evidence, numbers=numbers))
-            return ContactFindings([*chosen, _chosen([first, *named[1:]])], evidence, found, chi2, contact)
-    # what impacts alone show is left out where there are impacts
-    asked = [c for c in candidates if not impacts or c.effect.name not in IN_IMPACTS_ALONE]
-    scores = (GLIDE_SCORE, GLIDE_SCORE_FLEXIBLE)
-    limits = contact_limits(started, base.world, asked, scores, prepared.turned, IN_IMPACTS_ALONE)
-    final = replace(final, contact=base.world.contact)
-    return ContactFindings(chosen, evidence, final, chi2, contact, tuple(limits))
+    return _ContactData(chosen=chosen, after_flight=final, world=base.world, segments=contact, chi2=chi2)
 
 
-def _chosen(equals: Sequence[GlideEvidence | ImpactEvidence | ContactEvidence]) -> Chosen:
-    """Return the first of what a stage names, with its equals."""
-    every = tuple(one.evidence for one in equals)
-    return Chosen(every[0], every, "contact")
+def _by_sliding(data: _ContactData, evidence: Sequence[SlidingEvidence], explained: bool) -> ContactFindings | None:
+    """Return the findings of the sliding test; None where it selects no effect."""
+    selected = selected_in_sliding(evidence, explained, bool(data.chosen))
+    if not selected:
+        return None
+    listed = [ContactEvidence(one.evidence, one.score, None, None) for one in evidence]
+    return data.found(selected, listed, with_effect(data.world, selected[0]))
 
 
-def equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: bool) -> list[GlideEvidence]:
-    """Return the effect that glides name and its equals; none where they name none.
+def _by_impacts(data: _ContactData, evidence: Sequence[ImpactEvidence]) -> ContactFindings | None:
+    """Return the findings of the impact test; None where it selects no effect."""
+    selected = selected_in_impacts(evidence)
+    if not selected:
+        return None
+    listed = [ContactEvidence(one.evidence, one.score, one.gain, one.t) for one in evidence]
+    return data.found(selected, listed, with_impact_effect(data.world, selected[0]))
+
+
+def _by_friction_consistency(data: _ContactData, evidence: Sequence[SlidingEvidence]) -> ContactFindings | None:
+    """Return the findings of the friction consistency test; None where it selects no effect."""
+    selected = selected_by_friction_consistency(evidence)
+    if not selected:
+        return None
+    listed = [ContactEvidence(one.evidence, one.score, None, None) for one in selected]
+    return data.found(selected, listed, with_effect(data.world, selected[0]))
+
+
+def _by_segments(
+    data: _ContactData, evidence: list[ContactEvidence], sliding: Sequence[SlidingEvidence]
+) -> ContactFindings | None:
+    """Return the findings of the contact segments; None where they select no effect or a refit does not confirm it."""
+    selected = _selected_in_segments(evidence, sliding)
+    if not selected:
+        return None
+    world, parameters = _added(data.world, data.segments, selected[0].evidence)
+    if not any(abs(value) > CONFIRMED * error for value, error in parameters.values()):
+        return None
+    first = replace(selected[0], evidence=replace(selected[0].evidence, numbers=parameters))
+    return data.found([first, *selected[1:]], evidence, world)
+
+
+def selected_in_sliding(evidence: Sequence[SlidingEvidence], explained: bool, flown: bool) -> list[SlidingEvidence]:
+    """Return the effect that the sliding test selects and its equals; empty where it selects none.
 
     Args:
-        evidence: The best first.
-        explained: Whether flights are explained to the noise.
-        flown: Whether an effect of flight was found, whose law is never quite the true one.
+        evidence: Evidence in sliding segments, the best first.
+        explained: Whether the flight segments are explained down to the noise.
+        flown: Whether an effect was selected in flight, whose law is never exactly the true one.
     """
     fit = [one for one in evidence if one.evidence.test.admissible]
-    if not fit or not _told_by_glides(fit[0], flown):
+    if not fit or not _selected_effects_in_sliding(fit[0], flown):
         return []
     if not explained and fit[0].share < GLIDE_SHARE_SURE:
-        return []  # what flights leave unexplained acts here, too
+        return []  # what is unexplained in flight also acts during sliding
     alike = fit[0].score - max(GLIDE_LEAD, GLIDE_SHARE * fit[0].score)
     rival, share = fit[0].score - MISLED, RIVAL_SHARE * fit[0].share
     equals = [one for one in fit if one.score > alike or (one.score > rival and one.share > share)]
@@ -183,10 +288,10 @@ def equal_in_glides(evidence: Sequence[GlideEvidence], explained: bool, flown: b
     return equals
 
 
-def _told_by_glides(one: GlideEvidence, flown: bool) -> bool:
-    parameters, numbers = one.evidence.candidate.effect.parameters, one.evidence.numbers
-    assert numbers is not None
-    if all(abs(numbers[p.name][0]) < GLIDE_LEAST * p.scale for p in parameters):
+def _selected_effects_in_sliding(one: SlidingEvidence, flown: bool) -> bool:
+    """Return whether an effect is large enough, and its evidence strong enough, to be selected in sliding segments."""
+    parameters, estimates = one.evidence.candidate.effect.parameters, one.evidence.estimates
+    if all(abs(estimates[p.name][0]) < GLIDE_LEAST * p.scale for p in parameters):
         return False
     if flown and one.others < GLIDE_OTHERS:
         return False
@@ -197,21 +302,23 @@ def _told_by_glides(one: GlideEvidence, flown: bool) -> bool:
     return enough or (sure and not (flexible and flown))
 
 
-def _named(evidence: Sequence[ContactEvidence], glides: Sequence[GlideEvidence]) -> list[ContactEvidence]:
-    """Return the effect that contact names and its equals; none where it names none, or glides speak against it."""
+def _selected_in_segments(
+    evidence: Sequence[ContactEvidence], sliding: Sequence[SlidingEvidence]
+) -> list[ContactEvidence]:
+    """Return the effect that contact segments select and its equals; empty where none passes or sliding contradicts."""
     fit = [one for one in evidence if one.evidence.test.admissible and (one.gain or 0) > 0 and (one.t or 0) > CONTACT_T]
-    if not fit or fit[0] is not evidence[0] or fit[0].score < _least(fit[0], glides):
+    if not fit or fit[0] is not evidence[0] or fit[0].score < _threshold(fit[0], sliding):
         return []
     return [one for one in fit if one.score > CONTACT_LEAD * fit[0].score]
 
 
-def _least(one: ContactEvidence, glides: Sequence[GlideEvidence]) -> float:
-    """Return the score above which contact may name an effect, by what glides say of it."""
+def _threshold(one: ContactEvidence, sliding: Sequence[SlidingEvidence]) -> float:
+    """Return the minimum score of an effect in contact segments, given its evidence in sliding segments."""
     if one.evidence.candidate.effect.phase != "contact" or one.evidence.name in IN_IMPACTS_ALONE:
         return CONTACT_SCORE
-    if not glides:
+    if not sliding:
         return ALONE_SCORE
-    first = next((other for other in glides if other.evidence.test.admissible), None)
+    first = next((other for other in sliding if other.evidence.test.admissible), None)
     agreed = first is not None and first.evidence.name == one.evidence.name and first.score > AGREED_SCORE
     return AGREED_SCORE if agreed else float("inf")
 
@@ -229,16 +336,18 @@ def _added(world: World, contact: Segments, evidence: Evidence) -> tuple[World, 
     known = dict(zip((p.name for p in effect.parameters), evidence.test.estimate.tolist(), strict=False))
     start = base_values(added, parameters)
     for k, p in enumerate(parameters):
-        if p.name.startswith(f"{effect.name}."):  # from the score test's step: a rough valley hides it from neutral
+        if p.name.startswith(
+            f"{effect.name}."
+        ):  # from the estimate of the score test: the cost is too rough near neutral
             start[k] = min(max(known[p.name.partition(".")[2]], p.bounds[0]), p.bounds[1])
     found = refit([contact], added, parameters, start)
     own = [p for p in parameters if p.name.startswith(f"{effect.name}.")]
-    numbers = {p.name.partition(".")[2]: found.number(p.name) for p in own}
-    return found.world, numbers
+    estimates = {p.name.partition(".")[2]: found.number(p.name) for p in own}
+    return found.world, estimates
 
 
 def _replaced(world: World, old: Evidence, new: Evidence) -> World:
-    """Return the world with one effect in the place of another, at its refitted numbers."""
+    """Return the world with one effect replaced by another at its refitted parameters."""
     if old.name == new.name or new.refitted is None:
         return world
     own = next(a for a in new.refitted.world.effects if a.effect.name == new.name)
@@ -246,7 +355,7 @@ def _replaced(world: World, old: Evidence, new: Evidence) -> World:
 
 
 def _with_aliases(kept: Sequence[Evidence], equals: Sequence[Evidence]) -> list[Evidence]:
-    """Return what contact left of equals, with those that rigid contact cannot tell from it."""
+    """Return the remaining equals, with the original ones that rigid contact cannot distinguish from them."""
     names = {one.name for one in kept}
     names |= {name for group in CONTACT_ALIASES if group & names for name in group}
     return [*kept, *(one for one in equals if one.name in names and one not in kept)]

@@ -1,4 +1,7 @@
-"""Errors of predictions where an effect was not fitted: its numbers from other episodes, states from the start."""
+"""Cross-validation over episodes: prediction errors with effect parameters estimated from the other episodes.
+
+The state of a segment is fitted to its first frames only.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +13,27 @@ from torch import Tensor
 
 from ..physics.parameters import Parameter, effect_parameters
 from ..physics.world import World
-from .candidates import base_parameters, base_values, without_effect
-from .linear import linearised
-from .segment_states import fit_states
-from .segments import Segments
+from ..segments.candidates import base_parameters, base_values, without_effect
+from ..segments.segment_fit import linearised
+from ..segments.segment_states import fit_states
+from ..segments.segments import Segments
 
 KNOWN_SHARE = 0.5
-"""The state is fitted to this share of a segment's frames; the error is that of the rest."""
+"""Share of a segment's frames that the state is fitted to; the error is measured on the rest."""
 ITERATIONS = 3
-"""Steps of that fit, which begins at the state of all frames."""
+"""Iterations of that fit, which starts at the state fitted to all frames."""
 
 
 def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[float, float]:
-    """Return the mean error [m] of predictions without an effect and with it.
+    """Return the mean prediction error [m] without an effect and with it.
 
-    The numbers of the effect that predict an episode come from the other episodes, by one step from the estimate of
-    all.
+    The parameters of the effect that predict an episode are estimated from the other episodes, by one Gauss-Newton step
+    from the estimate of all.
 
     Args:
-        segments: With states fitted by the world.
+        segments: Segments with states fitted by the world.
         world: The world with the effect at its estimate.
-        effect: Its name.
+        effect: Name of the effect.
     """
     without = without_effect(world, effect)
     parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
@@ -41,12 +44,13 @@ def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[floa
 
 
 def held_out_loss(segments: Segments, world: World) -> float:
-    """Return the mean error of predictions by a world, in standard deviations of the noise, positions plus rotations.
+    """Return the mean prediction error of a world, positions plus rotations, in standard deviations of the noise.
 
-    The numbers of all its effects that predict an episode come from the other episodes, as of `held_out_errors`.
+    The parameters of all effects that predict an episode are estimated from the other episodes, as in
+    `held_out_errors`.
 
     Args:
-        segments: With states fitted by the world.
+        segments: Segments with states fitted by the world.
         world: The world with its effects at their estimates.
     """
     parameters = base_parameters(world, segments.kind)
@@ -62,7 +66,7 @@ def held_out_loss(segments: Segments, world: World) -> float:
 
 
 def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
-    """Return the parameters (B, P) of each segment as the other episodes tell them."""
+    """Estimate the parameters (B, P) of each segment from the other episodes."""
     linear = linearised(segments, parameters, values)
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(values))
     episode = torch.tensor([item.episode for item in segments.items])
@@ -76,6 +80,7 @@ def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tens
 
 
 def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> float:
+    """Return the mean position error [m] of the frames that the states are not fitted to."""
     fitted, late = _continued(segments, parameters, values)
     away = (fitted.positions(parameters, values) - segments.observations.position_m).norm(dim=-1)
     late = segments.observations.seen * late
@@ -83,10 +88,12 @@ def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) 
 
 
 def _continued(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> tuple[Segments, Tensor]:
-    """Return the segments with states fitted to their first frames, and which frames (B, T, 1) are the others."""
-    seen = segments.observations
+    """Fit the states to the first frames, and return the segments and the mask (B, T, 1) of the other frames."""
+    observed = segments.observations
     known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])
-    early = (torch.arange(seen.times_s.shape[1]) < known[:, None])[..., None].to(seen.seen)
-    start = replace(segments, observations=replace(seen, seen=seen.seen * early, turned=seen.turned * early))
+    early = (torch.arange(observed.times_s.shape[1]) < known[:, None])[..., None].to(observed.seen)
+    start = replace(
+        segments, observations=replace(observed, seen=observed.seen * early, turned=observed.turned * early)
+    )
     fitted = fit_states(start, parameters, values, ITERATIONS, search=False)
-    return replace(fitted, observations=replace(seen, state=fitted.observations.state)), 1 - early
+    return replace(fitted, observations=replace(observed, state=fitted.observations.state)), 1 - early

@@ -1,7 +1,7 @@
-"""Which effect fills a gap best in flight: score tests find those in question, refits decide between them.
+"""Forward selection of one effect in flight: score tests make a short list, refits decide between its candidates.
 
-The p-values here are the textbook's, for nothing but noise is between a flight and its model: uniform where nothing is
-missing (a test measures that).
+In flight, only noise separates the data from a complete model, so the textbook p-values apply: they are uniform where
+nothing is missing (a test measures that).
 """
 
 from __future__ import annotations
@@ -16,175 +16,213 @@ import torch
 from ..physics.effects.effect import ActiveEffect
 from ..physics.parameters import Parameter
 from ..physics.world import World
-from .candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of
-from .refit import Refit, refit
-from .score import Picture, ScoreTest, canonical_correlation, gain_by_episode, picture, score_test
-from .segments import Segments
+from ..segments.candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of
+from ..segments.linearization import Linearization, linearize
+from ..segments.segment_fit import Refit, refit
+from ..segments.segments import Segments
+from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
 
 ALPHA = 0.002
-"""Level of all flight tests of a diagnosis together (Bonferroni over the candidates and their grids)."""
+"""Significance level of all flight tests of a diagnosis together (Bonferroni over the candidates and their grids)."""
 SHORTLIST = 5
-"""So many candidates are refitted."""
+"""Number of candidates that are refitted."""
 SHORTLIST_SHARE = 0.4
-"""Those whose score statistic is at least this share of the largest."""
+"""Minimum score statistic of a refitted candidate, as a share of the largest."""
 UNFITTED = 1.5
-"""Where every refit leaves more than this [chi2 / dof], constants are tried that the score test did not choose."""
+"""Threshold on chi2 per degree of freedom: where every refit is above it, constants that the score test did not choose
+are refitted, too."""
 ALIAS_CHI2 = 6.0
-"""An effect that fits worse by less than this [chi2, at equal numbers] explains the data equally: odds of 20."""
+"""Maximum excess of chi2, at equal numbers of parameters, with which an effect counts as equal to the best: odds of
+20."""
 SLIGHT, SLIGHT_BIC = 0.15, -20.0
-"""An effect whose numbers all are below this share of their usual sizes is named only if BIC falls by more than this,
-and so is its class: small things are explained by much. On development seeds two such names were false (sizes 0.08 and
-0.10, BIC -15 and -8), as were two of report5 (0.06, 0.11; -10, -12) and one of report7 (0.03; 0); the smallest of the
-true ones was 0.22."""
+"""Thresholds on small effects: an effect with all parameters below the first share of their usual sizes is selected
+only if its change of BIC is below the second value; the same holds for its equals. Small residuals have many
+explanations: on the development cases five such detections were false (sizes 0.08, 0.10, 0.06, 0.11 and 0.03; changes
+of BIC -15, -8, -10, -12 and 0), and the smallest true effect had size 0.22."""
 CONTAINED = 0.995
-"""An effect with more numbers is an alias where it can imitate the best one to this correlation."""
+"""Minimum canonical correlation at which an effect of more parameters can imitate the best one and is its equal."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What one candidate has for it, beside a model, in one kind of segments.
-
-    test: of its best constants; p_value: corrected for the grid of constants; delta_bic: of the refit, against the
-    model without it, None where it was not refitted; gains: linearised gain of each held-out episode; numbers: estimate
-    and standard error by parameter.
-    """
+    """Evidence for one candidate in one kind of segments, in addition to a model."""
 
     candidate: Candidate
+    """The candidate."""
     constants: dict[str, float]
+    """Its constants with the best test."""
     test: ScoreTest
+    """Score test at these constants."""
     p_value: float
+    """P-value of the test, corrected for the number of constants that were tried."""
     gains: tuple[float, ...] = ()
+    """Linearized gain of chi2 in each held-out episode."""
     refitted: Refit | None = None
+    """Refit with the effect; None where it was not refitted."""
     delta_bic: float | None = None
+    """Change of BIC against the model without the effect; None where it was not refitted."""
     numbers: dict[str, tuple[float, float]] | None = None
+    """Estimate and standard error by parameter; None where only the score test was made."""
 
     @property
     def name(self) -> str:
         """Name of the effect."""
         return self.candidate.effect.name
 
+    @property
+    def estimates(self) -> dict[str, tuple[float, float]]:
+        """Estimate and standard error by parameter; empty where only the score test was made."""
+        return self.numbers or {}
+
 
 @dataclass(frozen=True)
-class Slot:
-    """All candidates for one gap, the best first; equals: those that explain it equally, the best among them.
-
-    flagged: whether one is significant.
-    """
+class SelectionStep:
+    """One step of forward selection: all candidates in addition to the effects selected before."""
 
     evidence: tuple[Evidence, ...]
+    """Evidence of all candidates, the best first."""
     equals: tuple[Evidence, ...]
+    """Candidates that explain the data equally well, the best first."""
     flagged: bool
+    """Whether the best candidate is significant and is selected."""
 
     @property
     def best(self) -> Evidence:
-        """The best one."""
+        """Evidence of the best candidate."""
         return self.equals[0]
 
 
 def tested(
-    seen: Picture, candidates: Sequence[Candidate], variants: Sequence[Variant], dispersion: float = 1.0
+    linear: Linearization, candidates: Sequence[Candidate], variants: Sequence[Variant], dispersion: float = 1.0
 ) -> list[Evidence]:
-    """Return the score test of each candidate at its best constants."""
+    """Return the score test of each candidate at its best constants, the smallest p-value first.
+
+    Args:
+        linear: Linearization of the segments with all variants.
+        candidates: The candidates.
+        variants: Variants of the candidates, one for each choice of constants.
+        dispersion: Factor by which variances exceed those of the noise.
+    """
     found: dict[int, tuple[Variant, ScoreTest]] = {}
     tries: dict[int, int] = {}
     for variant in variants:
-        test = score_test(seen, seen.columns(variant.parameters), dispersion=dispersion)
+        test = score_test(linear, linear.columns(variant.parameters), dispersion=dispersion)
         tries[variant.place] = tries.get(variant.place, 0) + 1
         if variant.place not in found or test.p_value < found[variant.place][1].p_value:
             found[variant.place] = (variant, test)
     results = []
     for place, (variant, test) in found.items():
         corrected = min(1.0, test.p_value * tries[place])
-        gains = gain_by_episode(seen, seen.columns(variant.parameters))
-        results.append(Evidence(candidates[place], variant.constants, test, corrected, tuple(gains.tolist())))
-    # names, not places, break ties: the order in which candidates are given shall not matter
+        gains = gain_by_episode(linear, linear.columns(variant.parameters))
+        results.append(
+            Evidence(
+                candidate=candidates[place],
+                constants=variant.constants,
+                test=test,
+                p_value=corrected,
+                gains=tuple(gains.tolist()),
+            )
+        )
+    # ties are broken by name, so that the order of the candidates does not matter
     return sorted(results, key=lambda e: (e.p_value, -e.test.statistic, e.name))
 
 
-def fill(
+def select_next(
     flight: Segments,
     world: World,
     candidates: Sequence[Candidate],
     groups: Sequence[int],
     turned: bool,
     dispersion: float = 1.0,
-) -> Slot:
-    """Return what the candidates have for them as the next effect of a world, in flight.
+) -> SelectionStep:
+    """Test all candidates as the next effect of a world in flight, and refit the most significant ones.
 
     Args:
         flight: Segments with states fitted by the world.
-        world: The world, with the effects found so far.
+        world: The world, with the effects selected so far.
         candidates: All candidates.
         groups: Session of each episode.
         turned: Whether orientations were measured.
-        dispersion: By what factor variances exceed those of the noise.
+        dispersion: Factor by which variances exceed those of the noise.
     """
     kept, _ = admissible(world, candidates, turned)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if acts_in(v, "flight")]
-    seen = picture(flight, world, variants, groups, robust=False)
-    evidence = tested(seen, kept, variants, dispersion)
+    linear = linearize(flight, world, variants, groups, robust=False)
+    evidence = tested(linear, kept, variants, dispersion)
     level = ALPHA / max(1, len(evidence))
     significant = [e for e in evidence if e.p_value < level]
     if not significant:
-        return Slot(tuple(evidence), tuple(evidence[:1]), False)
-    # a known sign that comes out wrong is no discovery, but bounds may still leave the rest of an effect's numbers
+        return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
+    done = _refitted_shortlist(significant, flight, world, linear, kept, variants, dispersion)
+    if not done:
+        return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
+    names = {e.name: e for e in done}
+    ranking = [*done, *(e for e in evidence if e.name not in names)]
+    equals = _equals(done, linear, kept, variants, dispersion)
+    return SelectionStep(tuple(ranking), tuple(equals), not any(is_slight(e) for e in equals))
+
+
+def _refitted_shortlist(
+    significant: Sequence[Evidence],
+    flight: Segments,
+    world: World,
+    linear: Linearization,
+    candidates: Sequence[Candidate],
+    variants: Sequence[Variant],
+    dispersion: float,
+) -> list[Evidence]:
+    """Refit the most significant candidates and return those that lower BIC, each at its best constants, best first."""
+    # a known sign that comes out wrong is not a detection, but the bounds may still admit the effect's other parameters
     most = max(e.test.statistic for e in significant)
     short = [e for e in significant if e.test.statistic >= SHORTLIST_SHARE * most]
-    short = sorted(short, key=lambda e: (_penalty(e) * _log(seen) - e.test.statistic, e.name))[: SHORTLIST + 2]
+    short = sorted(short, key=lambda e: (_penalty(e) * _log(linear) - e.test.statistic, e.name))[: SHORTLIST + 2]
     before = refit([flight], world, base_parameters(world, "flight"))
-    done = [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in short]
-    enough = UNFITTED * float(seen.dof.sum()) * dispersion
+    done = [refitted(e, [flight], world, before, math.exp(_log(linear)), dispersion) for e in short]
+    enough = UNFITTED * float(linear.dof.sum()) * dispersion
     if all(e.refitted is not None and e.refitted.cost > enough for e in done):
-        others = [e for one in short for e in _with_other_constants(one, seen, variants, kept, dispersion)]
-        done += [refitted(e, [flight], world, before, math.exp(_log(seen)), dispersion) for e in others]
+        others = [e for one in short for e in _with_other_constants(one, linear, variants, candidates, dispersion)]
+        done += [refitted(e, [flight], world, before, math.exp(_log(linear)), dispersion) for e in others]
     best: dict[int, Evidence] = {}  # each candidate at its best constants
     for e in sorted(done, key=lambda e: (e.delta_bic, e.name)):
         best.setdefault(id(e.candidate), e)
-    done = [e for e in best.values() if e.delta_bic is not None and e.delta_bic < 0]
-    if not done:
-        return Slot(tuple(evidence), tuple(evidence[:1]), False)
-    names = {e.name: e for e in done}
-    ranking = [*done, *(e for e in evidence if e.name not in names)]
-    equals = _equals(done, seen, kept, variants, dispersion)
-    return Slot(tuple(ranking), tuple(equals), not any(is_slight(e) for e in equals))
+    return [e for e in best.values() if e.delta_bic is not None and e.delta_bic < 0]
 
 
 def is_slight(evidence: Evidence) -> bool:
-    """Whether a refitted effect is too small for its evidence to be named."""
-    numbers = evidence.numbers or {}
-    small = all(abs(numbers[p.name][0]) < SLIGHT * p.scale for p in evidence.candidate.effect.parameters)
+    """Return whether a refitted effect is too small to be selected on its evidence."""
+    small = all(abs(evidence.estimates[p.name][0]) < SLIGHT * p.scale for p in evidence.candidate.effect.parameters)
     return small and evidence.delta_bic is not None and evidence.delta_bic > SLIGHT_BIC
 
 
 def _with_other_constants(
     evidence: Evidence,
-    seen: Picture,
+    linear: Linearization,
     variants: Sequence[Variant],
     candidates: Sequence[Candidate],
     dispersion: float,
 ) -> list[Evidence]:
-    """Return a candidate at each of its constants but those it was tested best with.
+    """Return a candidate at each of its constants except those of its best score test.
 
-    A score test looks at the first step from neutral; of a large effect the constants that are best there need not be
-    the best ones where it ends.
+    A score test uses the slope at the neutral value; the best constants there need not be the best ones at the estimate
+    of a large effect.
     """
     mine = [v for v in variants if candidates[v.place] is evidence.candidate and v.constants != evidence.constants]
-    tests = [score_test(seen, seen.columns(v.parameters), dispersion=dispersion) for v in mine]
+    tests = [score_test(linear, linear.columns(v.parameters), dispersion=dispersion) for v in mine]
     return [replace(evidence, constants=v.constants, test=test) for v, test in zip(mine, tests, strict=True)]
 
 
 def refitted(
     evidence: Evidence, parts: Sequence[Segments], world: World, before: Refit, count: float, dispersion: float
 ) -> Evidence:
-    """Return the evidence with a refit of the effect beside the model's numbers.
+    """Refit the effect together with the model's parameters, and return the evidence with the refit.
 
     Args:
-        evidence: Of the effect.
+        evidence: Evidence of the effect.
         parts: The segments.
-        world: The world without it.
-        before: The refit of that.
-        count: Number of measured numbers, for the penalty of BIC.
-        dispersion: By what factor variances exceed those of the noise.
+        world: The world without the effect.
+        before: Refit of that world.
+        count: Number of measured values, for the penalty of BIC.
+        dispersion: Factor by which variances exceed those of the noise.
     """
     effect = evidence.candidate.effect
     like = world.gravity[0, :1]
@@ -197,8 +235,8 @@ def refitted(
     rest = before.values.to(torch.float64)
     others = [p for p in parameters if p not in own]
     known = {p.name: rest[k] for k, p in enumerate(before.parameters)}
-    begun = torch.stack([*(known[p.name] for p in others), *values.to(torch.float64)])
-    after = refit(parts, added, [*others, *own], begun)
+    initial = torch.stack([*(known[p.name] for p in others), *values.to(torch.float64)])
+    after = refit(parts, added, [*others, *own], initial)
     bic = (after.cost - before.cost) / dispersion + len(own) * math.log(count)
     found = {p.name.partition(".")[2]: after.number(p.name) for p in own}
     numbers = {name: (value, std * math.sqrt(dispersion)) for name, (value, std) in found.items()}
@@ -207,44 +245,50 @@ def refitted(
 
 def _equals(
     done: Sequence[Evidence],
-    seen: Picture,
+    linear: Linearization,
     candidates: Sequence[Candidate],
     variants: Sequence[Variant],
     dispersion: float,
 ) -> list[Evidence]:
-    """Return the best and what explains the data as well as it."""
+    """Return the best refitted candidate and those that explain the data equally well."""
     best = done[0]
-    assert best.refitted is not None and best.delta_bic is not None
+    if best.refitted is None or best.delta_bic is None:
+        return [best]
     found = [best]
     for other in done[1:]:
-        assert other.refitted is not None and other.delta_bic is not None
+        if other.refitted is None or other.delta_bic is None:
+            continue
         worse = (other.refitted.cost - best.refitted.cost) / dispersion
         more = len(other.candidate.effect.parameters) > len(best.candidate.effect.parameters)
         close = other.delta_bic - best.delta_bic < ALIAS_CHI2 if more else worse < ALIAS_CHI2
         if more and not close and worse < ALIAS_CHI2:
-            close = _contains(seen, candidates, variants, best, other)
+            close = _contains(linear, candidates, variants, best, other)
         if close:
             found.append(other)
     return found
 
 
 def _contains(
-    seen: Picture, candidates: Sequence[Candidate], variants: Sequence[Variant], best: Evidence, other: Evidence
+    linear: Linearization, candidates: Sequence[Candidate], variants: Sequence[Variant], best: Evidence, other: Evidence
 ) -> bool:
+    """Return whether another effect, with more parameters, can imitate the best one."""
     columns = []
     for one in (best, other):
         mine = [v for v in variants if candidates[v.place] is one.candidate and v.constants == one.constants]
-        columns.append(seen.columns(mine[0].parameters))
-    return canonical_correlation(seen, columns[0], columns[1]) > CONTAINED
+        columns.append(linear.columns(mine[0].parameters))
+    return canonical_correlation(linear, columns[0], columns[1]) > CONTAINED
 
 
 def _clamped(parameter: Parameter, value: torch.Tensor) -> torch.Tensor:
+    """Return a value clamped to the bounds of its parameter."""
     return value.clamp(*parameter.bounds)
 
 
 def _penalty(evidence: Evidence) -> int:
+    """Return the number of parameters that BIC counts."""
     return evidence.test.dof
 
 
-def _log(seen: Picture) -> float:
-    return float(np.log(max(seen.dof.sum(), 2.0)))
+def _log(linear: Linearization) -> float:
+    """Return the logarithm of the number of measured values."""
+    return float(np.log(max(linear.dof.sum(), 2.0)))

@@ -1,4 +1,4 @@
-"""The episodes that a diagnosis looks at: with measured tracks, or with those that the model's fit found in videos."""
+"""Episodes of a diagnosis: with measured tracks, or with the pose tracks that the model's fit estimated from videos."""
 
 from __future__ import annotations
 
@@ -6,36 +6,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...datasets.capture import Capture
-from ...datasets.models import POSE_TRACKS, Model
-from ...datasets.tracks import Track
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.tracks import Track
+from ...datasets.models.model import POSE_TRACKS, Model
 from ...schemas import InputDataError
-from ..phys_geo import track_episodes
+from ..trajectories.observations import track_episodes
 
 MIN_EPISODES = 3
-"""Fewer leave nothing to hold out: what helps one episode would be proved by that episode."""
+"""Minimum number of episodes: with fewer, none can be held out to confirm an effect found in the others."""
 MAX_EPISODES = 40
-"""Of more episodes so many, evenly spread, are looked at: everything missing shows in them."""
+"""Maximum number of episodes; of more, an evenly spread subset is used, which suffices to show a missing effect."""
 
 
 @dataclass(frozen=True)
 class DiagnosedEpisodes:
-    """Name and tracks by body of each episode; noise (position [m], rotation [rad]) where it is known; warnings."""
+    """Episodes with their noise."""
 
     episodes: tuple[tuple[str, dict[str, Track]], ...]
+    """Name and tracks by body of each episode."""
     noise: tuple[float | None, float | None]
+    """Standard deviation of position [m] and rotation [rad]; None where it is unknown."""
     warnings: tuple[str, ...]
+    """Warnings for the report."""
 
 
 def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedEpisodes:
-    """Return the episodes of a split with tracks of all that moves.
+    """Return the episodes of a split that have tracks of all moving bodies.
 
-    Measured tracks are taken where any episode of the split has them; otherwise those that the fit of the model found
-    in the videos.
+    Measured tracks are used if any episode of the split has them, otherwise the tracks that the model's fit estimated
+    from the videos.
 
     Raises:
-        InputDataError: If there are too few.
-        UsageError: If there is no such split.
+        InputDataError: If these are too few.
+        UsageError: If the split does not exist.
     """
     free = {body.name for body in model.file.bodies if body.motion == "free"}
     known = (capture.manifest.measurement.position_std_m, capture.manifest.measurement.rotation_std_rad)
@@ -46,15 +49,15 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
     else:
         found, known = _filmed(model, capture, split), _filmed_noise(model, names)
         warnings = (
-            f"the tracks are those that the fit found in the videos ({POSE_TRACKS}/ of the model): poses of "
-            "neighbouring frames err alike, and what bends them all, as a wrong shape does, can pass for physics.",
+            f"the tracks are those that the fit found in the videos ({POSE_TRACKS}/ of the model): errors of "
+            "neighbouring frames are correlated, and a systematic error, as of a wrong shape, can look like physics.",
         )
     moving = {body.name for body in model.file.bodies if body.motion != "fixed"}
     episodes = [(name, tracks) for name, tracks in found if moving <= set(tracks)]
     if len(episodes) < MIN_EPISODES:
         raise InputDataError(
-            f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all that moves.",
-            f"at least {MIN_EPISODES}: what helps one has to be proved on others.",
+            f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all moving bodies.",
+            f"at least {MIN_EPISODES}: an effect found in one has to be confirmed in others.",
             "record more, or name another split with --split.",
         )
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
@@ -62,7 +65,7 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
 
 
 def _filmed(model: Model, capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
-    """Return the episodes with the poses that the model's fit found, and the commands of the driven bodies."""
+    """Return the episodes with the poses that the model's fit estimated, and the tracks of the kinematic bodies."""
     names = [name for name in capture.episodes(split) if name in model.tracks]
     if not names:
         raise InputDataError(
@@ -75,7 +78,7 @@ def _filmed(model: Model, capture: Capture, split: str) -> list[tuple[str, dict[
 
 
 def _filmed_noise(model: Model, names: list[str]) -> tuple[float | None, float | None]:
-    """Return the noise of the found poses, the median over the episodes; None where `fit.json` does not say it."""
+    """Return the noise of the estimated poses, the median over the episodes; None if `fit.json` does not contain it."""
     stage = model.fit.stages.get("phys-geo", {}).get("pose_tracks", {})
     records = [stage[name] for name in names if "position_std_m" in stage.get(name, {})]
     if not records:

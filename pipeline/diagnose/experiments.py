@@ -1,4 +1,4 @@
-"""Throws that could be made next: a grid of initial states, and each in words."""
+"""Candidate experiments: a grid of initial states, each with a description in words."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ import torch
 from torch import Tensor
 
 from ...schemas import InputDataError, ThrowGrid, ThrowsFile, read_toml
-from ..physics.sweeps import tangent_axes
+from ..physics.impulse_solver import tangent_axes
 from ..physics.world import State, World
 
 MOST_THROWS = 400
-"""More would take minutes to compare."""
+"""Maximum number of throws; more would take minutes to compare."""
 FLAT_DEG, FAST_M_S, SLOW_M_S = 15.0, 3.0, 1.2
-"""What the words mean."""
+"""Limits of the descriptions: maximum elevation of "flat" [deg], minimum speed of "fast" and maximum speed of "slowly"
+[m/s]."""
 ALL_AXES = ("up", "along", "across")
+"""Spin axes of a throw: vertical, along its path, and horizontal across its path."""
 DEFAULT: tuple[ThrowGrid, ...] = (
     ThrowGrid(height_m=(0.3, 1.0), speed_m_s=(0.0,), spin_rad_s=(0.0, 15.0)),
     ThrowGrid(speed_m_s=(1.0, 2.0, 4.0), elevation_deg=(0.0, 45.0)),
@@ -28,25 +30,33 @@ DEFAULT: tuple[ThrowGrid, ...] = (
     ThrowGrid(on_ground=True, speed_m_s=(0.5, 1.5, 3.0), heading_deg=(0.0, 90.0)),
     ThrowGrid(on_ground=True, speed_m_s=(0.0, 1.5), spin_rad_s=(15.0,), spin_axis=("up",)),
 )
-"""What a hand can do: drops, throws without and with spin, slides; 30 of them."""
+"""Default experiments, which can be made by hand: 30 drops, throws without and with spin, and slides."""
 
 
-@dataclass(frozen=True)
-class Throw:
-    """One motion; the fields are those of `ThrowGrid`."""
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Initial state of one throw, drop, slide or spin; the fields are those of `ThrowGrid`."""
 
     on_ground: bool
+    """Whether the body starts on the ground."""
     height_m: float
+    """Height of the body's lowest point above the ground [m]."""
     speed_m_s: float
+    """Initial speed [m/s]."""
     elevation_deg: float
+    """Angle of the velocity above the horizontal [deg]."""
     heading_deg: float
+    """Horizontal direction of the velocity [deg]."""
     spin_rad_s: float
+    """Initial angular speed [rad/s]."""
     spin_axis: Literal["up", "along", "across"]
+    """Axis of the spin: vertical, along the path, or horizontal across it."""
     duration_s: float
+    """Duration of the recording [s]."""
 
     @property
     def what(self) -> str:
-        """The throw in words."""
+        """Description of the experiment in words."""
         start = f"{self.height_m:.3g} m high"
         speed = f"{self.speed_m_s:.1f} m/s"
         heading = f", heading {self.heading_deg:.0f} deg" if self.heading_deg else ""
@@ -64,6 +74,7 @@ class Throw:
 
     @property
     def _spin(self) -> str:
+        """Axis of the spin in words."""
         if self.spin_rad_s == 0:
             return "without spin"
         words = {
@@ -75,28 +86,30 @@ class Throw:
 
     @property
     def _rate(self) -> str:
+        """Angular speed with its unit."""
         return f"{self.spin_rad_s:.0f} rad/s"
 
     @property
     def _more(self) -> str:
+        """Angular speed as the last part of a description; empty without spin."""
         return f", {self._rate}" if self.spin_rad_s else ""
 
 
-def read_throws(path: Path | str) -> list[Throw]:
-    """Return the throws of a TOML file of `[[throws]]` tables.
+def read_experiments(path: Path | str) -> list[Experiment]:
+    """Read the experiments of a TOML file of `[[throws]]` tables.
 
     Raises:
-        InputDataError: If it is missing or wrong, or has too many throws.
+        InputDataError: If the file is missing or invalid, or has too many throws.
     """
-    found = throws_of(read_toml(Path(path), ThrowsFile).throws)
+    found = experiments_of(read_toml(Path(path), ThrowsFile).throws)
     if len(found) > MOST_THROWS:
         raise InputDataError(f"{path}: {len(found)} throws.", f"at most {MOST_THROWS}.", "give fewer values.")
     return found
 
 
-def throws_of(grids: Sequence[ThrowGrid]) -> list[Throw]:
-    """Return the throws of grids, each once."""
-    found: dict[Throw, None] = {}
+def experiments_of(grids: Sequence[ThrowGrid]) -> list[Experiment]:
+    """Return the experiments of grids, each once."""
+    found: dict[Experiment, None] = {}
     for grid in grids:
         axes = (
             grid.height_m[:1] if grid.on_ground else grid.height_m,
@@ -108,31 +121,31 @@ def throws_of(grids: Sequence[ThrowGrid]) -> list[Throw]:
         )
         for height, speed, elevation, heading, spin, axis in itertools.product(*axes):
             if grid.on_ground and speed == spin == 0:
-                continue  # it only lies there
+                continue  # the body would only rest
             thrown = 0.0 if grid.on_ground or speed == 0 else elevation
             turned = heading if speed or (spin and axis != "up") else 0.0
-            one = Throw(
-                grid.on_ground,
-                0.0 if grid.on_ground else height,
-                speed,
-                thrown,
-                turned,
-                spin,
-                axis if spin else "across",
-                grid.duration_s,
+            one = Experiment(
+                on_ground=grid.on_ground,
+                height_m=0.0 if grid.on_ground else height,
+                speed_m_s=speed,
+                elevation_deg=thrown,
+                heading_deg=turned,
+                spin_rad_s=spin,
+                spin_axis=axis if spin else "across",
+                duration_s=grid.duration_s,
             )
             found[one] = None
     return list(found)
 
 
-def states_of(world: World, body: int, throws: Sequence[Throw], place_m: Tensor, like: State) -> State:
-    """Return the states (B) in which throws begin.
+def states_of(world: World, body: int, throws: Sequence[Experiment], place_m: Tensor, like: State) -> State:
+    """Return the initial states (B) of experiments.
 
     Args:
-        world: The world; without a ground, heights count from the place.
-        body: Index of the body that is thrown; it starts unturned.
-        throws: The throws (B).
-        place_m: Where on the ground [m], shape (3,).
+        world: The world; without a ground, heights are measured from the place.
+        body: Index of the thrown body, which starts with the identity rotation.
+        throws: The experiments (B).
+        place_m: Point on the ground [m], shape (3,), world frame.
         like: State (1, nb) of the other bodies.
     """
     up = world.up[0]
@@ -154,13 +167,13 @@ def states_of(world: World, body: int, throws: Sequence[Throw], place_m: Tensor,
 
 
 def described(state: State, item: int, body: int) -> dict[str, Any]:
-    """Return the state of a body as a report has it."""
+    """Return the state of a body as in the report, rounded to 6 decimals."""
     values = {key: getattr(state, key)[item, body].tolist() for key in State.__dataclass_fields__}
     return {key: [round(value, 6) + 0.0 for value in row] for key, row in values.items()}
 
 
 def _start(world: World, body: int, height_m: float, place_m: Tensor) -> Tensor:
-    """Return the position (3,) of an unturned body whose lowest point is that high over the ground."""
+    """Return the position (3,) [m] of an unrotated body whose lowest point has a given height above the ground."""
     normal, offset = world.ground_normal, world.ground_offset
     if normal is None or offset is None:
         return place_m + height_m * world.up[0]

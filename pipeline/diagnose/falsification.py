@@ -1,8 +1,9 @@
-"""Whether the effects that were found act alike wherever they act: the same numbers in every episode and segment.
+"""Consistency test of selected effects: the same parameters in every episode and segment.
 
-A force that depends on time or place may look like a drag or a tilt in one episode and like another in the next. With
-M_u and g_u of each unit u (an episode, a segment) at the fitted numbers, sum_u g_u' M_u^-1 g_u - g' M^-1 g is chi2 with
-as many degrees of freedom as the units have numbers more than all together (Cochran's Q for several numbers).
+A force that depends on time or place may look like one drag or tilt in one episode and like another in the next. With
+the information M_u and score g_u of each unit u (an episode, a segment) at the fitted parameters, and their sums M and
+g, the statistic sum_u g_u' M_u^-1 g_u - g' M^-1 g is distributed as chi2. Its degrees of freedom are the number of
+parameters of all units less those of the common fit (Cochran's Q for several parameters).
 """
 
 from __future__ import annotations
@@ -13,64 +14,74 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optimization.uncertainty import chi2_tail
 from ..physics.world import World
-from ..tails import chi2_tail
-from .candidates import base_values
-from .score import Picture, picture, solved
-from .segments import Segments
+from ..segments.candidates import base_values
+from ..segments.linearization import Linearization, linearize
+from ..segments.segments import Segments
+from .score_test import solved
 
 Array = NDArray[np.float64]
 
 LEVEL = 1e-4
+"""Significance level of the test."""
 ENOUGH_SHARE = 0.9
-"""An effect whose numbers, the same everywhere, explain this share of what numbers of each unit's own would: what is
-left is a detail of its law. Of less, it stands in for a stranger."""
+"""Minimum share that common parameters explain of what separate parameters of each unit explain. Above it, a difference
+between units counts as a detail of the effect's law; below it, the effect is a surrogate for an unknown one."""
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Cochran's Q of the effects' numbers over units; share: of what is explained, by numbers that all units share."""
+    """Cochran's Q of the effects' parameters over units."""
 
     statistic: float
+    """Cochran's Q in units of the dispersion."""
     dof: int
+    """Degrees of freedom."""
     p_value: float
+    """Probability of a larger statistic if all units share the parameters."""
     share: float
+    """Share of what separate parameters explain that common parameters explain."""
 
     @property
     def doubtful(self) -> bool:
-        """Whether the effects change from unit to unit by more than a detail of their law."""
+        """Whether the effects differ between units by more than a detail of their law."""
         return self.p_value < LEVEL and self.share < ENOUGH_SHARE
 
 
 def consistency(
     flight: Segments, world: World, names: Sequence[str], groups: Sequence[int], dispersion: float
 ) -> Consistency | None:
-    """Return the least consistent of the effects' numbers over episodes and over segments; None without effects.
+    """Test the effects' parameters over episodes and over segments, and return the less consistent result.
 
     Args:
         flight: Segments with states fitted by the world.
-        world: With the effects at their fitted numbers.
-        names: Of the effects.
+        world: The world with the effects at their fitted parameters.
+        names: Names of the effects.
         groups: Session of each episode.
-        dispersion: By what factor variances exceed those of the noise.
+        dispersion: Factor by which variances exceed those of the noise.
+
+    Returns:
+        The result with the smaller p-value; None without effects.
     """
     if not names:
         return None
-    seen = picture(flight, world, (), groups, robust=False)
-    columns = [k for k, p in enumerate(seen.parameters) if p.name.partition(".")[0] in names]
+    linear = linearize(flight, world, (), groups, robust=False)
+    columns = [k for k, p in enumerate(linear.parameters) if p.name.partition(".")[0] in names]
     if not columns:
         return None
-    values = base_values(world, [seen.parameters[k] for k in columns]).numpy()
-    units = (seen.episode, np.arange(len(seen.episode)))
-    return max((_over(seen, columns, values, unit, dispersion) for unit in units), key=lambda one: -one.p_value)
+    values = base_values(world, [linear.parameters[k] for k in columns]).numpy()
+    units = (linear.episode, np.arange(len(linear.episode)))
+    return max((_over(linear, columns, values, unit, dispersion) for unit in units), key=lambda one: -one.p_value)
 
 
 def _over(
-    seen: Picture, columns: Sequence[int], values: Array, unit: NDArray[np.int64], dispersion: float
+    linear: Linearization, columns: Sequence[int], values: Array, unit: NDArray[np.int64], dispersion: float
 ) -> Consistency:
+    """Return Cochran's Q over units; unit (B,): index of each segment's unit."""
     chosen = list(columns)
-    width = np.array([seen.parameters[k].prior[1] for k in chosen])
-    information, score = seen.information[:, chosen][:, :, chosen], seen.score[:, chosen]
+    width = np.array([linear.parameters[k].prior[1] for k in chosen])
+    information, score = linear.information[:, chosen][:, :, chosen], linear.score[:, chosen]
     places = np.unique(unit, return_inverse=True)[1]
     by_unit, slopes = np.zeros((places.max() + 1, len(chosen), len(chosen))), np.zeros((places.max() + 1, len(chosen)))
     np.add.at(by_unit, places, information)

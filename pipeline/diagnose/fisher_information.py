@@ -1,4 +1,4 @@
-"""What data, and throws that could be made, tell of a model's numbers and of rival effects: their information."""
+"""Fisher information of data and of simulated experiments on the parameters of a model and of rival effects."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.tracks import Track
-from ..physics.dispatch import rollout as rolled_out
-from ..physics.measured import as_measured, true_times
+from ...datasets.capture.tracks import Track
+from ..physics.engine import rollout as rolled_out
+from ..physics.observation_model import as_measured, true_times
 from ..physics.parameters import PRIOR_SCALES
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
-from .candidates import Variant, acts_in, base_parameters
-from .cuts import Segment, cut_episodes, whole_episodes
-from .phases import is_round
-from .prepared import Prepared
-from .score import picture
-from .segments import Kind, Segments
-from .throws import Throw, states_of
+from ..segments.candidates import Variant, acts_in, base_parameters
+from ..segments.contact_phases import is_round
+from ..segments.linearization import linearize
+from ..segments.prepare import Prepared
+from ..segments.segments import Kind, Segments
+from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
+from .experiments import Experiment, states_of
 
 Array = NDArray[np.float64]
 
 LEAST_STEP_S = 0.005
-"""Throws are simulated with frames no denser than this; the information of denser ones is scaled."""
+"""Minimum frame interval of simulated experiments [s]; the information of denser frames is obtained by scaling."""
 MOST_CONTACTS = 40
-"""Of more contact segments so many, evenly spread, tell what is known already."""
+"""Maximum number of contact segments whose information is computed; of more, an evenly spread subset is scaled up."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The numbers of the model and of the rivals.
-
-    names (P), the model's first; base: how many those are; prior (P,): information of their priors.
-    """
+    """Order of the parameters of the model and of the rivals."""
 
     names: tuple[str, ...]
+    """Names of the parameters (P), the model's first."""
     base: int
+    """Number of the model's parameters."""
     prior: Array
+    """Prior information of each parameter, shape (P,)."""
 
 
 def layout_of(world: World, variants: Sequence[Variant]) -> Layout:
-    """Return the numbers of a world, in flight and in contact, and those of effects beside it."""
+    """Return the order of a world's parameters, in flight and in contact, followed by those of the variants."""
     base = {p.name: 1 / p.prior[1] ** 2 for kind in ("flight", "contact") for p in base_parameters(world, kind)}
     own = {
         f"{v.active.effect.name}.{p.name}": 1 / (PRIOR_SCALES * p.scale) ** 2
@@ -58,7 +58,17 @@ def layout_of(world: World, variants: Sequence[Variant]) -> Layout:
 def information_of_data(
     prepared: Prepared, world: World, variants: Sequence[Variant], layout: Layout, discount: float
 ) -> Array:
-    """Return the information (P, P) of the data; it depends on the motion alone, so that states need no fit."""
+    """Return the information (P, P) of the data.
+
+    It depends on the motion alone, so the states need no fit.
+
+    Args:
+        prepared: The episodes.
+        world: The world without the rivals.
+        variants: The rivals, at neutral.
+        layout: Order of the parameters (P).
+        discount: Factor by which the information of contact is reduced.
+    """
     found = np.zeros((len(layout.names), len(layout.names)))
     if prepared.flight is not None:
         found += _embedded(prepared.flight, world, variants, layout).sum(0)
@@ -71,31 +81,31 @@ def information_of_data(
     return found
 
 
-def throw_states(prepared: Prepared, world: World, throws: Sequence[Throw]) -> State:
-    """Return the states (B) in which throws begin: over the middle of where the body was measured."""
+def experiment_states(prepared: Prepared, world: World, throws: Sequence[Experiment]) -> State:
+    """Return the start states (B) of experiments, above the median of the measured positions."""
     middle = prepared.whole.position_m[prepared.whole.seen > 0].median(0).values
     return states_of(world, world.free[0], throws, middle, prepared.whole.state)
 
 
-def information_of_throws(
+def information_of_experiments(
     prepared: Prepared,
     world: World,
     variants: Sequence[Variant],
     layout: Layout,
-    throws: Sequence[Throw],
+    throws: Sequence[Experiment],
     state: State,
     discount: float,
 ) -> list[Array | None]:
-    """Return the information (P, P) of each throw; None where its simulation diverged.
+    """Simulate experiments and return the information (P, P) of each; None where the simulation diverged.
 
     Args:
-        prepared: The data so far, whose frame rate and noise the throws get.
-        world: In which they are simulated.
+        prepared: The data so far; the experiments get their frame rate and noise.
+        world: World of the simulation.
         variants: The rivals, at neutral.
-        layout: The numbers (P).
-        throws: The throws (B).
-        state: Where they begin (B).
-        discount: By what factor contact counts less.
+        layout: Order of the parameters (P).
+        throws: The experiments (B).
+        state: Their start states (B).
+        discount: Factor by which the information of contact is reduced.
     """
     times, scale = _times(prepared, max(t.duration_s for t in throws))
     with torch.no_grad():
@@ -126,7 +136,7 @@ def information_of_throws(
 
 
 def _at_truth(segments: Segments, true: Rollout, rows: Sequence[int]) -> Segments:
-    """Return simulated segments with the states that they were simulated with."""
+    """Return simulated segments with their true states."""
     row = torch.tensor([rows[item.episode] for item in segments.items])
     first = torch.tensor([item.first for item in segments.items])
     state = State(*(getattr(true, key)[row, first] for key in State.__dataclass_fields__))
@@ -134,20 +144,20 @@ def _at_truth(segments: Segments, true: Rollout, rows: Sequence[int]) -> Segment
 
 
 def _embedded(segments: Segments, world: World, variants: Sequence[Variant], layout: Layout) -> Array:
-    """Return the information (B, P, P) of segments in the layout of all numbers."""
+    """Return the information (B, P, P) of segments in the order of all parameters."""
     kind: Kind = segments.kind
     found = np.zeros((len(segments.items), len(layout.names), len(layout.names)))
     if not base_parameters(world, kind) and not any(acts_in(v, kind) for v in variants):
         return found
     groups = [0] * (1 + max(item.episode for item in segments.items))
-    seen = picture(segments, world, variants, groups, robust=False)
-    place = np.array([layout.names.index(p.name) for p in seen.parameters])
-    found[:, place[:, None], place] = np.nan_to_num(seen.information)
+    linear = linearize(segments, world, variants, groups, robust=False)
+    place = np.array([layout.names.index(p.name) for p in linear.parameters])
+    found[:, place[:, None], place] = np.nan_to_num(linear.information)
     return found
 
 
 def _times(prepared: Prepared, duration_s: float) -> tuple[Tensor, float]:
-    """Return frame times of a throw [s], as dense as the data's, and by what the information is to be multiplied."""
+    """Return the frame times [s] of an experiment and the factor that scales its information to the data."""
     items: Sequence[Segment] = prepared.contact_items if prepared.flight is None else prepared.flight.items
     times = prepared.whole.times_s
     step = float(torch.cat([times[i.episode, i.first : i.last + 1].diff() for i in items]).median())
@@ -156,6 +166,7 @@ def _times(prepared: Prepared, duration_s: float) -> tuple[Tensor, float]:
 
 
 def _track(measured: Rollout, item: int, body: int, times: Tensor, duration_s: float, turned: bool) -> Track:
+    """Return the track of a body in one simulated experiment."""
     keep = times <= duration_s + 1e-9
     quat = measured.quat_wxyz[item, keep, body].numpy() if turned else None
     return Track(times[keep].numpy(), measured.position_m[item, keep, body].numpy(), quat)

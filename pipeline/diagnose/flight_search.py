@@ -1,8 +1,8 @@
-"""The search in flight: effects one after the other, each beside those found before, as long as they predict better.
+"""Forward selection of effects in flight, as long as each improves the predictions of held-out episodes.
 
-A score may be significant where an effect only patches up the law of another: a drag that is the same from all sides,
-of a box, leaves a little for a shifted centre of mass. So what comes second has to predict held-out episodes, and to
-explain most of what the first one leaves; else that stays unexplained.
+A score may be significant where an effect only compensates an error in the law of another: an isotropic drag of a box
+leaves a small residual that a shifted centre of mass fits. A second effect therefore has to improve held-out
+predictions and to explain most of the residual; otherwise the residual stays unexplained.
 """
 
 from __future__ import annotations
@@ -11,40 +11,69 @@ import math
 from collections.abc import Sequence
 
 from ..physics.world import World
-from .bundles import DRAGS, drag_in_wind
-from .candidates import Candidate, without_effect
-from .forecast import held_out_loss
-from .prepared import Prepared
-from .segment_states import fit_states
-from .segments import Segments
-from .slots import ALIAS_CHI2, Slot, fill
+from ..segments.candidates import Candidate, without_effect
+from ..segments.prepare import Prepared
+from ..segments.segment_states import fit_states
+from ..segments.segments import Segments
+from .coupled_effects import DRAGS, drag_in_wind
+from .cross_validation import held_out_loss
+from .effect_selection import ALIAS_CHI2, SelectionStep, select_next
 
 MOST_EFFECTS = 3
-"""So many effects are looked for in flight, one after the other."""
+"""Maximum number of effects that are selected in flight."""
 
 SHARE = 0.6
-"""What comes second explains at least this share of the excess of chi2 that is left. On development seeds true ones
-explain 0.83 or more, and those that patch up the law of a drag 0.42 at most, where there is anything to explain."""
+"""Minimum share of the remaining excess of chi2 that a further effect explains. On the development cases true effects
+explained at least 0.83, and effects that compensate an error in the law of a drag at most 0.42, where an excess
+remained."""
 
 
 def flight_search(
     prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float
-) -> tuple[list[Slot], World, Segments | None]:
-    """Return the slots that effects fill in flight, the world with the best of each, and the segments there."""
-    flight, slots, current = prepared.flight, [], world
-    if flight is None:
+) -> tuple[list[SelectionStep], World, Segments | None]:
+    """Select effects in flight one after the other.
+
+    Args:
+        prepared: The episodes.
+        world: The model's world.
+        candidates: All candidates.
+        scatter: Factor by which variances exceed those of the noise.
+
+    Returns:
+        The selection steps (without a selected effect the one step that selected none), the world with the best effect
+        of each step, and the flight segments with states fitted by it; None without flight.
+    """
+    if prepared.flight is None:
         return [], world, None
+    steps, losses, current, flight = _forward_selection(prepared, prepared.flight, world, candidates, scatter)
+    if len(steps) < 2:
+        return steps, current, flight
+    coupled = _coupled(prepared, world, steps, candidates, scatter)
+    if coupled is not None and held_out_loss(coupled[2], coupled[1]) < losses[0]:
+        return coupled
+    return _reselected(prepared, steps, current, flight, candidates, scatter)
+
+
+def _forward_selection(
+    prepared: Prepared, flight: Segments, world: World, candidates: Sequence[Candidate], scatter: float
+) -> tuple[list[SelectionStep], list[float], World, Segments]:
+    """Select effects until none is significant, or one explains or predicts too little.
+
+    Returns:
+        The steps; the held-out losses before the second effect and after each effect from the second on; the world
+        with the selected effects; and the segments with states fitted by it.
+    """
+    steps: list[SelectionStep] = []
     losses: list[float] = []
-    while len(slots) < MOST_EFFECTS:
-        slot = fill(flight, current, candidates, prepared.groups, prepared.turned, scatter)
-        if not slot.flagged:
-            slots = slots or [slot]
+    current = world
+    while len(steps) < MOST_EFFECTS:
+        step = select_next(flight, current, candidates, prepared.groups, prepared.turned, scatter)
+        refitted = step.best.refitted if step.flagged else None
+        if refitted is None:
+            steps = steps or [step]
             break
-        refitted = slot.best.refitted
-        assert refitted is not None
-        if slots:
-            before = slots[-1].best.refitted
-            assert before is not None  # it was flagged
+        before = steps[-1].best.refitted if steps else None
+        if before is not None:
             excess = before.cost - float(flight.dof.sum()) * scatter
             if before.cost - refitted.cost < SHARE * excess:
                 break
@@ -52,41 +81,48 @@ def flight_search(
             losses.append(held_out_loss(refitted.segments[0], refitted.world))
             if not losses[-1] < losses[-2]:
                 break
-        slots.append(slot)
+        steps.append(step)
         current, flight = refitted.world, refitted.segments[0]
-    filled = [slot for slot in slots if slot.flagged]
-    if len(filled) > 1:
-        bundled = _bundled(prepared, world, filled, candidates, scatter)
-        if bundled is not None and held_out_loss(bundled[2], bundled[1]) < losses[0]:
-            return bundled
-        for place in range(len(filled) - 1):  # the first were chosen before the others were known
-            without = without_effect(current, filled[place].best.name)
-            if len(without.effects) < len(current.effects) - 1:
-                continue  # another effect acts through this one
-            states = fit_states(flight.in_world(without))
-            slot = fill(states, without, candidates, prepared.groups, prepared.turned, scatter)
-            refitted = slot.best.refitted
-            if slot.flagged and refitted is not None:
-                filled[place] = slot
-                current, flight = refitted.world, refitted.segments[0]
-        slots = filled
-    return slots, current, flight
+    return steps, losses, current, flight
 
 
-def _bundled(
-    prepared: Prepared, world: World, filled: Sequence[Slot], candidates: Sequence[Candidate], scatter: float
-) -> tuple[list[Slot], World, Segments] | None:
-    """Return a drag in wind in place of what was found, where that explains the flights better."""
-    last = filled[-1].best.refitted
-    if prepared.flight is None or last is None or not any(slot.best.name in DRAGS for slot in filled):
+def _reselected(
+    prepared: Prepared,
+    steps: Sequence[SelectionStep],
+    current: World,
+    flight: Segments,
+    candidates: Sequence[Candidate],
+    scatter: float,
+) -> tuple[list[SelectionStep], World, Segments]:
+    """Select each effect but the last again, in the presence of the effects selected after it."""
+    chosen = list(steps)
+    for place in range(len(chosen) - 1):
+        without = without_effect(current, chosen[place].best.name)
+        if len(without.effects) < len(current.effects) - 1:
+            continue  # another effect acts through this one
+        states = fit_states(flight.in_world(without))
+        step = select_next(states, without, candidates, prepared.groups, prepared.turned, scatter)
+        refitted = step.best.refitted if step.flagged else None
+        if refitted is not None:
+            chosen[place] = step
+            current, flight = refitted.world, refitted.segments[0]
+    return chosen, current, flight
+
+
+def _coupled(
+    prepared: Prepared, world: World, steps: Sequence[SelectionStep], candidates: Sequence[Candidate], scatter: float
+) -> tuple[list[SelectionStep], World, Segments] | None:
+    """Return a drag in wind in place of the selected effects; None where it does not explain the flights better."""
+    last = steps[-1].best.refitted
+    if prepared.flight is None or last is None or not any(step.best.name in DRAGS for step in steps):
         return None
     count = float(prepared.flight.dof.sum())
     present = {a.effect.name for a in world.effects}
     kept = [candidate for candidate in candidates if candidate.effect.name not in present]
-    bundle = drag_in_wind(prepared.flight, world, kept, count, scatter)
-    numbers = sum(len(slot.best.candidate.effect.parameters) for slot in filled)
-    if bundle is None or bundle.total > last.cost / scatter + numbers * math.log(count) - ALIAS_CHI2:
+    coupled = drag_in_wind(prepared.flight, world, kept, count, scatter)
+    size = sum(len(step.best.candidate.effect.parameters) for step in steps)
+    if coupled is None or coupled.total > last.cost / scatter + size * math.log(count) - ALIAS_CHI2:
         return None
-    rest = filled[0].evidence
-    slots = [Slot((one, *rest), (one,), True) for one in (bundle.drag, bundle.wind)]
-    return slots, bundle.refitted.world, bundle.refitted.segments[0]
+    rest = steps[0].evidence
+    selected = [SelectionStep((one, *rest), (one,), True) for one in (coupled.drag, coupled.wind)]
+    return selected, coupled.refitted.world, coupled.refitted.segments[0]

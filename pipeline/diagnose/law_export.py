@@ -1,17 +1,19 @@
-"""A residual law as an effect's file of one's own."""
+"""Export of a residual law as the source file of a custom effect."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from ...datasets.atomic import new_file, refuse_existing
+from ...datasets.io.atomic import new_file, refuse_existing
 from ...schemas import DiagnoseResult, InputDataError, LawTerm, ResidualLaw, UsageError
 from ..physics.effects.registry import BUILT_IN
 
 CLASS = "ResidualLaw"
+"""Name of the class in the exported file."""
 AXES = {"x": 0, "y": 1, "z": 2}
+"""Axis of the terms that are a constant acceleration."""
 DAMPING = {"-u": ("u", 1.0), "-|u| u": ("u", 2.0), "-omega": ("omega", 1.0), "-|omega| omega": ("omega", 2.0)}
-"""Vector and exponent of the terms that damp a motion."""
+"""Vector and exponent of the damping terms."""
 SELECTED_TERMS = {
     "linear_drag": ("-u",),
     "quadratic_drag": ("-|u| u",),
@@ -19,11 +21,11 @@ SELECTED_TERMS = {
     "spin_damping": ("-omega",),
     "constant_force": ("x", "y", "z"),
 }
-"""Terms that a selected effect already has: the fit would not know which of the two is which."""
+"""Terms that a selected effect already contains: a fit of both could not separate them."""
 LIMIT = 100.0
-"""The fit may go to so many times what was found."""
+"""Bound of an exported parameter, in multiples of its estimate."""
 
-TEMPLATE = '''"""The law that `cgwm diagnose` found in what a model leaves: cgwm fit CAPTURE --effects {file}:{kind}."""
+TEMPLATE = '''"""Law found by `cgwm diagnose` in the residual of a model: cgwm fit CAPTURE --effects {file}:{kind}."""
 
 from __future__ import annotations
 
@@ -36,14 +38,14 @@ class {kind}(Effect):
     """{formula}; u: velocity, omega: angular velocity, world frame."""
 
     name = "{name}"
-    summary = "What a model left in flight, found by regression."
+    summary = "Residual acceleration of a model in flight, found by regression."
     formula = "{formula}"
     parameters = (
 {parameters}
     )
     phase = "flight"
     needs = {needs}
-    reveals = "free flights as different as can be; the residual was organised by: {where}"
+    reveals = "free flights as different as possible; the main covariate of the residual was: {where}"
     source = "cgwm diagnose, sparse regression of the residual wrench"
 
     def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
@@ -57,7 +59,7 @@ class {kind}(Effect):
 
 
 def require_law_file(path: Path, overwrite: bool) -> None:
-    """Refuse a file that could not be written, before the work.
+    """Raise an error for a file that could not be written, before the diagnosis runs.
 
     Raises:
         UsageError: If the name does not end with .py, or the file exists and `overwrite` is not set.
@@ -68,17 +70,17 @@ def require_law_file(path: Path, overwrite: bool) -> None:
 
 
 def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str:
-    """Write the residual law of a diagnosis as an effect, and return what to pass to `fit --effects`.
+    """Write the residual law of a diagnosis as a custom effect, and return the argument for `fit --effects`.
 
-    Terms that are those of a selected effect are left out: the two are fitted together.
+    Terms of a selected effect are left out, because the two are fitted together.
 
     Args:
         result: The diagnosis.
         path: The Python file.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing file.
 
     Raises:
-        InputDataError: If there is no law, or none of the known terms is in it.
+        InputDataError: If no law was found, or no term of it is left to export.
         UsageError: See :func:`require_law_file`.
     """
     require_law_file(path, overwrite)
@@ -98,17 +100,17 @@ def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str
 
 
 def law_source(law: ResidualLaw, path: Path) -> str:
-    """Return the text of an effect's file."""
+    """Return the source text of the effect."""
     parameters, lines, formulas = [], [], {"a": "", "alpha": ""}
     for number, term in enumerate(law.terms, 1):
         name = f"c{number}"
         target, formula, code, unit = _term(term, law, name)
         formulas[target] += formula if formulas[target] == "" else f" {formula}".replace(" -", " - ", 1)
-        size = abs(term.coefficient)
+        scale, limit = 0.5 * abs(term.coefficient), LIMIT * abs(term.coefficient)
         sign = ", nonnegative=True" if term.term in DAMPING and term.coefficient > 0 else ""
         parameters += [
             f"        # found: {term.coefficient:.3g} +- {term.std_error:.2g}",
-            f'        EffectParameter("{name}", "{unit}", scale={0.5 * size:.3g}, limit={LIMIT * size:.3g}{sign}),',
+            f'        EffectParameter(name="{name}", unit="{unit}", scale={scale:.3g}, limit={limit:.3g}{sign}),',
         ]
         lines.append(f'        {target} = {target} {code.replace("VALUE", f"""values["{name}"][:, None]""")}')
     stem = path.stem
@@ -126,7 +128,7 @@ def law_source(law: ResidualLaw, path: Path) -> str:
 
 
 def _term(term: LawTerm, law: ResidualLaw, name: str) -> tuple[str, str, str, str]:
-    """Return what a term adds to, its formula, its code with VALUE for its number, and the number's unit."""
+    """Return the target of a term, its formula, its code with VALUE for the parameter, and the parameter's unit."""
     if term.term in AXES:
         return "a", f"+{name} {term.term}", f"+ VALUE * torch.eye(3).to(u)[{AXES[term.term]}]", term.unit
     if term.term == "omega x u":
@@ -137,7 +139,7 @@ def _term(term: LawTerm, law: ResidualLaw, name: str) -> tuple[str, str, str, st
     target = "a" if vector == "u" else "alpha"
     if power == 1.0:
         return target, f"-{name} {vector}", f"- VALUE * {vector}", term.unit if own == power else "1/s"
-    # below 1 the direction jumps where the motion ends: rounded off there
+    # below an exponent of 1 the force jumps where the motion ends: smoothed there
     size = f"length({vector})" if power > 1 else f"(length({vector}) + 1e-3)"
     unit = term.unit if own == power else _unit(vector, power)
     factor = size if power == 2.0 else f"{size} ** {power - 1:g}"

@@ -1,12 +1,12 @@
-"""What to measure next: the throw that tells rival effects apart best, and what does where no throw can.
+"""Optimal experiment design: the throw that separates rival effects best, or advice where no throw can.
 
-Rivals A and B with estimates th. Data with information M let A's effect be seen beside everything that could stand for
-it, S = the model's numbers and B, by NC_A|B(M) = th_A' (M_AA - M_AS M_SS^-1 M_SA) th_A, the noncentrality of the test
-of A against B: twice the expected log-likelihood ratio if A is true. A throw adds its information, and is worth
-1/2 [dNC_A|B + dNC_B|A] (T-optimality: Atkinson & Fedorov 1975), in nats: the sum of what it gives if A is true and
-if B is. One of the two may be a tenth of the other, so the smaller one is said beside it. The numbers are not known
-but within their standard errors C, so that NC is its mean over them, th' R th + tr(R C): numbers that came out as
-nothing, because these data hardly show them, would make all throws alike.
+Rivals A and B have estimates th. Data with information M show A's effect, in the presence of all that could imitate it
+(S: the model's parameters and B), by NC_A|B(M) = th_A' (M_AA - M_AS M_SS^-1 M_SA) th_A, the noncentrality of the test
+of A against B: twice the expected log-likelihood ratio if A is true. A throw adds its information and is worth
+1/2 [dNC_A|B + dNC_B|A] nats (T-optimality: Atkinson & Fedorov 1975), the sum of its gains if A is true and if B is. One
+of the two may be a tenth of the other, so the smaller one is reported as well. The parameters are known within their
+standard errors C only, so NC is its mean over them, th' R th + tr(R C) with R the matrix in brackets: estimates near
+zero, because these data hardly show the effect, would otherwise give all throws the same value.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from numpy.typing import NDArray
 
 from ...schemas import NextExperiment
 from ..physics.world import World
-from .candidates import Variant, variants_of
-from .prepared import Prepared
-from .slots import Evidence
-from .throw_information import Layout, information_of_data, information_of_throws, layout_of, throw_states
-from .throws import Throw, described
+from ..segments.candidates import Variant, variants_of
+from ..segments.prepare import Prepared
+from .effect_selection import Evidence
+from .experiments import Experiment, described
+from .fisher_information import Layout, experiment_states, information_of_data, information_of_experiments, layout_of
 from .verdict import Findings
 
 Array = NDArray[np.float64]
 
 NEAR_BIC = 2 * math.log(1000)
-"""A second effect within these odds of the first is its rival, though it was not called its equal."""
+"""Maximum difference of BIC with which a second effect is a rival of the first without being its equal: odds of
+1000."""
 ENOUGH_NATS = 3.0
-"""Less than this, odds of 20, whichever of two is true, separates nothing: one that contains the other always gains a
-little if it is true, for the noise of its own numbers."""
+"""Minimum gain [nats] of an experiment that separates two rivals, whichever is true: odds of 20. An effect that
+contains the other always gains a little if it is true, from the noise of its additional parameters."""
 NEARLY = 1.15
-"""Gains within this factor are not told apart: they are estimates."""
+"""Factor within which gains count as equal, because they are estimates."""
 OTHERWISE = {
     "gravity_scale": "look gravity up for where you are, or drop another body: it changes all alike",
     "buoyancy": "repeat with a heavier body of the same shape: buoyancy lessens the acceleration of that one less",
@@ -53,51 +54,53 @@ OTHERWISE = {
     "linear_drag": "repeat with a heavier body of the same shape: drag slows it less",
     "quadratic_drag": "repeat with a heavier body of the same shape: drag slows it less",
 }
-"""What settles an effect where no throw does; of others, what the effect itself says reveals it."""
+"""Advice for effects that no throw separates, by name; other effects give the motion that reveals them."""
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """Effects (at least two) that explain the data about equally, and the world without any of them."""
+    """Effects that explain the data about equally well."""
 
     evidence: tuple[Evidence, ...]
+    """Evidence of the effects, at least two."""
     world: World
+    """World without any of them."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the user types for them."""
+        """Names of the effects as the user gives them."""
         return tuple(e.candidate.spec for e in self.evidence)
 
 
 @dataclass(frozen=True)
-class RankedThrow:
-    """A throw and its gain [nats] for each pair of rivals.
+class RankedExperiment:
+    """Experiment with its gain for each pair of rivals."""
 
-    state: as a report has it; by_pair: both directions added; least: the log-likelihood ratio to expect if that one of
-    the two is true that shows less.
-    """
-
-    throw: Throw
+    throw: Experiment
+    """The experiment."""
     state: dict[str, list[float]]
+    """Its initial state as in the report."""
     by_pair: dict[tuple[str, str], float]
+    """Gain for each pair [nats], the sum of both directions."""
     least: dict[tuple[str, str], float]
+    """Expected log-likelihood ratio [nats] for each pair if the effect that shows less is true."""
 
     def gain(self, pairs: Sequence[tuple[str, str]]) -> float:
-        """Return the gain for the pair that is separated least."""
+        """Return the gain [nats] for the pair that is separated least."""
         return min((self.by_pair[pair] for pair in pairs), default=0.0)
 
     def least_gain(self, pairs: Sequence[tuple[str, str]]) -> float:
-        """Return what is gained in any case, for the pair that is separated least."""
+        """Return the gain [nats] for the pair that is separated least, whichever effect is true."""
         return min((self.least[pair] for pair in pairs), default=0.0)
 
     def order(self, pairs: Sequence[tuple[str, str]]) -> tuple[float, ...]:
-        """Return what throws are sorted by: gains that are nearly equal count as equal, and the simpler throw wins."""
+        """Return the sort key: the gain in steps of `NEARLY`, then the simplicity of the throw."""
         step = round(math.log(max(self.gain(pairs), 1e-9)) / math.log(NEARLY))
         return -step, self.throw.spin_rad_s, self.throw.speed_m_s, self.throw.height_m
 
 
 def rivals_of(findings: Findings) -> Rivals | None:
-    """Return the effects between which a diagnosis could not decide, or hardly; None where there are none."""
+    """Return the effects that a diagnosis could not separate, or only just; None if all were separated."""
     if findings.verdict not in ("missing_effect", "not_separable"):
         return None
     for one in findings.chosen:
@@ -110,66 +113,74 @@ def rivals_of(findings: Findings) -> Rivals | None:
     return Rivals((first.evidence, second), _without(findings.world, first.evidence.name))
 
 
-def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Throw]) -> NextExperiment | None:
-    """Return what to measure next for the rivals of a diagnosis; None where nothing is open or can be thrown."""
+def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Experiment]) -> NextExperiment | None:
+    """Return the experiment that separates the rivals of a diagnosis best; None without rivals.
+
+    Where no throw separates them, the result has advice in words instead.
+
+    Args:
+        prepared: The data so far.
+        findings: The findings of the diagnosis.
+        throws: Experiments to choose from.
+    """
     rivals = rivals_of(findings)
     if rivals is None:
         return None
-    ranked = ranked_throws(prepared, rivals, throws, findings.contact_chi2)
+    ranked = ranked_experiments(prepared, rivals, throws, findings.contact_chi2)
     pairs = list(itertools.combinations(rivals.names, 2))
     open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
     closed = {name for pair in pairs if pair not in open_pairs for name in pair}
-    words = [_otherwise(e) for e in rivals.evidence if e.candidate.spec in closed]
     left = tuple(name for name in rivals.names if name in closed)
+    advice = _advice(rivals, left)
+    unseparated = f"no throw tells {' and '.join(left)} apart"
     if not open_pairs:
-        none = f"no throw tells {' and '.join(left)} apart; " if ranked else ""
-        what = none + "; ".join(words)
+        what = f"{unseparated}; {advice}" if ranked else advice
         return NextExperiment(what=what, initial_state={}, separates=left, expected_gain_nats=0.0, not_separated=left)
     ranked = sorted(ranked, key=lambda r: r.order(open_pairs))
     best = ranked[0]
-    rest = f"; no throw tells {' and '.join(left)} apart: {'; '.join(words)}" if left else ""
-    entries = []
-    for place, one in enumerate(ranked):
-        entries.append(
-            {
-                "rank": place + 1,
-                "what": one.throw.what,
-                "initial_state": one.state,
-                "expected_gain_nats": float(f"{one.gain(open_pairs):.3g}"),
-                "least_gain_nats": float(f"{one.least_gain(open_pairs):.3g}"),
-                "order_of_magnitude": magnitude(one.least_gain(open_pairs)),
-            }
-        )
     separates = {name for pair in open_pairs for name in pair}
     return NextExperiment(
-        what=f"{best.throw.what}{rest}",
+        what=f"{best.throw.what}; {unseparated}: {advice}" if left else best.throw.what,
         initial_state=best.state,
         separates=tuple(name for name in rivals.names if name in separates),
         expected_gain_nats=float(f"{best.gain(open_pairs):.3g}"),
         least_gain_nats=float(f"{best.least_gain(open_pairs):.3g}"),
         not_separated=left,
-        ranked=tuple(entries),
+        ranked=tuple(_entry(place, one, open_pairs) for place, one in enumerate(ranked)),
     )
 
 
+def _entry(place: int, one: RankedExperiment, pairs: Sequence[tuple[str, str]]) -> dict[str, object]:
+    """Return the entry of an experiment in the report; place: counted from 0."""
+    return {
+        "rank": place + 1,
+        "what": one.throw.what,
+        "initial_state": one.state,
+        "expected_gain_nats": float(f"{one.gain(pairs):.3g}"),
+        "least_gain_nats": float(f"{one.least_gain(pairs):.3g}"),
+        "order_of_magnitude": magnitude(one.least_gain(pairs)),
+    }
+
+
 def magnitude(gain: float) -> float:
-    """Return the power of ten next to a gain; 0 for less than one nat."""
+    """Return the power of ten nearest to a gain [nats]; 0 for less than one nat."""
     return 0.0 if gain < 1 else 10.0 ** round(math.log10(gain))
 
 
-def ranked_throws(
-    prepared: Prepared, rivals: Rivals, throws: Sequence[Throw], contact_chi2: float | None = None
-) -> list[RankedThrow]:
-    """Return throws with what each adds for every pair of rivals, the best for the hardest pair first.
+def ranked_experiments(
+    prepared: Prepared, rivals: Rivals, throws: Sequence[Experiment], contact_chi2: float | None = None
+) -> list[RankedExperiment]:
+    """Rank experiments by their gain for the pair of rivals that is hardest to separate, the best first.
 
     Args:
         prepared: The data so far.
         rivals: The rivals.
-        throws: To be compared; those on the ground are left out where there is none.
-        contact_chi2: Misfit of the contact law, mean chi2 per degree of freedom: contact counts less by it.
+        throws: Experiments to compare; those on the ground are left out if the world has none.
+        contact_chi2: Misfit of the contact law, mean chi2 per degree of freedom, by which the information of contact
+            is divided.
 
     Returns:
-        The throws; none where the world has driven or several free bodies, which nobody throws alone.
+        The experiments; empty if the world has kinematic bodies or several free ones, which cannot be thrown alone.
     """
     world = rivals.world
     chosen = [t for t in throws if not t.on_ground or world.ground_normal is not None]
@@ -179,8 +190,8 @@ def ranked_throws(
     sizes = layout_of(world, variants)
     discount = max(1.0, contact_chi2 or 1.0)
     known = information_of_data(prepared, world, variants, sizes, discount)
-    state = throw_states(prepared, world, chosen)
-    added = information_of_throws(prepared, world, variants, sizes, chosen, state, discount)
+    state = experiment_states(prepared, world, chosen)
+    added = information_of_experiments(prepared, world, variants, sizes, chosen, state, discount)
     found = []
     for item, (throw, more) in enumerate(zip(chosen, added, strict=True)):
         if more is None:
@@ -191,20 +202,20 @@ def ranked_throws(
             both = 0.5 * (after - before).clip(0.0)
             pair = rivals.names[a], rivals.names[b]
             gains[pair], least[pair] = float(both.sum()), float(both.min())
-        found.append(RankedThrow(throw, described(state, item, world.free[0]), gains, least))
+        found.append(RankedExperiment(throw, described(state, item, world.free[0]), gains, least))
     return sorted(found, key=lambda r: r.order(list(r.by_pair)))
 
 
 def _noncentralities(
     information: Array, layout: Layout, rivals: Rivals, variants: Sequence[Variant], pair: tuple[int, int]
 ) -> Array:
-    """Return NC_A|B and NC_B|A. The priors of S keep what was not measured from standing for everything."""
+    """Return NC_A|B and NC_B|A, with priors on S so that unmeasured parameters cannot imitate every effect."""
     found = []
     for a, b in (pair, pair[::-1]):
         own = [layout.names.index(name) for name in variants[a].parameters]
-        beside = [*range(layout.base), *(layout.names.index(name) for name in variants[b].parameters)]
-        inner = information[np.ix_(beside, beside)] + np.diag(layout.prior[beside])
-        mixed = information[np.ix_(beside, own)]
+        nuisance = [*range(layout.base), *(layout.names.index(name) for name in variants[b].parameters)]
+        inner = information[np.ix_(nuisance, nuisance)] + np.diag(layout.prior[nuisance])
+        mixed = information[np.ix_(nuisance, own)]
         reduced = information[np.ix_(own, own)] - mixed.T @ np.linalg.solve(inner, mixed)
         value, std_error = _estimate(rivals.evidence[a])
         found.append(float(value @ reduced @ value + std_error**2 @ np.diag(reduced)))
@@ -212,9 +223,9 @@ def _noncentralities(
 
 
 def _estimate(evidence: Evidence) -> tuple[Array, Array]:
-    """Return an effect's numbers and their standard errors, these at most the size that matters.
+    """Return the parameters of an effect and their standard errors, which are limited to the usual sizes.
 
-    Where each episode has its own numbers, those of a new one are of that size.
+    Where each episode has its own parameters, those of a new episode have the usual sizes.
     """
     parameters = evidence.candidate.effect.parameters
     scales = np.array([p.scale for p in parameters])
@@ -228,6 +239,7 @@ def _estimate(evidence: Evidence) -> tuple[Array, Array]:
 
 
 def _variants(rivals: Rivals, world: World) -> list[Variant]:
+    """Return the variant of each rival with its best constants."""
     chosen = [e.candidate for e in rivals.evidence]
     everything = variants_of(chosen, world.gravity[0, :1])
     return [
@@ -237,6 +249,7 @@ def _variants(rivals: Rivals, world: World) -> list[Variant]:
 
 
 def _second_in_flight(findings: Findings) -> Evidence | None:
+    """Return the second best effect in flight by BIC; None where the best one is clearly better."""
     first = findings.chosen[0].evidence
     others = [e for e in findings.ranking if e.delta_bic is not None and e.name != first.name]
     others = [e for e in others if e.name not in {one.evidence.name for one in findings.chosen}]
@@ -247,6 +260,7 @@ def _second_in_flight(findings: Findings) -> Evidence | None:
 
 
 def _second_in_contact(findings: Findings) -> Evidence | None:
+    """Return the second best effect in contact by score; None where the best one is clearly better."""
     first = findings.chosen[0].evidence
     score = next((one.score for one in findings.contact if one.evidence.name == first.name), None)
     others = [one for one in findings.contact if one.evidence.name != first.name and one.evidence.test.admissible]
@@ -256,10 +270,16 @@ def _second_in_contact(findings: Findings) -> Evidence | None:
     return second.evidence if score - second.score < NEAR_BIC else None
 
 
-def _otherwise(evidence: Evidence) -> str:
-    effect = evidence.candidate.effect
-    return f"{evidence.candidate.spec}: {OTHERWISE.get(effect.name, effect.reveals)}"
+def _advice(rivals: Rivals, left: Sequence[str]) -> str:
+    """Return the advice for rivals that no throw separates."""
+    words = []
+    for evidence in rivals.evidence:
+        effect, spec = evidence.candidate.effect, evidence.candidate.spec
+        if spec in left:
+            words.append(f"{spec}: {OTHERWISE.get(effect.name, effect.reveals)}")
+    return "; ".join(words)
 
 
 def _without(world: World, name: str) -> World:
+    """Return the world without an effect."""
     return replace(world, effects=tuple(a for a in world.effects if a.effect.name != name))

@@ -1,8 +1,8 @@
-"""The law of a residual wrench by sparse regression, where no candidate explains it: which terms, which exponent.
+"""Sparse regression of the residual wrench: terms and exponents of a law where no candidate explains the residual.
 
-The residual accelerations of windows, with their covariances, are regressed on a dictionary of physical terms; terms
-enter one by one while each pays for itself by BIC. The data are accelerations with their information, not derivatives
-of tracks, which drown in noise (study of diagnosis, section 4a).
+The residual accelerations of windows, weighted by their information, are regressed on a dictionary of physical terms.
+Terms are added one by one as long as each lowers BIC by a margin. The data are accelerations with their information,
+not derivatives of the tracks, which are dominated by noise.
 """
 
 from __future__ import annotations
@@ -14,38 +14,49 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .wrench import ResidualWrenches
+from ..segments.residual_wrench import ResidualWrenches
 
 Array = NDArray[np.float64]
 
 MOST_TERMS = 4
+"""Maximum number of terms of a law."""
 EXPONENTS = tuple(np.arange(0.0, 3.51, 0.25).tolist())
+"""Exponents of the speed that are tried."""
 MARGIN = 10.0
-"""A term enters if it lowers chi2 by this more than its penalty: the dictionary is searched, not given."""
+"""Minimum fall of chi2 beyond the penalty of BIC for a term to be added, because the term is searched in a
+dictionary."""
 CHI2_95 = 3.84
+"""95 % quantile of chi2 of one degree of freedom, for the interval of an exponent."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """A term: its coefficient, standard error and unit."""
+    """Term of a law."""
 
     name: str
+    """Name in `DICTIONARY`."""
     coefficient: float
+    """Coefficient in `unit`."""
     std_error: float
+    """Standard error of the coefficient, in `unit`."""
     unit: str
+    """Unit of the coefficient."""
 
 
 @dataclass(frozen=True)
 class Law:
-    """Terms, exponents of the speed by term (best, low, high), and the mean chi2 that is left per number."""
+    """Law of a residual wrench."""
 
     terms: tuple[Term, ...]
+    """Terms in the order in which they were added."""
     exponents: dict[str, tuple[float, float, float]]
+    """Exponent of the speed by term: best value and limits of the 95 % interval."""
     left_chi2: float
+    """Chi2 per degree of freedom of the residual of the law."""
 
 
 def residual_law(found: ResidualWrenches) -> Law:
-    """Return the law of residual wrenches (n windows)."""
+    """Fit a law to residual wrenches (n windows) by forward selection of terms."""
     target, information = found.wrench, found.information
     columns = {name: build(found) for name, (build, _) in DICTIONARY.items()}
     chosen: list[str] = []
@@ -99,24 +110,29 @@ def _fit(columns: list[Array], target: Array, information: Array) -> tuple[Array
 
 
 def _chi2(target: Array, information: Array) -> float:
+    """Return chi2 of residual accelerations (n, 6)."""
     return float(np.einsum("ni,nij,nj->", target, information, target))
 
 
 def _linear(values: Array) -> Array:
+    """Return a column (n, 6) of linear accelerations (n, 3)."""
     return np.concatenate((values, np.zeros_like(values)), 1)
 
 
 def _angular(values: Array) -> Array:
+    """Return a column (n, 6) of angular accelerations (n, 3)."""
     return np.concatenate((np.zeros_like(values), values), 1)
 
 
 def _along(values: Array, exponent: float) -> Array:
-    """Return |v|^(p - 1) v."""
+    """Return |v|^(p - 1) v for vectors v (n, 3) and exponent p."""
     size = np.linalg.norm(values, axis=1, keepdims=True).clip(1e-6)
     return values * size ** (exponent - 1)
 
 
 def _axis(place: int) -> Callable[[ResidualWrenches], Array]:
+    """Return the builder of a constant acceleration along an axis of the world frame."""
+
     def build(found: ResidualWrenches) -> Array:
         column = np.zeros((len(found.wrench), 6))
         column[:, place] = 1.0
@@ -135,10 +151,12 @@ DICTIONARY: dict[str, tuple[Callable[[ResidualWrenches], Array], str]] = {
     "-omega": (lambda f: _angular(-f.omega), "1/s"),
     "-|omega| omega": (lambda f: _angular(-_along(f.omega, 2)), "1/rad"),
 }
-"""Terms of the acceleration (x, y, z: constant along the world's axes) and, with omega alone, of the angular one."""
+"""Column builder and unit of each term: of the acceleration (x, y, z: constant along an axis of the world frame), and
+with omega alone of the angular acceleration."""
 POWERS: dict[str, Callable[[ResidualWrenches, float], Array]] = {
     "-u": lambda f, p: _linear(-_along(f.velocity, p)),
     "-|u| u": lambda f, p: _linear(-_along(f.velocity, p)),
     "-omega": lambda f, p: _angular(-_along(f.omega, p)),
     "-|omega| omega": lambda f, p: _angular(-_along(f.omega, p)),
 }
+"""Column builders of the damping terms for any exponent of the speed."""

@@ -1,4 +1,4 @@
-"""`cgwm diagnose`: which physical or measurement effect a model lacks, what else it could be, and what remains."""
+"""Diagnosis of a fitted model: the missing physical or measurement effect, its equals, and the residual."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datasets.capture import Capture
-from ..datasets.models import Model, read_model
-from ..schemas import (
+from ...datasets.capture.capture import Capture
+from ...datasets.models.model import Model, read_model
+from ...schemas import (
     ContactLimit,
     DiagnoseResult,
-    EffectEstimate,
+    EffectParameterEstimate,
     FlightTest,
     InputDataError,
     LawTerm,
@@ -23,23 +23,24 @@ from ..schemas import (
     ResidualLaw,
     UsageError,
 )
-from .diagnosis.candidates import Candidate, admissible
-from .diagnosis.contact_limits import ContactLimit as FoundLimit
-from .diagnosis.episodes import diagnosed_episodes
-from .diagnosis.law_file import require_law_file, save_law
-from .diagnosis.next_throw import next_experiment
-from .diagnosis.prepared import Prepared, prepare
-from .diagnosis.residual_law import residual_law
-from .diagnosis.slots import Evidence
-from .diagnosis.throws import DEFAULT, Throw, read_throws, throws_of
-from .diagnosis.usable import refuse_blind, refuse_strange
-from .diagnosis.verdict import Findings, find
-from .diagnosis.wrench import Omnibus, organisers, wrench_windows
-from .own_worlds import with_known_numbers
-from .physics.effects.registry import effect_names, load_effect, split_units
-from .physics.world import World
-from .sg_gs import resolve_device
-from .threads import one_torch_thread
+from ..physics.effects.registry import effect_names, load_effect, split_units
+from ..physics.world import World
+from ..runtime.device import resolve_device
+from ..runtime.resources import one_torch_thread
+from ..segments.candidates import Candidate, admissible
+from ..segments.input_checks import check_observability, check_units_and_geometry
+from ..segments.prepare import Prepared, prepare
+from ..segments.random_effects import with_known_groups
+from ..segments.residual_wrench import Omnibus, covariates_of, wrench_windows
+from .detection_limits import DetectionLimit
+from .effect_selection import Evidence
+from .episodes import diagnosed_episodes
+from .experiments import DEFAULT, Experiment, experiments_of, read_experiments
+from .law_export import require_law_file, save_law
+from .next_experiment import next_experiment
+from .sparse_regression import residual_law
+from .verdict import Findings, find
+from .wording import law_warnings, motion_warnings, sentence, unseen_motion
 
 
 @one_torch_thread()
@@ -53,26 +54,28 @@ def diagnose(
     overwrite: bool = False,
     device: str = "auto",
 ) -> DiagnoseResult:
-    """Find what a fitted model lacks of measured motions; no episode outside the split is opened.
+    """Find the effects that a fitted model lacks to explain measured motions.
+
+    Episodes outside the split are not opened.
 
     Args:
         model: MODEL, with fitted physics.
         capture: The capture, with tracks, or with videos in which the model's fit found the poses.
-        split: The episodes to look at; cross-validation is among them.
-        candidates: Effects beside the built-in ones, `file.py:Class` or names of entry points.
-        throws: A TOML file of throws among which to look for the next one; None for those that a hand can make.
-        save_law_to: Where to write the residual law as an effect of one's own; None for nowhere.
+        split: The episodes to use; cross-validation is among them.
+        candidates: Effects in addition to the built-in ones, `file.py:Class` or names of entry points.
+        throws: TOML file with the throws to choose the next experiment from; None for throws that can be made by hand.
+        save_law_to: File to write the residual law to, as a custom effect; None to write none.
         overwrite: Replace that file.
-        device: Where rollouts run: auto, cpu or cuda; what the kernel there cannot take runs on the CPU.
+        device: Device of the rollouts: auto, cpu or cuda. What the kernel does not support runs on the CPU.
 
     Raises:
-        InputDataError: If the data cannot carry a verdict: what is lacking, and what to do; or if there is no residual
-            law to save.
-        UsageError: If there is no such split or effect, or the file exists.
+        InputDataError: If the data do not suffice for a verdict (the message says what is missing), or no residual law
+            was found to save.
+        UsageError: If the split or an effect does not exist, or the file exists.
     """
     if save_law_to is not None:
         require_law_file(save_law_to, overwrite)
-    compared = throws_of(DEFAULT) if throws is None else read_throws(throws)
+    compared = experiments_of(DEFAULT) if throws is None else read_experiments(throws)
     library = library_of(candidates)
     world, prepared = prepared_world(read_model(model), Capture.open(capture, splits=(split,)), split, device)
     result = report(prepared, world, library, compared)
@@ -83,45 +86,59 @@ def diagnose(
 
 
 def prepared_world(model: Model, capture: Capture, split: str, device: str = "auto") -> tuple[World, Prepared]:
-    """Return a fitted model's world, and a split's episodes ready for tests of it.
+    """Return the world of a fitted model and the prepared episodes of a split.
+
+    Args:
+        model: The fitted model.
+        capture: The capture.
+        split: Name of the split.
+        device: Device of the rollouts: auto, cpu or cuda.
 
     Raises:
-        InputDataError: If the data cannot carry a verdict: what is lacking, and what to do.
-        UsageError: If there is no such split.
+        InputDataError: If the data do not suffice for a verdict; the message says what is missing.
+        UsageError: If the split does not exist.
     """
     world = replace(_world(model, capture), rolls_on=resolve_device(device).type)
     found = diagnosed_episodes(model, capture, split)
     names = [name for name, _ in found.episodes]
-    world = with_known_numbers(world, model.file, names, capture.groups)
-    refuse_strange(world, found.episodes, str(capture.root))
+    world = with_known_groups(world, model.file, names, capture.groups)
+    check_units_and_geometry(world, found.episodes, str(capture.root))
     prepared = prepare(world, found.episodes, found.noise, _groups(capture, names))
     prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
-    refuse_blind(world, prepared, str(capture.root))
+    check_observability(world, prepared, str(capture.root))
     return world, prepared
 
 
 def report(
-    prepared: Prepared, world: World, library: Sequence[Candidate], throws: Sequence[Throw] = ()
+    prepared: Prepared, world: World, library: Sequence[Candidate], throws: Sequence[Experiment] = ()
 ) -> DiagnoseResult:
-    """Return the diagnosis of prepared episodes; throws: among which to look for the next one."""
+    """Diagnose prepared episodes and return the result document.
+
+    Args:
+        prepared: The episodes.
+        world: The model's world.
+        library: All candidates.
+        throws: Experiments to choose the next one from.
+
+    Raises:
+        InputDataError: If no segment is long enough to be fitted.
+    """
     if prepared.flight is None and not prepared.contact_items:
         raise InputDataError(
-            "no part of the tracks is long enough to be followed by the model: neither six frames of flight nor of "
-            "contact without a gap.",
+            "no part of the tracks is long enough for a fit: neither flight nor contact has six frames without a gap.",
             todo="record at 60 Hz or more, or name another split.",
         )
     findings = find(prepared, world, library)
     _, refused = admissible(world, library, prepared.turned)
     clear = prepared.clear & (prepared.whole.seen.amax(-1) > 0)
     seen = int((prepared.whole.seen.amax(-1) > 0).sum())
-    warnings = [*prepared.warnings, *_one_phase(prepared)]
-    warnings += [f"{law.effect}: these flights fit {law.formula} as well as its own law." for law in findings.as_good]
+    warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings)]
     law = _law(prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
     return DiagnoseResult(
         verdict=findings.verdict,
-        sentence=_sentence(findings, law) + _unseen(prepared),
+        sentence=sentence(findings, law) + unseen_motion(prepared),
         selected=selected,
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
@@ -144,12 +161,12 @@ def library_of(candidates: Sequence[str]) -> list[Candidate]:
     """Return the built-in effects, those of installed packages, and the given ones, as candidates.
 
     Raises:
-        UsageError: If an effect cannot be loaded, or two have one name.
+        UsageError: If an effect cannot be loaded, or two have the same name.
     """
     shared = next((spec for spec in candidates if split_units(spec)[1] is not None), None)
     if shared is not None:
         raise UsageError(
-            f"{shared}: a diagnosis tests one value for all episodes of what it has built in.",
+            f"{shared}: a diagnosis tests built-in effects with one value for all episodes.",
             f"{split_units(shared)[0]}.",
             f"add it to the model: 'cgwm fit CAPTURE --from MODEL --effects {shared}'.",
         )
@@ -167,7 +184,10 @@ def library_of(candidates: Sequence[str]) -> list[Candidate]:
 
 
 def _world(model: Model, capture: Capture) -> World:
-    """Return the model's world, on the ground of the capture: one moved by a fit hides what moved it."""
+    """Return the model's world with the ground at the height of the capture.
+
+    A ground height changed by the fit would hide the effect that changed it.
+    """
     own = [body.name for body in model.file.bodies]
     if set(own) != set(capture.body_names):
         raise InputDataError(
@@ -183,30 +203,17 @@ def _world(model: Model, capture: Capture) -> World:
 
 
 def _groups(capture: Capture, names: Sequence[str]) -> list[int]:
+    """Return the index of each episode's group; episodes without a group share one."""
     entries = [capture.manifest.episodes.get(name) for name in names]
     sessions = [(entry.group or "") if entry is not None else "" for entry in entries]
     return [sorted(set(sessions)).index(session) for session in sessions]
 
 
-def _unseen(prepared: Prepared) -> str:
-    """Say of what kind of motion nothing was seen, and nothing is said."""
-    if not prepared.contact_items:
-        return " Only flight was seen: this says nothing about contact."
-    if prepared.flight is None:
-        return " Only contact was seen: this says nothing about flight."
-    return ""
-
-
-def _one_phase(prepared: Prepared) -> list[str]:
-    if not prepared.contact_items:
-        return ["there is no contact to look at: effects that act in contact cannot be judged."]
-    if prepared.flight is None:
-        return ["there is no flight to look at: effects that act in flight cannot be judged."]
-    return []
-
-
 def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
-    """Return the law of what is left: of everything where nothing was selected, else beside the selected effects."""
+    """Fit a law to the residual wrench in flight; None without flight.
+
+    For the verdict "unexplained" the residual is that of the model's world, else that with the selected effects.
+    """
     if prepared.flight is None:
         return None
     world = findings.base if findings.verdict == "unexplained" else findings.world
@@ -220,17 +227,18 @@ def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
         ),
         exponent=law.exponents,
         left_chi2=law.left_chi2,
-        where=organisers(windows)[0].coordinate,
+        where=covariates_of(windows)[0].coordinate,
     )
 
 
 def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
+    """Return the entry of a candidate in the result document."""
     effect = evidence.candidate.effect
     where = "contact" if effect.phase == "contact" or effect.name in findings.judged_in_contact else "flight"
-    numbers = evidence.numbers
-    if numbers is None:
+    estimates = evidence.numbers
+    if estimates is None:
         std = np.sqrt(np.diag(evidence.test.covariance))
-        numbers = {
+        estimates = {
             p.name: (float(v), float(s))
             for p, v, s in zip(effect.parameters, evidence.test.estimate, std, strict=False)
         }
@@ -246,39 +254,26 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
         cv_error_before_m=before,
         cv_error_after_m=after,
         parameters=tuple(
-            EffectEstimate(name=name, unit=unit[name], estimate=float(v), std_error=float(s))
-            for name, (v, s) in numbers.items()
+            EffectParameterEstimate(name=name, unit=unit[name], estimate=float(v), std_error=float(s))
+            for name, (v, s) in estimates.items()
         ),
         constants=evidence.constants,
     )
 
 
-def _limit(found: FoundLimit) -> ContactLimit:
+def _limit(found: DetectionLimit) -> ContactLimit:
+    """Return the entry of a detection limit in the result document."""
     units = {p.name: p.unit for p in found.candidate.effect.parameters if p.name in found.sizes}
     return ContactLimit(effect=found.candidate.spec, sizes=found.sizes, units=units, constants=found.constants)
 
 
 def _finite(value: float) -> float | None:
+    """Return the value; None if it is infinite or not a number."""
     return value if math.isfinite(value) else None
 
 
 def _flight_test(found: Omnibus | None) -> FlightTest | None:
+    """Return the entry of an omnibus test in the result document; None without flight."""
     if found is None:
         return None
     return FlightTest(statistic=found.statistic, degrees_of_freedom=found.dof, p_value=found.p_value)
-
-
-def _sentence(findings: Findings, law: ResidualLaw | None) -> str:
-    names = [c.evidence.candidate.spec for c in findings.chosen]
-    if findings.verdict == "none_missing":
-        return "Nothing is missing that these data could show."
-    if findings.verdict == "unexplained":
-        where = f"; it is organised by {law.where}" if law is not None else ""
-        return f"Something is missing in flight, and none of the candidates explains it{where}."
-    words = []
-    for one in findings.chosen:
-        others = [e.candidate.spec for e in one.equals[1:]]
-        words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
-    listed = " and ".join(word or name for word, name in zip(words, names, strict=True))
-    rest = " Something beside it remains unexplained." if findings.remaining else ""
-    return f"Missing: {listed}.{rest}"

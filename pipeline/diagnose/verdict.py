@@ -1,4 +1,4 @@
-"""The verdict: what is missing, what else it could be, whether something remains."""
+"""Verdict of a diagnosis: the missing effects, their equals, and whether a residual remains."""
 
 from __future__ import annotations
 
@@ -7,137 +7,167 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..physics.world import World
-from .candidates import Candidate
-from .consistency import consistency
-from .contact_limits import ContactLimit
-from .contact_search import Chosen, with_contact
-from .contact_stage import ContactEvidence
+from ..segments.candidates import Candidate
+from ..segments.prepare import Prepared
+from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, omnibus, residual_wrenches
+from ..segments.segments import Segments
+from .alternative_laws import OtherLaw, other_laws
+from .contact_search import Chosen, ContactFindings, with_contact
+from .contact_tests.segments import ContactEvidence
+from .cross_validation import held_out_errors
+from .detection_limits import DetectionLimit
+from .effect_selection import Evidence, SelectionStep
+from .falsification import consistency
 from .flight_search import flight_search
-from .forecast import held_out_errors
-from .other_laws import OtherLaw, other_laws
-from .prepared import Prepared
-from .segments import Segments
-from .slots import Evidence, Slot
-from .wrench import Omnibus, ResidualWrenches, dispersion, omnibus, residual_wrenches
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
 
 OMNIBUS_S = (0.3, 0.15)
-"""Lengths of the pieces of flight whose residual wrench tells whether anything is left: slow forces and short ones."""
+"""Lengths of the flight windows of the omnibus test [s]: the long ones show slow forces, the short ones fast forces."""
 OMNIBUS_LIMIT, OMNIBUS_P = 1.6, 1e-4
-"""Something is left where the mean chi2 of a residual wrench is above this and its p-value below. On data without an
-effect the statistic was 1.0 +- 0.2 (study of diagnosis, section 0)."""
+"""Thresholds of the omnibus test: a residual is significant if the mean chi2 of the residual wrench is above the first
+and its p-value below the second. On data without an effect the statistic was 1.0 +- 0.2."""
 ENOUGH_SHARE = 0.9
-"""What is left beside an effect that explains this share of the excess is a detail of its law; of less, a stranger."""
+"""Minimum share of the excess that the selected effects explain. Above it, a significant residual counts as a detail of
+their laws; below it, as an effect that no candidate describes."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Findings:
-    """All that a diagnosis finds.
-
-    before, after: the omnibus statistics of flight, the worst over the lengths of pieces; None without flight; ranking:
-    candidates, the best first; contact: all contact evidence; world: with the selected effects; base: without them;
-    errors: of predictions in episodes that the effect was not fitted to, without it and with it [m], by effect;
-    as_good: other laws that explain the flights as well as those of effects found; limits: what contact could have
-    shown, where it shows nothing.
-    """
+    """Result of all tests of a diagnosis."""
 
     verdict: VerdictName
+    """The verdict."""
     chosen: tuple[Chosen, ...]
+    """Selected effects with their equals, those of flight first."""
     remaining: bool
+    """Whether a residual remains in addition to the selected effects, or one of these is doubtful."""
     before: Omnibus | None
+    """Omnibus statistic of flight without the selected effects, the worst over window lengths; None without flight."""
     after: Omnibus | None
+    """The same with the selected effects."""
     ranking: tuple[Evidence, ...]
+    """Evidence of the candidates, the best first."""
     contact: tuple[ContactEvidence, ...]
+    """Evidence of the candidates in contact."""
     world: World
+    """World with the selected effects."""
     contact_chi2: float | None
+    """Chi2 per degree of freedom of the contact segments; None without contact."""
     base: World
+    """World without the selected effects."""
     errors: dict[str, tuple[float, float]]
+    """Held-out prediction errors without and with each selected effect [m], by effect name."""
     as_good: tuple[OtherLaw, ...] = ()
-    limits: tuple[ContactLimit, ...] = ()
+    """Alternative laws that explain the flights as well as those of the selected effects."""
+    limits: tuple[DetectionLimit, ...] = ()
+    """Detection limits of the contact effects, where contact selected none."""
 
     @property
     def judged_in_contact(self) -> set[str]:
-        """Names of the effects whose evidence is from contact."""
+        """Names of the effects whose evidence comes from contact."""
         return {one.evidence.name for one in self.contact} | {
             c.evidence.name for c in self.chosen if c.where != "flight"
         }
 
 
 def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
-    """Return what is missing of a world, from prepared episodes alone."""
-    pieces = _pieces(prepared, world)
-    scatter = max(prepared.slow, dispersion(*pieces[-1])) if pieces else 1.0
-    before = _worst_omnibus(pieces, scatter)
-    slots, after_flight, flight = flight_search(prepared, world, candidates, scatter)
-    flown = _worst_omnibus(_pieces(prepared, after_flight), scatter)
-    touched = with_contact(prepared, world, after_flight, slots, candidates, flight, explained=not _is_left(flown))
-    chosen, final = touched.chosen, touched.world
-    after = _worst_omnibus(_pieces(prepared, final), scatter) if chosen else before
-    in_flight = [slot.best.name for slot in slots if slot.flagged]
-    alike = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
+    """Search prepared episodes for the effects that a world lacks, in flight and then in contact.
+
+    Args:
+        prepared: The episodes.
+        world: The model's world.
+        candidates: All candidates.
+    """
+    windows = _flight_windows(prepared, world)
+    scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
+    before = _worst_omnibus(windows, scatter)
+    steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
+    after_search = _worst_omnibus(_flight_windows(prepared, after_flight), scatter)
+    contact = with_contact(
+        prepared, world, after_flight, steps, candidates, flight, explained=not _is_significant(after_search)
+    )
+    chosen, final = contact.chosen, contact.world
+    after = _worst_omnibus(_flight_windows(prepared, final), scatter) if chosen else before
+    in_flight = [step.best.name for step in steps if step.flagged]
+    agreement = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
     others = [] if flight is None else other_laws(flight, after_flight, in_flight, scatter)
-    doubtful = (alike is not None and alike.doubtful) or any(one.better for one in others)
-    left = _is_left(after)
-    remaining = left or doubtful
-    verdict: VerdictName = "none_missing"
-    if doubtful or (left and _explained(before, after) < ENOUGH_SHARE):
-        verdict = "unexplained"
-    elif any(len(one.equals) > 1 for one in chosen):
-        verdict = "not_separable"
-    elif chosen:
-        verdict = "missing_effect"
-    ranking = _ranking(chosen, slots, touched.evidence)
-    errors = {}
-    for one in chosen if verdict != "unexplained" else []:
-        segments = flight if one.where == "flight" else touched.segments
-        if segments is not None:
-            errors[one.evidence.name] = held_out_errors(segments, final, one.evidence.name)
+    doubtful = (agreement is not None and agreement.doubtful) or any(one.better for one in others)
+    verdict = _verdict(chosen, before, after, doubtful)
     return Findings(
-        verdict,
-        tuple(chosen),
-        remaining,
-        before,
-        after,
-        tuple(ranking),
-        tuple(touched.evidence),
-        final,
-        touched.chi2,
-        world,
-        errors,
-        tuple(one for one in others if one.as_good),
-        touched.limits,
+        verdict=verdict,
+        chosen=tuple(chosen),
+        remaining=_is_significant(after) or doubtful,
+        before=before,
+        after=after,
+        ranking=tuple(_ranking(chosen, steps, contact.evidence)),
+        contact=tuple(contact.evidence),
+        world=final,
+        contact_chi2=contact.chi2,
+        base=world,
+        errors={} if verdict == "unexplained" else _errors(contact, flight),
+        as_good=tuple(one for one in others if one.as_good),
+        limits=contact.limits,
     )
 
 
-def _pieces(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
-    """Return the flights in pieces of each length of `OMNIBUS_S` with their residual wrenches; none without flight."""
-    cut = [pieces for longest_s in OMNIBUS_S if (pieces := prepared.pieces(world, longest_s)) is not None]
-    return [(pieces, residual_wrenches(pieces)) for pieces in cut]
+def _verdict(chosen: Sequence[Chosen], before: Omnibus | None, after: Omnibus | None, doubtful: bool) -> VerdictName:
+    """Return the verdict from the selected effects and the omnibus statistics.
+
+    Args:
+        chosen: The selected effects.
+        before: Omnibus statistic of flight without them.
+        after: Omnibus statistic of flight with them.
+        doubtful: Whether an effect selected in flight changes between units or follows another law.
+    """
+    if doubtful or (_is_significant(after) and _explained(before, after) < ENOUGH_SHARE):
+        return "unexplained"
+    if any(len(one.equals) > 1 for one in chosen):
+        return "not_separable"
+    return "missing_effect" if chosen else "none_missing"
 
 
-def _worst_omnibus(pieces: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
-    """Return the omnibus statistic of flight over all lengths of pieces, the one with the smallest p-value."""
-    found = [omnibus(wrenches, scatter) for _, wrenches in pieces]
+def _errors(contact: ContactFindings, flight: Segments | None) -> dict[str, tuple[float, float]]:
+    """Return the held-out errors [m] without and with each selected effect, in the motion that showed it."""
+    errors = {}
+    for one in contact.chosen:
+        segments = flight if one.where == "flight" else contact.segments
+        if segments is not None:
+            errors[one.evidence.name] = held_out_errors(segments, contact.world, one.evidence.name)
+    return errors
+
+
+def _flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
+    """Cut the flights into windows of each length of `OMNIBUS_S` and estimate their residual wrenches."""
+    cut = [windows for longest_s in OMNIBUS_S if (windows := prepared.pieces(world, longest_s)) is not None]
+    return [(windows, residual_wrenches(windows)) for windows in cut]
+
+
+def _worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
+    """Return the omnibus statistic with the smallest p-value over all window lengths; None without flight."""
+    found = [omnibus(wrenches, scatter) for _, wrenches in windows]
     return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
 
 
-def _is_left(found: Omnibus | None) -> bool:
+def _is_significant(found: Omnibus | None) -> bool:
+    """Return whether a residual wrench exceeds the noise by both thresholds; False without flight."""
     return found is not None and found.statistic > OMNIBUS_LIMIT and found.p_value < OMNIBUS_P
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
-    """Return the share of the omnibus statistic's excess that is gone."""
+    """Return the share of the excess of the omnibus statistic over 1 that the selected effects explain."""
     if before is None or after is None or before.statistic <= 1:
         return 0.0
     return 1 - (after.statistic - 1) / (before.statistic - 1)
 
 
-def _ranking(chosen: Sequence[Chosen], slots: Sequence[Slot], contact: Sequence[ContactEvidence]) -> list[Evidence]:
-    """Return all candidates once: selected ones and their equals first, then by where they were judged."""
+def _ranking(
+    chosen: Sequence[Chosen], steps: Sequence[SelectionStep], contact: Sequence[ContactEvidence]
+) -> list[Evidence]:
+    """Return each candidate once: the selected effects and their equals, then flight, then contact."""
     found: dict[str, Evidence] = {}
     everything = [e for one in chosen for e in one.equals]
-    everything += [e for slot in slots[:1] for e in slot.evidence]
+    everything += [e for step in steps[:1] for e in step.evidence]
     everything += [one.evidence for one in contact if one.evidence.candidate.effect.phase == "contact"]
     for evidence in everything:
         found.setdefault(evidence.name, evidence)

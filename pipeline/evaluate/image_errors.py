@@ -1,4 +1,4 @@
-"""Predicted motions against the frames of videos: PSNR of the frame and of the object, and SSIM of the frame."""
+"""Image errors of predicted motions: PSNR of the frame and of the object, and SSIM of the frame."""
 
 from __future__ import annotations
 
@@ -8,76 +8,77 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets.cameras import Camera, pose_count
-from ..datasets.capture import Capture
-from ..datasets.models import Model
-from ..schemas import Exposure
-from .labels import LabelRenderer
+from ...datasets.capture.cameras import Camera
+from ...datasets.capture.capture import Capture
+from ...datasets.models.model import Model
+from ...schemas import Exposure
+from ..rendering.image_metrics import ssim_map
+from ..rendering.label_renderer import LabelRenderer
+from ..rendering.video_view import expose, video_view
 from .prediction import MODEL, EpisodePrediction, Motion
-from .splats.losses import ssim_map
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MIN_MEAN_SQUARE = 1e-10
-"""Equal pictures have 100 dB, not infinitely many."""
+"""Minimum mean square error, which limits the PSNR of equal pictures to 100 dB."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class VideoComparison:
-    """One camera's frames of an episode after the warm-up, beside what each method predicts.
-
-    Attributes:
-        camera: Name of the video camera.
-        time_s: Times of the frames [s], shape (F,).
-        psnr_db: By method, over the whole frame, shape (F,).
-        psnr_object_db: By method, over the union of the predicted and the true object mask, shape (F,); NaN where
-            neither has a pixel.
-        ssim: By method, structural similarity of the whole frame, shape (F,).
-        true_masks: Whether the true mask was known; without it the union is the predicted mask alone.
-        real: The frames without distortion, uint8 RGB, shape (F, H, W, 3); None where frames are not kept.
-        predicted: The model's, same shape, or None.
-    """
+    """Comparison of the F frames of one episode and camera after the warm-up with the predictions of each method."""
 
     camera: str
+    """Name of the video camera."""
     time_s: Array
+    """Times of the frames [s], shape (F,)."""
     psnr_db: dict[str, Array]
+    """PSNR of the whole frame by method [dB], shape (F,)."""
     psnr_object_db: dict[str, Array]
+    """PSNR over the union of the predicted and the true object mask by method [dB], shape (F,); NaN where both are
+    empty."""
     ssim: dict[str, Array]
+    """Structural similarity of the whole frame by method [1], shape (F,)."""
     true_masks: bool
+    """Whether the true mask is known; without it the union is the predicted mask alone."""
     real: Image | None = None
+    """Frames without distortion, uint8 RGB, shape (F, H, W, 3); None if frames are not kept."""
     predicted: Image | None = None
+    """Frames predicted by the model, same shape, or None."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Footage:
-    """Frames of a video without distortion: images (F, H, W, 3); objects (F, H, W) or None; valid (H, W)."""
+    """F frames of a video without distortion."""
 
     time_s: Array
+    """Times of the frames [s], shape (F,)."""
     images: Image
+    """Frames, uint8 RGB, shape (F, H, W, 3)."""
     objects: NDArray[np.bool_] | None
+    """True masks of the free bodies, shape (F, H, W), or None."""
     valid: NDArray[np.bool_]
+    """Pixels that the original frames cover, shape (H, W)."""
     cameras: list[Camera]
+    """Camera of each frame."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class VideoErrors:
-    """Compares predictions with the videos of a capture; renderers are kept from one episode to the next.
-
-    Attributes:
-        model: A model with a scene and visual spheres.
-        capture: With calibrated cameras.
-        device: Where to render.
-        keep_frames: Keep the frames of the model's prediction beside the real ones.
-        every: Look at every so manyth frame after the warm-up.
-    """
+    """Comparison of predictions with the videos of a capture; renderers are reused between episodes."""
 
     model: Model
+    """A model with a scene and visual spheres."""
     capture: Capture
+    """A capture with calibrated cameras."""
     device: str = "cpu"
+    """Device of the renderer."""
     keep_frames: bool = False
+    """Whether to keep the frames predicted by the model and the real ones."""
     every: int = 1
+    """Stride of the compared frames after the warm-up."""
     _renderers: dict[bytes, LabelRenderer] = field(default_factory=dict)
+    """Renderers by camera."""
 
     def compare(self, prediction: EpisodePrediction, camera: str) -> VideoComparison | None:
         """Return the comparison of one episode and camera, or None if no frame follows the warm-up."""
@@ -99,7 +100,16 @@ class VideoErrors:
                 shown = (exposed * 255).round().astype(np.uint8)
         real = footage.images if self.keep_frames else None
         known = footage.objects is not None
-        return VideoComparison(camera, footage.time_s, psnr, object_psnr, ssim, known, real, shown)
+        return VideoComparison(
+            camera=camera,
+            time_s=footage.time_s,
+            psnr_db=psnr,
+            psnr_object_db=object_psnr,
+            ssim=ssim,
+            true_masks=known,
+            real=real,
+            predicted=shown,
+        )
 
     def _footage(self, prediction: EpisodePrediction, camera: str) -> _Footage | None:
         capture, episode = self.capture, prediction.episode
@@ -118,15 +128,21 @@ class VideoErrors:
             plain = [view.undistorted(masks[k], labels=True)[0] for view, k in zip(views, chosen, strict=True)]
             objects = np.isin(np.stack(plain), labels)
         inside = views[0].undistorted(np.full(frames.shape[1:3], 255, np.uint8))[0] == 255
-        return _Footage(times[chosen], images, objects, inside, [view.undistorted(frames[0])[1] for view in views])
+        return _Footage(
+            time_s=times[chosen],
+            images=images,
+            objects=objects,
+            valid=inside,
+            cameras=[view.undistorted(frames[0])[1] for view in views],
+        )
 
     def _render(
         self, footage: _Footage, name: str, motion: Motion, at: NDArray[np.int64]
     ) -> tuple[Image, NDArray[np.bool_]]:
-        """Return pictures (F, H, W, 3) and the masks (F, H, W) of the free bodies."""
+        """Return rendered pictures (F, H, W, 3) and the masks (F, H, W) of the free bodies."""
         free = [k + 1 for k, body in enumerate(self.model.file.bodies) if body.motion == "free"]
         pictures, masks = np.empty_like(footage.images), np.zeros(footage.images.shape[:3], bool)
-        # what stays (a frozen body) is rendered once
+        # Repeated poses (a frozen body) are rendered once.
         poses = np.concatenate((motion.position_m[at], motion.quat_wxyz[at]), -1).reshape(len(at), -1)
         views = np.stack([camera.T_world_cam.ravel() for camera in footage.cameras])
         keys, first, place = np.unique(
@@ -144,7 +160,7 @@ class VideoErrors:
     def _renderer(self, name: str, camera: Camera) -> LabelRenderer:
         key = camera.T_world_cam.tobytes() + camera.K.tobytes() + bytes(f"{camera.width}x{camera.height}", "ascii")
         if key not in self._renderers:
-            if len(self._renderers) > 16:  # a camera that moves needs a new one for every frame
+            if len(self._renderers) > 16:  # a moving camera needs a new renderer for every frame
                 self._renderers.clear()
             self._renderers[key] = LabelRenderer(self.model, {name: camera}, self.device)
         return self._renderers[key]
@@ -166,35 +182,6 @@ class VideoErrors:
             real = torch.from_numpy(footage.images[k].astype(np.float32) / 255)
             similar[k] = float(ssim_map(torch.from_numpy(picture), real).numpy()[footage.valid].mean())
         return similar
-
-
-def usable_cameras(capture: Capture, episode: str) -> tuple[list[str], list[str]]:
-    """Return the video cameras of an episode that are calibrated, and those that are not."""
-    known = capture.cameras.videos if capture.cameras is not None else {}
-    names = capture.videos(episode)
-    calibrated = [name for name in names if name in known or f"{name}/{episode}" in known]
-    return calibrated, [name for name in names if name not in calibrated]
-
-
-def video_view(capture: Capture, camera: str, episode: str, frame: int, size: tuple[int, int]) -> Camera:
-    """Return the camera of a video frame at the size (width, height) [px] of the frame."""
-    known = capture.cameras.videos if capture.cameras is not None else {}
-    entry = known.get(f"{camera}/{episode}") or known.get(camera)
-    moving = entry is not None and pose_count(entry) > 1
-    view = capture.video_camera(camera, episode, frame if moving else None)
-    return view if (view.width, view.height) == tuple(size) else view.resized(*size)
-
-
-def expose(pictures: Image, exposure: Exposure) -> NDArray[np.float32]:
-    """Return what a camera makes of the model's colours: gain * colour + offset, values in [0, 1]."""
-    gain, offset = (np.asarray(values, np.float32) for values in (exposure.gain_rgb, exposure.offset_rgb))
-    return np.clip(pictures.astype(np.float32) / 255 * gain + offset, 0.0, 1.0).astype(np.float32)
-
-
-def renderable(model: Model) -> bool:
-    """Return whether a model's pictures can be compared with frames: it has a scene and spheres of every free body."""
-    seen = all(body.name in model.body_splats for body in model.file.bodies if body.motion == "free")
-    return seen and model.scene is not None
 
 
 def _decibel(square: NDArray[np.float32]) -> float:

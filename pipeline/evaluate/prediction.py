@@ -1,4 +1,4 @@
-"""Open-loop predictions of measured episodes, and what stands beside them: a frozen and a ballistic body."""
+"""Open-loop predictions of measured episodes, and two baselines: a frozen and a ballistic body."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.tracks import Track
-from .estimation.observations import Observations
-from .estimation.states import StartUncertainty
-from .estimation.warmup import estimate_states, warmup_frames
-from .physics.checks import require_finite
-from .physics.measured import measure
-from .physics.rollout import Rollout
-from .physics.rotation import quat_exp, quat_multiply, quat_to_matrix
-from .physics.world import World
+from ...datasets.capture.tracks import Track
+from ..geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
+from ..physics.observation_model import measure
+from ..physics.rollout import Rollout, require_finite
+from ..physics.world import World
+from ..trajectories.initial_state import estimate_states, warmup_frames
+from ..trajectories.observations import Observations
+from ..trajectories.state_uncertainty import StartUncertainty
 
 Array = NDArray[np.float64]
 Episode = tuple[str, dict[str, Track]]
@@ -27,62 +26,61 @@ MODEL, FROZEN, BALLISTIC = "model", "frozen", "ballistic"
 BASELINES = (FROZEN, BALLISTIC)
 
 BATCH = 64
-"""Episodes rolled out together: more run out of the processor's cache."""
+"""Number of episodes rolled out together; more exceed the cache of the processor."""
 SAME_TIME_S = 1e-6
-"""Frames of tracks and videos closer than this count as one moment."""
+"""Maximum difference between times of tracks and videos that count as one time [s]."""
 STATE_FIT_EPISODES = 10
-"""Of more episodes than this, the state-fitted residual is that of so many, evenly spread: it costs fifty rollouts."""
+"""Maximum number of episodes with a state-fitted residual, evenly spread; each costs about fifty rollouts."""
 STATE_FIT_ITERATIONS = 3
 WARMUP_ITERATIONS = 5
-"""Of the fit to the warm-up: mostly free flight, which is close to linear."""
+"""Number of iterations of the fit to the warm-up, which is mostly free flight and close to linear."""
 SAMPLES = (2, 8)
-"""Least and most samples of the initial state for one episode."""
+"""Minimum and maximum number of samples of the initial state for one episode."""
 SAMPLES_IN_ALL = 160
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Predicted poses of all bodies: position_m (G, nb, 3) of the body frames' origins, world; quat_wxyz (G, nb, 4)."""
+    """Predicted poses of all bodies."""
 
     position_m: Array
+    """Positions of the origins of the body frames [m], world frame, shape (G, nb, 3)."""
     quat_wxyz: Array
+    """Orientations (body to world), shape (G, nb, 4)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class EpisodePrediction:
-    """One episode: what was measured, and what each method predicts.
-
-    Attributes:
-        episode: Its name.
-        bodies: Names of the free bodies (nf).
-        free: Their places among the model's bodies (nb).
-        time_s: Times of the measured frames [s], shape (T,).
-        warmup: Which of them the methods may see, shape (T,).
-        position_m: Measured positions of the free bodies [m], world, shape (T, nf, 3).
-        quat_wxyz: Measured orientations, shape (T, nf, 4).
-        seen: Where a position was measured, shape (T, nf).
-        turned: Where an orientation was measured, shape (T, nf).
-        grid_s: Times of the predictions: those of tracks and videos together [s], shape (G,).
-        rows: Place of each measured frame among them, shape (T,).
-        motions: Predicted motion by method: model, frozen, ballistic.
-        noise_floor_m: Error that the uncertainty of the initial state alone predicts [m].
-        state_fitted_m: Error of the model from the state that fits the whole episode [m]; None where not computed.
-    """
+    """Measurements of one episode and the predictions of each method."""
 
     episode: str
+    """Name of the episode."""
     bodies: tuple[str, ...]
+    """Names of the free bodies (nf)."""
     free: tuple[int, ...]
+    """Indices of the free bodies among the bodies of the model (nb)."""
     time_s: Array
+    """Times of the measured frames [s], shape (T,)."""
     warmup: NDArray[np.bool_]
+    """Whether a frame belongs to the warm-up, which the methods may use, shape (T,)."""
     position_m: Array
+    """Measured positions of the free bodies [m], world frame, shape (T, nf, 3)."""
     quat_wxyz: Array
+    """Measured orientations of the free bodies (body to world), shape (T, nf, 4)."""
     seen: NDArray[np.bool_]
+    """Whether a position was measured, shape (T, nf)."""
     turned: NDArray[np.bool_]
+    """Whether an orientation was measured, shape (T, nf)."""
     grid_s: Array
+    """Times of the predictions, the union of those of tracks and videos [s], shape (G,)."""
     rows: NDArray[np.int64]
+    """Index of each measured frame in `grid_s`, shape (T,)."""
     motions: dict[str, Motion]
+    """Predicted motion by method: model, frozen, ballistic."""
     noise_floor_m: float
+    """Expected error due to the uncertainty of the initial state alone [m]."""
     state_fitted_m: float | None
+    """Error of the model from the state fitted to the whole episode [m]; None if not computed."""
 
     @property
     def warmup_end_s(self) -> float:
@@ -95,14 +93,14 @@ class EpisodePrediction:
         return motion.position_m[self.rows][:, free], motion.quat_wxyz[self.rows][:, free]
 
     def translation_error_m(self, method: str = MODEL) -> Array:
-        """Return the distance between predicted and measured position (T, nf) [m]; NaN where none was measured."""
+        """Return the distance between predicted and measured position [m], (T, nf); NaN where not measured."""
         error = np.linalg.norm(self.predicted(method)[0] - self.position_m, axis=-1)
         return np.where(self.seen, error, np.nan)
 
     def rotation_error_deg(self, method: str = MODEL) -> Array:
-        """Return the geodesic angle between predicted and measured orientation (T, nf) [deg]; NaN without one."""
+        """Return the angle between predicted and measured orientation [deg], (T, nf); NaN where not measured."""
         a, b = self.predicted(method)[1], self.quat_wxyz
-        # |a - b| = 2 sin(angle / 4) keeps its precision at small angles, where acos(a . b) has none; q and -q are one
+        # |a - b| = 2 sin(angle / 4) is precise at small angles, unlike acos(a . b); q and -q are equivalent.
         apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
         angle = 4 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together))
         return np.where(self.turned, np.degrees(angle), np.nan)
@@ -118,17 +116,17 @@ def predict(
     state_fits: int = STATE_FIT_EPISODES,
     fitted_world: World | None = None,
 ) -> list[EpisodePrediction]:
-    """Predict episodes open loop from their warm-ups.
+    """Predict episodes in open loop from their warm-ups.
 
     Args:
         world: The model's world.
-        episodes: Names, and tracks of all free and driven bodies.
+        episodes: Names and tracks of all free and driven bodies.
         noise: Standard deviations of the measurement (position [m], rotation [rad]).
         warmup_s: Length of the warm-up [s].
-        video_times_s: For each episode, further times at which to predict [s].
-        on_step: Called with a number of finished episodes.
-        state_fits: For how many of them, at most, the state is fitted to the whole episode.
-        fitted_world: The world with all episodes' own numbers, for these fits; None for the same.
+        video_times_s: Further times of predictions [s], for each episode.
+        on_step: Function called with numbers of finished episodes.
+        state_fits: Maximum number of episodes with a state fitted to the whole episode.
+        fitted_world: World with the random effects of all episodes, for these fits; None for `world`.
 
     Returns:
         The predictions, in the order of the episodes.
@@ -140,7 +138,7 @@ def predict(
     samples = min(max(SAMPLES_IN_ALL // count, SAMPLES[0]), SAMPLES[1])
     with_own = world if fitted_world is None else fitted_world
     fitted = set(np.linspace(0, count - 1, min(count, state_fits)).round().astype(int).tolist())
-    # those to fit in one batch; then episodes of similar length together, since a batch is as long as its longest
+    # Episodes to fit form one batch; the others are grouped by length, since a batch is as long as its longest.
     order = sorted(range(count), key=lambda i: (i not in fitted, max(len(track) for track in episodes[i][1].values())))
     found: dict[int, EpisodePrediction] = {}
     for first in range(0, count, BATCH):
@@ -157,12 +155,16 @@ def predict(
 
 @dataclass(frozen=True)
 class _Batch:
-    """Episodes that are rolled out together, their states at the warm-up's estimate; warm (B, T)."""
+    """Batch of B episodes that are rolled out together."""
 
     world: World
+    """World of the batch."""
     observations: Observations
+    """Measurements, with initial states estimated from the warm-ups."""
     warm: Tensor
+    """Whether a frame belongs to the warm-up, shape (B, T)."""
     covariance: Tensor
+    """Covariance of the initial states, by episode."""
 
     @staticmethod
     def of(world: World, episodes: Sequence[Episode], noise: tuple[float, float], warmup_s: float) -> _Batch:
@@ -173,14 +175,14 @@ class _Batch:
         return _Batch(world, observations, warm, solution.state_cov)
 
     def weight(self) -> Tensor:
-        """Return the measured frames after the warm-up (B, T, nf)."""
+        """Return the weights of the frames after the warm-up, shape (B, T, nf)."""
         return self.observations.seen * (~self.warm)[..., None].to(self.observations.seen.dtype)
 
     def uncertainty(self) -> StartUncertainty:
         return StartUncertainty(self.world, self.observations, self.covariance, self.weight())
 
     def state_fitted(self, items: list[int], noise: tuple[float, float], world: World) -> dict[int, float]:
-        """Return the state-fitted residual [m] of some items of the batch."""
+        """Return the state-fitted residual [m] of items of the batch, by item."""
         if not items:
             return {}
         chosen = StartUncertainty(
@@ -189,7 +191,7 @@ class _Batch:
         return dict(zip(items, chosen.fit(noise, STATE_FIT_ITERATIONS).tolist(), strict=True))
 
     def predictions(self, video_times_s: Sequence[Array]) -> list[EpisodePrediction]:
-        """Roll out on the times of tracks and videos together, and add the baselines."""
+        """Return predictions at the times of tracks and videos, with the baselines."""
         seen = self.observations
         times = [seen.times_s[k, : int(n)].numpy() for k, n in enumerate(_lengths(seen))]
         grids = [_merged(track, video) for track, video in zip(times, video_times_s, strict=True)]
@@ -210,20 +212,20 @@ class _Batch:
         warm = self.warm[item, :count].numpy()
         last = int(rows[np.flatnonzero(warm)[-1]])
         prediction = EpisodePrediction(
-            seen.names[item],
-            tuple(self.world.bodies[k].name for k in seen.free),
-            seen.free,
-            time,
-            warm,
-            seen.position_m[item, :count].numpy(),
-            seen.quat_wxyz[item, :count].numpy(),
-            seen.seen[item, :count].numpy() > 0,
-            seen.turned[item, :count].numpy() > 0,
-            grid,
-            rows,
-            {MODEL: model},
-            float("nan"),
-            None,
+            episode=seen.names[item],
+            bodies=tuple(self.world.bodies[k].name for k in seen.free),
+            free=seen.free,
+            time_s=time,
+            warmup=warm,
+            position_m=seen.position_m[item, :count].numpy(),
+            quat_wxyz=seen.quat_wxyz[item, :count].numpy(),
+            seen=seen.seen[item, :count].numpy() > 0,
+            turned=seen.turned[item, :count].numpy() > 0,
+            grid_s=grid,
+            rows=rows,
+            motions={MODEL: model},
+            noise_floor_m=float("nan"),
+            state_fitted_m=None,
         )
         prediction.motions[FROZEN] = _frozen(prediction, model, last)
         prediction.motions[BALLISTIC] = _ballistic(self.world, grid, rollout, item, model, last)
@@ -231,7 +233,7 @@ class _Batch:
 
 
 def _frozen(prediction: EpisodePrediction, model: Motion, last: int) -> Motion:
-    """Return the free bodies at their last measured pose of the warm-up; an unmeasured one is the model's there."""
+    """Return the free bodies at their last measured pose of the warm-up, or at the model's pose if unmeasured."""
     position, quat = model.position_m.copy(), model.quat_wxyz.copy()
     for column, body in enumerate(prediction.free):
         position[:, body], quat[:, body] = model.position_m[last, body], model.quat_wxyz[last, body]
@@ -246,7 +248,7 @@ def _frozen(prediction: EpisodePrediction, model: Motion, last: int) -> Motion:
 
 
 def _ballistic(world: World, grid: Array, rollout: Rollout, item: int, model: Motion, last: int) -> Motion:
-    """Return the free bodies in free flight from the estimated state at the end of the warm-up, through everything.
+    """Return the free bodies in free flight from the estimated state at the end of the warm-up, without contact.
 
     The centre of mass follows a parabola; the angular velocity is constant.
     """
@@ -273,7 +275,7 @@ def _lengths(observations: Observations) -> Tensor:
 
 
 def _merged(track_s: Array, video_s: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the times of a track and a video in one (G,), from the track's start on, and the track's places (T,)."""
+    """Return the times of a track and a video together (G,), from the track's start, and the track's rows (T,)."""
     later = video_s[video_s > track_s[0] + SAME_TIME_S]
     if len(later):
         nearest = np.abs(track_s[:, None] - later).min(0)

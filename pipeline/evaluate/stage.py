@@ -1,7 +1,7 @@
-"""`cgwm eval`: open-loop predictions of a model against measurements.
+"""The stage evaluate (`cgwm eval`): compare open-loop predictions of a model with measurements.
 
-The initial state of an episode is estimated by the model from its warm-up; from there nothing of the episode is
-shown to the model. Errors are averaged within an episode first, then over episodes.
+The initial state of an episode is estimated from its warm-up with the model; the prediction uses no later data.
+Errors are averaged within an episode first, then over episodes.
 """
 
 from __future__ import annotations
@@ -14,43 +14,49 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.cameras import require_metric
-from ..datasets.capture import Capture
-from ..datasets.kinds import kind_of
-from ..datasets.loader import RolloutReader
-from ..datasets.models import Model, read_model
-from ..datasets.progress import progress
-from ..datasets.tracks import Track
-from ..schemas import EpisodeErrors, ErrorSummary, EvalResult, InputDataError
-from .estimation.noise import estimate_noise
-from .image_errors import VideoComparison, VideoErrors, renderable, usable_cameras
-from .memory import enough_memory
-from .own_worlds import own_parameters, with_fitted_numbers, with_known_numbers
-from .physics.world import World
+from ...datasets.capture.cameras import require_metric
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.tracks import Track
+from ...datasets.io.kinds import kind_of
+from ...datasets.io.progress import progress
+from ...datasets.models.model import Model, read_model
+from ...datasets.rollouts.loader import RolloutReader
+from ...schemas import EpisodeErrors, ErrorSummary, EvalResult, InputDataError
+from ..physics.world import World
+from ..rendering.video_view import renderable, usable_cameras
+from ..runtime.device import resolve_device
+from ..runtime.resources import enough_memory, one_torch_thread
+from ..segments.random_effects import group_parameters, with_fitted_groups, with_known_groups
+from ..trajectories.track_noise import estimate_noise
+from .image_errors import VideoComparison, VideoErrors
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, Episode, EpisodePrediction, predict
-from .threads import one_torch_thread
 
 Array = NDArray[np.float64]
 
 DATASET_NOISE = (1e-4, 1e-3)
-"""Noise assumed for the poses of a dataset, which are exact (position [m], rotation [rad])."""
+"""Assumed noise of the poses of a dataset, which are exact (position [m], rotation [rad])."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeEvaluation:
-    """One episode: its predictions, its videos beside them where there are any, and its errors."""
+    """Evaluation of one episode."""
 
     prediction: EpisodePrediction
+    """Measurements and predictions."""
     videos: tuple[VideoComparison, ...]
+    """Comparisons with the videos, one per camera."""
     errors: EpisodeErrors
+    """Errors of the episode."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What `cgwm eval` prints, and the motions and frames behind it."""
+    """Result of `cgwm eval` with the underlying motions and frames."""
 
     result: EvalResult
+    """Summary of the errors."""
     episodes: tuple[EpisodeEvaluation, ...]
+    """Evaluations of the episodes."""
 
 
 def evaluate(model: Path, target: Path, split: str = "test", warmup_s: float = 0.1, device: str = "auto") -> EvalResult:
@@ -59,23 +65,25 @@ def evaluate(model: Path, target: Path, split: str = "test", warmup_s: float = 0
     Args:
         model: MODEL, with fitted physics.
         target: A capture, or a dataset.
-        split: The episodes to predict. A dataset has `train` and `valid` for those who learn from it; `test` takes
-            all its rollouts.
-        warmup_s: Length of the start of an episode that the model may see [s].
-        device: Where images are rendered: auto, cpu or cuda. Rollouts of few bodies are fastest on the CPU.
+        split: The episodes to predict. A dataset has `train` and `valid` for learning; `test` selects all its
+            rollouts.
+        warmup_s: Duration of the start of an episode that the model may use [s].
+        device: Device of the renderer: auto, cpu or cuda. Rollouts of few bodies are fastest on the CPU.
 
     Raises:
-        InputDataError: If the target has nothing to compare with, or other bodies than the model.
-        UsageError: If there is no such split.
+        InputDataError: If the target has no data to compare with, or other bodies than the model.
+        UsageError: If the split does not exist.
         NotConvergedError: If a rollout of the model diverges.
-        NotEnoughMemoryError: If the frames cannot be rendered in the memory that there is.
+        NotEnoughMemoryError: If the available memory is not sufficient to render the frames.
     """
     loaded = read_model(model)
     if kind_of(target) == "dataset":
         return evaluate_dataset(loaded, target, split, warmup_s).result
     capture = Capture.open(target, splits=(split,))
     tried = f"{loaded.visual_count} spheres, frames of the videos at their own size"
-    with enough_memory(tried, _device(device), "a model of fewer spheres (cgwm fit --spheres), smaller videos"):
+    with enough_memory(
+        tried, str(resolve_device(device)), "a model of fewer spheres (cgwm fit --spheres), smaller videos"
+    ):
         return evaluate_model(loaded, capture, split, warmup_s, device).result
 
 
@@ -88,16 +96,16 @@ def evaluate_model(
     keep_frames: bool = False,
     brief: bool = False,
 ) -> Evaluation:
-    """Evaluate a model against the tracks of a capture, and its frames where model and cameras allow it.
+    """Evaluate a model against the tracks of a capture, and against its frames if model and cameras allow.
 
     Args:
-        model: With fitted physics.
+        model: A model with fitted physics.
         capture: The measurements.
         split: The episodes to predict.
-        warmup_s: Length of the start of an episode that the model may see [s].
-        device: Where images are rendered: auto, cpu or cuda.
-        keep_frames: Keep the predicted frames beside the real ones (tens of megabytes an episode).
-        brief: The errors of the poses and of the baselines alone: no frames, no fitted states.
+        warmup_s: Duration of the start of an episode that the model may use [s].
+        device: Device of the renderer: auto, cpu or cuda.
+        keep_frames: Keep the predicted and the real frames (tens of megabytes an episode).
+        brief: Compute only the errors of the poses and of the baselines, without frames and fitted states.
 
     Raises:
         See :func:`evaluate`.
@@ -112,11 +120,15 @@ def evaluate_model(
             "add tracks, or name another split with --split.",
         )
     cameras = {} if brief else _cameras(model, capture, [name for name, _ in episodes], warnings)
-    videos = VideoErrors(model, capture, _device(device), keep_frames) if cameras else None
+    videos = (
+        VideoErrors(model=model, capture=capture, device=str(resolve_device(device)), keep_frames=keep_frames)
+        if cameras
+        else None
+    )
     video_times = [_video_times(capture, name, cameras.get(name, [])) for name, _ in episodes]
     noise = _noise(model, capture, episodes)
     fits = 0 if brief else STATE_FIT_EPISODES
-    world, fitted = _own_worlds(world, model, capture, episodes, noise, warnings, brief)
+    world, fitted = _worlds_with_random_effects(world, model, capture, episodes, noise, warnings, brief)
     predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits, fitted)
 
     def compare(prediction: EpisodePrediction) -> tuple[VideoComparison, ...]:
@@ -128,7 +140,7 @@ def evaluate_model(
 
 
 @one_torch_thread()
-def _own_worlds(
+def _worlds_with_random_effects(
     world: World,
     model: Model,
     capture: Capture,
@@ -137,17 +149,17 @@ def _own_worlds(
     warnings: list[str],
     brief: bool,
 ) -> tuple[World, World]:
-    """Return the world with the own numbers that the fit knows, and with those of all episodes, fitted to them."""
+    """Return the world with the random effects known from the fit, and the one with those fitted to all episodes."""
     names = [name for name, _ in episodes]
-    known = with_known_numbers(world, model.file, names, capture.groups)
-    unknown = [name for name in names if len(known.own.get(name, {})) < len(own_parameters(world))]
+    known = with_known_groups(world, model.file, names, capture.groups)
+    unknown = [name for name in names if len(known.own.get(name, {})) < len(group_parameters(world))]
     if brief or not unknown:
         return known, known
     warnings.append(
-        f"{len(unknown)} of the {len(names)} episodes should have numbers of their own, and the fit has not seen them: "
-        "open loop they have the mean; in the state-fitted residual they are fitted, as the state is."
+        f"{len(unknown)} of the {len(names)} episodes belong to groups that the fit has not seen: their "
+        "group parameters have the mean in open loop, and are fitted with the state in the state-fitted residual."
     )
-    return known, with_fitted_numbers(world, episodes, model.file, capture.groups, noise)
+    return known, with_fitted_groups(world, episodes, model.file, capture.groups, noise)
 
 
 def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s: float = 0.1) -> Evaluation:
@@ -159,7 +171,7 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
         names = [name.decode() for name in reader.group(0)["bodies/names"][()]]
         check_bodies(model, names, str(dataset))
         world = World.from_model(model)
-        # what a dataset stores are true states, not measured ones
+        # A dataset stores true states, not measured ones.
         world = replace(world, effects=tuple(a for a in world.effects if a.effect.phase != "measurement"))
         found = [(info.demo, _stored_tracks(reader, number)) for number, info in enumerate(reader.rollouts)]
     finally:
@@ -173,7 +185,7 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
 
 
 def _stored_tracks(reader: RolloutReader, number: int) -> dict[str, Track]:
-    """Return the states of a rollout as tracks of what moves."""
+    """Return the states of a rollout as tracks of the moving bodies."""
     group = reader.group(number)
     time, position, quat = (group[key][()] for key in ("time", "bodies/pos", "bodies/quat_wxyz"))
     names, motions = (group[f"bodies/{key}"][()] for key in ("names", "motions"))
@@ -183,10 +195,10 @@ def _stored_tracks(reader: RolloutReader, number: int) -> dict[str, Track]:
 
 
 def check_bodies(model: Model, names: Sequence[str], target: str) -> None:
-    """Refuse a model whose bodies do not have the names of a target's.
+    """Check that the bodies of a model have the names of those of a target.
 
     Raises:
-        InputDataError: With both lists.
+        InputDataError: If they do not, with both lists.
     """
     own = [body.name for body in model.file.bodies]
     if set(own) != set(names):
@@ -202,7 +214,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
-    """Return the episodes in which everything that moves has a track, and a message on the others."""
+    """Return the episodes in which every moving body has a track, and messages on the others."""
     moving = [body.name for body in model.file.bodies if body.motion != "fixed"]
     if not any(body.motion == "free" for body in model.file.bodies):
         raise InputDataError("none of the model's bodies is free, so there is no motion to predict.")
@@ -217,7 +229,7 @@ def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], l
 
 
 def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> tuple[float, float]:
-    """Return the measurement noise (position [m], rotation [rad]): the model's, the manifest's, or an estimate."""
+    """Return the measurement noise (position [m], rotation [rad]): from the model, the manifest or an estimate."""
     known, given = model.file.measurement_std, capture.manifest.measurement
     position = known.get("position_m") or given.position_std_m
     rotation = known.get("rotation_rad") or given.rotation_std_rad
@@ -244,7 +256,7 @@ def _predict(
 
 
 def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: list[str]) -> dict[str, list[str]]:
-    """Return the cameras by episode whose frames can be compared; say in `warnings` why others cannot."""
+    """Return the cameras with comparable frames by episode; add the reasons for the others to `warnings`."""
     filmed = [name for name in episodes if capture.videos(name)]
     if not filmed:
         return {}
@@ -264,12 +276,6 @@ def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: 
     if unexposed:
         warnings.append(f"the model has no exposure of {_listed(unexposed)}: its colours are compared as they are.")
     return {name: cameras for name, (cameras, _) in found.items() if cameras}
-
-
-def _device(name: str) -> str:
-    from .sg_gs import resolve_device
-
-    return str(resolve_device(name))
 
 
 def _video_times(capture: Capture, episode: str, cameras: Sequence[str]) -> Array:
@@ -345,7 +351,8 @@ def _plain(figures: dict[str, ErrorSummary | None]) -> dict[str, Any]:
 def _episode_errors(prediction: EpisodePrediction, videos: Sequence[VideoComparison]) -> EpisodeErrors:
     moved, moved_last = _within(prediction, prediction.translation_error_m())
     turned, turned_last = _within(prediction, prediction.rotation_error_deg())
-    assert moved is not None and moved_last is not None  # a measured frame follows the warm-up
+    if moved is None or moved_last is None:
+        raise ValueError(f"episode '{prediction.episode}': no measured frame follows the warm-up.")
     after = prediction.seen.any(1) & ~prediction.warmup
     return EpisodeErrors(
         episode=prediction.episode,
@@ -364,7 +371,7 @@ def _episode_errors(prediction: EpisodePrediction, videos: Sequence[VideoCompari
 
 
 def _within(prediction: EpisodePrediction, error: Array) -> tuple[float | None, float | None]:
-    """Return mean and last of an error (T, nf) after the warm-up; None where nothing was measured there."""
+    """Return mean and last value of an error (T, nf) after the warm-up; None without measurements there."""
     after = error[~prediction.warmup]
     measured = np.flatnonzero(np.isfinite(after).any(1))
     if len(measured) == 0:
@@ -373,7 +380,7 @@ def _within(prediction: EpisodePrediction, error: Array) -> tuple[float | None, 
 
 
 def _video_mean(videos: Sequence[VideoComparison], figure: str, method: str) -> float | None:
-    """Return the mean over all frames of all cameras; None where there is none."""
+    """Return the mean over all frames of all cameras; None without frames."""
     values = np.concatenate([getattr(video, figure)[method] for video in videos]) if videos else np.zeros(0)
     values = values[np.isfinite(values)]
     return float(values.mean()) if len(values) else None

@@ -1,4 +1,4 @@
-"""How far MuJoCo's simulation of an exported model is from our own engine's rollout."""
+"""Comparison of MuJoCo's simulation of an exported model with a rollout by our engine."""
 
 from __future__ import annotations
 
@@ -10,49 +10,54 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..datasets.mjcf import Keyframe
-from ..datasets.models import Model
-from ..datasets.tracks import Track
-from ..schemas import SamplingPlan
-from .physics.checks import require_finite
-from .physics.rollout import simulate
-from .physics.world import State, World
-from .sampling import Start, draw_start, resolve_plan
+from ...datasets.capture.tracks import Track
+from ...datasets.models.mjcf import Keyframe
+from ...datasets.models.model import Model
+from ...schemas import SamplingPlan
+from ..physics.rollout import require_finite, simulate
+from ..physics.world import State, World
+from ..synthesize.plan import resolve_plan
+from ..synthesize.start_states import Start, draw_start
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs, so a checker knows none of its names
 
 FRAME_S = 0.01
+"""Time between the compared frames [s]."""
 AFTER_CONTACT_S = 0.1
+"""Length of the compared motion after the first contact [s]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Deviation:
-    """MuJoCo against our engine, the largest over the free bodies; None where that part of the motion is missing.
-
-    Attributes:
-        duration_s: Length of the rollout [s].
-        first_contact_s: When something touches in our engine [s]; None: never.
-        flight: Largest position [mm] and rotation [deg] deviation before that.
-        impact: Largest ones up to `AFTER_CONTACT_S` after it.
-        end: Those of the last frame.
-    """
+    """Largest deviations of MuJoCo from our engine over the free bodies; None for a missing part of the motion."""
 
     duration_s: float
+    """Length of the rollout [s]."""
     first_contact_s: float | None
+    """Time of the first contact in our engine [s]; None without contact."""
     flight: tuple[float, float] | None
+    """Largest deviation of position [mm] and rotation [deg] before the first contact."""
     impact: tuple[float, float] | None
+    """Largest deviation from the first contact to `AFTER_CONTACT_S` after it, same units."""
     end: tuple[float, float]
+    """Deviation in the last frame, same units."""
 
 
 def start_of(model: Model, seed: int, duration_s: float) -> Start:
-    """Draw the start that `cgwm synthesize` would draw for its rollout 0, parameters at their estimate."""
+    """Draw the start that `cgwm synthesize` would draw for its rollout 0, with parameters at their estimates."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
     return draw_start(model, resolve_plan(model, SamplingPlan()), duration_s, rng)
 
 
 def keyframe_of(start: Start) -> Keyframe:
     """Return a start as a keyframe of MJCF."""
-    return Keyframe("start", start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s)
+    return Keyframe(
+        name="start",
+        position_m=start.position_m,
+        quat_wxyz=start.quat_wxyz,
+        velocity_m_s=start.velocity_m_s,
+        omega_body_rad_s=start.omega_body_rad_s,
+    )
 
 
 def resimulate(model: Model, mjcf: str, start: Start, duration_s: float) -> Deviation:
@@ -60,8 +65,9 @@ def resimulate(model: Model, mjcf: str, start: Start, duration_s: float) -> Devi
 
     Args:
         model: The model.
-        mjcf: Its MJCF, with a keyframe of that start. Its time step is lowered to the next divisor of `FRAME_S`.
-        start: Where both begin.
+        mjcf: MJCF of the model, with a keyframe of that start. Its time step is reduced to the next divisor of
+            `FRAME_S`.
+        start: Common start of both simulations.
         duration_s: Length [s], rounded to whole frames of `FRAME_S`.
 
     Raises:
@@ -112,7 +118,7 @@ def _mujoco_poses(
         for _ in range(steps):
             for body, track in driven.items():
                 mocap = int(loaded.body(body).mocapid[0])
-                # the command at the end of the step: where the body is when the step's contacts are solved
+                # the command at the end of the step, because the step's contacts are solved for that position
                 pose = _commanded(track, data.time + loaded.opt.timestep)
                 data.mocap_pos[mocap], data.mocap_quat[mocap] = pose
             mujoco.mj_step(loaded, data)
@@ -122,7 +128,7 @@ def _mujoco_poses(
 
 
 def _commanded(track: Track, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return position (3,) and quaternion w x y z (4,) of a command at a time; held still outside of it."""
+    """Return position (3,) and quaternion w x y z (4,) of a command at a time; constant outside its time range."""
     now = np.clip(time_s, track.time_s[0], track.time_s[-1])
     position = np.array([np.interp(now, track.time_s, axis) for axis in track.position_m.T])
     assert track.quat_wxyz is not None  # sampled commands have orientations

@@ -1,4 +1,4 @@
-"""The stage export: a dataset or a model in the format of another tool."""
+"""The stage export (`cgwm export`): a dataset or a model in the format of another tool."""
 
 from __future__ import annotations
 
@@ -9,67 +9,64 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from ..datasets.atomic import new_file, refuse_existing
-from ..datasets.cameras import read_cameras
-from ..datasets.capture import Capture
-from ..datasets.exports.bop import write_bop
-from ..datasets.exports.bop_models import ObjectModel
-from ..datasets.exports.colmap import write_colmap
-from ..datasets.exports.glb import write_glb
-from ..datasets.exports.lerobot import write_lerobot
-from ..datasets.exports.nerfstudio import MaskUse, write_nerfstudio
-from ..datasets.exports.selection import Selection
-from ..datasets.exports.splat_files import in_world, write_splat_files
-from ..datasets.kinds import Kind, kind_of, refuse_other_kind
-from ..datasets.mjcf import write_mjcf
-from ..datasets.models import Model, read_model
-from ..schemas import ExportFormat, ExportResult, InputDataError, UsageError
+from ...datasets.capture.cameras import read_cameras
+from ...datasets.capture.capture import Capture
+from ...datasets.exports.bop import write_bop
+from ...datasets.exports.bop_models import ObjectModel
+from ...datasets.exports.colmap import write_colmap
+from ...datasets.exports.glb import write_glb
+from ...datasets.exports.lerobot import write_lerobot
+from ...datasets.exports.nerfstudio import MaskUse, write_nerfstudio
+from ...datasets.exports.selection import Selection
+from ...datasets.exports.splat_files import in_world, write_splat_files
+from ...datasets.io.atomic import new_file, refuse_existing
+from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
+from ...datasets.models.mjcf import write_mjcf
+from ...datasets.models.model import Model, read_model
+from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
 
 DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio")
 MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "ply", "colmap", "glb")
 SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "glb": ".glb"}
-"""What the name of a single file ends with."""
+"""Suffixes of the formats that are single files."""
 
 LEROBOT_NOTES = (
-    "videos are lossy: the HDF5 file stays the master",
-    "depth, masks and contacts are left out; cameras and parameters are in meta/cgwm.json",
+    "videos are lossy; keep the HDF5 files as the original",
+    "depth, masks and contacts are omitted; cameras and parameters are in meta/cgwm.json",
 )
-BOP_NOTE = "the objects' meshes are the surface of their colliding spheres"
+BOP_NOTE = "the objects' meshes are the surfaces of their collision spheres"
 NERFSTUDIO_NOTE = (
     "time runs from 0 to 1; nerfstudio keeps the metres with --orientation-method none --center-method none "
     "--auto-scale-poses False"
 )
-NO_TURNING = "in the .ply and .glb the bodies have the light of the photos, however they are turned"
-NO_DRIVEN = "driven bodies are mocap bodies, whose speed MuJoCo's friction does not know"
+NO_TURNING = "in the .ply and .glb the bodies keep the light of the photos, whatever their orientation"
+NO_DRIVEN = "driven bodies are mocap bodies, whose velocity MuJoCo's friction ignores"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """What is asked for beyond the format; each format takes its own (see :data:`OPTIONS`).
-
-    Attributes:
-        split: Only the rollouts of `mask/<split>`.
-        cameras: Only these cameras of the dataset.
-        every: Every n-th frame.
-        task: LeRobot's task text.
-        rollout: Global index of the rollout.
-        mask: Which pixels nerfstudio's masks keep.
-        sh_degree: Degree of harmonics to pad the .ply to.
-        capture: The capture whose photos' cameras are taken.
-        seed: Seed of the start that is simulated again.
-        duration_s: How long that is simulated.
-    """
+    """Options of an export; each format takes some of them (see :data:`OPTIONS`)."""
 
     split: str | None = None
+    """Only the rollouts of `mask/<split>`."""
     cameras: tuple[str, ...] | None = None
+    """Only these cameras of the dataset."""
     every: int = 1
+    """Every n-th frame."""
     task: str | None = None
+    """Task description for LeRobot."""
     rollout: int = 0
+    """Global index of the rollout."""
     mask: MaskUse = "none"
+    """Which pixels nerfstudio's masks keep."""
     sh_degree: int = 0
+    """Degree of spherical harmonics to which the .ply is padded."""
     capture: Path | None = None
+    """The capture with the photos and their cameras."""
     seed: int = 0
+    """Seed of the start of the comparison with MuJoCo."""
     duration_s: float = 1.0
+    """Length of that comparison [s]."""
 
 
 OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
@@ -81,7 +78,7 @@ OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
     "colmap": ("capture",),
     "glb": (),
 }
-"""Which options mean something for which format."""
+"""Options that each format takes."""
 
 Facts = dict[str, int | float | str]
 
@@ -94,13 +91,13 @@ def export(
     Args:
         thing: DATASET for lerobot, bop and nerfstudio; MODEL for mjcf, ply, colmap and glb.
         format_: The format.
-        out: The file (.xml, .glb, .ply) or directory to write; it appears when it is complete.
-        options: What else is asked for.
+        out: The file (.xml, .glb, .ply) or directory to write; it appears once it is complete.
+        options: Options of the format.
         overwrite: Replace what exists.
 
     Raises:
-        InputDataError: If `thing` is of another kind, or lacks what the format needs.
-        UsageError: If `out` exists, or an option names what is not there.
+        InputDataError: If `thing` is of another kind, or lacks data that the format needs.
+        UsageError: If `out` exists, or an option names something that does not exist.
     """
     thing, out, chosen = Path(thing), Path(out), options or ExportOptions()
     _refuse_kind(thing, format_)
@@ -118,7 +115,7 @@ def _refuse_kind(thing: Path, format_: ExportFormat) -> None:
     if found is not None and found != wanted:
         raise InputDataError(
             f"{thing} is a {found}; --to {format_} takes a {wanted}.",
-            f"of a dataset: {', '.join(DATASET_FORMATS)}; of a model: {', '.join(MODEL_FORMATS)}.",
+            f"for a dataset: {', '.join(DATASET_FORMATS)}; for a model: {', '.join(MODEL_FORMATS)}.",
         )
     refuse_other_kind(thing, wanted)
 
@@ -142,7 +139,7 @@ def _nerfstudio(thing: Path, out: Path, options: ExportOptions, overwrite: bool)
 
 
 def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
-    from .resimulate import AFTER_CONTACT_S, keyframe_of, resimulate, start_of
+    from .mujoco_check import AFTER_CONTACT_S, keyframe_of, resimulate, start_of
 
     model = _simulated(thing)
     start = start_of(model, options.seed, options.duration_s)
@@ -165,7 +162,7 @@ def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tu
 def _ply(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
     model = _visible(thing)
     if not 0 <= options.sh_degree <= 3:
-        raise UsageError(f"--sh-degree {options.sh_degree}: no degree of harmonics.", "0 to 3.")
+        raise UsageError(f"--sh-degree {options.sh_degree}: not a degree of harmonics.", "0 to 3.")
     counts = write_splat_files(out, model, options.sh_degree, overwrite)
     return {f"{name}_spheres": count for name, count in counts.items()}, _light_notes(model)
 
@@ -178,27 +175,27 @@ def _glb(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tup
 
 def _colmap(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
     model, capture = _visible(thing), options.capture
-    # what the fit refined comes before what it began with
+    # cameras refined by the fit take precedence over those of the capture
     cameras = model.cameras
     if cameras is None and capture is not None:
         cameras = read_cameras(Capture.open(capture, check=False).root)
     if cameras is None or not cameras.images:
         raise InputDataError(
-            f"{thing if capture is None else capture}: no cameras of photos in it.",
+            f"{thing if capture is None else capture}: contains no cameras of photos.",
             "a model whose fit refined the cameras (cameras.json), or the capture with the photos' cameras.",
             f"cgwm export {thing} --to colmap --capture CAPTURE --out {out}",
         )
     photos = None if capture is None else capture / "images"
     counts = write_colmap(out, cameras, in_world(model), photos, overwrite)
-    notes = [] if cameras.scale.kind == "metric" else ["the cameras are unscaled: their unit is no metre"]
+    notes = [] if cameras.scale.kind == "metric" else ["the cameras have no metric scale"]
     if capture is None:
-        notes.append("without --capture the photos were not copied")
+        notes.append("the photos were not copied, because --capture is missing")
     return {**counts}, notes
 
 
 def object_model(model: Model, name: str) -> ObjectModel:
-    """Return the surface of a body's colliding spheres, coloured by the nearest visual sphere; grey without one."""
-    from .splats.surface_nets import union_mesh
+    """Return the surface of a body's collision spheres in the colour of the nearest visual sphere, grey without one."""
+    from ..geometry.isosurface import union_mesh
 
     body, spheres = model.body(name), model.collision[name]
     means = np.asarray(spheres.means, np.float64)
@@ -211,14 +208,14 @@ def object_model(model: Model, name: str) -> ObjectModel:
         colors = np.round(np.clip(np.asarray(visual.colors)[nearest], 0, 1) * 255).astype(np.uint8)
     off = body.collision_distance_m
     far = "" if off is None else f", at most {1e3 * off:.2g} mm from the fitted surface"
-    return ObjectModel(vertices, faces, colors, f"surface of {len(means)} colliding spheres{far}")
+    return ObjectModel(vertices, faces, colors, f"surface of {len(means)} collision spheres{far}")
 
 
 def _simulated(thing: Path) -> Model:
     model = read_model(thing)
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking or model.file.contact is None:
-        what = f"the body '{lacking[0]}' has no colliding spheres" if lacking else "its physics are not fitted"
+        what = f"the body '{lacking[0]}' has no collision spheres" if lacking else "its physics are not fitted"
         raise InputDataError(f"{thing}: {what}.", todo="fit it: cgwm fit CAPTURE --out MODEL.")
     return model
 

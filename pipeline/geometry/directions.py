@@ -1,4 +1,4 @@
-"""Directions that are evenly spread, and axes about one."""
+"""Evenly distributed directions, and axes about a direction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def fibonacci_directions(count: int) -> NDArray[np.float64]:
-    """Return `count` nearly evenly spread unit vectors, shape (count, 3)."""
+    """Return `count` nearly evenly distributed unit vectors, shape (count, 3)."""
     index = np.arange(count) + 0.5
     z = 1 - 2 * index / count
     angle = math.pi * (1 + math.sqrt(5)) * index
@@ -18,7 +18,7 @@ def fibonacci_directions(count: int) -> NDArray[np.float64]:
 
 
 def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return right-handed axes as rows, the last of them the unit vector `up` (3,), shape (3, 3)."""
+    """Return right-handed axes as rows (3, 3), the last one the unit vector `up` (3,)."""
     first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(up, first), up]).astype(np.float64)

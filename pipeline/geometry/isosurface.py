@@ -1,7 +1,7 @@
-"""A triangle mesh of a union of spheres, by surface nets.
+"""Triangle mesh of a union of spheres, by surface nets.
 
-Source: S. Gibson, "Constrained elastic surface nets" (MERL TR 1999-24), without the relaxation: a corner for each cell
-that the surface crosses, at the mean of the crossings of its edges; a quadrilateral for each grid edge that it crosses.
+Source: S. Gibson, "Constrained elastic surface nets" (MERL TR 1999-24), without the relaxation: one vertex for each
+cell that the surface crosses, at the mean of the crossings of its edges; one quadrilateral for each crossed grid edge.
 """
 
 from __future__ import annotations
@@ -9,20 +9,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .surface import union_distance
-from .volume import Array, grid_points
+from .solid_grid import Array, grid_points
+from .surface_distance import union_distance
 
 RESOLUTION = 64
+"""Default number of cells along the longest side."""
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 def union_mesh(centers: Array, radii: Array, resolution: int = RESOLUTION) -> tuple[Array, NDArray[np.int64]]:
-    """Return corners (V, 3) [m] and triangles (F, 3), anticlockwise from outside, of the surface of spheres' union.
+    """Return vertices (V, 3) [m] and triangles (F, 3), anticlockwise from outside, of a union of spheres.
 
     Args:
-        centers: Shape (N, 3) [m].
-        radii: Shape (N,) [m].
-        resolution: Cells along the longest side.
+        centers: Centres of the spheres [m], shape (N, 3).
+        radii: Radii of the spheres [m], shape (N,).
+        resolution: Number of cells along the longest side.
     """
     low, high = (centers - radii[:, None]).min(0), (centers + radii[:, None]).max(0)
     pitch = float((high - low).max()) / resolution
@@ -53,12 +54,12 @@ def _surface_net(field: Array, origin: Array, pitch: float) -> tuple[Array, NDAr
 
 
 def _at(field: Array, corner: NDArray[np.int64]) -> Array:
-    """Return the values at one corner of every cell."""
+    """Return the values of a field at one corner of every cell."""
     return field[tuple(slice(c, n - 1 + c) for c, n in zip(corner, field.shape, strict=True))]
 
 
 def _quads(inside: NDArray[np.bool_], number: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
-    """Return two triangles for each grid edge along an axis that the surface crosses."""
+    """Return two triangles (2 n, 3) for each of n grid edges along an axis that the surface crosses."""
     along = np.moveaxis(inside, axis, 0)
     edges = np.argwhere(along[:-1] != along[1:])
     out = along[:-1][tuple(edges.T)]  # inside first: the surface looks along the axis

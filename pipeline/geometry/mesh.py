@@ -1,4 +1,4 @@
-"""Closed triangle meshes as solids: reading, volume, surface samples, mass properties."""
+"""Closed triangle meshes: reading, conversion to a grid, surface samples, mass properties."""
 
 from __future__ import annotations
 
@@ -10,20 +10,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from ...schemas import InputDataError
-from .volume import Array, MassProperties, Volume
+from .solid_grid import Array, MassProperties, Volume
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh.
-
-    Attributes:
-        vertices: Positions [m], shape (V, 3).
-        faces: Vertex indices, counter-clockwise seen from outside, shape (F, 3).
-    """
+    """A triangle mesh."""
 
     vertices: Array
+    """Positions [m], shape (V, 3)."""
     faces: NDArray[np.int64]
+    """Vertex indices, counter-clockwise seen from outside, shape (F, 3)."""
 
     def corners(self) -> Array:
         """Return the triangles' corners [m], shape (F, 3 corners, 3)."""
@@ -31,10 +28,10 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a .obj or .stl file (binary or text), metres.
+    """Read a closed mesh from a .obj or .stl file (binary or text), in metres.
 
     Raises:
-        InputDataError: If the file is missing, is of another kind, holds no triangles, or is not closed.
+        InputDataError: If the file is missing or has another format, or the mesh has no triangles or is not closed.
     """
     if not path.is_file():
         raise InputDataError(f"{path}: no such file.", todo="correct the path of the mesh in capture.toml.")
@@ -48,12 +45,12 @@ def read_mesh(path: Path) -> Mesh:
     if mesh.faces.shape[0] < 4 or not np.isfinite(mesh.vertices).all():
         raise InputDataError(f"{path}: no closed mesh; found {mesh.faces.shape[0]} triangles.")
     _check_closed(mesh, path)
-    # A mesh turned inside out is as good as any other once its triangles are flipped.
+    # triangles of a mesh that is inside out are flipped
     return mesh if _signed_volume(mesh) > 0 else Mesh(mesh.vertices, mesh.faces[:, ::-1])
 
 
 def mesh_mass_properties(mesh: Mesh) -> MassProperties:
-    """Return the exact mass properties, by signed tetrahedra from the origin (divergence theorem)."""
+    """Return the exact mass properties of a mesh, by signed tetrahedra from the origin (divergence theorem)."""
     triangles = mesh.corners()
     volumes = np.linalg.det(triangles) / 6
     volume = volumes.sum()
@@ -65,7 +62,7 @@ def mesh_mass_properties(mesh: Mesh) -> MassProperties:
 
 
 def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
-    """Put a closed mesh on a grid whose longest side has about `resolution` points."""
+    """Convert a closed mesh to a grid with about `resolution` points along its longest side."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     pitch = float((high - low).max()) / (resolution - 6)
     # An irrational shift keeps rays off vertices and edges, where parity is ambiguous.
@@ -78,7 +75,7 @@ def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
 
 
 def sample_surface(mesh: Mesh, spacing: float) -> Array:
-    """Return points on all triangles no further apart than about `spacing` [m], the vertices among them, (S, 3)."""
+    """Return points (S, 3) [m] on all triangles, including the vertices, at most about `spacing` [m] apart."""
     triangles = mesh.corners()
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(1)
     divisions = np.maximum(1, np.ceil(longest / spacing)).astype(int)

@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions (w, x, y, z; Hamilton), batched and differentiable.
+"""Rotations as unit quaternions (w, x, y, z; Hamilton) in torch, batched and differentiable.
 
 Formulas: J. Sola, "Quaternion kinematics for the error-state Kalman filter" (arXiv 1711.02508), sections 1 to 4.
 """
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 _SMALL_ANGLE2 = 1e-8
-"""Below this squared angle [rad2] the series is exact to double precision."""
+"""Threshold on the squared angle [rad2] below which the series is exact to double precision."""
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Return the quaternion product a b, both (..., 4): first b rotates, then a."""
+    """Return the quaternion product a b of quaternions (..., 4): the rotation by b, then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -50,7 +50,7 @@ def quat_to_matrix(quat_wxyz: Tensor) -> Tensor:
 def matrix_to_quat(matrix: Tensor) -> Tensor:
     """Return unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
-    The largest of the four components is taken from the diagonal, so that no division is small (Shepperd 1978).
+    The largest of the four components is taken from the diagonal, which avoids small divisors (Shepperd 1978).
     """
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

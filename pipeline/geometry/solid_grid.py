@@ -1,4 +1,4 @@
-"""Solids on a grid: signed distance, surface points, and the mass properties of a uniform solid."""
+"""Solids on a regular grid: signed distance, surface points and mass properties."""
 
 from __future__ import annotations
 
@@ -15,75 +15,76 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass properties of a solid of uniform density.
-
-    Attributes:
-        volume_m3: Volume [m^3].
-        com_m: Centre of mass in the solid's frame [m], shape (3,).
-        inertia_m2: Inertia about the centre of mass for a mass of 1 kg, axes of the solid's frame [m^2], shape (3, 3).
-    """
+    """Mass properties of a solid of uniform density."""
 
     volume_m3: float
+    """Volume [m3]."""
     com_m: Array
+    """Centre of mass in the solid's frame [m], shape (3,)."""
     inertia_m2: Array
+    """Inertia about the centre of mass for a mass of 1 kg, axes of the solid's frame [m2], shape (3, 3)."""
 
     def shifted(self, offset: Array) -> MassProperties:
-        """Return the properties in a frame with the same axes in which the solid lies `offset` [m] further on."""
+        """Return the properties of the solid translated by `offset` (3,) [m], in the same frame."""
         return MassProperties(self.volume_m3, self.com_m + offset, self.inertia_m2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Volume:
-    """A solid, as its signed distance on a regular grid.
-
-    Attributes:
-        origin: Position of grid point (0, 0, 0) [m], shape (3,).
-        pitch: Grid spacing [m].
-        distance: Signed distance to the surface at the grid points [m], positive outside, shape (X, Y, Z).
-        surface: Points on the surface [m], about one or more per square pitch, shape (S, 3).
-        normals: Outward unit normals at `surface`, shape (S, 3).
-        corner_count: The last so many of `surface` are tips that are finer than the grid.
-    """
+    """A solid as its signed distance on a regular grid."""
 
     origin: Array
+    """Position of grid point (0, 0, 0) [m], shape (3,)."""
     pitch: float
+    """Grid spacing [m]."""
     distance: Array
+    """Signed distance to the surface at the grid points [m], positive outside, shape (X, Y, Z)."""
     surface: Array
+    """Points on the surface [m], at least about one per square pitch, shape (S, 3)."""
     normals: Array
+    """Outward unit normals at `surface`, shape (S, 3)."""
     corner_count: int = 0
+    """Number of points at the end of `surface` that are tips finer than the grid."""
 
     @staticmethod
     def from_inside(
         inside: NDArray[np.bool_], origin: Array, pitch: float, surface: Array, corner_count: int = 0
     ) -> Volume:
-        """Make a volume from an occupancy grid and accurate points on its surface.
+        """Build a volume from an occupancy grid and accurate points on its surface.
 
         Args:
             inside: Whether each grid point lies inside, shape (X, Y, Z).
             origin: Position of grid point (0, 0, 0) [m].
             pitch: Grid spacing [m].
             surface: Points on the surface [m], at most about a pitch apart, shape (S, 3).
-            corner_count: How many of them, at the end, are tips that are finer than the grid.
+            corner_count: Number of points at the end of `surface` that are tips finer than the grid.
         """
         away = _distance_to(surface, inside.shape, np.asarray(origin, float), pitch)
         distance = np.where(inside, -away, away)
         gradient = np.stack([np.gradient(distance, pitch, axis=k) for k in range(3)], -1)
         normals = np.stack([_interpolate(gradient[..., k], origin, pitch, surface) for k in range(3)], 1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        return Volume(np.asarray(origin, float), pitch, distance, surface, normals, corner_count)
+        return Volume(
+            origin=np.asarray(origin, float),
+            pitch=pitch,
+            distance=distance,
+            surface=surface,
+            normals=normals,
+            corner_count=corner_count,
+        )
 
     def at(self, points: Array) -> Array:
-        """Return the signed distance [m] at points (n, 3) [m], by trilinear interpolation (clamped at the border)."""
+        """Return the signed distance (n,) [m] at points (n, 3) [m], interpolated, clamped at the border."""
         return _interpolate(self.distance, self.origin, self.pitch, points)
 
     @property
     def tolerance(self) -> float:
-        """How accurate the signed distance is [m]."""
+        """Accuracy of the signed distance [m]."""
         return 0.1 * self.pitch
 
     @property
     def corners(self) -> Array:
-        """Return the tips that are finer than the grid [m], shape (corner_count, 3)."""
+        """Tips that are finer than the grid [m], shape (corner_count, 3)."""
         return self.surface[len(self.surface) - self.corner_count :]
 
     def size(self) -> float:
@@ -91,7 +92,7 @@ class Volume:
         return float(np.linalg.norm(np.ptp(self.surface, axis=0)))
 
     def mass_properties(self) -> MassProperties:
-        """Return the mass properties, with cells that the surface cuts counted in part."""
+        """Return the mass properties, with partial weights of the cells that the surface cuts."""
         share = np.clip(0.5 - self.distance / self.pitch, 0.0, 1.0).reshape(-1)
         kept = share > 0
         points = grid_points(self.distance.shape, self.origin, self.pitch)[kept]
@@ -104,13 +105,13 @@ class Volume:
 
 
 def grid_points(shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
-    """Return the positions of all grid points [m], shape (X * Y * Z, 3), the last axis running fastest."""
+    """Return the positions of all grid points [m], shape (X * Y * Z, 3), with the last axis fastest."""
     axes = [origin[k] + pitch * np.arange(shape[k]) for k in range(3)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
 def crossings(field: Array, origin: Array, pitch: float) -> Array:
-    """Return where a field on a grid changes sign along the grid's edges [m], shape (S, 3), by linear interpolation."""
+    """Return the points (S, 3) [m] at which a field changes sign along grid edges, by linear interpolation."""
     found = []
     for axis in range(3):
         low = np.take(field, np.arange(field.shape[axis] - 1), axis)
@@ -126,15 +127,15 @@ def crossings(field: Array, origin: Array, pitch: float) -> Array:
 
 
 def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
-    """Return the distance [m] from each grid point to the nearest of dense surface points, shape (X, Y, Z)."""
+    """Return the distance [m] from each grid point to the nearest surface point, shape (X, Y, Z)."""
     cells = np.clip(np.rint((surface - origin) / pitch).astype(int), 0, np.array(shape) - 1)
     representative = np.full(shape, -1)
     representative[tuple(cells.T)] = np.arange(surface.shape[0])
     nearest = np.asarray(distance_transform_edt(representative < 0, return_distances=False, return_indices=True))
     points = grid_points(shape, origin, pitch)
     away = np.linalg.norm(points - surface[representative[tuple(nearest)].reshape(-1)], axis=1)
-    # One point stands for a cell above; near the surface, where that matters, the nearest one is found instead. A tree
-    # search for all grid points would be slow: in the middle of a solid, many points are about equally near.
+    # Above, one point represents a cell; near the surface the exact nearest point is searched instead. A tree search
+    # for all grid points would be slow: in the middle of a solid, many points are about equally near.
     near = away < 3 * pitch
     away[near], _ = KDTree(surface).query(points[near])
     return away.reshape(shape)

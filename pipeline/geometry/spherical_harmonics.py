@@ -1,6 +1,7 @@
-"""Colours that depend on the direction from which they are seen: real spherical harmonics up to degree 3.
+"""View-dependent colours by real spherical harmonics up to degree 3.
 
-Basis and signs are those of 3D Gaussian splatting (its rasteriser; arXiv 2308.04079), so that its viewers agree.
+Basis and signs are those of 3D Gaussian splatting (its rasteriser; arXiv 2308.04079), so that its viewers show the same
+colours.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...datasets.ply import SH_C0
+from ...datasets.shapes.ply import SH_C0
 
 
 def term_count(degree: int) -> int:
@@ -17,7 +18,7 @@ def term_count(degree: int) -> int:
 
 
 def harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Return the harmonics (N, (degree + 1)^2) of unit directions from the camera to the sphere (N, 3), world frame."""
+    """Evaluate the harmonics (N, (degree + 1)^2) at unit directions (N, 3) from camera to sphere, world frame."""
     x, y, z = directions.unbind(-1)
     terms = [torch.full_like(x, SH_C0)]
     if degree > 0:
@@ -47,13 +48,13 @@ def harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def seen_colors(colors: Tensor, higher: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """Return the colours (N, 3) of spheres seen from a camera, at least 0.
+    """Return the colours (N, 3) of spheres as seen by a camera, at least 0.
 
     Args:
-        colors: Their mean over all directions, shape (N, 3).
+        colors: Mean colours over all directions, shape (N, 3).
         higher: Coefficients of the harmonics from degree 1 on, shape (N, (degree + 1)^2 - 1, 3).
-        means: Centres, world frame, shape (N, 3).
-        eye: The camera's centre, world frame, shape (3,).
+        means: Centres, world frame [m], shape (N, 3).
+        eye: Centre of the camera, world frame [m], shape (3,).
     """
     degree = round((higher.shape[1] + 1) ** 0.5) - 1
     directions = torch.nn.functional.normalize(means - eye, dim=-1)

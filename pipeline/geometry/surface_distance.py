@@ -1,4 +1,4 @@
-"""The surface of a union of spheres, and how far two such surfaces are apart."""
+"""Surface of a union of spheres, and distances between two such surfaces."""
 
 from __future__ import annotations
 
@@ -8,36 +8,43 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from .directions import fibonacci_directions
-from .volume import Array
+from .solid_grid import Array
 
 _SAMPLES = 60_000
+"""Approximate number of surface samples of all spheres together."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """How far a surface is from another, over its area: mean, 95th percentile and largest distance [m]."""
+    """Statistics of the distance of a surface from another, over its area."""
 
     mean_m: float
+    """Mean distance [m]."""
     percentile_95_m: float
+    """95th percentile of the distance [m]."""
     max_m: float
+    """Largest distance [m]."""
 
     @staticmethod
     def of(distances: Array) -> Gap:
-        """Return the figures of distances (n,) [m] at points that are spread evenly over a surface."""
+        """Return the statistics of distances (n,) [m] at points that are evenly distributed over a surface."""
         return Gap(float(distances.mean()), float(np.percentile(distances, 95)), float(distances.max()))
 
 
 @dataclass(frozen=True)
 class Union:
-    """A union of spheres: centres [m] (n, 3), radii [m] (n,), and points spread evenly over its surface [m] (S, 3)."""
+    """A union of spheres with samples of its surface."""
 
     centers: Array
+    """Centres [m], shape (n, 3)."""
     radii: Array
+    """Radii [m], shape (n,)."""
     surface: Array
+    """Points evenly distributed over the surface [m], shape (S, 3)."""
 
     @staticmethod
     def of(centers: Array, radii: Array) -> Union:
-        """Return the union of spheres, its surface sampled as densely as about 60,000 points on all spheres allow."""
+        """Build the union of spheres, its surface sampled at the density of about 60,000 points on all spheres."""
         centers, radii = np.asarray(centers, float), np.asarray(radii, float)
         spacing = float(np.sqrt(4 * np.pi * (radii**2).sum() / _SAMPLES))
         return Union(centers, radii, union_surface(centers, radii, spacing))
@@ -45,8 +52,8 @@ class Union:
     def distance(self, points: Array) -> Array:
         """Return the distance of points (n, 3) from the surface [m], shape (n,).
 
-        Inside, the nearest point of the sphere in which a point lies deepest is the nearest of all where no other
-        sphere covers it; elsewhere the nearest of `surface` stands for it.
+        Inside, the nearest surface point is that of the sphere in which a point lies deepest, if no other sphere covers
+        it; otherwise the nearest point of `surface` is used.
         """
         signed, deepest = _deepest(self.centers, self.radii, points)
         inside = np.flatnonzero(signed < 0)
@@ -59,17 +66,17 @@ class Union:
         return distance
 
     def gaps(self, other: Union) -> tuple[Gap, Gap]:
-        """Return how far this surface is from another, and the other from this one."""
+        """Return the distance statistics of this surface from another, and of the other from this one."""
         return Gap.of(other.distance(self.surface)), Gap.of(self.distance(other.surface))
 
 
 def union_distance(centers: Array, radii: Array, points: Array) -> Array:
-    """Return min |p - c| - r over spheres at points (n, 3) [m]: the exact distance outside of their union."""
+    """Return min |p - c| - r over spheres at points (n, 3) [m], which is the exact distance outside of their union."""
     return _deepest(centers, radii, points)[0]
 
 
 def _deepest(centers: Array, radii: Array, points: Array) -> tuple[Array, Array]:
-    """Return min |p - c| - r over spheres at points (n, 3) [m], and which sphere has it, each (n,)."""
+    """Return min |p - c| - r over spheres at points (n, 3) [m], and the index of that sphere, each (n,)."""
     nearest, which = np.full(points.shape[0], np.inf), np.zeros(points.shape[0], np.int64)
     for index, (center, radius) in enumerate(zip(centers, radii, strict=True)):
         away = np.linalg.norm(points - center, axis=1) - radius

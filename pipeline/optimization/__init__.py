@@ -1,1 +1,1 @@
-"""Least squares with exact forward-mode derivatives, and the uncertainty of what it finds."""
+"""Optimization kernels: least squares, importance sampling, forward-mode derivatives, uncertainty of estimates."""

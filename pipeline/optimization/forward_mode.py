@@ -22,7 +22,9 @@ _SCALAR_FORMS = {
     torch.Tensor.div: torch.ops.aten.div.Scalar,
     torch.Tensor.__truediv__: torch.ops.aten.div.Scalar,
 }
+"""Operations with a Python number, and their forms that need no tensor of it."""
 _RECIPROCAL = {torch.Tensor.__rtruediv__, torch.Tensor.__rdiv__}
+"""Divisions of a Python number by a tensor."""
 _MIXED = {
     *_SCALAR_FORMS,
     torch.Tensor.__rsub__,
@@ -33,13 +35,14 @@ _MIXED = {
     torch.minimum,
     torch.where,
 }
+"""Operations whose constant operands get a tangent of zeros."""
 
 
 class _DenseTangents(TorchFunctionMode):
-    """Give constants that meet differentiated tensors a tangent of zeros.
+    """Give constants that are combined with differentiated tensors a tangent of zeros.
 
-    Without one, torch 2.13 takes a symbolic zero and resolves every such operation in Python, which is 40 times
-    slower for small tensors (250 against 6 microseconds for a product with a constant).
+    Without one, torch 2.13 uses a symbolic zero and resolves every such operation in Python, which is 40 times slower
+    for small tensors (250 against 6 microseconds for a product with a constant).
     """
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -58,6 +61,7 @@ class _DenseTangents(TorchFunctionMode):
 
 
 def _lifted(x: Tensor) -> Tensor:
+    """Return a dual tensor with a tangent of zeros; tensors that have one, or are not floating point, unchanged."""
     if not x.is_floating_point() or forward_ad.unpack_dual(x).tangent is not None:
         return x
     dense = x.contiguous()  # an expanded view cannot carry a tangent
@@ -67,8 +71,8 @@ def _lifted(x: Tensor) -> Tensor:
 def batched_jacobian(function: Callable[[Tensor, int], Tensor], inputs: Tensor) -> tuple[Tensor, Tensor]:
     """Return values and Jacobians of a function that treats the items of a batch independently.
 
-    The batch is repeated once for each direction and pushed through in one forward-mode pass: rollouts of small
-    bodies are bound by the number of operations, not by their size, so all directions cost little more than one.
+    The batch is repeated once for each direction and evaluated in one forward-mode pass. Rollouts of small bodies are
+    limited by the number of operations, not by their size, so all directions cost little more than one.
 
     Args:
         function: Maps inputs (K B, D) and the number of repeats K to outputs (K B, M).

@@ -1,7 +1,10 @@
-"""Global search for a loss landscape that is bad: adaptive importance sampling, and uncertainty from its samples.
+"""Global search by adaptive importance sampling, and uncertainty from its samples, for rough loss landscapes.
 
-Open-loop errors of bouncing bodies are rough in the parameters: gradients mislead and the best sample of many is luck,
-averages over samples are neither.
+Open-loop errors of bouncing bodies are rough in the parameters: gradients are misleading and the best of many samples
+is random, but averages over samples are reliable.
+
+A model error affects every frame alike: a hundred frames of a toss contain a few independent errors, not a hundred.
+The likelihood is tempered accordingly (a generalized posterior; Bissiri, Holmes & Walker 2016).
 """
 
 from __future__ import annotations
@@ -17,40 +20,46 @@ Costs = Callable[[Array], Array]
 """Samples (K, P) -> costs of every episode (K, E); not finite where the model diverges."""
 
 _WIDENING = 1.5
-"""Each generation's proposal has this many times the covariance of the samples before it, so as not to miss tails."""
+"""Factor by which a proposal's covariance exceeds that of the weighted samples, so that tails are covered."""
 _LEAST_STD = 0.03
-"""Least spread of a proposal, as a share of the prior's."""
+"""Minimum standard deviation of a proposal, as a share of the prior's."""
 
 
 @dataclass(frozen=True)
-class Prior:
-    """A normal prior in the fitted coordinates: mean (P,), std (P,), cut off at bounds (P, 2)."""
+class NormalPrior:
+    """Normal prior in the fitted coordinates, truncated at bounds."""
 
     mean: Array
+    """Mean (P,)."""
     std: Array
+    """Standard deviation (P,)."""
     bounds: Array
+    """Lower and upper bounds (P, 2)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchResult:
-    """What the search saw.
-
-    mean (P,), covariance (P, P): of the tempered posterior; lowest: the lowest mean cost over episodes; samples
-    (N, P); costs (N, E); history: the lowest cost after every generation; effective_samples: of the N.
-    """
+    """Result of the search."""
 
     mean: Array
+    """Mean (P,) of the tempered posterior."""
     covariance: Array
+    """Covariance (P, P) of the tempered posterior."""
     lowest: float
+    """Lowest mean cost over episodes."""
     samples: Array
+    """All samples (N, P)."""
     costs: Array
+    """Their costs (N, E) by episode."""
     history: list[float]
+    """Lowest mean cost after each generation."""
     effective_samples: float
+    """Effective number of the N samples."""
 
 
 def importance_search(
     costs: Costs,
-    prior: Prior,
+    prior: NormalPrior,
     *,
     seed: int,
     population: int,
@@ -62,11 +71,9 @@ def importance_search(
 ) -> SearchResult:
     """Sample the posterior under a tempered likelihood, exp(-errors / 2 * (cost / scale)^2) with scale the lowest cost.
 
-    A model that misses something misses it in every frame alike: a hundred frames of a toss hold a few independent
-    errors and not a hundred, and `errors` says how many (a generalised posterior; Bissiri, Holmes & Walker 2016). The
-    sampler is population Monte Carlo (Cappe et al. 2004): every generation draws from a normal fitted to the weighted
-    samples so far, and all samples are weighted against the mixture of all proposals. While fewer than a quarter of a
-    generation would count, the likelihood is flattened further.
+    The sampler is population Monte Carlo (Cappe et al. 2004): every generation draws from a normal fitted to the
+    weighted samples so far, and all samples are weighted against the mixture of all proposals. While the effective
+    number of samples is below a quarter of a generation, the likelihood is flattened further.
 
     Args:
         costs: See `Costs`; errors in one unit, >= 0.
@@ -75,12 +82,11 @@ def importance_search(
         population: Samples in a generation.
         generations: Number of generations.
         errors: Number of independent errors in the mean cost.
-        floor: Cost that the measurement's noise alone makes; the scale is never below it.
+        floor: Cost of the measurement noise alone, the minimum of the scale.
         first: The first sample (P,); the prior's mean by default.
         on_generation: Called with the generation and the lowest cost so far.
     """
-    rng = np.random.default_rng(seed)
-    size = len(prior.mean)
+    rng, size = np.random.default_rng(seed), len(prior.mean)
     proposals = [(prior.mean.astype(float), np.diag(np.square(prior.std)))]
     samples, found = np.empty((0, size)), np.empty((0, 0))
     history: list[float] = []
@@ -98,17 +104,29 @@ def importance_search(
         if not np.isfinite(history[-1]):
             continue
         fit = -0.5 * (np.square(total) - history[-1] ** 2) / max(history[-1], floor) ** 2
-        weight, effective = _weights(
-            _log_ratio(samples, prior, proposals), fit, errors, max(population / 4, 2.0 * size)
-        )
-        mean = weight @ samples
-        covariance = (samples - mean).T @ ((samples - mean) * weight[:, None])
+        log_ratio, least = _log_ratio(samples, prior, proposals), max(population / 4, 2.0 * size)
+        weight, effective = _weights(log_ratio, fit, errors, least)
+        mean, covariance = _moments(samples, weight)
         proposals.append((mean, _WIDENING * covariance + np.diag(np.square(_LEAST_STD * prior.std))))
-    return SearchResult(mean, covariance, history[-1], samples, found, history, effective)
+    return SearchResult(
+        mean=mean,
+        covariance=covariance,
+        lowest=history[-1],
+        samples=samples,
+        costs=found,
+        history=history,
+        effective_samples=effective,
+    )
 
 
-def _log_ratio(samples: Array, prior: Prior, proposals: list[tuple[Array, Array]]) -> Array:
-    """Return log of the prior's density over the proposals' mixture (N,), up to a constant."""
+def _moments(samples: Array, weight: Array) -> tuple[Array, Array]:
+    """Return the mean (P,) and the covariance (P, P) of weighted samples (N, P)."""
+    mean = weight @ samples
+    return mean, (samples - mean).T @ ((samples - mean) * weight[:, None])
+
+
+def _log_ratio(samples: Array, prior: NormalPrior, proposals: list[tuple[Array, Array]]) -> Array:
+    """Return the log ratio (N,) of the prior's density to that of the mixture of proposals, up to a constant."""
     logs = []
     for mean, covariance in proposals:
         offset = np.linalg.solve(np.linalg.cholesky(covariance), (samples - mean).T)
@@ -118,7 +136,10 @@ def _log_ratio(samples: Array, prior: Prior, proposals: list[tuple[Array, Array]
 
 
 def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple[Array, float]:
-    """Return normalised weights (N,) and their effective number, with as much of `errors` as leaves `least`."""
+    """Return normalized weights (N,) and their effective number.
+
+    `errors` is reduced until the effective number reaches `least`.
+    """
     for _ in range(40):
         log_weight = log_ratio + errors * np.where(np.isfinite(fit), fit, -np.inf)
         weight = np.exp(log_weight - log_weight.max())
@@ -131,11 +152,20 @@ def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple
 
 
 def episode_covariance(result: SearchResult, at: np.ndarray, minimum: int = 8) -> np.ndarray | None:
-    """Return the covariance (P, P) of the minimiser from the scatter between episodes, or None for few episodes.
+    """Estimate the covariance (P, P) of the minimizer from the scatter between episodes.
 
-    A quadratic is fitted to every episode's cost over the samples nearest to `at`; with H the mean curvature and g
-    the episodes' slopes there, the covariance is H^-1 cov(g) H^-1 / E (the sandwich of an M-estimator; Huber 1967,
-    with derivatives over the width of the sample cloud, where the cost is smooth, not at a point, where it is rough).
+    A quadratic is fitted to every episode's cost over the samples nearest to `at`. With H the mean curvature and g the
+    episodes' slopes there, the covariance is H^-1 cov(g) H^-1 / E (the sandwich of an M-estimator; Huber 1967). The
+    derivatives are taken over the width of the sample cloud, where the cost is smooth, not at a point, where it is
+    rough.
+
+    Args:
+        result: Result of the search.
+        at: The minimizer (P,).
+        minimum: Minimum number of episodes.
+
+    Returns:
+        The covariance; None for too few episodes or samples, or without curvature.
     """
     episodes, size = result.costs.shape[1], len(at)
     terms = 1 + size + size * (size + 1) // 2
@@ -158,7 +188,7 @@ def episode_covariance(result: SearchResult, at: np.ndarray, minimum: int = 8) -
     eigenvalues, vectors = np.linalg.eigh(curvature)
     if eigenvalues[-1] <= 0:
         return None
-    # a direction without curvature is one that the data do not see: give it the width of the search
+    # the data do not determine a direction without curvature: it gets the width of the search
     floor = np.maximum(eigenvalues, 1e-3 * eigenvalues[-1])
     inverse = vectors @ np.diag(1 / floor) @ vectors.T
     covariance = inverse @ np.atleast_2d(np.cov(slopes)) @ inverse / episodes

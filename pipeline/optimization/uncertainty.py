@@ -1,25 +1,104 @@
-"""Tail probabilities and quantiles; from `scipy.special`, as `scipy.stats` alone takes half a second to import."""
+"""Tail probabilities, quantiles and covariances of estimates.
+
+The distributions come from `scipy.special`, because importing `scipy.stats` takes half a second.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, ndtr, stdtrit
+
+from ...schemas import Correlation
+
+Array = NDArray[np.float64]
 
 
 def chi2_tail(statistic: float, dof: float) -> float:
-    """Return the probability that chi2 of `dof` degrees of freedom exceeds a statistic."""
+    """Return the probability that chi2 with `dof` degrees of freedom exceeds a statistic."""
     return float(chdtrc(dof, max(statistic, 0.0)))
 
 
 def f_tail(statistic: float, dof_above: float, dof_below: float) -> float:
-    """Return the probability that Fisher's F of these degrees of freedom exceeds a statistic."""
+    """Return the probability that Fisher's F with the given degrees of freedom exceeds a statistic."""
     return float(fdtrc(dof_above, dof_below, max(statistic, 0.0)))
 
 
 def normal_tail(z: float) -> float:
-    """Return the probability that a standard normal number exceeds z."""
+    """Return the probability that a standard normal variable exceeds z."""
     return float(ndtr(-z))
 
 
 def student_quantile(probability: float, dof: float) -> float:
-    """Return the quantile of Student's t of `dof` degrees of freedom."""
+    """Return the quantile of Student's t with `dof` degrees of freedom."""
     return float(stdtrit(dof, probability))
+
+
+def scaled_pinv(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pseudo-inverse of a symmetric matrix, computed after scaling to a unit diagonal."""
+    scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+    return np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+
+
+LEAST_INFORMATION, ROUNDING = 1e-30, 1e-10
+"""Minimum information of a parameter, and minimum eigenvalue of the scaled information matrix as a share of the
+largest; smaller values are raised to these."""
+
+
+ENOUGH_EPISODES = 8
+"""Minimum number of episodes from which their scatter alone determines the intervals."""
+
+
+def correlation_of(names: Sequence[str], covariance: Array) -> Correlation:
+    """Return the correlations of fitted coordinates with a covariance (P, P), in the form of `model.json`."""
+    std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
+    return Correlation(parameters=tuple(names), matrix=tuple(map(tuple, (covariance / np.outer(std, std)).tolist())))
+
+
+def few_covariance(information: Array, scores: Array, prior: Array | None = None) -> Array:
+    """Return the covariance (P, P) of estimates from few episodes.
+
+    With `ENOUGH_EPISODES` or more it is that of the scatter between episodes (Huber 1967). With fewer, the scatter may
+    be small by chance, so each variance is at least that of the curvature, which follows from the noise. The curvature
+    alone would be far too narrow, because a model error affects all frames of an episode alike; the scatter is
+    therefore included, with the corrections for small samples (n / (n - 1), and Student's t instead of the normal
+    distribution).
+
+    Args:
+        information: Information (P, P).
+        scores: Gradient of each episode (E, P).
+        prior: Part (P, P) of the information that comes from a prior. It has no gradient in any episode, so it is added
+            to the scatter; otherwise a parameter that no episode shows would seem exact.
+    """
+    curvature = inverse(information)
+    count = len(scores)
+    spread = scores.T @ scores + (0.0 if prior is None else prior)
+    scatter = curvature @ spread @ curvature
+    if count >= ENOUGH_EPISODES:
+        return scatter
+    if count < 2:
+        return curvature
+    return _wider(curvature, count / (count - 1) * (student_quantile(0.975, count - 1) / REACH) ** 2 * scatter)
+
+
+def _wider(covariance: Array, other: Array) -> Array:
+    """Return a covariance (P, P) with variances raised to those of another where larger, and unchanged correlations."""
+    width = np.sqrt(np.maximum(1.0, np.diag(other) / np.diag(covariance).clip(1e-300)))
+    return covariance * np.outer(width, width)
+
+
+def inverse(information: Array) -> Array:
+    """Return the inverse of an information matrix (P, P), with a large positive variance in unmeasured directions.
+
+    The elimination of states may leave a direction with a slightly negative information, by rounding.
+    """
+    scale = np.sqrt(np.diag(information).clip(LEAST_INFORMATION))
+    sizes, directions = np.linalg.eigh(information / np.outer(scale, scale))
+    sizes = sizes.clip(ROUNDING * max(float(sizes[-1]), 1.0))
+    return (directions / sizes) @ directions.T / np.outer(scale, scale)
+
+
+REACH = 1.96
+"""Half width of a 95 % interval of a normal variable, in standard errors."""

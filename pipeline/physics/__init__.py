@@ -1,8 +1,8 @@
-"""Contact geometry, dynamics and rollouts of bodies made of spheres."""
+"""Contact geometry, dynamics and simulation of bodies made of spheres."""
 
-from .contact import ContactLaw, damping_ratio_of, restitution
-from .published import PublishedLaw
-from .records import ContactRecord
+from .contact_law import ContactLaw, damping_ratio_of, restitution
+from .contact_record import ContactRecord
+from .paper_law import PaperLaw
 from .rollout import Rollout, simulate
 from .world import Body, State, World, symmetric
 
@@ -10,7 +10,7 @@ __all__ = [
     "Body",
     "ContactLaw",
     "ContactRecord",
-    "PublishedLaw",
+    "PaperLaw",
     "Rollout",
     "State",
     "World",

@@ -1,38 +1,32 @@
-"""Worlds, starts and rollouts that cannot be right, refused with what was found and where."""
+"""Checks of worlds and initial states before a simulation; errors name the value, the body and the environment."""
 
 from __future__ import annotations
 
-import json
 import math
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from ...schemas import InputDataError, NotConvergedError
-from .contact import ContactLaw
-from .detection import GROUND, Placed, body_points, near_body, pairs_of, plain
-from .published import stable_step
-from .rotation import quat_to_matrix
+from ...schemas import InputDataError
+from ..geometry.rotation import quat_to_matrix
+from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of, plain
+from .contact_law import ContactLaw
+from .paper_law import stable_step
 from .world import State, World
 
-if TYPE_CHECKING:
-    from .rollout import Rollout
-
 DEEPEST_SHARE = 0.25
-"""Bodies may begin inside each other by this share of the smaller one's radius; deeper, contact would throw them."""
+"""Maximum initial overlap as a share of the smaller radius; from deeper overlaps contact would throw bodies apart."""
 TRIANGLE_TOLERANCE = 1e-6
+"""Relative tolerance of the triangle inequality between principal moments of inertia."""
 
 
 def require_physical(world: World) -> None:
-    """Check that masses, inertias, contact numbers and the step can be simulated.
+    """Check that masses, inertias, contact coefficients and the step can be simulated.
 
     Raises:
-        InputDataError: If one cannot, with the body or number, its value and the environment.
+        InputDataError: If one cannot, with the body or coefficient, its value and the environment.
     """
     for body in world.bodies:
         if not body.free:
@@ -82,8 +76,9 @@ def largest_step(world: World) -> float:
     """Return the largest step [s] that the contact law admits.
 
     The default law is stable at any step, since one step has the eigenvalues of the exact motion; but a contact must
-    not end within the step in which it begins: h < pi tau / sqrt(1 - zeta^2) (derived; half a period). The published
-    law is unstable beyond `stable_step`, taken for one contact on the lightest body: more at once bear less.
+    not end within the step in which it begins: h < pi tau / sqrt(1 - zeta^2) (derived; half a period). The paper's
+    law is unstable beyond `stable_step`, taken for one contact on the lightest body; several contacts at once need a
+    smaller step.
     """
     law = world.contact
     if isinstance(law, ContactLaw):
@@ -95,7 +90,7 @@ def largest_step(world: World) -> float:
 
 
 def require_state(state: State, names: Sequence[str]) -> None:
-    """Check that a start is finite.
+    """Check that an initial state is finite.
 
     Raises:
         InputDataError: If it is not, with the environment, the body and the quantity.
@@ -111,12 +106,12 @@ def require_state(state: State, names: Sequence[str]) -> None:
 
 
 def require_apart(world: World, state: State, name: str | None = None) -> None:
-    """Check that no two bodies, and no body and the ground, begin deep inside each other.
+    """Check that bodies do not begin deep inside each other or the ground.
 
     Args:
         world: The world.
-        state: The start.
-        name: What the environment is called, where there is one; its number where left out.
+        state: The initial state.
+        name: Name of the environment in messages; its number where left out.
 
     Raises:
         InputDataError: If two do, with their names, the depth and the environment.
@@ -136,24 +131,28 @@ def require_apart(world: World, state: State, name: str | None = None) -> None:
 
 @dataclass(frozen=True)
 class Overlap:
-    """How deep a body is in another or in the ground: depth_m (B,), 0 where apart; size_m (B,): the smaller radius."""
+    """Penetration of a body into another or into the ground."""
 
     body: str
+    """Name of the body."""
     other: str
+    """The other body or the ground, in words."""
     depth_m: Tensor
+    """Depth [m], 0 where they are apart, shape (B,)."""
     size_m: Tensor
+    """Radius of the smaller one about its reference point [m], shape (B,)."""
 
 
 @torch.no_grad()
 def overlaps(world: World, state: State) -> Iterator[Overlap]:
-    """Yield how deep bodies that can touch, and bodies and the ground, are in each other."""
+    """Yield the overlap of each pair of bodies that can touch, and of bodies with the ground."""
     rotations = quat_to_matrix(state.quat_wxyz)
     zero = torch.zeros_like(state.position_m[:, 0])
     placed = []
     for index, body in enumerate(world.bodies):
         position, rotation = state.position_m[:, index], rotations[:, index]
         com = (rotation @ body.com[..., None]).squeeze(-1) if body.free else torch.zeros_like(position)
-        placed.append(Placed(body, position + com, rotation, zero, zero))
+        placed.append(Placed(body=body, reference=position + com, rotation=rotation, velocity=zero, omega=zero))
     for a, b in pairs_of(world):
         depth = _depth(world, placed[a], None if b == GROUND else placed[b])
         size = placed[a].reach if b == GROUND else torch.minimum(placed[a].reach, placed[b].reach)
@@ -161,54 +160,10 @@ def overlaps(world: World, state: State) -> Iterator[Overlap]:
         yield Overlap(world.bodies[a].name, other, depth, size.expand_as(depth))
 
 
-def require_finite(
-    rollout: Rollout, world: World, state: State, names: Sequence[str] = (), frames: Sequence[int] = ()
-) -> None:
-    """Check that a rollout stayed finite; where it did not, save the start so that it can be replayed.
-
-    Args:
-        rollout: The rollout.
-        world: The world it was made of.
-        state: The state it began in.
-        names: What the environments are called; by their numbers where left out.
-        frames: How many frames of each count; all where left out.
-
-    Raises:
-        NotConvergedError: If it did not, with the environment, the step and the file with its start.
-    """
-    poses = torch.cat((rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s), -1)
-    finite = torch.isfinite(poses).flatten(2).all(-1)
-    for item, count in enumerate(frames):
-        finite[item, count:] = True
-    wrong = (~finite).nonzero()
-    if not len(wrong):
-        return
-    item, frame = (int(k) for k in wrong[0])
-    times = rollout.times_s if rollout.times_s.ndim == 1 else rollout.times_s[min(item, len(rollout.times_s) - 1)]
-    since = float(times[frame] - times[0])
-    path = Path(tempfile.mkdtemp(prefix="cgwm-diverged-")) / "start.json"
-    path.write_text(json.dumps(_start(state, world.body_names, item), indent=2) + "\n")
-    raise NotConvergedError(
-        f"{names[item] if names else f'environment {item}'} diverged by step {math.ceil(since / world.step_s - 1e-6)}, "
-        f"{since:.4g} s after its start: its state is not finite. Its start is in {path}.",
-        todo="fit again with a smaller step (--set phys-geo.step_s=...), or check masses, units and the sampling plan.",
-    )
-
-
-def _start(state: State, names: Sequence[str], item: int) -> dict[str, dict[str, list[float]]]:
-    """Return the state of one environment by body."""
-    fields = {key: getattr(state, key) for key in State.__dataclass_fields__}
-    return {
-        name: {key: values[min(item, len(values) - 1), index].tolist() for key, values in fields.items()}
-        for index, name in enumerate(names)
-    }
-
-
 def _depth(world: World, a: Placed, b: Placed | None) -> Tensor:
-    """Return how deep (B,) [m] two bodies are in each other; 0 where they are apart."""
+    """Return the penetration depth (B,) [m] of two bodies, of a and the ground for None; 0 where they are apart."""
     if b is None:
-        normal, offset = world.ground_normal, world.ground_offset
-        assert normal is not None and offset is not None
+        normal, offset = world.ground
         return -(a.centers() @ normal - offset[:, None] - a.radii()).amin(-1).clamp_max(0.0)
     zero = torch.zeros_like(a.reference[:, 0])
     if not bool(near_body(a, b, zero).any()):

@@ -1,12 +1,13 @@
-"""Which spheres of which bodies touch in a step, and where: broad phase, then the smooth distance of the few.
+"""Contact detection: spheres that touch within a step, by a broad phase and a smooth distance.
 
-A sphere that stays apart gets no impulse and has no part in the sharing of mass, so that leaving it out changes
-nothing. What is left out is decided without derivatives; what remains is computed with them.
+A sphere that stays apart gets no impulse and takes no share of the mass, so leaving it out changes nothing. The broad
+phase runs without derivatives; the contact points of the remaining spheres are computed with them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -14,31 +15,32 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from .distance import blended, log_sum_exp_distance, smooth_min
-from .rotation import cross
+from ..geometry.rotation import cross
+from .smooth_distance import blended, log_sum_exp_distance, smooth_min
 from .world import Body, World
 
 PAIR_SMOOTHING_M = 1e-3
-"""Width of the smooth minimum in distances between two bodies of spheres [m]."""
+"""Width of the smooth minimum in the distance between two bodies [m]."""
 ROUNDING_M = 1e-9
-"""Spheres this near to touching are kept in double precision: their distance is computed anew, in other order."""
+"""Margin of the broad phase [m], for rounding: distances are computed again afterwards, in another order."""
 GROUND = -1
-"""The ground's index as second body of a pair."""
+"""Index of the ground as the second body of a pair."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A body where it is in a step, world frame.
-
-    reference (n, 3) [m]: the centre of mass of a free body, the frame's origin of another; rotation (n, 3, 3), body to
-    world; velocity (n, 3) [m/s] of the reference point; omega (n, 3) [rad/s].
-    """
+    """A body at its pose in a step, world frame."""
 
     body: Body
+    """The body."""
     reference: Tensor
+    """Centre of mass of a free body, origin of the frame of another [m], shape (n, 3)."""
     rotation: Tensor
+    """Rotation, body to world, shape (n, 3, 3)."""
     velocity: Tensor
+    """Velocity of the reference point [m/s], shape (n, 3)."""
     omega: Tensor
+    """Angular velocity [rad/s], shape (n, 3)."""
 
     def arms(self, chosen: Tensor | None = None) -> Tensor:
         """Return the spheres (n, N or K, 3) [m] relative to the reference point, world axes."""
@@ -50,7 +52,7 @@ class Placed:
         return self.reference[:, None] + self.arms(chosen)
 
     def radii(self, chosen: Tensor | None = None) -> Tensor:
-        """Return the radii (1 or n, N or K) [m]."""
+        """Return the radii (1 or n, N or K) [m] of its spheres, or of the chosen ones (n, K)."""
         return pick(self.body.radii, chosen)
 
     def point_velocity(self, position: Tensor) -> Tensor:
@@ -58,7 +60,7 @@ class Placed:
         return self.velocity[:, None] + cross(self.omega[:, None], position - self.reference[:, None])
 
     def plain(self) -> Placed:
-        """Return it without derivatives."""
+        """Return the body without derivatives."""
         names = ("com", "centers", "radii")
         body = replace(self.body, **{name: plain(getattr(self.body, name)) for name in names})
         return Placed(body, *(plain(x) for x in (self.reference, self.rotation, self.velocity, self.omega)))
@@ -73,20 +75,22 @@ class Placed:
 
 @dataclass(frozen=True)
 class Points:
-    """Where two bodies touch: slot (n, C), the number of each point in the pair's fixed list; gap, normal, position.
-
-    near (n, C): whether the item has the point itself; the others are there only because another item has as many.
-    """
+    """Contact points of two bodies, world frame: n items of the batch, C points each."""
 
     slot: Tensor
+    """Number of each point in the pair's fixed list, shape (n, C)."""
     near: Tensor
+    """Whether the item itself has the point, shape (n, C); others only fill the item up to the largest number."""
     gap: Tensor
+    """Gap [m], negative where the bodies overlap, shape (n, C)."""
     normal: Tensor
+    """Unit normal, from body b to body a, shape (n, C, 3)."""
     position: Tensor
+    """Contact point [m], shape (n, C, 3)."""
 
 
 def pairs_of(world: World) -> list[tuple[int, int]]:
-    """Return the pairs of bodies that can touch: each free body with the ground (-1) and with every other body."""
+    """List the pairs of bodies that can touch: each free body with the ground (-1) and with every other body."""
     if not world.touching:
         return []
     bodies = world.bodies
@@ -99,7 +103,7 @@ def pairs_of(world: World) -> list[tuple[int, int]]:
 
 
 def slot_count(world: World, pair: tuple[int, int]) -> int:
-    """Return how many points a pair can have: the ground's spheres, or all spheres of both bodies."""
+    """Return the number of contact points that a pair can have: one per sphere that can touch the other side."""
     first = world.bodies[pair[0]]
     if pair[1] == GROUND:
         return first.radii.shape[-1] if first.on_plane is None else len(first.on_plane)
@@ -107,13 +111,12 @@ def slot_count(world: World, pair: tuple[int, int]) -> int:
 
 
 def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
-    """Return how deep (n, S) [m] each slot of a body is in the ground now or at the end of the step; negative: in it.
+    """Return the smaller gap (n, S) [m] of each sphere to the ground, now or at the end of the step; negative inside.
 
     Heights and their rates are products in the body frame: n . (R r) = (R^T n) . r and
     n . (omega x R r) = (R^T (n x omega)) . r.
     """
-    normal, offset, body = world.ground_normal, world.ground_offset, placed.body
-    assert normal is not None and offset is not None  # a pair with the ground exists only with one
+    (normal, offset), body = world.ground, placed.body
     with torch.no_grad():
         still = placed.plain()
         centers, radii = plain(body.centers), plain(body.radii)
@@ -126,7 +129,7 @@ def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
 
 
 def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | None = None) -> Tensor:
-    """Return whether (n,) the balls around two bodies meet within a step; see :func:`body_points`."""
+    """Return whether (n,) the bounding balls of two bodies meet within a step; see :func:`body_points`."""
     with torch.no_grad():
         soft = max(_softness(x, sharpness_per_m) for x in (a, b))
         apart = (plain(a.reference) - plain(b.reference)).square().sum(-1).sqrt()
@@ -134,65 +137,88 @@ def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | Non
 
 
 def ground_points(world: World, placed: Placed, slot: Tensor, near: Tensor | None = None) -> Points:
-    """Return the points by which the spheres in the given slots (n, C) face the ground; `near` as in `Points`."""
-    normal, offset, body = world.ground_normal, world.ground_offset, placed.body
-    assert normal is not None and offset is not None
+    """Return the contact points with the ground of the spheres in the given slots (n, C); `near` as in `Points`."""
+    (normal, offset), body = world.ground, placed.body
     chosen = slot if body.on_plane is None else body.on_plane[slot]
     centers, radii = placed.centers(chosen), placed.radii(chosen)
     gap = centers @ normal - offset[:, None] - radii
     position = centers - radii[..., None] * normal
     near = torch.ones_like(gap, dtype=torch.bool) if near is None else near
-    return Points(slot, near, gap, normal.expand_as(position), position)
+    return Points(slot=slot, near=near, gap=gap, normal=normal.expand_as(position), position=position)
 
 
-def body_points(a: Placed, b: Placed, step_s: Tensor | None, sharpness_per_m: float | None = None) -> Points | None:
-    """Return the points where two bodies touch, or will by the end of the step, both ways; None for none.
+def body_points(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | None = None) -> Points | None:
+    """Return the points where two bodies touch, or will by the end of the step; None where there are none.
 
     The spheres of b against the union of a come first, then those of a against the union of b.
 
     Args:
         a: The first body.
         b: The second body; normals point from it.
-        step_s: Step [s], shape (n,); None for all points, touching or not.
+        step_s: Step [s], shape (n,).
         sharpness_per_m: beta [1/m] of the published log-sum-exp distance; None for the simplex smooth minimum.
     """
     on_a, on_b = (_against_union(*order, step_s, sharpness_per_m) for order in ((a, b), (b, a)))
     count = b.body.radii.shape[-1]
     parts = []
     if on_a is not None:
-        parts.append(Points(on_a.slot, on_a.near, on_a.gap, -on_a.normal, on_a.position))
+        parts.append(replace(on_a, normal=-on_a.normal))
     if on_b is not None:
-        parts.append(Points(on_b.slot + count, on_b.near, on_b.gap, on_b.normal, on_b.position))
-    if not parts:
-        return None
+        parts.append(replace(on_b, slot=on_b.slot + count))
+    return _joined(parts) if parts else None
+
+
+def all_body_points(a: Placed, b: Placed) -> Points:
+    """Return the points of all spheres of two bodies against the other body, touching or not, in slot order."""
+    on_a, on_b = _all_against_union(a, b), _all_against_union(b, a)
+    return _joined([replace(on_a, normal=-on_a.normal), replace(on_b, slot=on_b.slot + b.body.radii.shape[-1])])
+
+
+def _joined(parts: Sequence[Points]) -> Points:
     return Points(*(torch.cat([getattr(part, name) for part in parts], 1) for name in Points.__dataclass_fields__))
 
 
-def _against_union(
-    union: Placed, spheres: Placed, step_s: Tensor | None, sharpness_per_m: float | None
-) -> Points | None:
-    """Return the points of `spheres` at the surface of `union`; normals point out of the union."""
+def _against_union(union: Placed, spheres: Placed, step_s: Tensor, sharpness_per_m: float | None) -> Points | None:
+    """Return the points of `spheres` that may touch `union` within a step; normals point out of the union."""
     softness = _softness(union, sharpness_per_m)
     with torch.no_grad():
         surface, queries = union.plain(), spheres.plain()
-        near = None if step_s is None else _within(queries, surface, step_s, softness)
-        if near is not None and not near.shape[1]:
+        slot = _within(queries, surface, step_s, softness)
+        if not slot.shape[1]:
             return None
-        distance = torch.cdist(queries.centers(near), surface.centers(), compute_mode="donot_use_mm_for_euclid_dist")
-        distance = distance - surface.radii()[:, None]
-        least = distance.amin(-1)
-        slot = _all(spheres, least) if near is None else near
-        own = torch.ones_like(least, dtype=torch.bool)
-        if step_s is not None and near is not None:
-            depth = least - queries.radii(near) - plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
-            kept = _lowest(depth, ROUNDING_M + softness)
-            if kept is None:
-                return None
-            slot, least = near.gather(1, kept), least.gather(1, kept)
-            own = depth.gather(1, kept) < ROUNDING_M + softness
-            distance = distance.gather(1, kept[..., None].expand(-1, -1, distance.shape[-1]))
+        distance = _sphere_distances(queries, surface, slot)
+        reached = plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
+        depth = distance.amin(-1) - queries.radii(slot) - reached
+        kept = _lowest(depth, ROUNDING_M + softness)
+        if kept is None:
+            return None
+        near = depth.gather(1, kept) < ROUNDING_M + softness
+        distance = distance.gather(1, kept[..., None].expand(-1, -1, distance.shape[-1]))
+    return _points_at(union, spheres, slot.gather(1, kept), near, distance, sharpness_per_m)
+
+
+def _all_against_union(union: Placed, spheres: Placed) -> Points:
+    """Return the points of all `spheres` at the surface of `union`; normals point out of the union."""
+    with torch.no_grad():
+        distance = _sphere_distances(spheres.plain(), union.plain(), None)
+    slot = torch.arange(spheres.body.radii.shape[-1], device=distance.device).expand(distance.shape[0], -1)
+    return _points_at(union, spheres, slot, torch.ones_like(slot, dtype=torch.bool), distance, None)
+
+
+def _sphere_distances(queries: Placed, surface: Placed, chosen: Tensor | None) -> Tensor:
+    """Return the distances (n, K, N) [m] from centres of `queries` to each sphere of `surface`."""
+    distance = torch.cdist(queries.centers(chosen), surface.centers(), compute_mode="donot_use_mm_for_euclid_dist")
+    return distance - surface.radii()[:, None]
+
+
+def _points_at(
+    union: Placed, spheres: Placed, slot: Tensor, near: Tensor, distance: Tensor, sharpness_per_m: float | None
+) -> Points:
+    """Return the points of the spheres in slots (n, K), given their distances (n, K, N) to the union's spheres."""
+    with torch.no_grad():
         most = distance.shape[-1]
         if sharpness_per_m is None:  # only spheres within the width of the nearest one have a weight in the minimum
+            least = distance.amin(-1)
             most = int((distance < least[..., None] + PAIR_SMOOTHING_M + ROUNDING_M).sum(-1).max())
         members = distance.topk(most, dim=-1, largest=False, sorted=False).indices
     points = spheres.centers(slot)
@@ -206,18 +232,20 @@ def _against_union(
         minimum = partial(log_sum_exp_distance, per_m=sharpness_per_m)
     value, normal = blended(offset, member_radii, minimum)
     gap = value - radii
-    return Points(slot, own, gap, normal, points - (radii + 0.5 * gap)[..., None] * normal)
+    return Points(
+        slot=slot, near=near, gap=gap, normal=normal, position=points - (radii + 0.5 * gap)[..., None] * normal
+    )
 
 
 def _softness(union: Placed, sharpness_per_m: float | None) -> float:
-    """Return how far [m] the smooth distance may lie below that of the nearest sphere, and a little more."""
+    """Return a bound [m] on how far the smooth distance lies below that of the nearest sphere."""
     if sharpness_per_m is None:
         return PAIR_SMOOTHING_M
     return math.log(union.body.radii.shape[-1]) / sharpness_per_m
 
 
 def _within(queries: Placed, surface: Placed, step_s: Tensor, softness_m: float) -> Tensor:
-    """Return the slots (n, K) of the spheres near the ball around the other body."""
+    """Return the slots (n, K) of the spheres near the bounding ball of the other body."""
     centers = queries.centers()
     apart = (centers - surface.reference[:, None]).square().sum(-1).sqrt() - queries.radii()
     margin = surface.reach + plain(step_s) * _speed_bound(queries, surface) + softness_m
@@ -232,13 +260,9 @@ def _speed_bound(a: Placed, b: Placed) -> Tensor:
 
 
 def _lowest(depth: Tensor, limit: float) -> Tensor | None:
-    """Return the slots (n, K) with values below the limit, as many for each item as any has; None for none."""
+    """Return the slots (n, K) with values below the limit, K the largest number of any item; None where K is 0."""
     most = int((depth < limit).sum(1).max()) if depth.numel() else 0
     return depth.topk(most, dim=1, largest=False, sorted=False).indices if most else None
-
-
-def _all(placed: Placed, like: Tensor) -> Tensor:
-    return torch.arange(placed.body.radii.shape[-1], device=like.device).expand(like.shape[0], -1)
 
 
 def plain(value: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The closed-form, complementarity-free contact law: its numbers, and the points where bodies touch.
+"""Closed-form, complementarity-free contact law: its coefficients, and the contact points to which it applies.
 
 Source: the row rule of complementarity-free contact (arXiv 2408.07855) in its mass- and count-normalised form
 (contact model notes, section 6; derived): for contact c with effective mass m_c and weight q_c,
@@ -8,7 +8,7 @@ Source: the row rule of complementarity-free contact (arXiv 2408.07855) in its m
 u_n is the free velocity of the gap, h the step. tau and zeta are the contact's natural time and damping ratio, so the
 material depends neither on mass, nor on the step, nor on how many spheres touch. Friction is applied to the
 tangential velocity separately, inside the disc of radius friction * impulse_n, which avoids the lift and the
-anisotropy of polyhedral rows. `sweeps.py` applies the law; `published.py` has the polyhedral form of the paper.
+anisotropy of polyhedral rows. `impulse_solver.py` applies the law; `paper_law.py` has the paper's polyhedral form.
 """
 
 from __future__ import annotations
@@ -25,51 +25,63 @@ from ...schemas import InputDataError
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """The numbers of a contact, each of shape (1,) or (B,): friction [1], contact time [s], damping ratio [1]."""
+    """Coefficients of the closed-form contact law, each of shape (1,) or (B,)."""
 
     name: ClassVar[str] = "closed_form"
     friction: Tensor
+    """Coulomb friction coefficient [1]."""
     contact_time_s: Tensor
+    """Natural time of a contact [s]."""
     damping_ratio: Tensor
+    """Damping ratio of a contact [1]."""
 
 
 @dataclass(frozen=True)
 class Touch:
-    """The points where two bodies may touch in a step, and the numbers of their contact, which effects may change.
+    """Contact points of two bodies in a step and their coefficients, which effects may change.
 
-    n items of the batch, C points each. ground: whether b is the ground; position (n, C, 3) [m], normal (n, C, 3)
-    from b to a, both world frame; gap (n, C) [m], negative where they overlap; velocity (n, C, 3) [m/s] of a's point
-    relative to b's without contact; spin_rad_s (n, 3): angular velocity of a relative to b; step_s (n, 1).
-
-    The numbers have shape (n, 1) or (n, C): friction [1]; contact_time_s [s]; damping_ratio [1]; viscous_n_s_m
-    [N s/m]: force against the slip, shared among the points that touch; rolling_m, torsion_m [m]: largest torque
-    against rolling, and against spinning about the normal, in units of the normal force. anisotropy (n, 1 or C, 2) [1]:
-    a and b of the friction by direction along `tangent_axes` of the normal, see `ellipse.py`.
+    n items of the batch, C points each; coefficients have shape (n, 1) or (n, C).
     """
 
     ground: bool
+    """Whether body b is the ground."""
     position: Tensor
+    """Contact points, world frame [m], shape (n, C, 3)."""
     normal: Tensor
+    """Unit normals from b to a, world frame, shape (n, C, 3)."""
     gap: Tensor
+    """Gap [m], negative where the bodies overlap, shape (n, C)."""
     velocity: Tensor
+    """Velocity of a's point relative to b's without contact, world frame [m/s], shape (n, C, 3)."""
     spin_rad_s: Tensor
+    """Angular velocity of a relative to b, world frame [rad/s], shape (n, 3)."""
     step_s: Tensor
+    """Time step [s], shape (n, 1)."""
     friction: Tensor
+    """Coulomb friction coefficient [1]."""
     contact_time_s: Tensor
+    """Natural time of the contact [s]."""
     damping_ratio: Tensor
+    """Damping ratio of the contact [1]."""
     viscous_n_s_m: Tensor | None = None
+    """Viscous force against the slip, shared among the touching points [N s/m]; None for none."""
     rolling_m: Tensor | None = None
+    """Largest torque against rolling in units of the normal force [m]; None for none."""
     torsion_m: Tensor | None = None
+    """Largest torque against spinning about the normal in units of the normal force [m]; None for none."""
     anisotropy: Tensor | None = None
+    """Coefficients a and b of anisotropic friction along `tangent_axes` of the normal [1], see `friction_ellipse.py`;
+    shape (n, 1 or C, 2); None for isotropic friction.
+    """
 
     @property
     def approach_m_s(self) -> Tensor:
-        """Speed (n, C) at which the gap widens; negative on approach."""
+        """Speed (n, C) [m/s] at which the gap widens; negative on approach."""
         return (self.velocity * self.normal).sum(-1)
 
     @property
     def slip_m_s(self) -> Tensor:
-        """Velocity (n, C, 3) along the surface."""
+        """Slip velocity (n, C, 3) [m/s] along the surface, world frame."""
         return self.velocity - self.approach_m_s[..., None] * self.normal
 
 
@@ -117,7 +129,7 @@ def damping_ratio_of(restitution_wanted: Tensor) -> Tensor:
         raise InputDataError(
             f"restitution {wanted.flatten().tolist()}: no damping ratio gives one of its values.",
             "0.005 < restitution < 1.",
-            "use 0.99 for a nearly lossless contact, 0.01 for a dead one.",
+            "use 0.99 for a nearly lossless contact, 0.01 for one that does not rebound.",
         )
     low, high = torch.full_like(wanted, math.log(1e-4)), torch.full_like(wanted, math.log(10.0))
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""The contacts of a rollout, frame by frame: labels for datasets."""
+"""Contact labels of a rollout, frame by frame, for datasets."""
 
 from __future__ import annotations
 
@@ -8,34 +8,41 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .contacts import PairImpulses, put
-from .detection import GROUND, Placed, Points, body_points, ground_points, pairs_of, slot_count
+from .contact_detection import GROUND, Placed, Points, all_body_points, ground_points, pairs_of, slot_count
+from .contact_solver import PairImpulses, put
 from .world import World
 
 SLIDES = 0.99
-"""A contact whose tangential impulse has this share of the friction limit slides."""
+"""Minimum share of the friction limit that the tangential impulse of a sliding contact reaches."""
 
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """The contacts of a rollout, summed over the steps since the previous frame.
-
-    body_a (C,), body_b (C,) int, -1 for the ground; impulse_n_s (B, T, C, 3) on body a; position_m (B, T, C, 3);
-    normal (B, T, C, 3) from b to a; distance_m (B, T, C), negative where they overlap; sliding (B, T, C) bool. World
-    frame.
-    """
+    """Contacts of a rollout, summed over the steps since the previous frame, world frame; C contacts."""
 
     body_a: Tensor
+    """Index of body a, int64, shape (C,)."""
     body_b: Tensor
+    """Index of body b, -1 for the ground, int64, shape (C,)."""
     impulse_n_s: Tensor
+    """Impulse on body a [N s], shape (B, T, C, 3)."""
     position_m: Tensor
+    """Contact point [m], shape (B, T, C, 3)."""
     normal: Tensor
+    """Unit normal from b to a, shape (B, T, C, 3)."""
     distance_m: Tensor
+    """Gap [m], negative where the bodies overlap, shape (B, T, C)."""
     sliding: Tensor
+    """Whether the contact slides, bool, shape (B, T, C)."""
 
 
 class Recorder:
-    """Sums impulses from step to step, and closes a frame with the geometry at its end."""
+    """Collector of contact labels: sums impulses over steps, and adds the geometry at the end of each frame.
+
+    Args:
+        world: The world.
+        placed: The bodies at the first frame.
+    """
 
     def __init__(self, world: World, placed: Sequence[Placed]) -> None:
         self.world = world
@@ -47,11 +54,11 @@ class Recorder:
         self.close_frame(placed)
 
     def add(self, touched: Sequence[PairImpulses]) -> None:
-        """Add the impulses of a step."""
+        """Add the impulses of one step."""
         self.steps.extend(touched)
 
     def close_frame(self, placed: Sequence[Placed]) -> None:
-        """Sum the impulses since the last frame; where none acted, tell the geometry of now."""
+        """Sum the impulses since the last frame; contacts without impulse get the current geometry."""
         columns = []
         for number, (a, b) in enumerate(self.pairs):
             points = self._points(a, b, placed)
@@ -89,9 +96,7 @@ class Recorder:
         if b == GROUND:
             slots = torch.arange(slot_count(self.world, (a, b)), device=placed[a].reference.device)
             return ground_points(self.world, placed[a], slots.expand(self.batch, -1))
-        points = body_points(placed[a], placed[b], None)
-        assert points is not None  # asked for all
-        return points
+        return all_body_points(placed[a], placed[b])
 
     def record(self) -> ContactRecord:
         """Return the record of all frames."""

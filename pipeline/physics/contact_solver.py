@@ -1,16 +1,17 @@
-"""The contacts of all pairs of bodies in a step: found, prepared, and settled together."""
+"""Contact solver of one step: detect the contacts of all pairs of bodies, prepare them, and solve their impulses."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from ...schemas import UsageError
-from .contact import ContactLaw, Touch
-from .detection import (
+from ..geometry.rotation import cross
+from .contact_detection import (
     GROUND,
     ROUNDING_M,
     Placed,
@@ -22,37 +23,43 @@ from .detection import (
     pairs_of,
     slot_count,
 )
-from .ellipse import Ellipse
-from .motion import Inertia, Motion
-from .published import PublishedLaw, published_impulses
-from .rotation import cross
-from .sweeps import ContactGroup, Impulses, Rows, settle, tangent_axes
+from .contact_law import ContactLaw, Touch
+from .friction_ellipse import Ellipse
+from .impulse_solver import ContactGroup, Impulses, Rows, solve_impulses, tangent_axes
+from .paper_law import PaperLaw, paper_impulses
+from .rigid_body import Inertia, Motion
 from .world import World
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PairImpulses:
-    """What one pair of bodies gave each other in a step.
-
-    pair: number in the world's list of pairs; a, b: bodies, b = -1 the ground; free: which of the two move; items
-    (n,): which items of the batch, all for None; points: where; impulse_n_s (n, C, 3): on a, world frame;
-    along_axes_n_s (n, C, 3): the same along the contacts' axes; angular_n_m_s (n, 3): on a beyond the moments of the
-    impulses, None where nothing resists turning; friction: of the contacts, along their impulses.
-    """
+    """Impulses between one pair of bodies in a step; n items of the batch, C points."""
 
     pair: int
+    """Number of the pair in the world's list of pairs."""
     a: int
+    """Index of body a."""
     b: int
+    """Index of body b, -1 for the ground."""
     free: tuple[bool, bool]
+    """Whether a and b move freely."""
     items: Tensor | None
+    """Items of the batch, shape (n,); None for all."""
     points: Points
+    """The contact points."""
     impulse_n_s: Tensor
+    """Impulses on a, world frame [N s], shape (n, C, 3)."""
     along_axes_n_s: Tensor
+    """Impulses on a along the contacts' normals and tangents [N s], shape (n, C, 3)."""
     angular_n_m_s: Tensor | None
+    """Angular impulse on a in addition to the moments of the impulses, world frame [N m s], shape (n, 3); None without
+    resistance to turning.
+    """
     friction: Tensor
+    """Friction coefficient along the impulse [1], shape (n, 1 or C)."""
 
     def on_bodies(self, motions: Sequence[Motion]) -> dict[int, tuple[Tensor, Tensor]]:
-        """Return for each free body the impulse (B, 3) and its moment (B, 3) about the centre of mass."""
+        """Return for each free body the impulse (B, 3) [N s] and its moment (B, 3) [N m s] about the centre of mass."""
         found = {}
         for index, sign, free in ((self.a, 1.0, self.free[0]), (self.b, -1.0, self.free[1])):
             if free:
@@ -67,7 +74,7 @@ class PairImpulses:
         return found
 
     def at(self, slot: Tensor, items: Tensor | None, slots: int, batch: int) -> Tensor:
-        """Return the impulses along the axes (m, K, 3) of given slots (m, K) of given items, 0 where none acted."""
+        """Return the impulses along the axes (m, K, 3) [N s] at slots (m, K) of given items, 0 where none acted."""
         index = self.points.slot[..., None].expand_as(self.along_axes_n_s)
         wide = self.along_axes_n_s.new_zeros((index.shape[0], slots, 3)).scatter(1, index, self.along_axes_n_s)
         full = take(put(wide, self.items, batch), items)
@@ -75,26 +82,35 @@ class PairImpulses:
 
 
 class Contacts:
-    """Finds and settles the contacts of a world's bodies."""
+    """Contact solver of a world.
+
+    Args:
+        world: The world.
+        inertias: The inertias of its bodies, in the world's order.
+    """
 
     def __init__(self, world: World, inertias: Sequence[Inertia]) -> None:
         self.world = world
         self.inertias = inertias
         self.pairs = pairs_of(world)
         self.effects = [active for active in world.effects if active.effect.has("contact")]
-        law, normal = world.contact, world.ground_normal
-        self.sharpness_per_m = law.sharpness_per_m if isinstance(law, PublishedLaw) else None
-        self.ground_axes = None if normal is None else tangent_axes(normal)
+        law = world.contact
+        self.sharpness_per_m = law.sharpness_per_m if isinstance(law, PaperLaw) else None
+
+    @cached_property
+    def _ground_axes(self) -> Tensor:
+        """Normal and tangents of the ground as rows (3, 3)."""
+        return tangent_axes(self.world.ground[0])
 
     def resolve(
         self, placed: Sequence[Placed], step_s: Tensor, before: Sequence[PairImpulses] = ()
     ) -> list[PairImpulses]:
-        """Return the impulses of a step.
+        """Solve the contact impulses of a step.
 
         Args:
             placed: The bodies with their free velocities; B items each.
             step_s: Step [s], shape (B,).
-            before: The impulses of the step before, from which the sweeps begin.
+            before: The impulses of the previous step, which warm-start the solver.
         """
         candidates = self._candidates(placed, step_s)
         if not candidates:
@@ -105,13 +121,12 @@ class Contacts:
         found: list[tuple[int, Points, Touch, Tensor]] = []
         for number, (_, depth) in candidates.items():
             a, b = self.pairs[number]
-            if b == GROUND:
-                assert depth is not None
+            if depth is not None:
                 near = take(depth, items)
                 most = int((near < ROUNDING_M).sum(1).max())
                 slots = near.topk(most, dim=1, largest=False, sorted=False).indices
-                own = near.gather(1, slots) < ROUNDING_M
-                points = ground_points(_on(self.world, items), some[a], slots, own)
+                reached = near.gather(1, slots) < ROUNDING_M
+                points = ground_points(_on(self.world, items), some[a], slots, reached)
             else:
                 points = body_points(some[a], some[b], h, self.sharpness_per_m)
             if points is not None:
@@ -131,12 +146,23 @@ class Contacts:
             if touch.anisotropy is not None:
                 friction = Ellipse.of(friction, touch.anisotropy).along(impulse.linear[..., 1:])
             results.append(
-                PairImpulses(number, a, b, free, items, points, world_impulse, impulse.linear, angular, friction)
+                PairImpulses(
+                    pair=number,
+                    a=a,
+                    b=b,
+                    free=free,
+                    items=items,
+                    points=points,
+                    impulse_n_s=world_impulse,
+                    along_axes_n_s=impulse.linear,
+                    angular_n_m_s=angular,
+                    friction=friction,
+                )
             )
         return results
 
     def _candidates(self, placed: Sequence[Placed], step_s: Tensor) -> dict[int, tuple[Tensor, Tensor | None]]:
-        """Return by pair which items (B,) may touch and, for the ground, how deep each slot (B, S) is."""
+        """Return by pair which items (B,) may touch and, for the ground, the gap of each slot (B, S) [m]."""
         found: dict[int, tuple[Tensor, Tensor | None]] = {}
         for number, (a, b) in enumerate(self.pairs):
             if b == GROUND:
@@ -156,20 +182,28 @@ class Contacts:
             velocity, spin = velocity - b.point_velocity(points.position), spin - b.omega
             axes = tangent_axes(points.normal)
         else:
-            assert self.ground_axes is not None
-            axes = self.ground_axes.expand(*points.gap.shape, 3, 3)
+            axes = self._ground_axes.expand(*points.gap.shape, 3, 3)
         law = self.world.contact
         friction = take(law.friction, items)[:, None]
         if isinstance(law, ContactLaw):
             time, ratio = (take(x, items)[:, None] for x in (law.contact_time_s, law.damping_ratio))
         else:
-            time = ratio = torch.full_like(friction, torch.nan)  # the published law has others
+            time = ratio = torch.full_like(friction, torch.nan)  # the paper's law has other coefficients
         touch = Touch(
-            b is None, points.position, points.normal, points.gap, velocity, spin, h[:, None], friction, time, ratio
+            ground=b is None,
+            position=points.position,
+            normal=points.normal,
+            gap=points.gap,
+            velocity=velocity,
+            spin_rad_s=spin,
+            step_s=h[:, None],
+            friction=friction,
+            contact_time_s=time,
+            damping_ratio=ratio,
         )
         for active in self.effects:
             changed = active.effect.contact(active.at(items), touch)
-            if isinstance(law, PublishedLaw) and not _only_friction(touch, changed):
+            if isinstance(law, PaperLaw) and not _only_friction(touch, changed):
                 raise UsageError(
                     f"the effect '{active.effect.name}' changes what the published contact law does not have.",
                     "effects on the friction coefficient.",
@@ -177,7 +211,9 @@ class Contacts:
                 )
             touch = changed
         if self.effects:
-            touch = replace(touch, friction=touch.friction.clamp_min(0.0))  # no sum of effects pushes a slider on
+            touch = replace(
+                touch, friction=touch.friction.clamp_min(0.0)
+            )  # no sum of effects accelerates a sliding body
         return touch, axes
 
     def _impulses(
@@ -188,11 +224,11 @@ class Contacts:
         warm: Sequence[Tensor | None],
     ) -> list[Impulses]:
         law = self.world.contact
-        if isinstance(law, PublishedLaw):
+        if isinstance(law, PaperLaw):
             law = replace(
                 law, stiffness_n_m=take(law.stiffness_n_m, items), damping_n_s_m=take(law.damping_n_s_m, items)
             )
-            return [Impulses(published_impulses(law, touch, axes)) for _, _, touch, axes in found]
+            return [Impulses(paper_impulses(law, touch, axes)) for _, _, touch, axes in found]
         groups = []
         for number, points, touch, axes in found:
             sides = []
@@ -203,7 +239,7 @@ class Contacts:
                     root = body.rotation @ take(inertia.root, items)
                     sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
             groups.append(ContactGroup.of(touch, axes, tuple(sides)))
-        return settle(groups, self.world.sweeps, warm)
+        return solve_impulses(groups, self.world.sweeps, warm)
 
     def _warm(
         self,
@@ -212,8 +248,8 @@ class Contacts:
         before: Sequence[PairImpulses],
         batch: int,
     ) -> list[Tensor | None]:
-        """Return the impulses of the step before (n, C, 3), along the axes, for each pair; None from nothing."""
-        old = {pair.pair: pair for pair in before} if self.world.sweeps > 1 else {}  # one sweep is the closed form
+        """Return the impulses of the previous step along the axes (n, C, 3) [N s] for each pair; None for zero."""
+        old = {pair.pair: pair for pair in before} if self.world.sweeps > 1 else {}  # one iteration is the closed form
         warm: list[Tensor | None] = []
         for number, points, _, _ in found:
             if number in old:
@@ -226,13 +262,13 @@ class Contacts:
 
 
 def _only_friction(before: Touch, after: Touch) -> bool:
-    """Tell whether an effect changed nothing of a contact but its friction."""
+    """Return whether an effect changed only the friction of a contact."""
     names = set(Touch.__dataclass_fields__) - {"friction"}
     return all(getattr(before, name) is getattr(after, name) for name in names)
 
 
 def take(x: Tensor, items: Tensor | None) -> Tensor:
-    """Return some items (n, ...) of a tensor (B, ...); all of it for None, or where it serves all items (1, ...)."""
+    """Return some items (n, ...) of a tensor (B, ...); the whole tensor for None or for a batch of 1."""
     return x if items is None or x.shape[0] == 1 else x.index_select(0, items)
 
 
@@ -244,7 +280,7 @@ def put(x: Tensor, items: Tensor | None, batch: int) -> Tensor:
 
 
 def _union(touching: Sequence[Tensor]) -> Tensor | None:
-    """Return the items (n,) that touch anywhere; None where most do, so that picking them would not pay."""
+    """Return the items (n,) with any contact; None where more than 80 % have one, as selecting them costs more."""
     found = torch.stack(list(touching)).any(0)
     items = found.nonzero().squeeze(1)
     return None if len(items) > 0.8 * len(found) else items
@@ -260,5 +296,4 @@ def _select(placed: Placed, items: Tensor | None) -> Placed:
 
 
 def _on(world: World, items: Tensor | None) -> World:
-    assert world.ground_offset is not None
-    return replace(world, ground_offset=take(world.ground_offset, items))
+    return replace(world, ground_offset=take(world.ground[1], items))

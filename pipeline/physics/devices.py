@@ -1,4 +1,4 @@
-"""Worlds, states and rollouts from one device to another."""
+"""Transfer of worlds, states and rollouts between devices."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ T = TypeVar("T")
 
 
 def on_device(thing: T, device: torch.device | str, dtype: torch.dtype | None = None) -> T:
-    """Return a thing whose tensors lie on a device; derivatives go along.
+    """Copy all tensors of a nested structure to a device; derivatives are kept.
 
     Args:
         thing: A tensor, a dataclass, a mapping or a tuple of such; anything else is returned as it is.
-        device: Where to.
-        dtype: Of the floating-point tensors; None leaves it.
+        device: Target device.
+        dtype: Type of the floating-point tensors; None leaves it.
     """
     return _moved(thing, torch.device(device), dtype)
 

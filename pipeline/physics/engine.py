@@ -1,4 +1,4 @@
-"""Rollouts by the fused kernel where it can take them, on the GPU or the CPU, by the torch engine elsewhere."""
+"""Choice between the fused kernel, on the GPU or the CPU, and the torch engine for a rollout."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ..compiler import compiler
-from .detection import pairs_of, slot_count
-from .driven import Drive
+from ..runtime.kernel_build import compiler
+from .contact_detection import pairs_of, slot_count
 from .fused import simulate_fused, unsupported
 from .fused.host import lacking, simulate_on_host
+from .kinematic import Drive
 from .rollout import Rollout, simulate
 from .world import State, World
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
 
 CPU_CONTACTS, CPU_ROLLOUTS, GPU_ROLLOUTS = 32_000, (160, 2048), 8192
-"""Possible contacts in a batch on the CPU, and the least and most rollouts; rollouts on a GPU."""
+"""Batch sizes: possible contacts on the CPU, minimum and maximum rollouts on the CPU, rollouts on a GPU."""
 
 
 def rollout(
@@ -33,11 +33,10 @@ def rollout(
     driven: Mapping[str, Track | Drive] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
-    """Do what `simulate` does, in one kernel where that can take the world: on CUDA, or on a CPU with a C++ compiler.
+    """Simulate a world, in the fused kernel where that supports it: on CUDA, or on a CPU with a C++ compiler.
 
-    Where it cannot, the log says so once for each reason; on a CPU without a compiler there is no choice, and nothing
-    to say. A world that rolls on another device than its own is taken there if the kernel can take it, and the rollout
-    brought back.
+    Otherwise the torch engine runs, and the log gives each reason once, except on a CPU without a compiler. A world
+    whose `rolls_on` is another device is copied there if the kernel supports it, and the rollout is copied back.
 
     Raises:
         InputDataError, UsageError: See :func:`simulate`.
@@ -58,7 +57,7 @@ def rollout(
 
 
 def rollouts_at_once(world: World) -> int:
-    """Return how many rollouts one call should take: more run out of the processor's cache, or of the GPU's memory."""
+    """Return the number of rollouts per call; more exceed the processor's cache, or the memory of the GPU."""
     if "cuda" in (world.rolls_on, world.gravity.device.type):
         return GPU_ROLLOUTS
     contacts = sum(slot_count(world, pair) for pair in pairs_of(world))
@@ -68,7 +67,7 @@ def rollouts_at_once(world: World) -> int:
 def lacking_derivatives(
     world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive], record_contacts: bool
 ) -> str | None:
-    """Return which derivatives are asked for that the kernel does not have; None for none."""
+    """Return the requested derivatives that the kernel does not support, in words; None for none."""
     tensors = list(_tensors(world, state, times_s, driven))
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return "derivatives in reverse are asked for"

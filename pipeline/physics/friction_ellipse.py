@@ -1,9 +1,10 @@
-"""The ellipse of admissible friction of a ground with a grain, and the nearest vector in it.
+"""Anisotropic friction: the ellipse of admissible tangential impulses, and the projection onto it.
 
-A contact with normal impulse N may pass on every tangential impulse j with |M^-1 j| <= N, where
-M = mu I + [[a, b], [b, -a]]. Of these the sliding one takes away the most power (Moreau's maximum dissipation;
-Goyal, Ruina & Papadopoulos, Wear 143, 1991): j = -N M^2 v / |M v|, which pushes sideways too. The nearest vector of the
-ellipse to j - s v, with any s > 0, has that as its fixed point, for what is taken away is normal to it (derived).
+A contact with normal impulse N admits every tangential impulse j with |M^-1 j| <= N, where
+M = mu I + [[a, b], [b, -a]]. A sliding contact takes the one that dissipates the most power (Moreau's maximum
+dissipation; Goyal, Ruina & Papadopoulos, Wear 143, 1991): j = -N M^2 v / |M v|, which also has a sideways component. It
+is the fixed point of the projection of j - s v onto the ellipse for any s > 0, since v is normal to the ellipse there
+(derived).
 """
 
 from __future__ import annotations
@@ -14,24 +15,27 @@ import torch
 from torch import Tensor
 
 TINY = 1e-24
-"""Added to squared lengths, so that their roots have a derivative where they vanish."""
+"""Constant added to squared lengths, so that their roots have a derivative where they vanish."""
 FLATTEST = 0.1
-"""The lower principal friction is at least this share of the higher one."""
+"""Minimum ratio of the lower to the higher principal friction."""
 LEAST = 1e-6
-"""The higher principal friction is at least this, so that M has an inverse."""
+"""Minimum of the higher principal friction [1], so that M has an inverse."""
 NEWTON_STEPS = 5
-"""To 1e-14 where the principal frictions differ by a factor of 3, to 1e-5 at 10 (measured, float64)."""
-
+"""Newton steps of the projection: accurate to 1e-14 for principal frictions that differ by a factor of 3, to 1e-5 for a
+factor of 10 (measured, float64).
+"""
 CLOSE = 1e-7
-"""Relative; Newton's steps double the digits."""
+"""Relative error at which Newton's method ends; each step doubles the number of digits."""
 
 
 @dataclass(frozen=True)
 class Ellipse:
-    """M = mean I + [[even, mixed], [mixed, -even]] of contacts [1]: mean (...), grain (..., 2) of even and mixed."""
+    """Friction matrix M = mean I + [[even, mixed], [mixed, -even]] of contacts."""
 
     mean: Tensor
+    """Mean friction [1], shape (...)."""
     grain: Tensor
+    """Components even and mixed [1], shape (..., 2)."""
 
     @staticmethod
     def of(friction: Tensor, anisotropy: Tensor) -> Ellipse:
@@ -49,10 +53,10 @@ class Ellipse:
         return Ellipse(mean, scale[..., None] * anisotropy)
 
     def nearest(self, wanted: Tensor, limit: Tensor) -> Tensor:
-        """Return the vectors j (..., 2) with |M^-1 j| <= limit (...) that are nearest to the wanted ones.
+        """Project vectors (..., 2) onto the ellipses |M^-1 j| <= limit (...).
 
         j = M y, y = M (M^2 + t I)^-1 wanted, with the least t >= 0 for which |y| <= limit: Newton steps of 1/|y|, which
-        is concave in t, from below (More & Sorensen 1983). What is left of |y| above the limit is scaled away.
+        is concave in t, from below (More & Sorensen 1983). The remaining excess of |y| over the limit is scaled away.
         """
         mean, even, mixed = self.mean[..., None], *self.grain.unsqueeze(-2).unbind(-1)
         square = self.grain.square().sum(-1, keepdim=True)
@@ -78,7 +82,7 @@ class Ellipse:
             bent = inverse * (first * size2 - twice * (y * turned(y)).sum(-1, keepdim=True))
             beyond = size / torch.maximum(most, 1e-9 * size) - 1
             t_before, t = t, (t + size2 / bent * beyond).clamp_min(0.0)
-            # what lies inside stays, and the step after a small one changes nothing but rounding
+            # vectors inside stay, and the step after a small one changes only rounding
             if bool(((beyond.abs() < CLOSE) | ((t_before == 0) & (t == 0))).all()):
                 break
         inverse, first = 1 / (t.square() + 2 * half_trace * t + root_det.square()), half_trace + t
@@ -87,7 +91,7 @@ class Ellipse:
         return scale * (mean * y + turned(y))
 
     def along(self, direction: Tensor) -> Tensor:
-        """Return the friction (...) that the ellipse admits along directions (..., 2) of any length; 0 for none."""
+        """Return the friction (...) [1] along directions (..., 2) of any length; 0 for a zero vector."""
         (x, y), (even, mixed) = direction.unbind(-1), self.grain.unbind(-1)
         det = self.mean.square() - self.grain.square().sum(-1)
         inverse = torch.stack((self.mean * x - even * x - mixed * y, self.mean * y - mixed * x + even * y), -1)

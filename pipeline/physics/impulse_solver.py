@@ -1,12 +1,12 @@
-"""Impulses of contacts that act at once: the closed form of every contact, then projected sweeps over all of them.
+"""Impulses of simultaneous contacts: the closed form of every contact, then projected iterations over all of them.
 
-One sweep is the closed form alone. Further ones let contacts that touch at once agree: each takes back what it gave,
-sees the velocity that all the others leave, and is projected anew on its own admissible set. They begin from the
-impulses of the step before, so that over the steps even slow modes of contacts come to rest.
+One iteration is the closed form alone. Further ones (projected Jacobi iterations with shared masses) couple contacts
+that act at once: each contact is projected anew on its own admissible set, given the velocity under the impulses of all
+others. They are warm-started with the impulses of the previous step, so that slow modes converge over several steps.
 
 Everything is expressed by mass-weighted Jacobian rows (n, 3 C, nv), |row|^2 = 1/m_eff, of the generalised velocity
-of a body: nv = 6 for a free one, rows [d/sqrt(m), (arm x d) S] with inverse inertia S S^T. A chain of links needs only
-other rows: those of its generalised velocity times the inverse root of its mass matrix.
+of a body: nv = 6 for a free one, rows [d/sqrt(m), (arm x d) S] with inverse inertia S S^T. For a chain of links only
+the rows differ: those of its generalised velocity times the inverse root of its mass matrix.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .contact import Touch, coefficients
-from .ellipse import TINY, Ellipse
-from .rotation import cross
+from ..geometry.rotation import cross
+from .contact_law import Touch, coefficients
+from .friction_ellipse import TINY, Ellipse
 
 CONTACT_ONSET_M = 2e-4
-"""A contact counts fully in the sharing of a body's mass from this depth on [m]; it only smooths the onset."""
+"""Depth [m] from which a contact takes its full share of a body's mass; below, the share grows smoothly."""
 FAR_M_S = 1e30
-"""An open contact asks for a gap speed below any [m/s]; finite, as the reverse derivative of infinity is no number."""
+"""Target gap speed of an open contact [m/s], below any real one; finite, so that reverse derivatives stay finite."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """How impulses at the contact points move one body, and the body's points.
-
-    body: its index in the world; sign: +1 as body a, -1 as body b; jacobian (n, 3 C, 6): rows of each contact along
-    its normal and two tangents; root (n, 3, 3): S with inverse inertia = S S^T, world axes.
-    """
+    """Jacobian rows that map impulses at the contact points to the velocity of one body."""
 
     body: int
+    """Index of the body in the world."""
     sign: float
+    """+1 as body a, -1 as body b."""
     jacobian: Tensor
+    """Mass-weighted rows of each contact along its normal and two tangents, shape (n, 3 C, 6)."""
     root: Tensor
+    """Matrix S with inverse inertia = S S^T, world axes, shape (n, 3, 3)."""
 
     @staticmethod
     def of(
@@ -79,34 +79,47 @@ def tangent_axes(normal: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ContactGroup:
-    """The contacts of one pair of bodies in one step, prepared for the sweeps; n items, C points.
+class TurningResistance:
+    """Resistance of the contacts of one pair to rolling and to spinning about the normal; n items, C points."""
 
-    axes (n, C, 3, 3): normal and tangents as rows; relative (n, C, 3): free velocity of a against b along them;
-    sides: the rows of the bodies that can move; target (n, C): the gap speed that each closed contact asks for;
-    stop_n, stop_t (n, C) [kg]: what one contact may move at once; steady (n, C, 3) [N s]: impulses that stay as they
-    are; where turning is resisted, spin (n, 3) [rad/s]: free angular velocity of a against b, stop_w (n, C, 2) [kg m2]:
-    what one contact may stop of it about the normal and across it, torsion_m and rolling_m (n, C). ellipse: in place of
-    the friction, where that depends on the direction.
-    """
+    spin: Tensor
+    """Free angular velocity of a against b, world frame [rad/s], shape (n, 3)."""
+    stop: Tensor
+    """Angular mass that one contact may stop about the normal and across it [kg m2], shape (n, C, 2)."""
+    torsion_m: Tensor
+    """Largest torque about the normal in units of the normal force [m], shape (n, C)."""
+    rolling_m: Tensor
+    """Largest torque across the normal in units of the normal force [m], shape (n, C)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactGroup:
+    """Contacts of one pair of bodies in one step, prepared for the solver; n items, C points."""
 
     axes: Tensor
+    """Normal and tangents of each point as rows, shape (n, C, 3, 3)."""
     relative: Tensor
+    """Free velocity of a against b along the axes [m/s], shape (n, C, 3)."""
     sides: tuple[Rows, ...]
+    """Jacobian rows of the bodies that can move."""
     target: Tensor
+    """Gap speed that each closed contact asks for [m/s], shape (n, C)."""
     stop_n: Tensor
+    """Mass that one contact may move along its normal [kg], shape (n, C)."""
     stop_t: Tensor
+    """Mass that one contact may move along its tangents [kg], shape (n, C)."""
     friction: Tensor
+    """Friction coefficient [1], shape (n, 1 or C)."""
     steady: Tensor | None = None
-    spin: Tensor | None = None
-    stop_w: Tensor | None = None
-    torsion_m: Tensor | None = None
-    rolling_m: Tensor | None = None
+    """Impulses that the iterations do not change [N s], shape (n, C, 3); None for none."""
+    turning: TurningResistance | None = None
+    """Resistance to rolling and spinning; None for none."""
     ellipse: Ellipse | None = None
+    """Anisotropic friction, which replaces `friction`; None for isotropic friction."""
 
     @staticmethod
     def of(touch: Touch, axes: Tensor, sides: tuple[Rows, ...]) -> ContactGroup:
-        """Prepare the contacts of a pair; `axes` have the touch's normals as first rows."""
+        """Prepare the contacts of a pair; the first rows of `axes` are the normals of the touch."""
         h, gap = touch.step_s, touch.gap
         relative = (axes @ touch.velocity[..., None]).squeeze(-1)
         speed = relative[..., 0]
@@ -126,59 +139,69 @@ class ContactGroup:
         target = torch.where(touching, speed + demand, torch.full_like(gap, -FAR_M_S))
         # the sum of the two tangential mobilities bounds the larger one
         stop_t = share / (mobility[..., 1] + mobility[..., 2])
-        group = ContactGroup(axes, relative, sides, target, share * mass, stop_t, touch.friction)
+        group = ContactGroup(
+            axes=axes,
+            relative=relative,
+            sides=sides,
+            target=target,
+            stop_n=share * mass,
+            stop_t=stop_t,
+            friction=touch.friction,
+        )
         if touch.anisotropy is not None:
             group = replace(group, ellipse=Ellipse.of(touch.friction, touch.anisotropy))
         if touch.viscous_n_s_m is not None:
-            # implicit in the slip of the point itself, so that no viscosity turns it round
+            # implicit in the slip of the point itself, so that no viscosity reverses it
             drag = h * touch.viscous_n_s_m * _shares(ahead, gap)
             slip = torch.cat((torch.zeros_like(relative[..., :1]), relative[..., 1:]), -1)
             group = replace(group, steady=-(drag / (1 + drag / stop_t))[..., None] * slip)
         if touch.torsion_m is not None or touch.rolling_m is not None:
-            group = group._resisting(touch, touching)
+            group = replace(group, turning=group._resistance(touch, touching))
         return group
 
-    def _resisting(self, touch: Touch, touching: Tensor) -> ContactGroup:
-        """Return the group with resistance to turning: all its points act on the same spin, and share it."""
+    def _resistance(self, touch: Touch, touching: Tensor) -> TurningResistance:
+        """Return the resistance to turning: all points of the group act on the same spin, and share it."""
         roots = torch.cat([side.root for side in self.sides], -1)
         mobility = (self.axes.flatten(1, 2) @ roots).square().sum(-1).unflatten(1, (-1, 3))
         count = touching.to(mobility.dtype).sum(1, keepdim=True).clamp_min(1.0)
         stop = torch.stack((mobility[..., 0], mobility[..., 1] + mobility[..., 2]), -1) * count[..., None]
         zero = torch.zeros_like(self.stop_n)
-        none = [zero if value is None else value + zero for value in (touch.torsion_m, touch.rolling_m)]
-        return replace(self, spin=touch.spin_rad_s, stop_w=1 / stop, torsion_m=none[0], rolling_m=none[1])
+        torsion, rolling = (zero if value is None else value + zero for value in (touch.torsion_m, touch.rolling_m))
+        return TurningResistance(touch.spin_rad_s, 1 / stop, torsion, rolling)
 
 
 @dataclass(frozen=True)
 class Impulses:
-    """Impulses of a group on body a, along its axes (n, C, 3) [N s], and angular ones (n, C, 3) [N m s]."""
+    """Impulses of a group on body a."""
 
     linear: Tensor
+    """Impulses along the axes [N s], shape (n, C, 3)."""
     angular: Tensor | None = None
+    """Angular impulses along the axes [N m s], shape (n, C, 3); None for none."""
 
 
-def settle(groups: Sequence[ContactGroup], sweeps: int, warm: Sequence[Tensor | None]) -> list[Impulses]:
-    """Return the impulses of all groups after the given number of sweeps; one from nothing is the closed form.
+def solve_impulses(groups: Sequence[ContactGroup], iterations: int, warm: Sequence[Tensor | None]) -> list[Impulses]:
+    """Solve the impulses of all groups by projected iterations; one iteration without warm start is the closed form.
 
     Args:
         groups: The contacts of a step.
-        sweeps: How often every contact is projected anew.
-        warm: Impulses (n, C, 3) [N s] along the axes from which each group begins, None for nothing: those of the step
-            before, so that what a few sweeps leave of slow modes is made up for in the following steps.
+        iterations: Number of iterations.
+        warm: Initial impulses (n, C, 3) [N s] along the axes of each group, None for zero: those of the previous step,
+            so that slow modes that few iterations do not resolve converge over the following steps.
     """
     groups = _splitting(groups)
     found = [
         Impulses(torch.zeros_like(group.relative) if old is None else old)
         for group, old in zip(groups, warm, strict=True)
     ]
-    for _ in range(sweeps):
-        seen = _all_seen(groups, found)
-        found = [_sweep(group, given, *now) for group, given, now in zip(groups, found, seen, strict=True)]
+    for _ in range(iterations):
+        velocities = _all_velocities(groups, found)
+        found = [_iterate(group, given, *now) for group, given, now in zip(groups, found, velocities, strict=True)]
     return found
 
 
 def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
-    """Return the groups, each to move its share of a body that others touch too, or the sweeps would overshoot."""
+    """Divide the mass of each body among the groups that touch it, so that the iterations do not overshoot."""
     if len(groups) < 2:
         return groups
     count: dict[int, Tensor] = {}
@@ -189,19 +212,21 @@ def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
     split = []
     for group in groups:
         share = 1 / torch.stack([count[side.body] for side in group.sides]).amax(0).clamp_min(1.0)
-        wide = None if group.stop_w is None else share[..., None] * group.stop_w
-        split.append(replace(group, stop_n=share * group.stop_n, stop_t=share * group.stop_t, stop_w=wide))
+        turning = group.turning
+        if turning is not None:
+            turning = replace(turning, stop=share[..., None] * turning.stop)
+        split.append(replace(group, stop_n=share * group.stop_n, stop_t=share * group.stop_t, turning=turning))
     return split
 
 
-def _all_seen(groups: Sequence[ContactGroup], impulses: Sequence[Impulses]) -> list[tuple[Tensor, Tensor | None]]:
+def _all_velocities(groups: Sequence[ContactGroup], impulses: Sequence[Impulses]) -> list[tuple[Tensor, Tensor | None]]:
     """Return for each group the velocities of its points (n, C, 3) and its spin (n, 3) under all impulses."""
     moved: dict[int, Tensor] = {}
     for group, given in zip(groups, impulses, strict=True):
         for side in group.sides:
             motion = _motion(side, group, given)
             moved[side.body] = motion if side.body not in moved else moved[side.body] + motion
-    return [_seen(group, moved) for group in groups]
+    return [_velocities(group, moved) for group in groups]
 
 
 def _motion(side: Rows, group: ContactGroup, impulses: Impulses) -> Tensor:
@@ -214,9 +239,9 @@ def _motion(side: Rows, group: ContactGroup, impulses: Impulses) -> Tensor:
     return motion + torch.cat((torch.zeros_like(turning), turning), 1)
 
 
-def _seen(group: ContactGroup, moved: dict[int, Tensor]) -> tuple[Tensor, Tensor | None]:
+def _velocities(group: ContactGroup, moved: dict[int, Tensor]) -> tuple[Tensor, Tensor | None]:
     """Return the velocity of the points and the relative spin under the impulses of all groups."""
-    relative, omega = group.relative, group.spin
+    relative, omega = group.relative, None if group.turning is None else group.turning.spin
     for side in group.sides:
         change = moved[side.body]
         relative = relative + (side.jacobian @ change).squeeze(-1).unflatten(1, (-1, 3))
@@ -225,8 +250,8 @@ def _seen(group: ContactGroup, moved: dict[int, Tensor]) -> tuple[Tensor, Tensor
     return relative, omega
 
 
-def _sweep(group: ContactGroup, before: Impulses, relative: Tensor, omega: Tensor | None) -> Impulses:
-    """Return the impulses after one projected sweep from those before, under the velocities (n, C, 3) they leave."""
+def _iterate(group: ContactGroup, before: Impulses, relative: Tensor, omega: Tensor | None) -> Impulses:
+    """Return the impulses after one projected iteration, given the velocities (n, C, 3) under the previous ones."""
     steady = group.steady
     linear = before.linear if steady is None else before.linear - steady
     along = linear[..., 0] + group.stop_n * (group.target - relative[..., 0])
@@ -239,15 +264,15 @@ def _sweep(group: ContactGroup, before: Impulses, relative: Tensor, omega: Tenso
     linear = torch.cat((along[..., None], across), -1)
     if steady is not None:
         linear = linear + steady
-    if omega is None:
+    resistance = group.turning
+    if omega is None or resistance is None:
         return Impulses(linear)
-    assert group.stop_w is not None and group.torsion_m is not None and group.rolling_m is not None
     turning = (group.axes @ omega[:, None, :, None]).squeeze(-1)
-    wanted = -torch.cat((group.stop_w[..., :1], group.stop_w[..., 1:].expand(-1, -1, 2)), -1) * turning
+    wanted = -torch.cat((resistance.stop[..., :1], resistance.stop[..., 1:].expand(-1, -1, 2)), -1) * turning
     if before.angular is not None:
         wanted = before.angular + wanted
-    torsion = in_disc(wanted[..., :1], group.torsion_m * along)
-    rolling = in_disc(wanted[..., 1:], group.rolling_m * along)
+    torsion = in_disc(wanted[..., :1], resistance.torsion_m * along)
+    rolling = in_disc(wanted[..., 1:], resistance.rolling_m * along)
     return Impulses(linear, torch.cat((torsion, rolling), -1))
 
 
@@ -258,11 +283,11 @@ def in_disc(wanted: Tensor, limit: Tensor) -> Tensor:
 
 
 def _share(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
-    """Return the share of its work that each contact does itself (n, C): 1 alone, 1/n for n coincident ones.
+    """Return the share of the mass for each contact (n, C): 1 for a single contact, 1/n for n coincident ones.
 
     Derived: its weight over the sum of the touching contacts' weights times the squared correlations of their rows with
     its own in the mass metric, in O(C) through the small matrix sum of m r r^T. Only ratios of weights count: contacts
-    that all touch lightly share like contacts that all touch hard, or the sweeps would overshoot.
+    that all touch lightly share like contacts that all touch hard; otherwise the iterations would overshoot.
     """
     weight = _onset(ahead, gap)
     weighted = rows * (weight * mass)[..., None]
@@ -272,14 +297,14 @@ def _share(rows: Tensor, mass: Tensor, ahead: Tensor, gap: Tensor) -> Tensor:
 
 
 def _onset(ahead: Tensor, gap: Tensor) -> Tensor:
-    """Return how far each contact counts (n, C), from 0 where it is open to 1 where it is deep."""
+    """Return the weight of each contact (n, C), from 0 where it is open to 1 from the depth CONTACT_ONSET_M on."""
     return (-torch.minimum(ahead, gap) / CONTACT_ONSET_M).clamp(0.0, 1.0)
 
 
 def _shares(ahead: Tensor, gap: Tensor) -> Tensor:
-    """Return the shares (n, C) of what all the contacts of a pair carry together; they add up to 1.
+    """Return the shares (n, C) of the contacts of a pair in a common load; they sum to 1.
 
-    Only within the first 2 % of the onset is it less, so that a grazing contact begins without a jump.
+    Within the first 2 % of the onset the sum is less, so that a grazing contact begins without a jump.
     """
     touching = _onset(ahead, gap)
     return touching / touching.sum(1, keepdim=True).clamp_min(0.02)

@@ -1,4 +1,4 @@
-"""Bodies whose motion is given: measured tracks, or velocities, as commands."""
+"""Commanded motions of kinematic bodies, from measured tracks or from velocities."""
 
 from __future__ import annotations
 
@@ -10,41 +10,43 @@ import torch
 from torch import Tensor
 
 from ...schemas import InputDataError
-from .motion import Motion
-from .rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from .rigid_body import Motion
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Commanded motions of a batch, linear in position and angle between their samples; held still outside them.
-
-    times_s (B, S); position_m (B, S, 3); quat_wxyz (B, S, 4); velocity_m_s, omega_world_rad_s (B, S, 3) from a sample
-    to the next; last (B,): index of the last interval (shorter tracks are padded by their end).
-    """
+    """Commanded motions of a batch, linear in position and angle between samples and at rest outside them."""
 
     times_s: Tensor
+    """Times of the samples [s], shape (B, S)."""
     position_m: Tensor
+    """Origin of the body frame, world frame [m], shape (B, S, 3)."""
     quat_wxyz: Tensor
+    """Orientation, body to world, shape (B, S, 4)."""
     velocity_m_s: Tensor
+    """Velocity from each sample to the next, world frame [m/s], shape (B, S, 3)."""
     omega_world_rad_s: Tensor
+    """Angular velocity from each sample to the next, world frame [rad/s], shape (B, S, 3)."""
     last: Tensor
+    """Index of the last interval, shape (B,); shorter tracks are padded with their last sample."""
 
     @staticmethod
     def of(tracks: Sequence[Track], like: Tensor) -> Drive:
-        """Prepare one track for each rollout, or one for all; tensors take dtype and device of `like`."""
+        """Build the commands of a batch from one track per rollout, or one for all, with dtype and device of `like`."""
         longest = max(len(track.time_s) for track in tracks)
         rows = [_prepare(track, longest, like) for track in tracks]
         return Drive(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
     @staticmethod
     def command(body: str, driven: Mapping[str, Track | Drive], like: Tensor) -> Drive:
-        """Return the command of a driven body, prepared where it is a track.
+        """Return the command of a driven body as a `Drive`.
 
         Raises:
-            InputDataError: If it has none.
+            InputDataError: If the body has no command.
         """
         if body not in driven:
             raise InputDataError(
@@ -58,7 +60,7 @@ class Drive:
     def from_velocities(
         times_s: Tensor, position_m: Tensor, quat_wxyz: Tensor, velocity_m_s: Tensor, omega_world_rad_s: Tensor
     ) -> Drive:
-        """Integrate a velocity command: each velocity holds until the next sample.
+        """Integrate a velocity command in which each velocity holds until the next sample.
 
         Args:
             times_s: Samples [s], increasing, shape (B, S).
@@ -75,21 +77,28 @@ class Drive:
         still = torch.zeros_like(position_m)[:, None]
         last = torch.full(times_s.shape[:1], times_s.shape[1] - 2, device=times_s.device)
         velocity, omega = (torch.cat((x, still), 1) for x in (velocity_m_s, omega_world_rad_s))
-        return Drive(times_s, position, torch.stack(quats, 1), velocity, omega, last)
+        return Drive(
+            times_s=times_s,
+            position_m=position,
+            quat_wxyz=torch.stack(quats, 1),
+            velocity_m_s=velocity,
+            omega_world_rad_s=omega,
+            last=last,
+        )
 
     def repeat(self, times: int) -> Drive:
-        """Return the batch repeated, as `Tensor.repeat` does."""
+        """Return the commands with their batch repeated, as `Tensor.repeat` does."""
         if self.times_s.shape[0] == 1:
             return self
         every = (getattr(self, field.name) for field in fields(self))
         return Drive(*(values.repeat(times, *[1] * (values.ndim - 1)) for values in every))
 
     def select(self, rows: Tensor) -> Drive:
-        """Return some rows of the batch."""
+        """Return the commands at some rows of the batch."""
         return Drive(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def at(self, time_s: Tensor) -> Motion:
-        """Return pose and velocity at times (B,) or (1,) [s]; the motion's spin is the angular velocity (world)."""
+        """Return pose and velocity at times (B,) or (1,) [s]; the spin is the angular velocity, world frame [rad/s]."""
         batch = max(time_s.shape[0], self.times_s.shape[0])
         time = time_s.expand(batch)
         grid = self.times_s.expand(batch, -1)

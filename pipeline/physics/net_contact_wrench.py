@@ -1,16 +1,16 @@
-"""The net force and torque of the contacts on each body, from labels."""
+"""Net contact force and torque on each body, from the labels of a dataset."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..datasets.rollouts import ContactTable
-from .physics.world import symmetric
-from .sampling import rotation_matrix
+from ...datasets.rollouts.rollouts import ContactTable
+from ..geometry.viewpoint import rotation_matrix
+from .world import symmetric
 
 
 def contact_force_n(contacts: ContactTable, time_s: np.ndarray, bodies: int) -> np.ndarray:
-    """Return the mean force (T, B, 3) [N] of all contacts on each body since the frame before, world; 0 at frame 0."""
+    """Return the mean contact force (T, B, 3) [N] on each body since the previous frame, world frame; 0 at frame 0."""
     impulse = np.zeros((len(time_s), bodies, 3))
     frame = np.repeat(np.arange(len(time_s)), np.diff(contacts.offsets))
     np.add.at(impulse, (frame, contacts.body_a), contacts.impulse_n_s)
@@ -22,11 +22,11 @@ def contact_force_n(contacts: ContactTable, time_s: np.ndarray, bodies: int) -> 
 def contact_torque_n_m(
     quat_wxyz: np.ndarray, omega_body_rad_s: np.ndarray, inertia_kg_m2: np.ndarray, time_s: np.ndarray, free: np.ndarray
 ) -> np.ndarray:
-    """Return the mean torque (T, B, 3) [N m] on free bodies since the frame before, about their centres of mass, world.
+    """Return the mean torque (T, B, 3) [N m] on free bodies since the previous frame about the centres of mass, world.
 
-    It is the change of the angular momentum R I omega over the time: what contacts do, gravity having no moment about
-    the centre of mass, and effects where they turn bodies. Arms times impulses would be wrong between frames, in which
-    bodies move by centimetres.
+    It is the rate of change of the angular momentum R I omega: the torque of contacts, and of effects that turn bodies;
+    gravity has no moment about the centre of mass. The sum of arms times impulses would be wrong, since bodies move by
+    centimetres between frames.
 
     Args:
         quat_wxyz: T_world_body, shape (T, B, 4).

@@ -1,4 +1,4 @@
-"""What a measurement sees of a rollout: effects of the measurement come between the motion and its record."""
+"""Observation model: measurement effects that map a rollout to the poses as they are recorded."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from .dispatch import rollout as rolled_out
 from .effects.effect import Poses
+from .engine import rollout as rolled_out
 from .rollout import Rollout
 from .world import State, World
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
-    from .driven import Drive
+    from ...datasets.capture.tracks import Track
+    from .kinematic import Drive
 
 
 def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive] | None = None) -> Rollout:
-    """Roll the world out and return the poses as they would be measured at the recorded times.
+    """Simulate a world and return the poses as they would be measured at the recorded times.
 
     Args:
         world: The world; its effects may change times and poses.
@@ -37,7 +37,7 @@ def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Tr
 
 
 def true_times(world: World, times_s: Tensor) -> Tensor:
-    """Return the true times of recorded ones [s], shape (T,) or (B, T)."""
+    """Return the true times [s] of recorded times (T,) or (B, T), same or batched shape."""
     for active in world.effects:
         if active.effect.has("times"):
             times_s = active.effect.times(active.values, times_s if times_s.ndim == 2 else times_s[None])
@@ -45,7 +45,7 @@ def true_times(world: World, times_s: Tensor) -> Tensor:
 
 
 def as_measured(world: World, rollout: Rollout, times_s: Tensor) -> Rollout:
-    """Return a rollout over true times as it is recorded: at the recorded times, poses as measured."""
+    """Return a rollout over true times as it is recorded: at the recorded times, with measured poses."""
     poses = Poses(rollout.position_m, rollout.quat_wxyz, up=world.up)
     for active in world.effects:
         if active.effect.has("observe"):

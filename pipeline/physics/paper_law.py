@@ -1,12 +1,12 @@
-"""The contact law as ContactGaussian-WM publishes it, faithfully, with its known defects.
+"""Contact law of the ContactGaussian-WM paper, reproduced with its known defects.
 
 Source: ContactGaussian-WM (arXiv 2602.11021) as read by its public re-implementation (contact model notes, sections 2
 to 5). One explicit evaluation of polyhedral rows n - mu d on every contact, stiffness and damping in SI units:
 
     lambda = SoftPlus(-K (h J b + phi) - D J b),    v = b + h M^-1 J^T lambda
 
-What it does that the default law does not: its stiffness grows with the number of touching spheres, its restitution
-depends on the step, it creeps on slopes that friction should hold, and a slider floats higher than a body at rest.
+Differences from the default law: the stiffness grows with the number of touching spheres, the restitution depends on
+the step, bodies creep on slopes on which friction should hold them, and a sliding body floats higher than one at rest.
 """
 
 from __future__ import annotations
@@ -19,27 +19,30 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from .contact import Touch
+from .contact_law import Touch
 
 
-@dataclass(frozen=True)
-class PublishedLaw:
-    """The published numbers: friction [1], stiffness K [N/m] and damping D [N s/m] of a row, each (1,) or (B,).
-
-    directions: rows of a contact's friction pyramid; softplus_per_n: sharpness of SoftPlus [1/N], infinite for a plain
-    maximum; sharpness_per_m: beta of the log-sum-exp distance between bodies, the simplex smooth minimum for None;
-    clamp_depth_m, clamp_per_m: delta and gamma of the sigmoid clamp of the distance, none for None.
-    """
+@dataclass(frozen=True, kw_only=True)
+class PaperLaw:
+    """Coefficients of the paper's contact law; tensors have shape (1,) or (B,)."""
 
     name: ClassVar[str] = "published"
     friction: Tensor
+    """Coulomb friction coefficient [1]."""
     stiffness_n_m: Tensor
+    """Stiffness K of a row [N/m]."""
     damping_n_s_m: Tensor
+    """Damping D of a row [N s/m]."""
     directions: int = 4
+    """Number of rows of a contact's friction pyramid."""
     softplus_per_n: float = math.inf
+    """Sharpness of SoftPlus [1/N]; infinite for a plain maximum."""
     sharpness_per_m: float | None = None
+    """Sharpness beta of the log-sum-exp distance between bodies [1/m]; None for the simplex smooth minimum."""
     clamp_depth_m: float | None = None
+    """Depth delta of the sigmoid clamp of the distance [m]; None for no clamp."""
     clamp_per_m: float | None = None
+    """Sharpness gamma of the sigmoid clamp of the distance [1/m]; None for no clamp."""
 
 
 def clamped(distance: Tensor, depth_m: float, per_m: float) -> Tensor:
@@ -69,7 +72,7 @@ def creep_speed(
     return gravity * math.sin(slope_rad) * (held - step_s)
 
 
-def stable_step(law: PublishedLaw, mass: Tensor, rows: int) -> Tensor:
+def stable_step(law: PaperLaw, mass: Tensor, rows: int) -> Tensor:
     """Return the largest stable step [s] for a persistent contact of `rows` rows on a mass [kg], same shape.
 
     Derived (contact model notes, section 5.6): 3 kappa + 2 c < 4 with kappa = h^2 rows K / m, c = h rows D / m.
@@ -78,12 +81,12 @@ def stable_step(law: PublishedLaw, mass: Tensor, rows: int) -> Tensor:
     return 8 / (b + (b.square() + 16 * a).sqrt())
 
 
-def published_impulses(law: PublishedLaw, touch: Touch, axes: Tensor) -> Tensor:
+def paper_impulses(law: PaperLaw, touch: Touch, axes: Tensor) -> Tensor:
     """Return the impulses (n, C, 3) [N s] on body a along normal and tangents.
 
     Args:
         law: The law; its K and D have shape (1,) or (n,).
-        touch: The contacts; of its numbers only the friction is used.
+        touch: The contacts; of its coefficients only the friction is used.
         axes: Normal and tangents as rows (n, C, 3, 3).
     """
     free = (axes @ touch.velocity[..., None]).squeeze(-1)

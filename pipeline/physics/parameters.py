@@ -1,4 +1,4 @@
-"""The physical numbers that a fit may change, by name."""
+"""Physical parameters that a fit may change, by name."""
 
 from __future__ import annotations
 
@@ -14,24 +14,26 @@ from .effects.effect import ActiveEffect
 from .world import World, stretched_inertia
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """A number to fit: bounded, and fitted as its logarithm where it is positive over decades.
-
-    reveals: which motion makes it observable; prior: median and standard deviation before any data, the latter in the
-    fitted coordinate (natural logarithm where the parameter is logarithmic); at_bounds: what it means when a fit ends
-    at the lower and at the upper bound; shared: whether one value serves all episodes, or each
-    group of episodes, or each episode, has its own.
-    """
+    """A bounded parameter of a fit, fitted as its logarithm where it is positive over decades."""
 
     name: str
+    """Name, `effect.parameter` for effects."""
     unit: str
+    """Unit."""
     bounds: tuple[float, float]
+    """Lower and upper bound, in its unit."""
     logarithmic: bool
+    """Whether its natural logarithm is fitted."""
     reveals: str
+    """Motion that makes it observable."""
     prior: tuple[float, float]
+    """Median and standard deviation before any data, the latter in the fitted coordinate."""
     at_bounds: tuple[str, str] = ("the motion asks for less", "the motion asks for more")
+    """Meaning of a fit that ends at the lower, and at the upper bound."""
     shared: Literal["all", "group", "episode"] = "all"
+    """Whether one value serves all episodes, each group of episodes, or each episode."""
 
     def encode(self, value: float) -> float:
         """Return the fitted coordinate of a value."""
@@ -47,62 +49,61 @@ class Parameter:
         return self.encode(self.bounds[0]), self.encode(self.bounds[1])
 
 
-# One toss hardly shows some of these; their priors keep them plausible. The contact time is that of the real cube
-# tosses: what is called rigid touches for a few milliseconds.
+# A single toss hardly identifies some of these; their priors keep them plausible. The contact time is that of the real
+# cube tosses: bodies called rigid touch for a few milliseconds.
 FRICTION = Parameter(
-    "friction",
-    "1",
-    (0.01, 2.0),
-    True,
-    "sliding on the ground",
-    (0.3, 0.5),
-    (
+    name="friction",
+    unit="1",
+    bounds=(0.01, 2.0),
+    logarithmic=True,
+    reveals="sliding on the ground",
+    prior=(0.3, 0.5),
+    at_bounds=(
         "the body slides as if on ice. Check the scale, and [world] ground: it may lie too low to be touched",
         "the body does not slide at all, so that any larger friction fits as well: read it as a lower limit",
     ),
 )
 CONTACT_TIME = Parameter(
-    "contact_time_s",
-    "s",
-    (0.001, 0.03),
-    True,
-    "an impact sampled faster than the contact lasts",
-    (0.0033, 0.5),
-    (
+    name="contact_time_s",
+    unit="s",
+    bounds=(0.001, 0.03),
+    logarithmic=True,
+    reveals="an impact sampled faster than the contact lasts",
+    prior=(0.0033, 0.5),
+    at_bounds=(
         "contacts are shorter than the engine's shortest, and nothing in the motion tells them apart: read it as rigid",
         "contacts are as long as those of foam. Check that the body is rigid, the frames are sharp, and [world] "
         "ground lies where the body rests",
     ),
 )
 DAMPING_RATIO = Parameter(
-    "damping_ratio",
-    "1",
-    (0.02, 3.0),
-    True,
-    "an impact and the rebound after it",
-    (0.4, 0.6),
-    (
+    name="damping_ratio",
+    unit="1",
+    bounds=(0.02, 3.0),
+    logarithmic=True,
+    reveals="an impact and the rebound after it",
+    prior=(0.4, 0.6),
+    at_bounds=(
         "the body bounces without losing speed. Check gravity, the scale and the frame rate",
         "the body does not bounce at all, so that any larger damping fits as well: read it as a restitution of 0",
     ),
 )
 GROUND_SHIFT = Parameter(
-    "ground_shift_m",
-    "m",
-    (-0.02, 0.02),
-    False,
-    "resting on the ground",
-    (0.0, 0.002),
-    (
+    name="ground_shift_m",
+    unit="m",
+    bounds=(-0.02, 0.02),
+    logarithmic=False,
+    reveals="resting on the ground",
+    prior=(0.0, 0.002),
+    at_bounds=(
         "the ground seems to lie 2 cm or more below [world] ground. Check that, the scale and the shape",
         "the ground seems to lie 2 cm or more above [world] ground. Check that, the scale and the shape",
     ),
 )
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
-
-
+"""Coefficients of the contact law."""
 PRIOR_SCALES = 5.0
-"""Width of the prior of an effect's parameter, in scales that matter."""
+"""Standard deviation of the prior of an effect's parameter, in units of its scale."""
 
 
 def effect_parameters(world: World) -> list[Parameter]:
@@ -117,7 +118,16 @@ def effect_parameters(world: World) -> list[Parameter]:
             least = "these data do not show the effect: leave it out" if number.nonnegative else beyond
             bounds = (low, number.limit)
             found.append(
-                Parameter(name, number.unit, bounds, False, effect.reveals, prior, (least, beyond), number.shared)
+                Parameter(
+                    name=name,
+                    unit=number.unit,
+                    bounds=bounds,
+                    logarithmic=False,
+                    reveals=effect.reveals,
+                    prior=prior,
+                    at_bounds=(least, beyond),
+                    shared=number.shared,
+                )
             )
     return found
 
@@ -125,40 +135,40 @@ def effect_parameters(world: World) -> list[Parameter]:
 _OUTSIDE = (
     "the centre of mass would lie half the body's size away from where it was. Check the shape and the body's frame"
 )
-_SPREAD = "the mass would be spread ten times differently than it was said. Check the shape, or give inertia_kg_m2"
+_SPREAD = "the mass would be spread ten times differently than given. Check the shape, or give inertia_kg_m2"
 
 
 def mass_distribution(body: str, size_m: float) -> tuple[Parameter, ...]:
-    """Return the parameters of where a body's mass is: its centre, and factors of its second moments about it.
+    """Return the parameters of a body's mass distribution: centre of mass, and factors of its second moments about it.
 
-    The second moment along a body axis, the integral of x^2 dm, may be any positive number, so that every inertia made
-    of three of them is one that a body can have.
+    The second moment along a body axis, the integral of x^2 dm, may be any positive number, so every inertia made of
+    three of them is physically possible.
 
     Args:
         body: Its name.
-        size_m: Distance of its surface from the centre of mass [m], which bounds how far that may move.
+        size_m: Distance of its surface from the centre of mass [m]; half of it bounds the shift of the centre.
     """
     centre = [
         Parameter(
-            f"{body}.com_{axis}_m",
-            "m",
-            (-0.5 * size_m, 0.5 * size_m),
-            False,
-            "spinning flight and impacts",
-            (0.0, 0.25 * size_m),
-            (_OUTSIDE, _OUTSIDE),
+            name=f"{body}.com_{axis}_m",
+            unit="m",
+            bounds=(-0.5 * size_m, 0.5 * size_m),
+            logarithmic=False,
+            reveals="spinning flight and impacts",
+            prior=(0.0, 0.25 * size_m),
+            at_bounds=(_OUTSIDE, _OUTSIDE),
         )
         for axis in "xyz"
     ]
     moments = [
         Parameter(
-            f"{body}.moment_{axis}",
-            "1",
-            (0.1, 10.0),
-            True,
-            "impacts that change the spin",
-            (1.0, 0.5),
-            (_SPREAD, _SPREAD),
+            name=f"{body}.moment_{axis}",
+            unit="1",
+            bounds=(0.1, 10.0),
+            logarithmic=True,
+            reveals="impacts that change the spin",
+            prior=(1.0, 0.5),
+            at_bounds=(_SPREAD, _SPREAD),
         )
         for axis in "xyz"
     ]
@@ -193,25 +203,25 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
 
 
 def with_own(world: World, own: Mapping[str, Tensor], repeats: int = 1) -> World:
-    """Return the world with an own value for each item of a batch.
+    """Return the world with group- or episode-specific values of effects' parameters, one per item of a batch.
 
     Args:
         world: The world.
         own: Values (B,) by `effect.parameter`.
-        repeats: How often the batch is repeated.
+        repeats: Number of repetitions of the batch.
     """
     return replace(world, effects=tuple(_with_own(active, own, repeats) for active in world.effects)) if own else world
 
 
 def _with_own(active: ActiveEffect, own: Mapping[str, Tensor], repeats: int) -> ActiveEffect:
-    mine = {name: own.get(f"{active.effect.name}.{name}") for name in active.values}
-    size = next((len(value) for value in mine.values() if value is not None), 0)
+    specific = {name: own.get(f"{active.effect.name}.{name}") for name in active.values}
+    size = next((len(value) for value in specific.values() if value is not None), 0)
     if size == 0:
         return active
-    # what is stacked with an own number has as many values
+    # shared values are expanded to the size of the specific ones
     values = {
         name: (active.values[name].expand(size) if value is None else value).repeat(repeats)
-        for name, value in mine.items()
+        for name, value in specific.items()
     }
     return replace(active, values=values)
 

@@ -1,4 +1,4 @@
-"""Rigid-body motion over one step: free flight that keeps momentum exactly, and the update after contact."""
+"""Rigid-body motion over one step, with exact conservation of momentum in free flight."""
 
 from __future__ import annotations
 
@@ -7,36 +7,40 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .rotation import cross, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix
+from ..geometry.rotation import cross, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix
 from .world import Body
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A body's motion in the world frame.
-
-    com (B, 3) [m]: centre of mass; quat_wxyz (B, 4); velocity (B, 3) [m/s] of the centre of mass; spin (B, 3): angular
-    momentum about it [kg m2/s], or, for a driven body, its angular velocity [rad/s].
-    """
+    """Motion of a body in the world frame."""
 
     com: Tensor
+    """Centre of mass [m], shape (B, 3); origin of the frame where the body is not free."""
     quat_wxyz: Tensor
+    """Orientation, body to world, shape (B, 4)."""
     velocity: Tensor
+    """Velocity of the centre of mass [m/s], shape (B, 3)."""
     spin: Tensor
+    """Angular momentum about the centre of mass [kg m2/s], shape (B, 3); angular velocity [rad/s] of a driven body."""
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """Constants of a free body: inverse mass (B,), inverse inertia (B, 3, 3) and its Cholesky root, body axes."""
+    """Inertial constants of a free body, body axes."""
 
     mass: Tensor
+    """Mass [kg], shape (B,)."""
     inverse: Tensor
+    """Inverse inertia [1/(kg m2)], shape (B, 3, 3)."""
     root: Tensor
+    """Cholesky root of the inverse inertia, shape (B, 3, 3)."""
     matrix: Tensor
+    """Inertia [kg m2], shape (B, 3, 3)."""
 
     @staticmethod
     def of(body: Body) -> Inertia:
-        """Invert the body's inertia once for the whole rollout."""
+        """Compute the constants of a body once for a rollout."""
         inverse = torch.linalg.inv(body.inertia)
         return Inertia(body.mass, inverse, torch.linalg.cholesky(inverse), body.inertia)
 
@@ -45,12 +49,12 @@ class Inertia:
         return (rotation @ self.omega_body(rotation, spin)[..., None]).squeeze(-1)
 
     def omega_body(self, rotation: Tensor, spin: Tensor) -> Tensor:
-        """Return the same in the body frame."""
+        """Return the angular velocity (B, 3) [rad/s], body frame, of an angular momentum (B, 3) [kg m2/s]."""
         return (self.inverse @ (rotation.transpose(-1, -2) @ spin[..., None])).squeeze(-1)
 
 
 def start(body: Body, position: Tensor, quat: Tensor, velocity: Tensor, omega_body: Tensor) -> Motion:
-    """Return the motion of a free body whose frame's origin has the given pose and velocity."""
+    """Return the motion of a free body from the pose and velocity of its frame's origin."""
     arm = quat_rotate(quat, body.com)
     omega = quat_rotate(quat, omega_body)
     momentum = quat_rotate(quat, (body.inertia @ omega_body[..., None]).squeeze(-1))
@@ -73,7 +77,7 @@ def advance(
 
     Positions follow the mean velocity (exact for constant acceleration); the rotation follows the angular velocity
     that the mean angular momentum has half-way through the step (explicit midpoint, second order; derived). The
-    published law is `semi_implicit`: positions and rotations follow the velocities at the end of the step.
+    paper's law is `semi_implicit`: positions and rotations follow the velocities at the end of the step.
     """
     h = step_s[:, None]
     mean_spin, mean_velocity = (

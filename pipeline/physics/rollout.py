@@ -1,38 +1,49 @@
-"""Rollouts: the world stepped through time, batched, from given initial states."""
+"""Batched simulation of a world from given initial states, by the torch engine."""
 
 from __future__ import annotations
 
+import json
+import math
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from ...schemas import NotConvergedError
+from ..geometry.rotation import quat_to_matrix
 from .checks import require_physical, require_state
-from .contacts import Contacts, PairImpulses
-from .detection import Placed
-from .driven import Drive
+from .contact_detection import Placed
+from .contact_record import ContactRecord, Recorder
+from .contact_solver import Contacts, PairImpulses
 from .effects.effect import BodyMotion, changed_by_effects
-from .motion import Inertia, Motion, advance, finish, start
-from .records import ContactRecord, Recorder
-from .rotation import quat_to_matrix
+from .kinematic import Drive
+from .rigid_body import Inertia, Motion, advance, finish, start
 from .world import State, World
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """Poses and velocities at the frames: times_s (T,) or (B, T); the others (B, T, nb, ...) as in `State`."""
+    """Poses and velocities of all bodies at the frame times, in the order and frames of `State`."""
 
     times_s: Tensor
+    """Frame times [s], shape (T,) or (B, T)."""
     position_m: Tensor
+    """Origins of the body frames, world frame [m], shape (B, T, nb, 3)."""
     quat_wxyz: Tensor
+    """Orientations, body to world, shape (B, T, nb, 4)."""
     velocity_m_s: Tensor
+    """Velocities of the origins, world frame [m/s], shape (B, T, nb, 3)."""
     omega_body_rad_s: Tensor
+    """Angular velocities, body frame [rad/s], shape (B, T, nb, 3)."""
     contacts: ContactRecord | None = None
+    """Contact labels; None where they were not recorded."""
 
 
 def simulate(
@@ -42,7 +53,7 @@ def simulate(
     driven: Mapping[str, Track | Drive] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
-    """Roll the world out from `state`, open loop.
+    """Simulate a world from an initial state, open loop.
 
     Args:
         world: The world; its tensors and the state's broadcast over the batch B.
@@ -55,8 +66,8 @@ def simulate(
         The rollout at the frame times.
 
     Raises:
-        InputDataError: If a driven body has no track, the start is not finite, or masses, inertias, contact numbers or
-            the step cannot be simulated.
+        InputDataError: If a driven body has no track, the start is not finite, or masses, inertias, contact
+            coefficients or the step cannot be simulated.
         UsageError: If an effect needs what the world or the other effects lack, or the contact law cannot take it.
     """
     require_physical(world)
@@ -74,11 +85,25 @@ def simulate(
         if recorder is not None:
             recorder.close_frame(engine.placed(motions))
     position, quat, velocity, omega = (torch.stack([frame[k] for frame in frames], 1) for k in range(4))
-    return Rollout(times_s, position, quat, velocity, omega, recorder.record() if recorder is not None else None)
+    return Rollout(
+        times_s=times_s,
+        position_m=position,
+        quat_wxyz=quat,
+        velocity_m_s=velocity,
+        omega_body_rad_s=omega,
+        contacts=recorder.record() if recorder is not None else None,
+    )
 
 
 class Engine:
-    """The constants of one rollout, its step, and the contacts of the last step, from which the next begins."""
+    """Time stepper of one rollout: its constants, and the contacts of the last step, which warm-start the next.
+
+    Args:
+        world: The world.
+        state: The state at the first time.
+        times_s: Frame times [s], shape (T,) or (B, T).
+        driven: The command of each driven body.
+    """
 
     def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
         world = self.world = changed_by_effects(world)
@@ -100,14 +125,14 @@ class Engine:
         return {k: Drive.command(body.name, driven, like) for k, body in bodies if body.motion == "driven"}
 
     def _batch(self, state: State) -> int:
-        """Return the size of the batch that all the tensors together have."""
+        """Return the batch size common to all tensors."""
         world = self.world
-        numbers = [world.gravity, self.times, state.position_m, state.velocity_m_s, state.omega_body_rad_s]
-        numbers += [getattr(world.contact, name) for name in vars(world.contact)] if world.bodies else []
-        numbers += [world.ground_offset] + [value for active in world.effects for value in active.values.values()]
-        numbers += [value for body in world.bodies for value in (body.mass, body.inertia, body.com, body.centers)]
-        numbers += [drive.times_s for drive in self.drives.values()]
-        return max(x.shape[0] for x in numbers if isinstance(x, torch.Tensor))
+        tensors = [world.gravity, self.times, state.position_m, state.velocity_m_s, state.omega_body_rad_s]
+        tensors += [getattr(world.contact, name) for name in vars(world.contact)] if world.bodies else []
+        tensors += [world.ground_offset] + [value for active in world.effects for value in active.values.values()]
+        tensors += [value for body in world.bodies for value in (body.mass, body.inertia, body.com, body.centers)]
+        tensors += [drive.times_s for drive in self.drives.values()]
+        return max(x.shape[0] for x in tensors if isinstance(x, torch.Tensor))
 
     def begin(self, state: State) -> list[Motion]:
         """Return the motions of the bodies at the first time."""
@@ -124,17 +149,17 @@ class Engine:
         return motions
 
     def commanded(self, motions: list[Motion], driven: Mapping[str, Track | Drive]) -> list[Motion]:
-        """Take other commands from the first time on, and return the motions with driven bodies as they begin."""
+        """Replace the commands, and return the motions with driven bodies at the start of the new ones."""
         self.drives = self._commands(driven, motions[0].com)
         first = self.times[:, 0]
         return [self._whole(self.drives[k].at(first)) if k in self.drives else m for k, m in enumerate(motions)]
 
     def _whole(self, motion: Motion) -> Motion:
-        """Return a motion with as many rows as the batch has."""
+        """Return a motion expanded to the size of the batch."""
         return Motion(*(_expanded(x, self.batch) for x in vars(motion).values()))
 
     def step(self, motions: list[Motion], interval: int, substep: int) -> tuple[list[Motion], list[PairImpulses]]:
-        """Return the motions after a sub-step of an interval (counted from 1), and what touched."""
+        """Return the motions after a sub-step of an interval (counted from 1), and the impulses of the contacts."""
         count = self.substeps[interval - 1]
         h = _expanded(self.lengths[:, interval - 1] / count, self.batch)
         rotations = [quat_to_matrix(m.quat_wxyz) for m in motions]
@@ -164,9 +189,9 @@ class Engine:
         if not self.wrenches:
             return replace(motion, velocity=velocity)
         inertia = self.inertias[index]
-        seen = self._seen(index, motion, rotation)
+        current = self._body_motion(index, motion, rotation)
         for active in self.wrenches:
-            wrench = active.effect.wrench(active.values, seen)
+            wrench = active.effect.wrench(active.values, current)
             if wrench.force is not None:
                 velocity = velocity + (h / inertia.mass)[:, None] * wrench.force
             if wrench.torque is not None:
@@ -174,7 +199,7 @@ class Engine:
         return replace(motion, velocity=velocity, spin=spin)
 
     def loads(self, motions: Sequence[Motion]) -> dict[int, tuple[Tensor, Tensor]]:
-        """Return what effects give each free body now: acceleration (B, 3) [m/s2], torque (B, 3) [N m], world frame."""
+        """Return the effect on each free body now: acceleration (B, 3) [m/s2] and torque (B, 3) [N m], world frame."""
         found = {}
         for index, (body, motion) in enumerate(zip(self.world.bodies, motions, strict=True)):
             if body.free:
@@ -183,28 +208,41 @@ class Engine:
                 found[index] = after.velocity - motion.velocity - self.world.gravity, after.spin - motion.spin
         return found
 
-    def _seen(self, index: int, motion: Motion, rotation: Tensor) -> BodyMotion:
-        """Return what effects see of a free body."""
+    def _body_motion(self, index: int, motion: Motion, rotation: Tensor) -> BodyMotion:
+        """Return the motion of a free body as effects receive it."""
         body, inertia, world = self.world.bodies[index], self.inertias[index], self.world
         omega = inertia.omega(rotation, motion.spin)
         turned = rotation @ inertia.matrix @ rotation.transpose(-1, -2)
         up, offset = world.up, world.ground_offset
         normal = up if world.ground_normal is None else world.ground_normal[None]
-        seen = BodyMotion(body, inertia.mass, turned, motion.com, rotation, motion.velocity, omega, up, normal, offset)
+        current = BodyMotion(
+            body=body,
+            mass=inertia.mass,
+            inertia=turned,
+            com=motion.com,
+            rotation=rotation,
+            velocity=motion.velocity,
+            omega=omega,
+            up=up,
+            normal=normal,
+            ground_offset=offset,
+        )
         for active in self.flows:
-            flow = active.effect.flow(active.values, seen)
-            seen = replace(seen, air=flow if seen.air is None else seen.air + flow)
-        return seen
+            flow = active.effect.flow(active.values, current)
+            current = replace(current, air=flow if current.air is None else current.air + flow)
+        return current
 
     def _place(self, motions: list[Motion], rotations: list[Tensor]) -> list[Placed]:
         placed = []
         for index, (body, motion, rotation) in enumerate(zip(self.world.bodies, motions, rotations, strict=True)):
             omega = self.inertias[index].omega(rotation, motion.spin) if body.free else motion.spin
-            placed.append(Placed(body, motion.com, rotation, motion.velocity, omega))
+            placed.append(
+                Placed(body=body, reference=motion.com, rotation=rotation, velocity=motion.velocity, omega=omega)
+            )
         return placed
 
     def placed(self, motions: list[Motion]) -> list[Placed]:
-        """Return the bodies where they are."""
+        """Return the bodies at their current poses."""
         return self._place(motions, [quat_to_matrix(m.quat_wxyz) for m in motions])
 
     def _after(self, ahead: list[Motion], touched: list[PairImpulses]) -> tuple[list[Tensor], list[Tensor]]:
@@ -230,3 +268,46 @@ class Engine:
 
 def _expanded(x: Tensor, batch: int) -> Tensor:
     return x if x.shape[0] == batch else x.expand(batch, *x.shape[1:])
+
+
+def require_finite(
+    rollout: Rollout, world: World, state: State, names: Sequence[str] = (), frames: Sequence[int] = ()
+) -> None:
+    """Check that a rollout stayed finite; otherwise save its initial state, so that it can be replayed.
+
+    Args:
+        rollout: The rollout.
+        world: The world that was simulated.
+        state: The initial state.
+        names: Names of the environments in messages; their numbers where left out.
+        frames: Number of frames of each environment to check; all where left out.
+
+    Raises:
+        NotConvergedError: If a state is not finite, with the environment, the step and the file of its initial state.
+    """
+    poses = torch.cat((rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s), -1)
+    finite = torch.isfinite(poses).flatten(2).all(-1)
+    for item, count in enumerate(frames):
+        finite[item, count:] = True
+    wrong = (~finite).nonzero()
+    if not len(wrong):
+        return
+    item, frame = (int(k) for k in wrong[0])
+    times = rollout.times_s if rollout.times_s.ndim == 1 else rollout.times_s[min(item, len(rollout.times_s) - 1)]
+    since = float(times[frame] - times[0])
+    path = Path(tempfile.mkdtemp(prefix="cgwm-diverged-")) / "start.json"
+    path.write_text(json.dumps(_start(state, world.body_names, item), indent=2) + "\n")
+    raise NotConvergedError(
+        f"{names[item] if names else f'environment {item}'} diverged by step {math.ceil(since / world.step_s - 1e-6)}, "
+        f"{since:.4g} s after its start: its state is not finite. Its start is in {path}.",
+        todo="fit again with a smaller step (--set phys-geo.step_s=...), or check masses, units and the sampling plan.",
+    )
+
+
+def _start(state: State, names: Sequence[str], item: int) -> dict[str, dict[str, list[float]]]:
+    """Return the state of one environment by body."""
+    fields = {key: getattr(state, key) for key in State.__dataclass_fields__}
+    return {
+        name: {key: values[min(item, len(values) - 1), index].tolist() for key, values in fields.items()}
+        for index, name in enumerate(names)
+    }

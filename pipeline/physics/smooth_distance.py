@@ -8,9 +8,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..splats.directions import fibonacci_directions
+from ..geometry.directions import fibonacci_directions
 
 _PLANE_DIRECTIONS = 2000
+"""Number of directions in which `plane_contacts` compares support functions."""
 
 
 def smooth_min(distances: Tensor, width: float) -> tuple[Tensor, Tensor]:
@@ -45,7 +46,7 @@ def smooth_min(distances: Tensor, width: float) -> tuple[Tensor, Tensor]:
 
 
 def log_sum_exp_distance(distances: Tensor, per_m: float) -> tuple[Tensor, Tensor]:
-    """Return the published smooth minimum of distances (..., N) [m] and its weights.
+    """Return the log-sum-exp smooth minimum of the paper for distances (..., N) [m], and its weights.
 
     -(1/beta) log sum exp(-beta d): between min d - log(N)/beta and min d.
     """
@@ -95,14 +96,14 @@ def blended(offset: Tensor, radii: Tensor, minimum: Callable[[Tensor], tuple[Ten
 def plane_contacts(centers: Tensor, radii: Tensor, tolerance_m: float = 1e-4) -> Tensor:
     """Return the indices (K,) of the spheres by which a plane touches a union of spheres.
 
-    A plane sees of a union only its support function, the largest n . c + r, and most spheres on a flat side add
-    nothing to it that the corners do not have. Spheres are taken greedily where the support function of those taken
-    lacks most, until it lacks less than the tolerance.
+    Contact with a plane depends only on the support function of the union, the largest n . c + r, to which most spheres
+    on a flat side add nothing in addition to the corners. Spheres are chosen greedily where the support function of the
+    chosen ones is farthest below that of all, until the difference is below the tolerance.
 
     Args:
         centers: Sphere centres [m], shape (N, 3).
         radii: Sphere radii [m], shape (N,).
-        tolerance_m: How much of the support function may be lost [m].
+        tolerance_m: Largest admitted loss of the support function [m].
     """
     directions = torch.as_tensor(fibonacci_directions(_PLANE_DIRECTIONS)).to(centers)
     reach = centers @ directions.T + radii[:, None]

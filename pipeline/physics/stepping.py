@@ -1,6 +1,6 @@
-"""A world taken on by one interval after the other, each with its own commands: on any device by the torch engine.
+"""Stepwise simulation of one environment with new commands for each interval, by the torch engine on any device.
 
-`FusedStepper` does the same on CUDA.
+`fused.stepping.FusedStepper` does the same on CUDA.
 """
 
 from __future__ import annotations
@@ -10,46 +10,47 @@ from typing import Protocol
 
 import torch
 
+from ...schemas import UsageError
 from .checks import require_physical, require_state
-from .driven import Drive
-from .motion import Motion
+from .kinematic import Drive
+from .rigid_body import Motion
 from .rollout import Engine
 from .world import State, World
 
 
 class Stepper(Protocol):
-    """Takes one environment on by intervals of equal length; the same steps as one rollout over all of them."""
+    """Interface for the simulation of one environment by intervals of equal length, with the steps of one rollout."""
 
     def reset(self, state: State, drives: Mapping[str, Drive]) -> None:
-        """Start anew from a state (1, nb, ...).
+        """Start from a state (1, nb, ...).
 
         Args:
-            state: Where all bodies are; driven ones are where their commands begin.
-            drives: For each driven body a command over one interval, which begins at time 0.
+            state: Poses and velocities of all bodies; driven ones are at the start of their commands.
+            drives: Command of each driven body over one interval, which begins at time 0.
 
         Raises:
-            InputDataError: If the start is not finite.
+            InputDataError: If the state is not finite.
         """
         ...
 
     def command(self, drives: Mapping[str, Drive]) -> None:
-        """Give the driven bodies the commands of the next interval."""
+        """Set the commands of the driven bodies for the next interval."""
         ...
 
     def advance(self) -> State:
-        """Take the world on by one interval, and return its state there (1, nb, ...)."""
+        """Simulate one interval, and return the state at its end (1, nb, ...)."""
         ...
 
 
 class TorchStepper:
-    """A `Stepper` by the torch engine.
+    """`Stepper` that uses the torch engine.
 
     Args:
-        world: The world, of one environment.
+        world: The world, with a batch of one.
         interval_s: Length of an interval [s].
 
     Raises:
-        InputDataError: If masses, inertias, contact numbers or the step cannot be simulated.
+        InputDataError: If masses, inertias, contact coefficients or the step cannot be simulated.
     """
 
     def __init__(self, world: World, interval_s: float) -> None:
@@ -67,14 +68,17 @@ class TorchStepper:
 
     def command(self, drives: Mapping[str, Drive]) -> None:
         """See :class:`Stepper`."""
-        assert self._engine is not None  # see reset
-        self._motions = self._engine.commanded(self._motions, drives)
+        self._motions = self._started().commanded(self._motions, drives)
 
     @torch.no_grad()
     def advance(self) -> State:
         """See :class:`Stepper`."""
-        engine = self._engine
-        assert engine is not None  # see reset
+        engine = self._started()
         for substep in range(engine.substeps[0]):
             self._motions, _ = engine.step(self._motions, 1, substep)
         return State(*engine.frame(self._motions))
+
+    def _started(self) -> Engine:
+        if self._engine is None:
+            raise UsageError("the stepper has no state yet.", todo="call reset first.")
+        return self._engine

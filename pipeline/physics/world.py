@@ -1,4 +1,4 @@
-"""What the engine simulates: bodies of spheres, the ground, gravity and the contact law."""
+"""World model of the engine: bodies made of spheres, the ground, gravity, the contact law and the effects."""
 
 from __future__ import annotations
 
@@ -12,35 +12,39 @@ import torch
 from torch import Tensor
 
 from ...schemas import InputDataError, UsageError
-from .contact import ContactLaw
-from .distance import plane_contacts
+from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import load_effect
-from .published import PublishedLaw
+from .paper_law import PaperLaw
+from .smooth_distance import plane_contacts
 
 if TYPE_CHECKING:
-    from ...datasets.models import Model
+    from ...datasets.models.model import Model
     from ...schemas import EffectModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Body:
-    """A rigid body made of spheres. Every tensor has a batch dimension of 1 or B.
-
-    mass (B,) [kg]; inertia (B, 3, 3) [kg m2] about the centre of mass, body axes; com (B, 3) [m] in the body frame;
-    centers (B, N, 3) [m] in the body frame; radii (B, N) [m]; place (1, 7): position [m] and quat_wxyz of a fixed body;
-    on_plane (K,): which spheres the ground can touch, all where None.
-    """
+    """A rigid body made of spheres; every tensor has a batch dimension of 1 or B."""
 
     name: str
+    """Name of the body, unique in the world."""
     motion: str
+    """How the body moves: "free", "driven" or "fixed"."""
     mass: Tensor
+    """Mass [kg], shape (B,)."""
     inertia: Tensor
+    """Inertia about the centre of mass, body axes [kg m2], shape (B, 3, 3)."""
     com: Tensor
+    """Centre of mass in the body frame [m], shape (B, 3)."""
     centers: Tensor
+    """Centres of the spheres in the body frame [m], shape (B, N, 3)."""
     radii: Tensor
+    """Radii of the spheres [m], shape (B, N)."""
     place: Tensor | None = None
+    """Position [m] and quat_wxyz of a fixed body, world frame, shape (1, 7)."""
     on_plane: Tensor | None = None
+    """Indices of the spheres that the ground can touch, shape (K,); None for all."""
 
     @property
     def free(self) -> bool:
@@ -48,28 +52,34 @@ class Body:
         return self.motion == "free"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class World:
-    """The bodies and what surrounds them.
-
-    gravity (B, 3) [m/s2]; ground normal (3,) and offset (B,) [m]; contact: the contact law; step_s: largest step;
-    sweeps: of the closed form over all contacts; effects: what acts beyond gravity and contact; touching: whether
-    bodies touch at all (without, every motion is free flight, and costs a tenth); rolls_on: the device that
-    `dispatch.rollout` takes rollouts to and their results back from, None for where the tensors lie; own: by episode,
-    its own values of effects' parameters, `effect.parameter` by name.
-    """
+    """The bodies of a scene, the ground, gravity, the contact law and the effects."""
 
     bodies: tuple[Body, ...]
+    """The bodies, in the order of the state."""
     gravity: Tensor
+    """Gravitational acceleration, world frame [m/s2], shape (B, 3)."""
     ground_normal: Tensor | None
+    """Unit normal of the ground, world frame, shape (3,); None without a ground."""
     ground_offset: Tensor | None
-    contact: ContactLaw | PublishedLaw
+    """Offset of the ground along its normal [m], shape (B,); None without a ground."""
+    contact: ContactLaw | PaperLaw
+    """The contact law and its coefficients."""
     step_s: float = 0.001
+    """Largest time step [s]."""
     sweeps: int = 10
+    """Projected Jacobi iterations over all contacts of a step; 1 is the closed form alone."""
     effects: tuple[ActiveEffect, ...] = ()
+    """Effects in addition to gravity and contact."""
     touching: bool = True
+    """Whether bodies can touch at all; without contact every motion is free flight, at a tenth of the cost."""
     rolls_on: str | None = None
+    """Device on which `engine.rollout` computes before it returns results to the device of the tensors; None for that
+    of the tensors.
+    """
     own: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Group- or episode-specific values of effects' parameters: by episode, then by `effect.parameter`."""
 
     @property
     def body_names(self) -> list[str]:
@@ -80,6 +90,17 @@ class World:
     def free(self) -> list[int]:
         """Indices of the free bodies."""
         return [index for index, body in enumerate(self.bodies) if body.free]
+
+    @property
+    def ground(self) -> tuple[Tensor, Tensor]:
+        """Normal (3,) of the ground and its offset (1 or B,) [m] along the normal.
+
+        Raises:
+            UsageError: If the world has no ground.
+        """
+        if self.ground_normal is None or self.ground_offset is None:
+            raise UsageError("this world has no ground.", todo="give the ground in capture.toml, under [world].")
+        return self.ground_normal, self.ground_offset
 
     def substeps(self, times_s: Tensor) -> list[int]:
         """Return the number of steps in each interval of times (B, T) [s], none of them longer than `step_s`."""
@@ -102,9 +123,9 @@ class World:
 
         Args:
             model: The model.
-            dtype: Of all tensors.
-            device: Of all tensors.
-            geometry: A world of the same model with other numbers, to share the colliding spheres with.
+            dtype: Type of all tensors.
+            device: Device of all tensors.
+            geometry: A world of the same model with other parameters, whose collision spheres are used again.
 
         Raises:
             InputDataError: If the model has no fitted physics yet.
@@ -131,15 +152,15 @@ class World:
                 centers, radii, place, on_plane = known.centers, known.radii, known.place, known.on_plane
             bodies.append(
                 Body(
-                    body.name,
-                    body.motion,
-                    tensor(body.mass_kg),
-                    tensor(symmetric(body.inertia_kg_m2)),
-                    tensor(body.com_m),
-                    centers,
-                    radii,
-                    place,
-                    on_plane,
+                    name=body.name,
+                    motion=body.motion,
+                    mass=tensor(body.mass_kg),
+                    inertia=tensor(symmetric(body.inertia_kg_m2)),
+                    com=tensor(body.com_m),
+                    centers=centers,
+                    radii=radii,
+                    place=place,
+                    on_plane=on_plane,
                 )
             )
         law = ContactLaw(
@@ -147,14 +168,14 @@ class World:
         )
         ground = file.ground
         return World(
-            tuple(bodies),
-            tensor(file.gravity_m_s2),
-            tensor(ground.normal)[0] if ground else None,
-            tensor(ground.offset_m) if ground else None,
-            law,
-            file.solver.step_s,
-            file.solver.sweeps,
-            tuple(_active(effect, str(model.root), tensor(0.0)) for effect in file.effects),
+            bodies=tuple(bodies),
+            gravity=tensor(file.gravity_m_s2),
+            ground_normal=tensor(ground.normal)[0] if ground else None,
+            ground_offset=tensor(ground.offset_m) if ground else None,
+            contact=law,
+            step_s=file.solver.step_s,
+            sweeps=file.solver.sweeps,
+            effects=tuple(_active(effect, str(model.root), tensor(0.0)) for effect in file.effects),
         )
 
     def with_body(self, index: int, **changes: Tensor) -> World:
@@ -166,28 +187,28 @@ class World:
 
 @dataclass(frozen=True)
 class State:
-    """Poses and velocities of all bodies at one time, in the order of the world's bodies.
-
-    position_m (B, nb, 3): body frame origin, world; quat_wxyz (B, nb, 4); velocity_m_s (B, nb, 3): of the body frame
-    origin, world; omega_body_rad_s (B, nb, 3): body frame.
-    """
+    """Poses and velocities of all bodies at one time, in the order of the world's bodies."""
 
     position_m: Tensor
+    """Origins of the body frames, world frame [m], shape (B, nb, 3)."""
     quat_wxyz: Tensor
+    """Orientations, body to world, shape (B, nb, 4)."""
     velocity_m_s: Tensor
+    """Velocities of the body frames' origins, world frame [m/s], shape (B, nb, 3)."""
     omega_body_rad_s: Tensor
+    """Angular velocities, body frame [rad/s], shape (B, nb, 3)."""
 
     def at(self, rows: Tensor | Sequence[int] | slice) -> State:
-        """Return some rows of the batch."""
+        """Return the state at some rows of the batch."""
         return State(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def repeat(self, times: int) -> State:
-        """Return the batch repeated, as `Tensor.repeat` does."""
+        """Return the state with its batch repeated, as `Tensor.repeat` does."""
         return State(*(getattr(self, field.name).repeat(times, 1, 1) for field in fields(self)))
 
     @staticmethod
     def joined(*states: State) -> State:
-        """Return the batches one after the other."""
+        """Concatenate the batches of several states."""
         return State(*(torch.cat([getattr(state, field.name) for state in states]) for field in fields(State)))
 
 

@@ -1,1 +1,1 @@
-"""Spherical Gaussians: rendering, fitting to photos, and the spheres that collide."""
+"""Render spherical Gaussians: images, depth, masks and labels, on the CPU in torch and on CUDA devices."""

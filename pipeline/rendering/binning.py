@@ -1,8 +1,8 @@
-"""Triton kernels that find which spheres each tile composites: projection, its derivative, pairs with tiles.
+"""Triton kernels that assign spheres to tiles: projection, its derivative, and pairs of tiles and spheres.
 
-What a sphere can reach is a rectangle: of pixels for a pinhole camera, of x and y on the plane z = 1 for one that
-distorts. The latter is compared with the bounds of the tiles' own rays: no point is sent through the distortion, which
-folds back outside of the picture.
+The bound of a sphere is a rectangle: of pixels for a pinhole camera, of x and y on the plane z = 1 for a distorting
+one. The latter is compared with the bounds of the rays of each tile: no point is distorted, since the distortion folds
+back outside of the image.
 """
 
 # pyright: reportGeneralTypeIssues=false
@@ -14,12 +14,14 @@ import triton
 import triton.language as tl
 
 PROJECT_BLOCK = 256
+"""Number of spheres per program of `project`."""
 EMIT_BLOCK = 128
+"""Number of spheres per program of `emit`."""
 
 
 @triton.jit
 def _tangents(x, z, reach):
-    """Return the least and the greatest x / z of the rays that pass a centre within the reach, in the xz plane."""
+    """Return the minimum and maximum x / z of the rays that pass a centre within the reach, in the xz plane."""
     front = z * z - reach * reach
     wide = (z <= reach) | (front <= 0)
     front = tl.where(wide, 1.0, front)
@@ -33,16 +35,16 @@ def _tangents(x, z, reach):
 
 @triton.jit
 def _range(low, high, COUNT, TILE: tl.constexpr):
-    """Return the first tile from low to high [px], and how many of them."""
+    """Return the first tile from low to high [px], and the number of tiles."""
     first = tl.maximum(tl.floor(low / TILE), 0.0).to(tl.int32)
     return first, tl.maximum(tl.minimum(tl.floor(high / TILE).to(tl.int32) + 1, COUNT) - first, 0)
 
 
 @triton.jit
 def _range_of_rays(low, high, bounds, COUNT):
-    """Return the first column (or row) of tiles with rays from low to high, and how many up to the last one.
+    """Return the first column (or row) of tiles with rays from low to high, and the number up to the last one.
 
-    Reads bounds (COUNT, 4): the least coordinate of a column's rays, and two numbers on minus the greatest.
+    Reads bounds (COUNT, 4): the minimum coordinate of a column's rays, and two places further minus the maximum.
     """
     first = tl.full(low.shape, 0, tl.int32) + COUNT
     last = tl.full(low.shape, -1, tl.int32)
@@ -57,7 +59,7 @@ def _range_of_rays(low, high, bounds, COUNT):
 
 @triton.jit
 def _rectangle(left, top, right, bottom, camera, column_bounds, row_bounds, COLUMNS, ROWS, TILE: tl.constexpr):
-    """Return the tiles that hold all that a span meets: first column, their number, first row, their number."""
+    """Return the tiles that cover a span: first column, number of columns, first row, number of rows."""
     if column_bounds is None:
         first_column, columns = _range(left, right, COLUMNS, TILE)
         first_row, rows = _range(top, bottom, ROWS, TILE)
@@ -69,7 +71,7 @@ def _rectangle(left, top, right, bottom, camera, column_bounds, row_bounds, COLU
 
 @triton.jit
 def _meets(left, top, right, bottom, bounds, tile, active):
-    """Tell which spans meet the rays of their tiles; bounds: x, y least, minus x, y greatest, (tiles, 4)."""
+    """Return which spans meet the rays of their tiles; bounds (tiles, 4): minimum x and y, minus maximum x and y."""
     at = bounds + tile * 4
     met = (tl.load(at, mask=active, other=0.0) <= right) & (-tl.load(at + 2, mask=active, other=0.0) >= left)
     met &= (tl.load(at + 1, mask=active, other=0.0) <= bottom) & (-tl.load(at + 3, mask=active, other=0.0) >= top)
@@ -83,12 +85,12 @@ def project(  # noqa: PLR0915
     N, WIDTH, HEIGHT, COLUMNS, ROWS, min_alpha,
     PER_CAMERA: tl.constexpr, HAS_LEAST: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Move spheres into camera frames, and find the tiles that each can reach.
+    """Transform spheres into camera frames, and count the tiles that each can reach.
 
-    Reads the bounds of `kernels.trace` of each tile, of each column and of each row of tiles; None for pinholes. Writes
-    centres (C, N, 4): x, y, z [m] and -1 / (2 s^2); log_opacities (N,); distances (C, N), inf where a sphere is not
-    drawn; spans (C, N, 4): left, top, right, bottom of what it reaches, in pixels, or on z = 1 with bounds; counts
-    (C, N) of tiles.
+    Reads the bounds of `triton_kernels.trace` of each tile, of each column and of each row of tiles; None for pinhole
+    cameras. Writes centres (C, N, 4): x, y, z [m] and -1 / (2 s^2); log_opacities (N,); distances (C, N), inf where a
+    sphere is not drawn; spans (C, N, 4): left, top, right, bottom of its bound, in pixels, or on z = 1 with bounds;
+    counts (C, N) of tiles.
     """
     camera = tl.program_id(0)
     n = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
@@ -109,8 +111,8 @@ def project(  # noqa: PLR0915
         reach = s * tl.sqrt(tl.maximum(2 * (log_opacity - tl.log(min_alpha)), 0.0))
     else:
         reach = s * 1e4
-    reach = reach * 1.0001 + 1e-9  # rounding must not lose what is visible
-    # (comparisons with NaN are false: what has no place is not drawn)
+    reach = reach * 1.0001 + 1e-9  # rounding must not lose visible spheres
+    # (comparisons with NaN are false, so spheres at undefined positions are not drawn)
     drawn = inside & (z > s) & (opacity > min_alpha) & (distance < 1e30)
     left, right = _tangents(x, z, reach)
     top, bottom = _tangents(y, z, reach)
@@ -158,10 +160,10 @@ def emit(
     order, ends, spans, tile_bounds, column_bounds, row_bounds, keys, rows,
     TOTAL, N, CAPACITY, COLUMNS, ROWS, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write a pair of tile key and sphere row for every tile that a sphere can reach, spheres nearest first.
+    """Write a pair of tile key and sphere row for every tile that a sphere can reach, nearest spheres first.
 
     Reads order: rows (camera * N + sphere) by distance, int64 (TOTAL,); ends: the running sum of the tile counts in
-    that order; spans and bounds: as `project` has them. Writes (CAPACITY,) keys: camera * tiles + tile; and rows.
+    that order; spans and bounds: as in `project`. Writes (CAPACITY,) keys: camera * tiles + tile; and rows.
     """
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = k < TOTAL
@@ -214,9 +216,9 @@ def project_backward(
     gradients, viewmats, scales, opacities, by_means, by_scales, by_opacities, by_features, CAMERAS, N,
     F: tl.constexpr, WIDE: tl.constexpr, PER_CAMERA: tl.constexpr, GROUP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Turn derivatives by centres in camera frames, k, log opacities and features into those by what was given.
+    """Convert derivatives by centres in camera frames, k, log opacities and features to those by the inputs.
 
-    Reads the rows (C, N, WIDE) of `kernels.composite_backward`, GROUP cameras at a time. Writes by_means (N, 3), or
+    Reads the rows (C, N, WIDE) of `composite_backward`, GROUP cameras at a time. Writes by_means (N, 3), or
     (C, N, 3) where they differ by camera; by_scales (N,); by_opacities (N,); by_features (N, F).
     """
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -1,12 +1,12 @@
-"""Front-to-back compositing of tile lists, with a hand-written derivative.
+"""Front-to-back compositing of tile lists in torch, with a hand-written derivative.
 
 The alpha of a sphere at a pixel is exp(basis . coefficients): in the frame of a tile, whose z axis is the ray through
 the tile's centre, the squared distance from a centre p to the ray (x, y, 1) is a quadratic polynomial of (x, y),
 
     dist^2 (1 + x^2 + y^2) = (px - pz x)^2 + (py - pz y)^2 + (px y - py x)^2          (derived: |p x d|^2 / |d|^2)
 
-so exponents are one small matrix product per tile, and so are their derivatives. Nothing of the size
-pixels times spheres is kept between the forward and the backward pass: the latter computes it again.
+so exponents are one small matrix product per tile, and so are their derivatives. No array of the size pixels times
+spheres is kept between the forward and the backward pass; the latter computes it again.
 """
 
 from __future__ import annotations
@@ -19,43 +19,49 @@ import torch
 from torch import Tensor
 
 MAX_ALPHA = 0.99
-"""No sphere is more opaque than this at a pixel: the derivative divides by 1 - alpha."""
+"""Maximum alpha of a sphere at a pixel, because the derivative divides by 1 - alpha."""
 _CHUNK = 32
+"""Number of spheres per tile that are evaluated together."""
 _ELEMENTS = {"cpu": 400_000, "cuda": 40_000_000}
+"""Maximum number of elements of the largest arrays of a batch of tiles, by device."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TileLists:
-    """For each tile, which rows of the pair arrays it composites, nearest first.
-
-    Attributes:
-        basis: Monomials (1, x, y, x^2, x y, y^2) / (1 + x^2 + y^2) of the pixels in the tile frame, shape (K, P, 6).
-        frame: Row of `basis` for each tile, shape (T,).
-        starts: First row of each tile's list in the pair arrays, shape (T,).
-        counts: Length of each tile's list, shape (T,).
-        min_alpha: An alpha below this counts as 0.
-        min_transmittance: A tile is finished when no pixel lets more light through than this.
-    """
+    """Rows of the pair arrays that each tile composites, nearest first."""
 
     basis: Tensor
+    """Monomials (1, x, y, x^2, x y, y^2) / (1 + x^2 + y^2) of the pixels in the tile frame, shape (K, P, 6)."""
     frame: Tensor
+    """Row of `basis` for each tile, shape (T,)."""
     starts: Tensor
+    """First row of each tile's list in the pair arrays, shape (T,)."""
     counts: Tensor
+    """Length of each tile's list, shape (T,)."""
     min_alpha: float
+    """Threshold below which an alpha counts as 0."""
     min_transmittance: float
+    """Transmittance of all pixels at which a tile is finished."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Chunk:
-    """Up to 32 successive spheres of each of some tiles; t tiles, L spheres, P pixels."""
+    """Up to 32 successive spheres of each of some tiles: t tiles, L spheres, P pixels."""
 
-    tiles: Tensor  # (t,) into the batch
-    rows: Tensor  # (t, L) into the pair arrays; the last row of those is empty
-    basis: Tensor  # (t, P, 6)
-    alpha: Tensor  # (t, L, P)
-    clamped: Tensor | None  # (t, L, P) where alpha was cut to MAX_ALPHA
-    weights: Tensor  # (t, L, P)
-    transmittance: Tensor  # (t, L, P) before each sphere
+    tiles: Tensor
+    """Indices of the tiles in the batch, shape (t,)."""
+    rows: Tensor
+    """Rows of the pair arrays, whose last row is empty, shape (t, L)."""
+    basis: Tensor
+    """See `TileLists`, shape (t, P, 6)."""
+    alpha: Tensor
+    """Alpha of each sphere at each pixel, shape (t, L, P)."""
+    clamped: Tensor | None
+    """Whether alpha was limited to MAX_ALPHA, shape (t, L, P); None where none was."""
+    weights: Tensor
+    """Contribution of each sphere to alpha, shape (t, L, P)."""
+    transmittance: Tensor
+    """Transmittance before each sphere, shape (t, L, P)."""
 
 
 def composite(
@@ -67,11 +73,11 @@ def composite(
         coefficients: Exponent coefficients of each (tile, sphere) pair, shape (M, 6).
         features: Features of each pair, shape (M, F).
         lists: The tiles.
-        median: Whether to look for the median of the last feature.
+        median: Whether to compute the median of the last feature.
 
     Returns:
-        Features (T, P, F), not divided by alpha, alpha (T, P), and the last feature of the sphere at which the light
-        that gets through falls to half, (T, P), without derivative; zero where it does not, or was not asked for.
+        Features (T, P, F), not divided by alpha; alpha (T, P); and the last feature of the sphere at which the
+        transmittance falls to half (T, P), without derivative, zero where it does not or was not requested.
     """
     return _Composite.apply(coefficients, features, lists, median)  # type: ignore[return-value]
 
@@ -107,7 +113,7 @@ class _Composite(torch.autograd.Function):
         coefficients, features, out, left = ctx.saved_tensors
         lists: TileLists = ctx.lists
         grad_out, grad_alpha = (gradient.contiguous() for gradient in gradients[:2])
-        # What lies behind a sphere, seen through it: starts at everything, and loses each sphere as it is passed.
+        # Contribution of all that lies behind a sphere: the total minus each sphere that has been passed.
         behind = (out * grad_out).sum(-1) - grad_alpha * left
         table, padded_features = _with_empty_row(coefficients, features, lists)
         grad_table, grad_features = torch.zeros_like(table), torch.zeros_like(padded_features)
@@ -124,7 +130,7 @@ class _Composite(torch.autograd.Function):
 
 
 def _grad_exponent(chunk: _Chunk, along: Tensor, rest: Tensor) -> Tensor:
-    """Return the derivative by the exponents, (t, L, P); moves `rest` past the chunk.
+    """Return the derivative with respect to the exponents (t, L, P), and advance `rest` past the chunk.
 
     d out / d alpha_i = T_i f_i - sum_(j > i) w_j f_j / (1 - alpha_i), and d alpha / d exponent = alpha.
     """
@@ -139,14 +145,14 @@ def _grad_exponent(chunk: _Chunk, along: Tensor, rest: Tensor) -> Tensor:
 
 
 def _with_empty_row(coefficients: Tensor, features: Tensor, lists: TileLists) -> tuple[Tensor, Tensor]:
-    """Append a row that renders as nothing, which pads lists to a common length."""
+    """Append a row that is invisible, which pads lists to a common length."""
     nothing = coefficients.new_zeros(1, 6)
     nothing[0, [0, 3, 5]] = -1e4
     return torch.cat([coefficients, nothing]), torch.cat([features, features.new_zeros(1, features.shape[1])])
 
 
 def _batches(lists: TileLists) -> Iterator[Tensor]:
-    """Yield groups of tiles that are small enough for the cache (CPU) or for the memory (CUDA)."""
+    """Yield batches of tiles that are small enough for the cache (CPU) or for the memory (CUDA)."""
     order = torch.argsort(lists.counts, descending=True, stable=True)
     order = order[: int((lists.counts > 0).sum())]
     limit = _ELEMENTS.get(lists.basis.device.type, _ELEMENTS["cuda"])
@@ -155,7 +161,7 @@ def _batches(lists: TileLists) -> Iterator[Tensor]:
 
 
 def _chunks(table: Tensor, lists: TileLists, batch: Tensor, remaining: Tensor) -> Iterator[_Chunk]:
-    """Yield the chunks of a batch of tiles from near to far; `remaining` (t, P) holds what still shines through."""
+    """Yield the chunks of a batch of tiles from near to far, and update the transmittance `remaining` (t, P)."""
     starts, counts, frames = lists.starts[batch], lists.counts[batch], lists.frame[batch]
     empty = table.shape[0] - 1
     first = 0
@@ -167,8 +173,8 @@ def _chunks(table: Tensor, lists: TileLists, batch: Tensor, remaining: Tensor) -
         if tiles.shape[0] == 0:
             return
         length = min(_CHUNK, int(counts[tiles].max()) - first)
-        slots = torch.arange(first, first + length, device=table.device)
-        rows = torch.where(slots < counts[tiles, None], starts[tiles, None] + slots, empty)
+        places = torch.arange(first, first + length, device=table.device)
+        rows = torch.where(places < counts[tiles, None], starts[tiles, None] + places, empty)
         yield _evaluate(table, lists, tiles, rows, frames[tiles], remaining)
         first += length
 
@@ -190,4 +196,12 @@ def _evaluate(
     for index in range(1, rows.shape[1]):
         torch.mul(transmittance[:, index - 1], keep[:, index - 1], out=transmittance[:, index])
     remaining[tiles] = transmittance[:, -1] * keep[:, -1]
-    return _Chunk(tiles, rows, basis, alpha, clamped, alpha * transmittance, transmittance)
+    return _Chunk(
+        tiles=tiles,
+        rows=rows,
+        basis=basis,
+        alpha=alpha,
+        clamped=clamped,
+        weights=alpha * transmittance,
+        transmittance=transmittance,
+    )

@@ -1,4 +1,4 @@
-"""Pictures of reports: strips of frames, real and predicted, and false-colour depth and masks."""
+"""Images for reports: strips of real and predicted frames, contact sheets, false-colour depth and masks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 TILE_WIDTH = 264
-"""Width of a frame in a report [px]; on a page of 1100 px six stand side by side."""
+"""Width of a frame in a report [px]; six fit side by side on a page of 1100 px."""
 SHEET_BYTES = 3_000_000
-"""Most bytes of a contact sheet in a model."""
+"""Maximum size of a contact sheet in a model [bytes]."""
 _ASPECT = 4 / 3
 _MARGIN = 0.2
 _COLUMNS = 4
@@ -24,42 +24,44 @@ _OUTLINE = (255, 214, 10)
 _LABEL_COLORS = np.array([[32, 36, 44], [240, 165, 40], [70, 160, 220], [120, 200, 120], [220, 110, 150]], np.uint8)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrameStrip:
-    """All frames of one episode from one camera.
-
-    Attributes:
-        episode: Name of the episode.
-        camera: Name of the video camera.
-        times_s: Of the frames [s], shape (T,).
-        real: uint8 RGB, shape (T, H, W, 3).
-        predicted: The same moments as the model renders them, same shape.
-        masks: True masks, 0 background, shape (T, H, W); None where there are none.
-    """
+    """Frames of one episode from one camera."""
 
     episode: str
+    """Name of the episode."""
     camera: str
+    """Name of the video camera."""
     times_s: NDArray[np.float64]
+    """Times of the frames [s], shape (T,)."""
     real: Image
+    """Real frames, uint8 RGB, shape (T, H, W, 3)."""
     predicted: Image
+    """Renders of the model at the same times, same shape."""
     masks: Image | None = None
+    """True masks, 0 for the background, shape (T, H, W); None where they are unknown."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutTile:
-    """One moment of one synthesized rollout: uint8 RGB (H, W, 3), depth [m] with 0 for none (H, W), labels (H, W)."""
+    """One moment of one synthesized rollout."""
 
     rollout: int
+    """Number of the rollout."""
     time_s: float
+    """Time [s]."""
     image: Image
+    """uint8 RGB, shape (H, W, 3)."""
     depth_m: NDArray[np.float32]
+    """Depth [m], 0 without a surface, shape (H, W)."""
     mask: Image
+    """Labels of the bodies, shape (H, W)."""
 
 
 def tiles(strip: FrameStrip, width: int = TILE_WIDTH, outlined: bool = True) -> tuple[Image, Image]:
-    """Return the real and the predicted frames, cut to where the object moves and reduced to `width` pixels.
+    """Return the real and the predicted frames, cropped to the motion of the object and resized to `width` pixels.
 
-    Where masks are known, the predicted frames carry the outline of where the object truly was, if `outlined`.
+    If `outlined` and masks are known, the outline of the true mask is drawn on the predicted frames.
 
     Returns:
         Two arrays, uint8 RGB, shape (T, 3/4 width, width, 3).
@@ -76,18 +78,18 @@ def tiles(strip: FrameStrip, width: int = TILE_WIDTH, outlined: bool = True) -> 
 
 
 def telling(strip: FrameStrip, wanted: int) -> list[int]:
-    """Return frame numbers between which the object moves about equally far; evenly spread where no masks are known."""
+    """Return frame numbers between which the object moves about equally far, evenly spread without masks."""
     if strip.masks is None:
         return evenly(len(strip.real), wanted)
     seen = strip.masks > 0
     changed = (seen[1:] != seen[:-1]).sum((1, 2)) / max(1.0, float(seen.sum((1, 2)).mean()))
-    # A still object counts a little too, so that its rest at the end is not left out.
+    # A small constant is added for an object at rest, so that its final pose is included.
     way = np.concatenate([[0.0], np.cumsum(changed + 0.05)])
     return [int(k) for k in np.unique(np.searchsorted(way, np.linspace(0, way[-1], wanted)))]
 
 
 def evenly(count: int, wanted: int) -> list[int]:
-    """Return `wanted` frame numbers spread evenly over `count` frames, first and last among them.
+    """Return `wanted` frame numbers spread evenly over `count` frames, including the first and the last.
 
     >>> evenly(36, 6)
     [0, 7, 14, 21, 28, 35]
@@ -96,12 +98,12 @@ def evenly(count: int, wanted: int) -> list[int]:
 
 
 def sprite(frames: Image) -> Image:
-    """Return frames (T, H, W, 3) side by side, shape (H, T W, 3)."""
+    """Concatenate frames (T, H, W, 3) side by side to an image (H, T W, 3)."""
     return np.concatenate(list(frames), axis=1)
 
 
 def contact_sheet(rows: Sequence[Image], gutter: int = 4) -> Image:
-    """Return rows of equally many frames, each (T, H, W, 3), one below the other with white gutters."""
+    """Arrange rows of equal length, each (T, H, W, 3), below each other with white gutters."""
     count, height, width = rows[0].shape[:3]
     sheet = np.full((len(rows) * (height + gutter) - gutter, count * (width + gutter) - gutter, 3), 255, np.uint8)
     for i, row in enumerate(rows):
@@ -112,15 +114,15 @@ def contact_sheet(rows: Sequence[Image], gutter: int = 4) -> Image:
 
 
 def compared(photos: Sequence[Image], renders: Sequence[Image], wanted: int = 8, width: int = TILE_WIDTH) -> Image:
-    """Return a contact sheet: up to `wanted` photos, the renders below them, and the error below those.
+    """Return a contact sheet with rows of photos, renders and errors.
 
-    The error is the mean difference of the channels in false colour (magma), brightest from a quarter of full scale on.
+    The error is the mean difference of the channels in false colour (magma), saturated at a quarter of full scale.
 
     Args:
         photos: uint8 RGB, each (H, W, 3); sizes may differ.
-        renders: Of the same sizes.
-        wanted: Most columns.
-        width: Of a tile [px]; its height is that of the first photo at this width.
+        renders: Renders of the same sizes.
+        wanted: Maximum number of columns.
+        width: Width of a tile [px]; its height is that of the first photo at this width.
     """
     chosen = evenly(len(photos), wanted)
     size = (width, round(width * photos[chosen[0]].shape[0] / photos[chosen[0]].shape[1]))
@@ -134,13 +136,13 @@ def compared(photos: Sequence[Image], renders: Sequence[Image], wanted: int = 8,
 
 
 def separated(photos: Sequence[Image], masks: Sequence[Mask], wanted: int = 12, width: int = TILE_WIDTH) -> Image:
-    """Return a contact sheet of up to `wanted` photos, four a row: bodies as they are and outlined, the rest dimmed.
+    """Return a contact sheet of photos, four per row, with outlined bodies on a dimmed background.
 
     Args:
         photos: uint8 RGB, each (H, W, 3); sizes may differ.
         masks: Whether each pixel shows a body, (H, W).
-        wanted: Most photos.
-        width: Of a tile [px]; its height is that of the first photo at this width.
+        wanted: Maximum number of photos.
+        width: Width of a tile [px]; its height is that of the first photo at this width.
     """
     chosen = evenly(len(photos), wanted)
     size = (width, round(width * photos[chosen[0]].shape[0] / photos[chosen[0]].shape[1]))
@@ -155,7 +157,7 @@ def separated(photos: Sequence[Image], masks: Sequence[Mask], wanted: int = 12, 
 
 
 def depth_colors(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> Image:
-    """Return depth in false colour (viridis, near bright); black where there is no surface. Shape (H, W, 3)."""
+    """Return depth (H, W) [m] in false colour (H, W, 3): viridis, near bright, black without a surface."""
     place = np.clip((far_m - depth_m) / max(far_m - near_m, 1e-9), 0, 1)
     colors = cv2.applyColorMap((255 * place).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
     colors[depth_m <= 0] = 0
@@ -163,7 +165,7 @@ def depth_colors(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> I
 
 
 def label_colors(labels: Image) -> Image:
-    """Return a mask in colours, a dark background and one for each body. Shape (H, W, 3)."""
+    """Return a mask (H, W) in colours (H, W, 3), one per body on a dark background."""
     return _LABEL_COLORS[np.where(labels == 0, 0, (labels.astype(int) - 1) % (len(_LABEL_COLORS) - 1) + 1)]
 
 
@@ -178,13 +180,13 @@ def png_uri(image: Image) -> str:
 
 
 def encoded(image: Image, suffix: str, options: Sequence[int] = ()) -> bytes:
-    """Return an RGB image as a file of OpenCV's format for a suffix, ".png" or ".jpg"."""
+    """Encode an RGB image in OpenCV's format for a suffix, ".png" or ".jpg"."""
     _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
     return data.tobytes()
 
 
 def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
-    """Return an RGB image as a PNG file below a size: noise and fine shades are given up as far as is needed."""
+    """Encode an RGB image as PNG below a size, with as many grey levels and pixels as fit."""
     for bits in range(8, 3, -1):
         step = 1 << (8 - bits)
         reduced = image if bits == 8 else np.minimum(cv2.medianBlur(image, 3) // step * step + step // 2, 255)
@@ -196,13 +198,13 @@ def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
 
 
 def resized(image: Image, size: tuple[int, int]) -> Image:
-    """Return a picture at another size (width, height) [px]: averaged where it shrinks, interpolated where it grows."""
+    """Resize an image to (width, height) [px], by area averaging if it shrinks and linear interpolation otherwise."""
     shrinks = size[0] < image.shape[1]
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
 
 
 def _window(strip: FrameStrip) -> tuple[int, int, int, int]:
-    """Return left, top, width, height [px] of the part of the frames where the object moves, at the tiles' aspect."""
+    """Return left, top, width, height [px] of the region in which the object moves, at the tiles' aspect ratio."""
     height, width = strip.real.shape[1:3]
     if strip.masks is None or not strip.masks.any():
         low, high = np.zeros(2), np.array([width, height], float)
@@ -219,7 +221,7 @@ def _window(strip: FrameStrip) -> tuple[int, int, int, int]:
 
 
 def _outline(frame: Image, mask: Image) -> None:
-    """Draw the outline of a mask onto a frame of another size, in place."""
+    """Draw the outline of a mask onto a frame, in place; their sizes may differ."""
     height, width = frame.shape[:2]
     reduced = cv2.resize((mask > 0).astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
     contours, _ = cv2.findContours(reduced, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -227,7 +229,7 @@ def _outline(frame: Image, mask: Image) -> None:
 
 
 def _fitted(image: Image, size: tuple[int, int]) -> Image:
-    """Return a picture reduced to fit into a tile (width, height) [px], with white beside it."""
+    """Resize an image to fit into a tile (width, height) [px], with white margins."""
     scale = min(size[0] / image.shape[1], size[1] / image.shape[0])
     small = resized(image, (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))))
     tile = np.full((size[1], size[0], 3), 255, np.uint8)

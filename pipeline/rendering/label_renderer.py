@@ -1,13 +1,12 @@
-"""Labelled images of a moving model: colour, depth, instance masks and amodal masks.
+"""Renderer of labelled images of a moving model: colour, depth, instance masks and amodal masks.
 
-Colour, depth and masks come from one pass of the renderer. The depth of a pixel is the expected depth of the one
-surface that its mask names, so that no depths float between an object and what is behind it. Amodal masks are made of
-each body's own spheres alone.
+Colour, depth and masks come from one pass of the renderer. The depth of a pixel is the expected depth of the surface
+that its mask names, so that no depth lies between an object and the background. Amodal masks are rendered from the
+spheres of each body alone.
 
-On a CUDA device many frames of all cameras are rendered at once, whole. On the CPU what never moves (the background
-and fixed bodies) is rendered once a camera, and in each frame only the tiles that the moving bodies can reach are
-rendered again, with everything in them: outside, nothing of a body contributes, so the result is that of rendering the
-whole picture.
+On a CUDA device many frames of all cameras are rendered at once, in full. On the CPU the background and fixed bodies
+are rendered once per camera, and in each frame only the tiles that moving bodies can reach are rendered again, with all
+spheres in them: outside, moving bodies contribute nothing, so the result equals that of rendering the full image.
 """
 
 from __future__ import annotations
@@ -21,60 +20,77 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..datasets.chunks import CHUNK_FRAMES
-from ..datasets.models import Model
-from ..datasets.processors import processors
-from ..datasets.rollouts import FrameBlock, amodal_dtype
-from ..schemas import Exposure, Light
-from .label_reach import TILE, Box, inside, reach, spans
-from .labelled_spheres import Labelled, LabelledModel
-from .splats.render import RenderOutput, render
+from ...datasets.capture.cameras import Camera
+from ...datasets.io.processors import processors
+from ...datasets.models.model import Model
+from ...datasets.rollouts.chunks import CHUNK_FRAMES
+from ...datasets.rollouts.rollouts import FrameBlock, amodal_dtype
+from ...schemas import Exposure, Light
+from .posed_scene import Labelled, LabelledModel
+from .render import RenderOutput, render
+from .screen_bounds import TILE, Box, inside, reach, spans
 
 SOLID_ALPHA = 0.5
-"""A pixel shows a surface (and gets a depth and a label) where the spheres let less than half of the light through."""
+"""Threshold on alpha above which a pixel shows a surface, and has a depth and a label."""
 NUMBERS_AT_ONCE = 100_000_000
-"""Of the largest arrays of one call on a GPU: features of spheres, and of pixels."""
+"""Maximum size of the largest arrays of one call on a GPU: features of spheres, and of pixels."""
 _SIGNED = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
-"""Torch's integers with the bits of the amodal masks' types, by size in bytes."""
+"""Torch integer types with the bits of the amodal masks' types, by size in bytes."""
 
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Labels of n views, as `FrameBlock` has them; amodal as numbers of the same bits that torch can work with."""
+    """Labels of n views, as in `FrameBlock`."""
 
     image: Tensor
+    """Colours, uint8 RGB, shape (n, H, W, 3)."""
     depth: Tensor
+    """Depth [m], 0 without a surface, shape (n, H, W)."""
     mask: Tensor
+    """Label of the visible body, uint8, shape (n, H, W)."""
     amodal: Tensor
+    """Bits of the bodies that each pixel would show alone, in a torch type of the same size, shape (n, H, W)."""
     visible_px: Tensor
+    """Visible pixels of each body, shape (n, B)."""
     amodal_px: Tensor
+    """Amodal pixels of each body, shape (n, B)."""
 
 
 @dataclass(frozen=True)
-class _View:
-    """A camera and what never moves, as it sees it.
+class _Plate:
+    """What a camera sees of all that never moves; made once per camera on the CPU."""
 
-    alone (H, W, B): which fixed bodies are seen if they are alone. On the CPU only: plate, the labels of what never
-    moves; reaches (N, 4): `spans` of its spheres.
-    """
+    labels: _Pictures
+    """Labels of one view."""
+    reaches: Tensor
+    """`spans` of the spheres that never move [px], shape (N, 4)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _View:
+    """A camera with its view of the background and the fixed bodies."""
 
     camera: Camera
+    """The camera."""
     viewmat: Tensor
+    """T_cam_world, shape (4, 4)."""
     K: Tensor
+    """Camera matrix [px], shape (3, 3)."""
     still: Labelled
+    """Background and fixed bodies, in the colours that the camera sees."""
     alone: Tensor
-    plate: _Pictures | None
-    reaches: Tensor | None
+    """Whether each fixed body would be visible alone, shape (H, W, B)."""
+    plate: _Plate | None
+    """Rendering of what never moves; on the CPU only."""
 
 
 class LabelRenderer:
-    """Renders the labels of a model for a set of cameras without distortion.
+    """Renderer of the labels of a model for a set of cameras without distortion.
 
     Args:
         model: A model with visual spheres.
         cameras: The cameras by name.
-        device: Where to render.
+        device: Device on which to render.
     """
 
     def __init__(self, model: Model, cameras: Mapping[str, Camera], device: str = "cpu"):
@@ -85,11 +101,11 @@ class LabelRenderer:
         self.set_cameras(cameras)
 
     def set_cameras(self, cameras: Mapping[str, Camera]) -> None:
-        """Look through these cameras from now on."""
+        """Replace the cameras."""
         self._views = {name: self._view(camera) for name, camera in cameras.items()}
 
     def set_light(self, light: Light | None) -> None:
-        """Shade what moves in this light from now on; None: in that of the photos."""
+        """Set the light that shades moving bodies; None keeps the colours of the photos."""
         self._scene.set_light(light)
 
     @torch.no_grad()
@@ -100,13 +116,13 @@ class LabelRenderer:
         wait: bool = True,
         exposures: Mapping[str, Exposure] | None = None,
     ) -> Iterator[FrameBlock]:
-        """Render a rollout, a chunk of frames of one camera after the other.
+        """Render a rollout, and yield it in chunks of frames of one camera each.
 
         Args:
             position_m: Body frame origins [m], world, shape (T, B, 3).
             quat_wxyz: T_world_body, shape (T, B, 4).
-            wait: Whether to wait for the device; without, whoever reads a block calls its `ready` first.
-            exposures: Of some of the cameras; the others show the model's colours.
+            wait: Whether to wait for the device; otherwise the reader of a block calls its `ready` first.
+            exposures: Exposures of some cameras; the others show the model's colours.
         """
         at_once = self._frames_at_once() if self._together else CHUNK_FRAMES
         for first in range(0, len(position_m), at_once):
@@ -120,7 +136,7 @@ class LabelRenderer:
                 pictures, ready = _to_host(pictures)
                 if wait:
                     ready()
-            # cut by numpy: each call of torch would give the interpreter to other threads, and wait to get it back
+            # cut by numpy: each call of torch would release the interpreter lock, and wait to get it back
             whole = {name: self._arrays(picture) for name, picture in pictures.items()}
             for start in range(0, count, CHUNK_FRAMES):
                 for name, arrays in whole.items():
@@ -146,12 +162,19 @@ class LabelRenderer:
             picture = _rendered(spheres, spheres.opacities[:, None], viewmat[None], K[None], whole)
             alone[..., body] = picture.alpha > SOLID_ALPHA
         if self._together:
-            return _View(camera, viewmat, K, still, alone[0], None, None)
-        plate = self._labels([], still, viewmat[None], K[None], whole, alone)
-        return _View(camera, viewmat, K, still, alone[0], plate, spans(still, viewmat, K))
+            return _View(camera=camera, viewmat=viewmat, K=K, still=still, alone=alone[0], plate=None)
+        labels = self._labels([], still, viewmat[None], K[None], whole, alone)
+        return _View(
+            camera=camera,
+            viewmat=viewmat,
+            K=K,
+            still=still,
+            alone=alone[0],
+            plate=_Plate(labels, spans(still, viewmat, K)),
+        )
 
     def _all_at_once(self, placed: Sequence[tuple[int, Labelled]], count: int) -> dict[str, _Pictures]:
-        """Return the labels of so many frames for each camera; cameras of one size in one call."""
+        """Return the labels of `count` frames for each camera; cameras of equal size are rendered in one call."""
         found: dict[str, _Pictures] = {}
         order = sorted(self._views, key=lambda name: _size(self._views[name].camera))
         for size, group in groupby(order, key=lambda name: _size(self._views[name].camera)):
@@ -160,9 +183,12 @@ class LabelRenderer:
             viewmats = torch.stack([view.viewmat for view in views]).repeat_interleave(count, 0)
             Ks = torch.stack([view.K for view in views]).repeat_interleave(count, 0)
             still = Labelled(
-                views[0].still.means, views[0].still.scales, views[0].still.opacities,
-                torch.stack([view.still.colors for view in views]).repeat_interleave(count, 0), views[0].still.labels,
-            )  # fmt: skip
+                means=views[0].still.means,
+                scales=views[0].still.scales,
+                opacities=views[0].still.opacities,
+                colors=torch.stack([view.still.colors for view in views]).repeat_interleave(count, 0),
+                labels=views[0].still.labels,
+            )
             moving = [(body, spheres.repeated(len(views))) for body, spheres in placed]
             alone = torch.stack([view.alone for view in views]).repeat_interleave(count, 0)
             labels = self._labels(moving, still, viewmats, Ks, Box(0, 0, *size), alone)
@@ -172,14 +198,18 @@ class LabelRenderer:
         return {name: found[name] for name in self._views}
 
     def _one_by_one(self, placed: Sequence[tuple[int, Labelled]], count: int) -> dict[str, _Pictures]:
-        """Return the labels of so many frames for each camera: the plate, and on it what moving bodies can reach."""
+        """Return the labels of `count` frames for each camera: the plate, redrawn where moving bodies reach."""
         names = [field.name for field in fields(_Pictures)]
         made: dict[str, dict[str, Tensor]] = {}
-        for camera, view in self._views.items():
-            assert view.plate is not None  # on the CPU
-            made[camera] = {name: getattr(view.plate, name).repeat_interleave(count, 0) for name in names}
-        tasks = [(camera, frame) for camera in self._views for frame in range(count)]
-        crops = self._threads.map(lambda task: self._crop(self._views[task[0]], placed, task[1]), tasks)
+        plates = {
+            camera: view.plate for camera, view in self._views.items() if view.plate is not None
+        }  # on the CPU all
+        for camera, plate in plates.items():
+            made[camera] = {name: getattr(plate.labels, name).repeat_interleave(count, 0) for name in names}
+        tasks = [(camera, frame) for camera in plates for frame in range(count)]
+        crops = self._threads.map(
+            lambda task: self._crop(self._views[task[0]], plates[task[0]], placed, task[1]), tasks
+        )
         for (camera, frame), crop in zip(tasks, crops, strict=True):
             if crop is not None:
                 for name in ("image", "depth", "mask", "amodal"):
@@ -189,15 +219,16 @@ class LabelRenderer:
         return {camera: _Pictures(**arrays) for camera, arrays in made.items()}
 
     @torch.no_grad()
-    def _crop(self, view: _View, placed: Sequence[tuple[int, Labelled]], frame: int) -> tuple[Box, _Pictures] | None:
-        """Return what the moving bodies can reach in one frame, and its labels; None where they reach nothing."""
-        assert view.reaches is not None  # on the CPU
+    def _crop(
+        self, view: _View, plate: _Plate, placed: Sequence[tuple[int, Labelled]], frame: int
+    ) -> tuple[Box, _Pictures] | None:
+        """Return the box that moving bodies can reach in one frame, and its labels; None where they reach no pixel."""
         moving = [(body, spheres.view(frame)) for body, spheres in placed]
         bodies = Labelled.joined([self._scene.none, *(spheres for _, spheres in moving)])
         box = reach(bodies, view.viewmat, view.K, view.camera.width, view.camera.height)
         if box is None:
             return None
-        near = view.still.rows(inside(view.reaches, box))
+        near = view.still.rows(inside(plate.reaches, box))
         viewmats, Ks = view.viewmat[None], box.camera_matrix(view.K)[None]
         return box, self._labels(moving, near, viewmats, Ks, box, view.alone[box.place][None])
 
@@ -210,15 +241,15 @@ class LabelRenderer:
         box: Box,
         alone: Tensor,
     ) -> _Pictures:
-        """Render views of all that there is.
+        """Render the labels of n views of all spheres.
 
         Args:
-            moving: What moves, by body; of one view, or of n.
-            still: What does not.
-            viewmats: (n, 4, 4).
-            Ks: (n, 3, 3).
-            box: The picture.
-            alone: Which bodies that do not move are seen if they are alone, (n, H, W, B).
+            moving: Moving spheres by body, of one view or of n.
+            still: Spheres that do not move.
+            viewmats: T_cam_world, shape (n, 4, 4).
+            Ks: Camera matrices [px], shape (n, 3, 3).
+            box: The part of the image to render.
+            alone: Whether each fixed body would be visible alone, shape (n, H, W, B).
         """
         spheres = Labelled.joined([*(part for _, part in moving), still])
         ends = np.cumsum([0, *(len(part) for _, part in moving)]).tolist()
@@ -250,7 +281,7 @@ class LabelRenderer:
         return _Pictures(image, depth, mask, amodal, *self._pixels(mask, amodal))
 
     def _pixels(self, mask: Tensor, amodal: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pixels (n, B) of each body in masks and in amodal masks (n, H, W)."""
+        """Return the number of pixels (n, B) of each body in masks and in amodal masks (n, H, W)."""
         bodies = range(self._scene.bodies)
         visible = [(mask == body + 1).flatten(1).sum(1) for body in bodies]
         whole = [((amodal >> body) & 1).flatten(1).sum(1) for body in bodies]
@@ -258,7 +289,7 @@ class LabelRenderer:
 
 
 def _exposed(image: Tensor, exposure: Exposure) -> Tensor:
-    """Return images as a camera of that exposure shows them, cut off at black and white."""
+    """Apply an exposure to images, clipped to black and white."""
     if exposure == Exposure():
         return image
     gain, offset = (torch.tensor(three, device=image.device) for three in (exposure.gain_rgb, exposure.offset_rgb))
@@ -274,7 +305,9 @@ def _rendered(
 ) -> RenderOutput:
     if len(spheres) == 0:
         nothing = viewmats.new_zeros(len(viewmats), box.height, box.width)
-        return RenderOutput(nothing[..., None].expand(-1, -1, -1, features.shape[-1]), nothing, nothing)
+        return RenderOutput(
+            features=nothing[..., None].expand(-1, -1, -1, features.shape[-1]), alpha=nothing, weighted_depth=nothing
+        )
     return render(
         spheres.means, spheres.scales, spheres.opacities, features, viewmats, Ks, box.width, box.height,
         tile_size=TILE, groups=groups, group_transmittance=0.99 * (1 - SOLID_ALPHA),
@@ -282,7 +315,7 @@ def _rendered(
 
 
 def _to_host(pictures: dict[str, _Pictures]) -> tuple[dict[str, _Pictures], Callable[[], None]]:
-    """Copy pictures from the device into pinned memory, and return what waits for that; nothing waits here."""
+    """Start to copy images from the device into pinned memory, and return a function that waits for the copies."""
     names = [field.name for field in fields(_Pictures)]
     copied: dict[str, _Pictures] = {}
     for camera, picture in pictures.items():

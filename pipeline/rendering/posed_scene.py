@@ -1,4 +1,4 @@
-"""The spheres of a model with the label of the body that each belongs to, placed for the frames of a motion."""
+"""Spheres of a model with the label of their body, posed for the frames of a motion."""
 
 from __future__ import annotations
 
@@ -8,50 +8,60 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..datasets.models import Model
-from ..schemas import BodyModel, Light
-from .physics.rotation import quat_to_matrix
-from .splats.relighting import Relighting
-from .splats.spheres import Spheres
+from ...datasets.capture.cameras import Camera
+from ...datasets.models.model import Model
+from ...schemas import BodyModel, Light
+from ..geometry.rotation import quat_to_matrix
+from ..geometry.spheres import Spheres
+from .relighting import Relighting
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """Spheres to render, float32.
-
-    means (N, 3) or (n, N, 3) where they differ by view [m], world; scales (N,) [m]; opacities (N,); colors (N, 3) or
-    (n, N, 3); labels (N,): 0 the background, k the k-th body.
-    """
+    """Spheres to render, float32."""
 
     means: Tensor
+    """Centres, world frame [m], shape (N, 3), or (n, N, 3) where they differ by view."""
     scales: Tensor
+    """Standard deviations [m], shape (N,)."""
     opacities: Tensor
+    """Peak alphas in [0, 1], shape (N,)."""
     colors: Tensor
+    """Colours in [0, 1], shape (N, 3), or (n, N, 3) where they differ by view."""
     labels: Tensor
+    """Label of each sphere: 0 for the background, k for the k-th body, shape (N,)."""
 
     def __len__(self) -> int:
         return self.scales.shape[0]
 
     def rows(self, kept: Tensor | slice) -> Labelled:
-        """Return some of the spheres."""
+        """Return the spheres at some rows."""
         return Labelled(
-            self.means[..., kept, :], self.scales[kept], self.opacities[kept], self.colors[..., kept, :],
-            self.labels[kept],
-        )  # fmt: skip
+            means=self.means[..., kept, :],
+            scales=self.scales[kept],
+            opacities=self.opacities[kept],
+            colors=self.colors[..., kept, :],
+            labels=self.labels[kept],
+        )
 
     def view(self, number: int) -> Labelled:
         """Return the spheres of one view."""
-        return Labelled(self.means[number], self.scales, self.opacities, self.colors[number], self.labels)
+        return Labelled(
+            means=self.means[number],
+            scales=self.scales,
+            opacities=self.opacities,
+            colors=self.colors[number],
+            labels=self.labels,
+        )
 
     def repeated(self, times: int) -> Labelled:
-        """Return the views one after the other, so many times."""
+        """Return the spheres with their views repeated `times` times, one sequence after the other."""
         means, colors = (values.repeat(times, 1, 1) for values in (self.means, self.colors))
-        return Labelled(means, self.scales, self.opacities, colors, self.labels)
+        return Labelled(means=means, scales=self.scales, opacities=self.opacities, colors=colors, labels=self.labels)
 
     @staticmethod
     def joined(parts: list[Labelled]) -> Labelled:
-        """Return all spheres of several sets, in their order; sets of one view serve all n."""
+        """Concatenate the spheres of several sets, in order; sets with one view are used for all n views."""
         views = max((part.means.shape[0] for part in parts if part.means.dim() == 3), default=0)
         if views:
             parts = [part._of_views(views) for part in parts]
@@ -63,32 +73,44 @@ class Labelled:
         means, colors = (
             values if values.dim() == 3 else values.expand(views, -1, -1) for values in (self.means, self.colors)
         )
-        return Labelled(means, self.scales, self.opacities, colors, self.labels)
+        return Labelled(means=means, scales=self.scales, opacities=self.opacities, colors=colors, labels=self.labels)
 
 
 @dataclass(frozen=True)
 class _Moving:
+    """Spheres of a moving body."""
+
     body: int
+    """Index of the body."""
     spheres: Labelled
+    """Spheres in the body frame."""
     normals: Tensor | None
+    """Unit normals of the spheres, body frame, shape (N, 3); None where they are unknown."""
     relighting: Relighting | None
+    """Relighting of the spheres; None to keep the colours of the photos."""
 
     def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> Labelled:
-        """Return the spheres at poses (n, 3) and (n, 4)."""
+        """Return the spheres at positions (n, 3) [m] and orientations (n, 4)."""
         rotations = quat_to_matrix(quat_wxyz)
         means = self.spheres.means @ rotations.transpose(1, 2) + position_m[:, None]
         colors = self.spheres.colors.expand(len(means), -1, -1)
         if self.relighting is not None:
             colors = (colors * self.relighting.turned(rotations)[..., None]).clamp(0, 1)
-        return Labelled(means, self.spheres.scales, self.spheres.opacities, colors, self.spheres.labels)
+        return Labelled(
+            means=means,
+            scales=self.spheres.scales,
+            opacities=self.spheres.opacities,
+            colors=colors,
+            labels=self.spheres.labels,
+        )
 
 
 class LabelledModel:
-    """What of a model moves, what stands still, and where.
+    """Spheres of a model, separated into moving ones, fixed bodies and the background.
 
     Args:
         model: A model with visual spheres.
-        device: Where to render.
+        device: Device on which to render.
     """
 
     def __init__(self, model: Model, device: str = "cpu") -> None:
@@ -97,7 +119,9 @@ class LabelledModel:
         self._scene = None if model.scene is None else Spheres.from_numpy(model.scene, device=device)
         nothing = torch.zeros(0, 3, device=device)
         labels = torch.zeros(0, dtype=torch.int64, device=device)
-        self.none = Labelled(nothing, nothing[:, 0], nothing[:, 0], nothing, labels)
+        self.none = Labelled(
+            means=nothing, scales=nothing[:, 0], opacities=nothing[:, 0], colors=nothing, labels=labels
+        )
         self.fixed: list[tuple[int, Labelled]] = []
         self.moving: list[_Moving] = []
         for index, body in enumerate(model.file.bodies):
@@ -107,14 +131,14 @@ class LabelledModel:
             spheres = self._labelled(Spheres.from_numpy(splats, device=device), index + 1)
             normals = None if splats.normals is None else self.tensor(splats.normals)
             if body.motion == "fixed":
-                self.fixed.append((index, self._standing(spheres, body)))
+                self.fixed.append((index, self._fixed(spheres, body)))
             else:
                 self.moving.append(_Moving(index, spheres, normals, None))
         self._bodies = model.file.bodies
         self.set_light(model.file.light)
 
     def set_light(self, light: Light | None) -> None:
-        """Shade what moves in this light; None: in that of the photos, whatever its pose."""
+        """Set the light that shades moving bodies; None keeps the colours of the photos in every pose."""
         self.moving = [
             replace(
                 part,
@@ -126,31 +150,43 @@ class LabelledModel:
         ]
 
     def tensor(self, values: object) -> Tensor:
-        """Return numbers as float32 on the device."""
+        """Return values as a float32 tensor on the device."""
         return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
 
     def still(self, camera: Camera) -> Labelled:
-        """Return what never moves, in the colours that a camera sees."""
+        """Return the background and the fixed bodies, in the colours that a camera sees."""
         parts = [self.none, *(spheres for _, spheres in self.fixed)]
         if self._scene is not None:
             parts.insert(0, self._labelled(self._scene.seen_from(self.tensor(camera.center)), 0))
         return Labelled.joined(parts)
 
     def placed(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> list[tuple[int, Labelled]]:
-        """Return what moves, by body, at poses (n, B, 3) and (n, B, 4) of all bodies."""
+        """Return the moving spheres by body, given positions (n, B, 3) [m] and quaternions (n, B, 4) of all bodies."""
         positions, quats = self.tensor(position_m), self.tensor(quat_wxyz)
         return [(part.body, part.placed(positions[:, part.body], quats[:, part.body])) for part in self.moving]
 
     @property
     def moving_count(self) -> int:
-        """Spheres that move."""
+        """Number of moving spheres."""
         return sum(len(part.spheres) for part in self.moving)
 
     def _labelled(self, spheres: Spheres, label: int) -> Labelled:
         labels = torch.full((len(spheres),), label, dtype=torch.int64, device=self.device)
-        return Labelled(spheres.means, spheres.scales, spheres.opacities, spheres.colors, labels)
+        return Labelled(
+            means=spheres.means,
+            scales=spheres.scales,
+            opacities=spheres.opacities,
+            colors=spheres.colors,
+            labels=labels,
+        )
 
-    def _standing(self, spheres: Labelled, body: BodyModel) -> Labelled:
+    def _fixed(self, spheres: Labelled, body: BodyModel) -> Labelled:
         rotation = quat_to_matrix(self.tensor(body.photo_pose.quat_wxyz))
         means = spheres.means @ rotation.T + self.tensor(body.photo_pose.position_m)
-        return Labelled(means, spheres.scales, spheres.opacities, spheres.colors, spheres.labels)
+        return Labelled(
+            means=means,
+            scales=spheres.scales,
+            opacities=spheres.opacities,
+            colors=spheres.colors,
+            labels=spheres.labels,
+        )

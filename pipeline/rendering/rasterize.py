@@ -1,12 +1,12 @@
-"""The renderer on CUDA: the kernels put together, with their derivative for torch.
+"""Renderer on CUDA: the sequence of kernels, and their derivative for torch.
 
 Spheres are sorted by distance once, over all cameras; then pairs of tiles and spheres are written in that order and
-sorted by tile with a stable sort. Keys of 16 bits need two passes of a radix sort where a key of tile and depth
-needs six.
+sorted by tile with a stable sort. Keys of 16 bits need two passes of a radix sort; a key of tile and depth would need
+six.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false
-# (Triton annotates what is constant when it compiles; callers pass plain numbers, and num_warps beside them.)
+# (Triton annotates what is constant when it compiles; callers pass plain numbers, and num_warps in addition.)
 
 from __future__ import annotations
 
@@ -16,87 +16,88 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import nvrtc
-from . import binning, cuda, kernels
+from ..runtime import kernel_build
+from . import binning, cuda_kernels, triton_kernels
 from .rays import LEAST_DETERMINANT, UNDISTORT_STEPS
 
 TILE = 16
 """Side of a tile [px]."""
 BLOCK = 16
-"""Spheres of a tile that a Triton program looks at together."""
+"""Number of spheres of a tile that a Triton program processes together."""
 _WARPS = TILE * TILE // 64
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Size and thresholds of a rendering.
-
-    Attributes:
-        width: Of the pictures [px].
-        height: Of the pictures [px].
-        min_alpha: Smaller alphas are taken as 0.
-        min_transmittance: What lies behind pixels that let less through than this is skipped.
-        capacity: Room for pairs of tiles and spheres; None counts them, which waits for the device. With a capacity
-            nothing waits, so that a CUDA graph can capture the call; pairs beyond it are lost, and the caller is to
-            compare the number of pairs that `rasterize` returns.
-        kernels: What composites: the CUDA kernels (faster) or the Triton ones; auto takes the former where cuda.core is
-            installed to compile them.
-    """
+    """Size and thresholds of a rendering."""
 
     width: int
+    """Width of the images [px]."""
     height: int
+    """Height of the images [px]."""
     min_alpha: float
+    """Threshold below which an alpha counts as 0."""
     min_transmittance: float
+    """Threshold on a pixel's transmittance below which spheres behind are skipped."""
     capacity: int | None = None
+    """Maximum number of pairs of tiles and spheres; None counts them, which waits for the device. With a capacity
+    nothing waits, so that a CUDA graph can capture the call; pairs beyond it are lost, and the caller compares the
+    number of pairs that `rasterize` returns.
+    """
     kernels: Literal["auto", "cuda", "triton"] = "auto"
+    """Kernels that composite: the CUDA ones (faster) or the Triton ones; auto takes the CUDA ones where cuda.core is
+    installed to compile them.
+    """
 
     @property
     def columns(self) -> int:
-        """Return the number of tiles in a row."""
+        """Number of tiles in a row."""
         return -(-self.width // TILE)
 
     @property
     def rows(self) -> int:
-        """Return the number of rows of tiles."""
+        """Number of rows of tiles."""
         return -(-self.height // TILE)
 
     @property
     def thresholds(self) -> tuple[float, float]:
-        """Return the two thresholds."""
+        """Thresholds on alpha and on transmittance, for the kernels."""
         return float(self.min_alpha), float(self.min_transmittance)
 
     @property
     def compiled(self) -> bool:
-        """Tell whether the CUDA kernels composite."""
-        return self.kernels == "cuda" or (self.kernels == "auto" and nvrtc.available())
+        """Whether the CUDA kernels composite."""
+        return self.kernels == "cuda" or (self.kernels == "auto" and kernel_build.available())
 
 
 class _Lists(NamedTuple):
-    """Which spheres each tile composites, nearest first.
-
-    centres (C, N, 4), log_opacities (N,), spans (C * N, 4): as `binning.project` writes them; rows (M,): camera * N +
-    sphere; starts (tiles + 1,): where each tile's rows begin; pairs (): how many rows all tiles need.
-    """
+    """Spheres that each tile composites, nearest first."""
 
     centres: Tensor
+    """See `binning.project`, shape (C, N, 4)."""
     log_opacities: Tensor
+    """See `binning.project`, shape (N,)."""
     spans: Tensor
+    """See `binning.project`, shape (C * N, 4)."""
     rows: Tensor
+    """Row camera * N + sphere of each pair, shape (M,)."""
     starts: Tensor
+    """First pair of each tile, shape (tiles + 1,)."""
     pairs: Tensor
+    """Number of pairs that all tiles need, shape ()."""
 
 
 class _Rays(NamedTuple):
-    """The rays of cameras that distort, as `kernels.trace` writes them; every field None for pinholes.
-
-    rays (C, H, W, 2); tiles, columns and rows (C, ..., 4): bounds of the rays in each tile, and in each column and row
-    of tiles.
-    """
+    """Rays of distorting cameras, as `triton_kernels.trace` writes them; every field is None for pinhole cameras."""
 
     rays: Tensor | None = None
+    """Rays (x, y) on the plane z = 1, shape (C, H, W, 2)."""
     tiles: Tensor | None = None
+    """Bounds of the rays in each tile, shape (C, rows, columns, 4)."""
     columns: Tensor | None = None
+    """Bounds of the rays in each column of tiles, shape (C, columns, 4)."""
     rows: Tensor | None = None
+    """Bounds of the rays in each row of tiles, shape (C, rows, 4)."""
 
 
 def rasterize(
@@ -109,12 +110,12 @@ def rasterize(
     raster: Raster,
     distortion: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return features (C, H, W, F), alpha (C, H, W), depth times alpha, median depth, and the number of pairs ().
+    """Render to features (C, H, W, F), alpha (C, H, W), depth times alpha, median depth, and the number of pairs ().
 
-    Shapes as `render.render` has them; all float32 on one CUDA device. The last two have no derivative.
+    Shapes as in `render.render`; all float32 on one CUDA device. The last two results have no derivative.
 
     Raises:
-        ValueError: If a derivative is asked for with features that differ by camera.
+        ValueError: If a derivative is requested with features that differ by camera.
     """
     arguments = (means, scales, opacities, features, viewmats, Ks, raster, distortion)
     return _Rasterize.apply(*arguments)  # type: ignore[return-value]
@@ -149,10 +150,10 @@ class _Rasterize(torch.autograd.Function):
         numbers = (scales.shape[0], raster.columns, raster.rows, raster.width, raster.height)
         if raster.compiled:
             tensors = (*lists[:3], features, *lists[3:5], Ks, rays.rays, out, left, depth, median)
-            for first in range(0, channels, cuda.CHANNELS):
-                cuda.launch("composite_forward", tiles, tensors, (*numbers, *raster.thresholds), first)
+            for first in range(0, channels, cuda_kernels.CHANNELS):
+                cuda_kernels.launch("composite_forward", tiles, tensors, (*numbers, *raster.thresholds), first)
         else:
-            kernels.composite_forward[(tiles,)](
+            triton_kernels.composite_forward[(tiles,)](
                 *lists[:2], features, *lists[3:5], Ks, rays.rays, out, left, depth, median,
                 *numbers, *raster.thresholds,
                 F=channels, CHANNELS=_filled(channels), BY_CAMERA=by_camera, TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
@@ -170,13 +171,13 @@ class _Rasterize(torch.autograd.Function):
         count, channels, cameras = scales.shape[0], features.shape[1], viewmats.shape[0]
         tiles = cameras * raster.columns * raster.rows
         numbers = (count, raster.columns, raster.rows, raster.width, raster.height)
-        rows = torch.zeros(cameras, count, cuda.gradient_width(channels), device=means.device)
+        rows = torch.zeros(cameras, count, cuda_kernels.gradient_width(channels), device=means.device)
         pictures = (out, left, depth, grad_out, grad_alpha, grad_depth, rows)
         if raster.compiled:
             tensors = (*lists[:3], features, *lists[3:5], Ks, rays, *pictures)
-            cuda.launch("composite_backward", tiles, tensors, (*numbers, *raster.thresholds))
+            cuda_kernels.launch("composite_backward", tiles, tensors, (*numbers, *raster.thresholds))
         else:
-            kernels.composite_backward[(tiles,)](
+            triton_kernels.composite_backward[(tiles,)](
                 *lists[:2], features, *lists[3:5], Ks, rays, *pictures, *numbers, *raster.thresholds,
                 F=channels, CHANNELS=_filled(channels), WIDE=rows.shape[2], TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
             )  # fmt: skip
@@ -198,7 +199,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _filled(channels: int) -> int:
-    """Return the next power of two, which a side of a Triton tensor has to be."""
+    """Return the next power of two, as Triton requires for the side of a tensor."""
     return 1 << (channels - 1).bit_length()
 
 
@@ -207,7 +208,7 @@ def _trace(Ks: Tensor, distortion: Tensor, raster: Raster) -> _Rays:
     distortion = distortion.detach().to(Ks).expand(cameras, -1).contiguous()
     rays = Ks.new_empty(cameras, raster.height, raster.width, 2)
     bounds = Ks.new_empty(cameras, raster.rows, raster.columns, 4)
-    kernels.trace[(cameras * raster.columns * raster.rows,)](
+    triton_kernels.trace[(cameras * raster.columns * raster.rows,)](
         Ks, distortion, rays, bounds, raster.columns, raster.rows, raster.width, raster.height,
         TERMS=distortion.shape[1], STEPS=UNDISTORT_STEPS, LEAST=LEAST_DETERMINANT, TILE=TILE, num_warps=_WARPS,
     )  # fmt: skip
@@ -238,7 +239,7 @@ def _bin(
     keys = torch.empty(capacity, device=device, dtype=key_type)
     rows = torch.empty(capacity, device=device, dtype=torch.int32)
     if raster.capacity is not None:
-        keys.fill_(torch.iinfo(key_type).max)  # what no pair fills sorts behind all tiles
+        keys.fill_(torch.iinfo(key_type).max)  # unused entries sort behind all tiles
     if total:
         binning.emit[(-(-total // binning.EMIT_BLOCK),)](
             order, ends, spans, *rays[1:], keys, rows, total, count, capacity, raster.columns, raster.rows,
@@ -246,4 +247,11 @@ def _bin(
         )  # fmt: skip
     keys, place = torch.sort(keys, stable=True)
     starts = torch.searchsorted(keys, torch.arange(tiles + 1, device=device, dtype=key_type), out_int32=True)
-    return _Lists(centres, log_opacities, spans, rows.gather(0, place), starts, pairs)
+    return _Lists(
+        centres=centres,
+        log_opacities=log_opacities,
+        spans=spans,
+        rows=rows.gather(0, place),
+        starts=starts,
+        pairs=pairs,
+    )

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 UNDISTORT_STEPS = 10
-"""Newton's method doubles the digits with each."""
+"""Number of Newton steps; each doubles the number of digits."""
 LEAST_DETERMINANT = 1e-3
-"""Of the distortion's Jacobian: where it folds there is no ray, and a step must not leave for infinity."""
+"""Minimum determinant of the distortion's Jacobian, which bounds the steps where the distortion folds."""
 
 
 def pixel_rays(pixels: Tensor, Ks: Tensor, distortion: Tensor | None = None) -> Tensor:
@@ -34,8 +34,8 @@ def pixel_rays(pixels: Tensor, Ks: Tensor, distortion: Tensor | None = None) -> 
 def undistort(distorted: Tensor, distortion: Tensor) -> Tensor:
     """Invert OpenCV's distortion by Newton's method; points (C, n, 2) on the plane z = 1.
 
-    From the distorted point it goes straight to the nearer root, whether the lens is a barrel or a pincushion
-    (derived: along a radius the distortion is concave or convex, and the start lies on the side where tangents help).
+    From the distorted point the iteration converges to the nearer root, for barrel and for pincushion distortion
+    (derived: along a radius the distortion is concave or convex, and the start lies where Newton's method is monotone).
     """
     k1, k2, p1, p2 = (distortion[:, None, index] for index in range(4))
     k3 = distortion[:, None, 4] if distortion.shape[1] > 4 else torch.zeros_like(k1)

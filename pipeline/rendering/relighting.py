@@ -1,9 +1,9 @@
-"""A body in the light of another pose: photos show each side of it in one light, a motion shows it in others.
+"""Relighting of a body in poses other than that of the photos.
 
-Spheres carry the colours of the photos. In another pose a sphere's colour is multiplied by L(n) / L(n_photo), with
+Spheres have the colours of the photos. In another pose the colour of a sphere is multiplied by L(n) / L(n_photo), with
 L(n) = 1 + sky n_z + max(0, lamp . n) the brightness of a white matt surface of normal n (world frame) in a room with
-one lamp: four numbers, which a short motion determines (eight spherical harmonics, the general form of soft light,
-fitted the frames better and other poses worse). Shadows that bodies cast and highlights are not in it.
+one lamp: four parameters, which a short motion determines (eight spherical harmonics, the general form of soft light,
+fitted the frames better and other poses worse). Cast shadows and highlights are not modelled.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ import torch
 from torch import Tensor
 
 from ...schemas import BodyModel, Light
-from ..physics.rotation import quat_to_matrix
+from ..geometry.rotation import quat_to_matrix
 
 DARKEST = 0.2
-"""L is at least this: the light from below that a floor sends back."""
+"""Minimum of L [1], for the light that a floor reflects."""
 
 
 def light_terms(normals: Tensor, lamp: Tensor) -> Tensor:
-    """Return what the numbers of a light (lamp, sky) are multiplied by (..., 4) at unit normals (..., 3), world frame.
+    """Return the factors (..., 4) of a light's parameters (lamp, sky) at unit normals (..., 3), world frame.
 
-    L - 1 is linear in them on each side of the lamp's terminator, whose place `lamp` (3,) tells.
+    L - 1 is linear in the parameters on each side of the lamp's terminator, which `lamp` (3,) determines.
     """
     return torch.cat((normals * (normals @ lamp > 0).to(normals)[..., None], normals[..., 2:]), -1)
 
 
 def brightness(light: Light, normals: Tensor) -> Tensor:
-    """Return L (N,) at unit normals (N, 3), world frame."""
+    """Return the brightness L (N,) at unit normals (N, 3), world frame."""
     return _brightness(_numbers(light, normals), normals)
 
 
@@ -43,21 +43,18 @@ def _brightness(numbers: Tensor, normals: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Relighting:
-    """What turns the colours of a body's photos into those of another pose.
-
-    Attributes:
-        numbers: The light's lamp and sky, shape (4,).
-        normals: Of the body's spheres, body frame, shape (N, 3).
-        in_photos: L at the normals of the photos, shape (N,).
-    """
+    """Factors that turn the colours of a body's photos into those of another pose."""
 
     numbers: Tensor
+    """The light's lamp and sky, shape (4,)."""
     normals: Tensor
+    """Unit normals of the body's spheres, body frame, shape (N, 3)."""
     in_photos: Tensor
+    """L at the normals in the pose of the photos, shape (N,)."""
 
     @staticmethod
     def of(light: Light, body: BodyModel, normals: Tensor) -> Relighting:
-        """Prepare a body, given its spheres' normals (N, 3) in the body frame."""
+        """Prepare the relighting of a body, given the normals (N, 3) of its spheres in the body frame."""
         rotation = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz).to(normals))
         numbers = _numbers(light, normals)
         return Relighting(numbers, normals, _brightness(numbers, normals @ rotation.T))

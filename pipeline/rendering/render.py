@@ -1,12 +1,12 @@
-"""Rendering of spherical Gaussians: one pure, differentiable function, on any device.
+"""Differentiable rendering of spherical Gaussians by one pure function, on any device.
 
-A sphere's response along a ray depends only on the distance from its centre to the ray, so it is used as it is
-(no projection to an ellipse on the image plane):
+The response of a sphere along a ray depends only on the distance from its centre to the ray, so it is evaluated
+directly, without projection to an ellipse on the image plane:
 
     alpha_i(ray) = opacity_i exp(-dist(c_i, ray)^2 / (2 s_i^2))
 
 Spheres are composited front to back in the order of their distance from the camera's centre, which does not change
-when the camera turns.
+when the camera rotates.
 """
 
 from __future__ import annotations
@@ -20,41 +20,46 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from .composite import TileLists, composite
+from .composite_reference import TileLists, composite
 from .rays import pixel_rays
 
 MIN_ALPHA = 1 / 255
+"""Threshold on alpha below which a sphere does not contribute to a pixel."""
 MIN_TRANSMITTANCE = 1e-4
+"""Threshold on the transmittance of a pixel below which spheres behind are skipped."""
 _TILE = 8
-_BLOCK = 8  # tiles along the side of a block, the coarse level of culling
+"""Default side of a tile of the torch path [px]."""
+_BLOCK = 8
+"""Number of tiles along the side of a block, the coarse level of culling."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RenderOutput:
-    """What the cameras see.
-
-    Attributes:
-        features: Composited features with the background behind them, shape (C, H, W, F).
-        alpha: Opacity of all spheres together in [0, 1), shape (C, H, W).
-        weighted_depth: Depths along the optical axis [m], each times what its sphere adds to alpha, shape (C, H, W).
-        median_depth: Depth of the sphere behind which less than half of the light gets through [m], shape (C, H, W);
-            0 where more does. It has no derivative. None where it was not asked for.
-        pairs: From the kernels of `rasterize`: how many pairs of tiles and spheres there are, to compare with the
-            capacity, int32 () on the device; otherwise None.
-        alone: Opacity of each group of spheres if it were alone, shape (C, H, W, G); it has no derivative. None where
-            there are no groups.
-    """
+    """Images of C cameras."""
 
     features: Tensor
+    """Composited features with the background behind them, shape (C, H, W, F)."""
     alpha: Tensor
+    """Opacity of all spheres together in [0, 1), shape (C, H, W)."""
     weighted_depth: Tensor
+    """Sum of depths along the optical axis [m] weighted by the contributions of the spheres to alpha, shape (C, H, W).
+    """
     median_depth: Tensor | None = None
+    """Depth of the sphere at which the transmittance falls to half [m], 0 where it does not, shape (C, H, W); without
+    derivative. None where it was not requested.
+    """
     pairs: Tensor | None = None
+    """Number of pairs of tiles and spheres in the kernels of `rasterize`, to compare with the capacity, int32 on the
+    device, shape (); None in the torch path.
+    """
     alone: Tensor | None = None
+    """Opacity of each group of spheres as if it were alone, shape (C, H, W, G); without derivative. None without
+    groups.
+    """
 
     @property
     def depth(self) -> Tensor:
-        """Return the expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is seen."""
+        """Expected depth along the optical axis [m], shape (C, H, W); 0 where nothing is visible."""
         seen = self.alpha > 0
         return torch.where(seen, self.weighted_depth / torch.where(seen, self.alpha, 1.0), 0.0)
 
@@ -81,55 +86,127 @@ def render(
 ) -> RenderOutput:
     """Render spheres into C cameras.
 
-    Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn where its centre
-    lies in front of the camera by more than its scale; one whose place is not finite is not drawn. float32 tensors on
-    CUDA go through the kernels of `rasterize`, everything else (and systems without Triton) through plain torch; both
-    give the same pictures.
+    Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn if its centre lies
+    in front of the camera by more than its scale, and its position is finite. float32 tensors on CUDA are rendered by
+    the kernels of `rasterize`, all others (and systems without Triton) by plain torch, with the same result.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
         scales: Standard deviations s > 0 [m], shape (N,).
         opacities: Peak alphas in [0, 1], shape (N,).
-        features: Colours or any other channels, shape (N, F), or (C, N, F) where they differ by camera; these have no
-            derivative on CUDA.
+        features: Colours or any other channels, shape (N, F), or (C, N, F) where they differ by camera; the latter have
+            no derivative on CUDA.
         viewmats: T_cam_world, camera axes OpenCV, shape (C, 4, 4).
         Ks: Camera matrices [px], shape (C, 3, 3); the centre of the top-left pixel is (0.5, 0.5).
         width: Image width [px].
         height: Image height [px].
-        background: Features behind everything, shape (F,) or (C, F); zero where left out.
-        distortion: OpenCV's k1, k2, p1, p2 [, k3], shape (k,) or (C, k); none where left out.
-        min_alpha: Smaller alphas are taken as 0 (0 keeps all, and every sphere meets every pixel).
-        min_transmittance: What lies behind pixels that let less through than this is skipped.
-        tile_size: Side of the tiles of the torch path [px]; changes the speed only.
+        background: Features behind everything, shape (F,) or (C, F); None for zero.
+        distortion: OpenCV's k1, k2, p1, p2 [, k3], shape (k,) or (C, k); None for pinhole cameras.
+        min_alpha: Threshold below which an alpha counts as 0; with 0 every sphere meets every pixel.
+        min_transmittance: Threshold on a pixel's transmittance below which spheres behind are skipped.
+        tile_size: Side of the tiles of the torch path [px]; affects only the speed.
         median: Whether to return the median depth.
-        capacity: Room for pairs of tiles and spheres in the kernels, see `rasterize.Raster`.
-        groups: Spheres whose opacities alone are asked for, too: G slices of the N.
-        group_transmittance: `min_transmittance` of the groups: where a group lets less through, its opacity may be
-            told too low, but not below 1 minus this.
+        capacity: Maximum number of pairs of tiles and spheres in the kernels, see `rasterize.Raster`.
+        groups: Groups of spheres whose opacity alone is also returned: G slices of the N spheres.
+        group_transmittance: `min_transmittance` of the groups: below it the returned opacity of a group may be too low,
+            but not below 1 minus this.
 
     Returns:
         Features, alpha and depth.
     """
+    scene = _Scene(
+        means=means,
+        scales=scales,
+        opacities=opacities,
+        features=features,
+        viewmats=viewmats,
+        Ks=Ks,
+        distortion=distortion,
+        width=width,
+        height=height,
+        groups=groups,
+    )
     if means.is_cuda and means.dtype == torch.float32 and _has_triton():
-        from .rasterize import Raster, rasterize  # imports Triton
+        drawn = _draw_by_kernels(scene, min_alpha, min_transmittance, group_transmittance, capacity)
+        drawn = drawn if median else replace(drawn, median_depth=None)
+    else:
+        drawn = _draw_in_torch(scene, min_alpha, min_transmittance, group_transmittance, tile_size, median)
+    return drawn if background is None else _with_background(drawn, background)
 
-        raster = Raster(width, height, min_alpha, min_transmittance, capacity)
-        values, alpha, depth, middle, pairs = rasterize(
-            means, scales, opacities, features, viewmats, Ks, raster, distortion
-        )
-        made = _finished(values, alpha, depth, background, middle if median else None)
-        single = replace(raster, min_transmittance=group_transmittance, capacity=None)
-        alphas = [
-            rasterize(
-                means[..., group, :], scales[group], opacities[group], opacities[group, None], viewmats, Ks, single,
-                distortion,
-            )[1]
-            for group in groups
-        ]  # fmt: skip
-        return replace(made, pairs=pairs, alone=torch.stack(alphas, -1).detach() if groups else None)
-    camera_count = viewmats.shape[0]
-    local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
-    tiles = _Tiles.make(Ks, distortion, width, height, tile_size)
+
+@dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """Spheres and cameras of a call of `render`, with the arguments of the same names there."""
+
+    means: Tensor
+    """Centres, world frame [m], shape (N, 3) or (C, N, 3)."""
+    scales: Tensor
+    """Standard deviations [m], shape (N,)."""
+    opacities: Tensor
+    """Peak alphas, shape (N,)."""
+    features: Tensor
+    """Features, shape (N, F) or (C, N, F)."""
+    viewmats: Tensor
+    """T_cam_world, shape (C, 4, 4)."""
+    Ks: Tensor
+    """Camera matrices [px], shape (C, 3, 3)."""
+    distortion: Tensor | None
+    """Distortion coefficients, shape (k,) or (C, k); None for pinhole cameras."""
+    width: int
+    """Image width [px]."""
+    height: int
+    """Image height [px]."""
+    groups: Sequence[slice]
+    """Groups of spheres whose opacity alone is also rendered."""
+
+
+def _draw_by_kernels(
+    scene: _Scene, min_alpha: float, min_transmittance: float, group_transmittance: float, capacity: int | None
+) -> RenderOutput:
+    """Render on CUDA, by the kernels of `rasterize`, without a background."""
+    from .rasterize import Raster, rasterize  # imports Triton
+
+    raster = Raster(
+        width=scene.width,
+        height=scene.height,
+        min_alpha=min_alpha,
+        min_transmittance=min_transmittance,
+        capacity=capacity,
+    )
+    means, scales, opacities = scene.means, scene.scales, scene.opacities
+    values, alpha, depth, middle, pairs = rasterize(
+        means, scales, opacities, scene.features, scene.viewmats, scene.Ks, raster, scene.distortion
+    )
+    single = replace(raster, min_transmittance=group_transmittance, capacity=None)
+    alphas = [
+        rasterize(
+            means[..., group, :], scales[group], opacities[group], opacities[group, None], scene.viewmats, scene.Ks,
+            single, scene.distortion,
+        )[1]
+        for group in scene.groups
+    ]  # fmt: skip
+    return RenderOutput(
+        features=values,
+        alpha=alpha,
+        weighted_depth=depth,
+        median_depth=middle,
+        pairs=pairs,
+        alone=torch.stack(alphas, -1).detach() if scene.groups else None,
+    )
+
+
+def _draw_in_torch(
+    scene: _Scene,
+    min_alpha: float,
+    min_transmittance: float,
+    group_transmittance: float,
+    tile_size: int,
+    median: bool,
+) -> RenderOutput:
+    """Render in plain torch, in tiles, without a background."""
+    camera_count, scales, opacities, features = scene.viewmats.shape[0], scene.scales, scene.opacities, scene.features
+    local = scene.means @ scene.viewmats[:, :3, :3].transpose(1, 2) + scene.viewmats[:, None, :3, 3]
+    tiles = _Tiles.make(scene.Ks, scene.distortion, scene.width, scene.height, tile_size)
     with torch.no_grad():
         tile_ids, cameras, spheres = _pairs(local, scales, opacities, tiles, min_alpha)
         counts = torch.bincount(tile_ids, minlength=tiles.count * camera_count)
@@ -145,48 +222,56 @@ def render(
     )
     seen = features.index_select(0, spheres) if features.dim() == 2 else features.flatten(0, 1).index_select(0, flat)
     channels = torch.cat([seen, centres[:, 2:]], 1)
-    every_tile = torch.arange(counts.shape[0], device=means.device)
+    every_tile = torch.arange(counts.shape[0], device=scene.means.device)
     lists = TileLists(
-        tiles.basis, tiles.frame_of(every_tile), counts.cumsum(0) - counts, counts, min_alpha, min_transmittance
+        basis=tiles.basis,
+        frame=tiles.frame_of(every_tile),
+        starts=counts.cumsum(0) - counts,
+        counts=counts,
+        min_alpha=min_alpha,
+        min_transmittance=min_transmittance,
     )
     values, alpha, middle = composite(coefficients, channels, lists, median)
     alone = None
-    if groups:
+    if scene.groups:
         with torch.no_grad():
             single = replace(lists, min_transmittance=group_transmittance)
-            alphas = [_alone(coefficients, tile_ids, (spheres >= g.start) & (spheres < g.stop), single) for g in groups]
+            members = [(spheres >= group.start) & (spheres < group.stop) for group in scene.groups]
+            alphas = [_alone(coefficients, tile_ids, chosen, single) for chosen in members]
             alone = tiles.to_image(torch.stack(alphas, 2), camera_count)
     image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
-    median_depth = tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None
-    return replace(_finished(image[..., :-2], image[..., -1], image[..., -2], background, median_depth), alone=alone)
+    return RenderOutput(
+        features=image[..., :-2],
+        alpha=image[..., -1],
+        weighted_depth=image[..., -2],
+        median_depth=tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None,
+        alone=alone,
+    )
+
+
+def _with_background(drawn: RenderOutput, background: Tensor) -> RenderOutput:
+    """Return a rendering with features (F,) or (C, F) behind it."""
+    behind = background.expand(drawn.features.shape[0], -1)[:, None, None, :]
+    return replace(drawn, features=drawn.features + (1 - drawn.alpha)[..., None] * behind)
 
 
 def _alone(coefficients: Tensor, tile_ids: Tensor, chosen: Tensor, lists: TileLists) -> Tensor:
-    """Return the alpha (T, P) of some of the pairs alone."""
+    """Return the alpha (T, P) of a subset of the pairs, as if the other pairs did not exist."""
     counts = torch.bincount(tile_ids[chosen], minlength=lists.counts.shape[0])
-    own = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
-    return composite(coefficients[chosen], coefficients[chosen, :1], own)[1]
+    subset = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
+    return composite(coefficients[chosen], coefficients[chosen, :1], subset)[1]
 
 
 @cache
 def _has_triton() -> bool:
-    """Tell whether Triton is there: it comes with torch's CUDA wheels for Linux."""
+    """Return whether Triton is installed; torch's CUDA wheels for Linux contain it."""
     return importlib.util.find_spec("triton") is not None
-
-
-def _finished(
-    colours: Tensor, alpha: Tensor, weighted_depth: Tensor, background: Tensor | None, median_depth: Tensor | None
-) -> RenderOutput:
-    if background is not None:
-        behind = background.expand(colours.shape[0], -1)[:, None, None, :]
-        colours = colours + (1 - alpha)[..., None] * behind
-    return RenderOutput(colours, alpha, weighted_depth, median_depth)
 
 
 def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
     """Return the exponent's coefficients of (1, x, y, x^2, xy, y^2) / (1 + x^2 + y^2), shape (M, 6).
 
-    The logarithm of the opacity stands with the monomials 1, x^2 and y^2, whose quotients sum to 1.
+    The logarithm of the opacity is added to the coefficients of 1, x^2 and y^2, whose quotients sum to 1.
     """
     px, py, pz = centres.unbind(1)
     k = -0.5 / (scales * scales)
@@ -206,33 +291,35 @@ def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Tiles:
-    """The tiles of a picture. Cameras with equal K and distortion share their G rows.
-
-    Attributes:
-        basis: See `TileLists`, shape (G * tiles, P, 6).
-        rotations: Camera axes to tile axes (rows), shape (G * tiles, 3, 3); the last row is the tile's axis.
-        half_angle: Angle between the axis and the farthest pixel [rad], shape (G * tiles,).
-        group: Row group of each camera, shape (C,).
-    """
+    """Tiles of the images; cameras with equal K and distortion share their G rows."""
 
     basis: Tensor
+    """See `TileLists`, shape (G * tiles, P, 6)."""
     rotations: Tensor
+    """Rotations from camera axes to tile axes (rows), shape (G * tiles, 3, 3); the last row is the tile's axis."""
     half_angle: Tensor
+    """Angle between the axis and the farthest pixel [rad], shape (G * tiles,)."""
     group: Tensor
+    """Row group of each camera, shape (C,)."""
     columns: int
+    """Number of tiles in a row."""
     rows: int
+    """Number of rows of tiles."""
     size: int
+    """Side of a tile [px]."""
     width: int
+    """Image width [px]."""
     height: int
+    """Image height [px]."""
 
     @property
     def count(self) -> int:
         return self.columns * self.rows
 
     def frame_of(self, tile_ids: Tensor) -> Tensor:
-        """Return the rows of `basis` and `rotations` for tiles numbered camera * count + tile."""
+        """Return the rows of `basis` and `rotations` for tiles with the numbers camera * count + tile."""
         return self.group[tile_ids // self.count] * self.count + tile_ids % self.count
 
     @staticmethod
@@ -244,7 +331,7 @@ class _Tiles:
             keys = torch.cat([keys, distortion.expand(camera_count, -1)], 1)
         unique, group = torch.unique(keys, dim=0, return_inverse=True)
         columns, rows = math.ceil(width / size), math.ceil(height / size)
-        # Pixels beyond the border repeat the last one inside, so that a tile's cone is never wider than the picture.
+        # Pixels beyond the border repeat the last one inside, so that a tile's cone is never wider than the image.
         u = (torch.arange(columns * size, device=Ks.device, dtype=Ks.dtype) + 0.5).clamp_max(width - 0.5)
         v = (torch.arange(rows * size, device=Ks.device, dtype=Ks.dtype) + 0.5).clamp_max(height - 0.5)
         pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
@@ -258,10 +345,20 @@ class _Tiles:
         x, y = (local[..., :2] / local[..., 2:]).unbind(-1)
         one = torch.ones_like(x)
         basis = torch.stack([one, x, y, x * x, x * y, y * y], -1) / (1 + x * x + y * y)[..., None]
-        return _Tiles(basis, rotations, half_angle, group, columns, rows, size, width, height)
+        return _Tiles(
+            basis=basis,
+            rotations=rotations,
+            half_angle=half_angle,
+            group=group,
+            columns=columns,
+            rows=rows,
+            size=size,
+            width=width,
+            height=height,
+        )
 
     def to_image(self, values: Tensor, camera_count: int) -> Tensor:
-        """Lay tiles (C * tiles, P, F) out as pictures (C, H, W, F)."""
+        """Arrange tiles (C * tiles, P, F) as images (C, H, W, F)."""
         grid = values.reshape(camera_count, self.rows, self.columns, self.size, self.size, -1).transpose(2, 3)
         grid = grid.reshape(camera_count, self.rows * self.size, self.columns * self.size, -1)
         return grid[:, : self.height, : self.width]
@@ -280,10 +377,10 @@ def _frames(axis: Tensor) -> Tensor:
 def _pairs(
     local: Tensor, scales: Tensor, opacities: Tensor, tiles: _Tiles, min_alpha: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """List which spheres meet which tiles, nearest first within a tile.
+    """List the pairs of tiles and spheres that intersect, nearest first within a tile.
 
-    A sphere reaches to where its alpha falls to `min_alpha`; it meets a tile when the cone around it meets the cone
-    around the tile. Blocks of tiles first, then their tiles.
+    A sphere extends to where its alpha falls to `min_alpha`; it intersects a tile if the cone around it intersects the
+    cone around the tile. Blocks of tiles are tested first, then their tiles.
 
     Returns:
         Tile number (camera * tiles + tile), camera and sphere of each pair, three arrays (M,).
@@ -311,7 +408,7 @@ def _pairs(
 
 
 def _meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tile and sphere of every meeting of cones for one camera; spheres ascend within a tile.
+    """Return tile and sphere of every intersection of cones for one camera, spheres in ascending order within a tile.
 
     Args:
         axes: Tile axes, shape (rows, columns, 3).
@@ -342,18 +439,18 @@ def _meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[
 
 
 def _cones_meet(axes: Tensor, half: Tensor, direction: Tensor, cone: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the meetings of cones, by axes (t, 3) and (n, 3) and half angles (t,) and (n,); all angles to pi.
+    """Return the intersecting cones, given axes (t, 3) and (n, 3) and half angles (t,) and (n,) up to pi.
 
     Cosines are compared, not angles: cos a >= cos(b + c) where b + c stays within pi.
     """
     limit = half.cos()[:, None] * cone.cos() - half.sin()[:, None] * cone.sin()
-    limit = limit - 8 * torch.finfo(limit.dtype).eps  # culling must not lose what is visible
+    limit = limit - 8 * torch.finfo(limit.dtype).eps  # culling must not lose visible spheres
     meets = (axes @ direction.T >= limit) | (half[:, None] + cone >= math.pi)
     tile, place = meets.nonzero(as_tuple=True)
     return tile, place
 
 
 def _angle(cosine: Tensor) -> Tensor:
-    """Return the angle [rad], a little too small rather than too large: culling must not lose what is visible."""
+    """Return the angle [rad], rounded down, so that culling loses no visible sphere."""
     slack = 4 * torch.finfo(cosine.dtype).eps
     return torch.acos((cosine + slack).clamp(-1.0, 1.0))

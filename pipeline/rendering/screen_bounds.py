@@ -1,4 +1,4 @@
-"""What of a picture spheres can reach: boxes of pixels outside of which they add nothing."""
+"""Screen-space bounds of spheres: boxes of pixels outside of which they contribute nothing."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .labelled_spheres import Labelled
-from .splats.render import MIN_ALPHA
+from .posed_scene import Labelled
+from .render import MIN_ALPHA
 
 TILE = 8
-"""Crops begin and end on multiples of the renderer's tile [px], so that its tiles are those of the whole picture."""
+"""Side of a tile [px]; crops begin and end on its multiples, so that their tiles are those of the full image."""
 
 
 class Box(NamedTuple):
-    """A box of pixels."""
+    """Box of pixels; right and bottom are exclusive."""
 
     left: int
     top: int
@@ -25,21 +25,21 @@ class Box(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Columns."""
+        """Number of columns."""
         return self.right - self.left
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return self.bottom - self.top
 
     @property
     def place(self) -> tuple[slice, slice]:
-        """Rows and columns."""
+        """Slices of rows and columns."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def camera_matrix(self, K: Tensor) -> Tensor:
-        """Return the camera matrix (3, 3) of a camera that sees the box alone."""
+        """Return the camera matrix (3, 3) [px] of a camera that sees only the box."""
         shifted = K.clone()
         shifted[0, 2] -= self.left
         shifted[1, 2] -= self.top
@@ -47,10 +47,10 @@ class Box(NamedTuple):
 
 
 def spans(spheres: Labelled, viewmat: Tensor, K: Tensor) -> Tensor:
-    """Return left, top, right, bottom (N, 4) [px] of where each sphere reaches MIN_ALPHA; nothing is inf to -inf.
+    """Return bounds (N, 4) [px] left, top, right, bottom of where each sphere reaches MIN_ALPHA; inf to -inf for none.
 
     Derived: the rays that pass a centre (x, z) within r lie, in the plane of x and z, within asin(r / |(x, z)|) of
-    its direction; so for y. A sphere around the camera reaches everywhere.
+    its direction; likewise for y. A sphere around the camera reaches all pixels.
     """
     local = spheres.means @ viewmat[:3, :3].T + viewmat[:3, 3]
     reach = spheres.scales * (2 * (spheres.opacities / MIN_ALPHA).clamp_min(1.0).log()).sqrt()
@@ -62,7 +62,7 @@ def spans(spheres: Labelled, viewmat: Tensor, K: Tensor) -> Tensor:
         middle = torch.atan2(local[:, axis], depth)
         half = torch.asin((reach / torch.hypot(local[:, axis], depth)).clamp_max(1.0))
         for sign in (-1.0, 1.0):
-            # a pixel against rounding
+            # one pixel of margin for rounding
             end = torch.tan(middle + sign * half) * K[axis, axis] + K[axis, 2] + sign
             end = torch.where(around, sign * torch.inf, end)
             columns.append(torch.where(drawn, end, -sign * torch.inf))
@@ -70,7 +70,7 @@ def spans(spheres: Labelled, viewmat: Tensor, K: Tensor) -> Tensor:
 
 
 def reach(spheres: Labelled, viewmat: Tensor, K: Tensor, width: int, height: int) -> Box | None:
-    """Return the box, on tile borders, outside of which no sphere reaches MIN_ALPHA; None where none does."""
+    """Return the box, on tile borders, outside of which no sphere reaches MIN_ALPHA; None for an empty box."""
     if len(spheres) == 0:
         return None
     each = spans(spheres, viewmat, K)
@@ -86,6 +86,6 @@ def reach(spheres: Labelled, viewmat: Tensor, K: Tensor, width: int, height: int
 
 
 def inside(each: Tensor, box: Box) -> Tensor:
-    """Return which spheres (N,) with these spans (N, 4) reach into a box."""
+    """Return which spheres (N,) with spans (N, 4) reach into a box."""
     low, high = each.new_tensor([box.left, box.top]), each.new_tensor([box.right, box.bottom])
     return ((each[:, :2] <= high) & (each[:, 2:] >= low)).all(1)

@@ -1,1 +1,1 @@
-"""Pieces of reports: the page, its charts and pictures, the verdict, and estimates next to the truth."""
+"""Building blocks of HTML reports: pages, tables and charts."""

@@ -1,4 +1,4 @@
-"""Small charts as inline SVG: lines over time, and intervals. Plain text in, no fonts or scripts needed."""
+"""Small charts as inline SVG, without fonts or scripts: lines over time, and intervals."""
 
 from __future__ import annotations
 
@@ -14,43 +14,38 @@ _LABEL_GAP = 4
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a chart.
-
-    Attributes:
-        name: Its name in the title that browsers show on hovering.
-        style: Class in the page's style sheet.
-        values: One for each time; None where there is none.
-    """
+    """One line of a chart."""
 
     name: str
+    """Name, which browsers show on hovering."""
     style: str
+    """Class in the page's style sheet."""
     values: Sequence[float | None]
+    """Value at each time; None where it is missing."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Chart:
-    """Lines over time on a logarithmic scale.
-
-    Attributes:
-        title: Above the chart, with the unit.
-        times_s: Shared by all lines [s].
-        lines: The lines, the first drawn last, on top.
-        low, high: Range of the scale; what lies below or above is drawn on its rim.
-        shaded_until_s: The start up to here is shaded (what the model may see) [s].
-        marked_s: A moment marked by a vertical line [s].
-    """
+    """Lines over time on a logarithmic scale."""
 
     title: str
+    """Title above the chart, with the unit."""
     times_s: Sequence[float]
+    """Times of the values of all lines [s]."""
     lines: Sequence[Line]
+    """The lines; the first is drawn last, on top."""
     low: float
+    """Lower end of the scale; smaller values are drawn at it."""
     high: float
+    """Upper end of the scale; larger values are drawn at it."""
     shaded_until_s: float | None = None
+    """End of the shaded start, which the model may see [s]."""
     marked_s: float | None = None
+    """Moment marked by a vertical line [s]."""
 
 
 def decades(values: Sequence[float | None], floor: float) -> tuple[float, float]:
-    """Return the powers of ten that hold all values, not below `floor`, at least one decade apart.
+    """Return the powers of ten that enclose all values, not below `floor`, at least one decade apart.
 
     >>> decades([0.5, 210.0, None], 0.1)
     (0.1, 1000.0)
@@ -85,7 +80,7 @@ def chart_svg(chart: Chart) -> str:
 
 
 def _scales(chart: Chart, end: float) -> list[str]:
-    """Return grid lines, one for each power of ten and about five in time, with their labels."""
+    """Return grid lines for each power of ten and about five ticks of time, with their labels."""
     bottom, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
     parts = []
     for power in range(round(math.log10(chart.low)), round(math.log10(chart.high)) + 1):
@@ -102,7 +97,7 @@ def _scales(chart: Chart, end: float) -> list[str]:
 
 
 def _path(chart: Chart, values: Sequence[float | None], end: float) -> str:
-    """Return the path of a line, broken where values are missing."""
+    """Return the path of a line, interrupted where values are missing."""
     parts, joined = [], False
     for time, value in zip(chart.times_s, values, strict=True):
         if value is None:
@@ -124,13 +119,13 @@ def _y(value: float, chart: Chart) -> float:
 
 
 def _round_step(step: float) -> float:
-    """Return the next of 1, 2, 5 times a power of ten that is no smaller."""
+    """Return the smallest of 1, 2 and 5 times a power of ten that is at least `step`."""
     power = 10.0 ** math.floor(math.log10(step))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= step - 1e-12)
 
 
 def interval_svg(estimate: float, interval: tuple[float, float], true_value: float | None) -> str:
-    """Return an estimate (dot), its interval (bar) and the true value (tick) on a small scale of their own."""
+    """Return a small chart of an estimate (dot), its interval (bar) and the true value (tick)."""
     shown = [estimate, *interval, *([] if true_value is None else [true_value])]
     low, high = min(shown), max(shown)
     span = (high - low) or 1.0

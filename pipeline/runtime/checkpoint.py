@@ -1,8 +1,8 @@
-"""Checkpoints of a fit: what an interrupted one takes up again with `--resume`.
+"""Checkpoints of a fit, from which an interrupted one continues with `--resume`.
 
-They lie in a directory beside the model that is being made, `MODEL.checkpoint`, one file for each descent. A file
-appears when it is complete, so that a fit that is killed at any moment leaves the last complete one. Everything that
-a descent draws from or moves is in it, generators included: a resumed fit gives the spheres that it would have given.
+They are stored in the directory `MODEL.checkpoint` next to the model, one file per descent. Files are written
+atomically, so that a fit that is killed at any moment leaves the last complete one. They hold the full state of a
+descent, including its random generators: a resumed fit gives the same spheres as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -21,25 +21,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.atomic import new_file
-from ..schemas import InputDataError, UsageError
+from ...datasets.io.atomic import new_file
+from ...schemas import InputDataError, UsageError
 
 State = dict[str, Any]
-"""Tensors, numbers, text, and lists and dictionaries of them."""
+"""State of a descent: tensors, numbers, text, and lists and dictionaries of them."""
 Array = NDArray[Any]
 
 _KEY = "made_of.json"
+"""File that names what the fit is made of."""
 
 
 class Checkpoint:
-    """The checkpoints of one fit.
-
-    Nothing is written before the fit has run for `every_s`: a short one leaves no trace.
+    """Checkpoints of one fit; none is written before the fit has run for `every_s`.
 
     Args:
-        path: The directory; it is made with the first checkpoint.
-        made_of: What the fit is made of (settings, inputs), by name, as text. A checkpoint of anything else is refused.
-        every_s: Least time between two checkpoints [s].
+        path: Directory, which is created with the first checkpoint.
+        made_of: Settings and inputs of the fit by name, as text; a checkpoint of other ones is refused.
+        every_s: Minimum time between two checkpoints [s].
     """
 
     def __init__(self, path: Path, made_of: Mapping[str, str], every_s: float = 15.0) -> None:
@@ -50,11 +49,11 @@ class Checkpoint:
 
     @staticmethod
     def beside(out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool) -> Checkpoint:
-        """Return the checkpoints of the fit that writes the model `out`; what lies there is kept where it resumes.
+        """Return the checkpoints of the fit that writes the model `out`; existing ones are kept if it resumes.
 
         Raises:
-            UsageError: If what lies there holds no checkpoints, if it does and neither `resume` nor `overwrite` is
-                given, or what is to be resumed was made of something else.
+            UsageError: If the directory exists and holds no checkpoints, if it does and neither `resume` nor
+                `overwrite` is set, or if the fit to resume had other settings or inputs.
         """
         checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
         path = checkpoint.path
@@ -77,20 +76,20 @@ class Checkpoint:
         return checkpoint
 
     def slot(self, name: str) -> Slot:
-        """Return the place of one descent's state."""
+        """Return the storage of one descent's state."""
         return Slot(self, name)
 
     def remove(self) -> None:
-        """Remove all checkpoints: the model is complete."""
+        """Remove all checkpoints, when the model is complete."""
         if (self.path / _KEY).is_file():
             shutil.rmtree(self.path)
 
     def due(self) -> bool:
-        """Tell whether the last checkpoint is old enough for another."""
+        """Return whether the last checkpoint is at least `every_s` old."""
         return time.monotonic() - self._last >= self._every_s
 
     def write(self, name: str, state: State) -> None:
-        """Write a state, complete or not at all."""
+        """Write a state atomically."""
         if not (self.path / _KEY).is_file():
             self.path.mkdir(parents=True, exist_ok=True)
             with new_file(self.path / _KEY, overwrite=True) as path:
@@ -104,7 +103,7 @@ class Checkpoint:
         self._last = time.monotonic()
 
     def read(self, name: str, device: torch.device) -> State | None:
-        """Return a state, its tensors on a device, or None where there is none.
+        """Return a state with its tensors on a device; None where there is none.
 
         Raises:
             InputDataError: If the file cannot be read.
@@ -136,17 +135,17 @@ class Checkpoint:
 
 
 class Slot:
-    """The place of one descent's state in a checkpoint."""
+    """Storage of one descent's state in a checkpoint."""
 
     def __init__(self, checkpoint: Checkpoint, name: str) -> None:
         self._checkpoint, self._name = checkpoint, name
 
     def read(self, device: torch.device) -> State | None:
-        """Return the state that was written last, or None."""
+        """Return the last written state; None where there is none."""
         return self._checkpoint.read(self._name, device)
 
     def due(self) -> bool:
-        """Tell whether it is time to write."""
+        """Return whether the next state should be written."""
         return self._checkpoint.due()
 
     def write(self, state: State) -> None:
@@ -155,13 +154,13 @@ class Slot:
 
 
 def _file_name(name: str) -> str:
-    """Return a file name for a descent: its name where that is plain, told apart from others by a hash."""
+    """Return the file name of a descent: its name in plain letters, made unique by a hash."""
     plain = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
     return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}.npz"
 
 
 def _taken_apart(value: Any, arrays: list[Array]) -> Any:
-    """Return a state as JSON writes it, with tensors by their place among the arrays, to which they are added."""
+    """Return a state for JSON, with tensors replaced by their index in `arrays`, to which they are appended."""
     if isinstance(value, Tensor):
         arrays.append(value.detach().cpu().numpy())
         return {"tensor": len(arrays) - 1}

@@ -1,4 +1,4 @@
-"""What this machine has, and what cgwm would use of it. Imports nothing heavy before it is asked for."""
+"""Report of this machine's software and hardware, and of what cgwm uses of it; heavy packages load only on demand."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
-from ..schemas.doctor import DoctorReport, Missing, PackageState
-from .compiler import compiler
+from ...schemas.doctor import DoctorReport, Missing, PackageState
+from .kernel_build import compiler
 
 _IMPORT_NAMES = {"opencv-python-headless": "cv2"}
 _CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
@@ -21,7 +21,7 @@ _GIB = 2**30
 
 
 def doctor() -> DoctorReport:
-    """Look at this machine: versions, devices, memory, and whether what cgwm needs works."""
+    """Report versions, devices and memory of this machine, and whether the requirements of cgwm work."""
     packages = _packages()
     torch, pycolmap, cv2 = (_load(name) for name in ("torch", "pycolmap", "cv2"))
     cuda = _cuda_devices(torch)
@@ -60,7 +60,7 @@ def cpu_cores() -> int:
 
 
 def memory_bytes() -> int:
-    """Return the memory that this process may use: the machine's, or a smaller limit of its container."""
+    """Return the memory that this process may use [bytes]: that of the machine, or a smaller limit of its container."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         try:
@@ -73,7 +73,7 @@ def memory_bytes() -> int:
 
 
 def satisfies(version: str, requirement: str) -> bool:
-    """Tell whether a version fulfils bounds such as `>=3.17,<4`; only release numbers are compared.
+    """Return whether a version satisfies bounds such as `>=3.17,<4`; only release numbers are compared.
 
     >>> satisfies("3.17.0", "mujoco<4,>=3.17"), satisfies("4.0.1", "mujoco<4,>=3.17"), satisfies("2.13.0+cpu", ">=2.11")
     (True, False, True)
@@ -102,7 +102,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def _packages() -> list[PackageState]:
-    """List what cgwm requires, as its own metadata states it, with what is installed."""
+    """List the requirements in the metadata of cgwm, with the installed versions."""
     try:
         requirements = metadata.requires("cgwm") or []
     except metadata.PackageNotFoundError:
@@ -125,7 +125,7 @@ def _missing_package(package: PackageState) -> Missing:
 
 
 def _broken(packages: list[PackageState]) -> list[Missing]:
-    """Find packages that are installed but do not import: the commonest cause is a missing system library."""
+    """List packages that are installed but fail to import, usually for want of a system library."""
     faults = []
     for package in packages:
         module = _IMPORT_NAMES.get(package.name, package.name)
@@ -140,7 +140,7 @@ def _broken(packages: list[PackageState]) -> list[Missing]:
 
 
 def _load(module: str) -> Any:
-    """Import a package, or return None where that fails; the reason is reported by `_broken`."""
+    """Import a package; return None where that fails, as `_broken` reports the reason."""
     try:
         return import_module(module)
     except Exception:  # as above
@@ -180,7 +180,7 @@ def _colmap_version(pycolmap: Any) -> str | None:
 
 
 def _zstd_fault() -> str:
-    """Write and read a small compressed dataset in memory; return what went wrong, or nothing."""
+    """Write and read a small compressed dataset in memory; return the fault, empty for none."""
     try:
         import h5py
         import hdf5plugin
@@ -201,7 +201,7 @@ def _renderer(cuda: bool) -> str:
         return "torch, in tiles"
     if _version("cuda-core"):
         return "CUDA kernels, compiled at run time"
-    return "Triton kernels (pip install 'cgwm[gpu]' for those in CUDA, 1.5 to 5 times faster)"
+    return "Triton kernels (pip install cuda-core for those in CUDA, 1.5 to 5 times faster)"
 
 
 def _rollouts() -> str:

@@ -1,16 +1,21 @@
-"""CUDA source compiled at run time by NVRTC (no toolkit: it comes with torch's CUDA wheels), and launched."""
+"""Compilation, cache and launch of kernels at run time: CUDA by NVRTC, which torch's CUDA wheels contain, and C++."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-
-from . import kernel_cache
 
 
 @cache
@@ -23,12 +28,23 @@ def _core() -> Any:
 
 
 def available() -> bool:
-    """Tell whether cuda.core is installed, which compiles and launches kernels."""
+    """Return whether cuda.core is installed, which compiles and launches kernels."""
     return _core() is not None
 
 
+@cache
+def source_file(module: str, path: str) -> str:
+    """Return the text of a CUDA or C++ file of the package in which a module is.
+
+    Args:
+        module: Name of the module, its `__name__`.
+        path: The file, relative to the folder of the package.
+    """
+    return files(module.rpartition(".")[0]).joinpath(path).read_text(encoding="utf-8")
+
+
 def compiled(source: str, name: str, device: int) -> Any:
-    """Return the kernel of that name for a device, built or taken from an earlier process; the caller keeps it."""
+    """Return a kernel of a source for a device, built now or by an earlier process; the caller keeps it."""
     core = _core()
     core.Device(device).set_current()
     major, minor = torch.cuda.get_device_capability(device)
@@ -40,14 +56,14 @@ def compiled(source: str, name: str, device: int) -> Any:
         return work / "kernel.cubin"
 
     recipe = "\n".join((f"cuda.core {core.__version__}, CUDA {torch.version.cuda}", *options.values(), source))
-    program = kernel_cache.built(recipe, ".cubin", build, lambda file: core.ObjectCode.from_cubin(file.read_bytes()))
+    program = built(recipe, ".cubin", build, lambda file: core.ObjectCode.from_cubin(file.read_bytes()))
     return program.get_kernel(name)
 
 
 def launch(
     kernel: Any, device: torch.device, blocks: int, threads: int, tensors: tuple[Tensor | None, ...], *words: Any
 ) -> None:
-    """Launch a kernel on torch's current stream; its pointers come first, null where a tensor is None."""
+    """Launch a kernel on torch's current stream; pointers come first, null where a tensor is None."""
     pointers = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
     stream = _stream(torch.cuda.current_stream(device).cuda_stream)
     _core().launch(stream, _config(blocks, threads), kernel, *pointers, *words)
@@ -61,3 +77,60 @@ def _config(blocks: int, threads: int) -> Any:
 @cache
 def _stream(handle: int) -> Any:
     return _core().Stream.from_handle(handle)
+
+
+@cache
+def compiler() -> str | None:
+    """Return the path of a C++ compiler; None where there is none, or outside of POSIX systems."""
+    if os.name != "posix":
+        return None
+    return next((found for name in ("g++", "clang++", "c++") if (found := shutil.which(name)) is not None), None)
+
+
+@cache
+def compiler_version() -> str | None:
+    """Return name and version of the C++ compiler, on which rounding depends; None where there is none."""
+    command = compiler()
+    if command is None:
+        return None
+    version = subprocess.run([command, "-dumpversion"], capture_output=True, text=True, check=False).stdout.strip()
+    return f"{Path(command).name} {version}".strip()
+
+
+T = TypeVar("T")
+
+
+def built(recipe: str, suffix: str, build: Callable[[Path], Path], load: Callable[[Path], T]) -> T:
+    """Load a product from the cache, where an earlier process may have built it by the same recipe, else build it.
+
+    Args:
+        recipe: Everything that the product depends on: source, compiler, options, machine.
+        suffix: Suffix of the cached file.
+        build: Function that makes the product in an empty folder, and returns its path.
+        load: Function that reads the product.
+    """
+    name = hashlib.sha256(recipe.encode()).hexdigest()[:32] + suffix
+    kept = folder()
+    if kept is not None and (kept / name).exists():
+        return load(kept / name)
+    # an interrupted compiler leaves temporary files: they are in this folder, too
+    with tempfile.TemporaryDirectory(dir=kept, prefix="build-", ignore_cleanup_errors=True) as work:
+        product = build(Path(work))
+        if kept is None:
+            return load(product)
+        # atomic: other processes see the complete file or none
+        product.replace(kept / name)
+    return load(kept / name)
+
+
+def folder() -> Path | None:
+    """Return the cache of built kernels; None where it is not writable, or is writable by other users."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    found = Path(base) / "cgwm" / "kernels"
+    try:
+        found.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = found.stat()
+    except OSError:
+        return None
+    safe = status.st_uid == os.getuid() and not status.st_mode & 0o022
+    return found if safe and os.access(found, os.W_OK) else None

@@ -1,6 +1,6 @@
 """Tasks in several processes of this machine, each with its share of the cores.
 
-One process of Python runs Python in one thread at a time, however many cores there are.
+A Python process runs Python code in one thread at a time, whatever the number of cores.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, NoReturn
 
-from ..schemas import CgwmError
+from ...schemas import CgwmError
 
 GRACE_S = 10.0
-"""What is interrupted gets this time to remove what is unfinished."""
+"""Time for interrupted processes to remove unfinished files [s]."""
 LOOK_UP_S = 0.5
-"""An interrupt that reached another thread than the one that waits is seen after so long."""
+"""Interval [s] at which the waiting thread checks for interrupts that reached another thread."""
 
 
 def in_workers(
     task: Callable[..., Any], calls: Mapping[int, tuple[Any, ...]], count: int
 ) -> Generator[tuple[int, Any], None, None]:
-    """Yield what a task returns for each call, as they end.
+    """Run a task in several processes, and yield number and result of each call in the order of completion.
 
-    Processes that still work when the generator is closed, or left by an error, are interrupted.
+    Processes that still run when the generator is closed, or left by an error, are interrupted.
 
     Args:
-        task: A function of a module, for processes that begin anew.
-        calls: Its arguments, by number. What it takes and gives travels by pickle.
-        count: How many processes.
+        task: Function of a module, because processes are spawned.
+        calls: Arguments of each call, by number; arguments and results are pickled.
+        count: Maximum number of processes.
 
     Raises:
-        CgwmError: If a process dies; with the number of its call.
-        Exception: What a task raises.
+        CgwmError: If a process dies, with the number of its call.
+        Exception: Any exception that a task raises.
     """
     context = multiprocessing.get_context("spawn")  # CUDA does not survive a fork
     count = min(count, len(calls))
@@ -53,8 +53,8 @@ def in_workers(
             processes[here] = process
             _hand_out(here, calls, waiting, busy)
         while busy:
-            for connection in wait(list(busy), LOOK_UP_S):
-                assert isinstance(connection, Connection)
+            ready = set(wait(list(busy), LOOK_UP_S))
+            for connection in [one for one in busy if one in ready]:
                 number = busy.pop(connection)
                 try:
                     outcome, error = connection.recv()
@@ -69,7 +69,7 @@ def in_workers(
 
 
 def share_of_cores(number: int, count: int) -> list[int]:
-    """Return the cores of a process out of several; none where the system does not say which there are."""
+    """Return the cores for one of several processes; empty where the system does not report the cores."""
     if not hasattr(os, "sched_getaffinity"):
         return []
     cores = sorted(os.sched_getaffinity(0))
@@ -83,14 +83,14 @@ def _hand_out(
 ) -> None:
     if waiting:
         busy[connection] = waiting.popleft()
-        with suppress(OSError):  # of a process that has died, as its connection will say
+        with suppress(OSError):  # if the process has died, its connection reports that later
             connection.send(calls[busy[connection]])
 
 
 def _work(task: Callable[..., Any], connection: Connection, cores: Sequence[int]) -> None:
-    """Do what the connection says, until it ends."""
+    """Run the calls that arrive over a connection, until it closes."""
     signal.signal(signal.SIGTERM, _interrupt)
-    os.environ["CGWM_QUIET"] = "1"  # one bar is enough
+    os.environ["CGWM_QUIET"] = "1"  # only the parent shows a progress bar
     if cores:
         os.sched_setaffinity(0, cores)
     with suppress(KeyboardInterrupt, EOFError, ConnectionError):
@@ -104,13 +104,13 @@ def _work(task: Callable[..., Any], connection: Connection, cores: Sequence[int]
 
 
 def _interrupt(number: int, frame: object) -> NoReturn:
-    signal.signal(number, signal.SIG_IGN)  # once: it must not interrupt the tidying up
+    signal.signal(number, signal.SIG_IGN)  # once: a second one must not interrupt the clean-up
     raise KeyboardInterrupt
 
 
 @contextmanager
 def _no_interrupts() -> Iterator[None]:
-    """Begin processes that Ctrl-C does not reach: who began them tells them when to end."""
+    """Start processes that Ctrl-C does not reach, as the parent ends them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -125,7 +125,7 @@ def _end(processes: Mapping[Connection, Any], busy: Mapping[Connection, int]) ->
     for connection, process in processes.items():
         if connection in busy:
             process.terminate()
-        connection.close()  # those that wait for work end by themselves
+        connection.close()  # idle processes end by themselves
     for process in processes.values():
         process.join(GRACE_S)
         if process.is_alive():

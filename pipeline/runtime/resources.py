@@ -1,4 +1,4 @@
-"""How many threads work on the CPU: one for torch where its tensors are small, all for the compiled kernels."""
+"""Limits of memory and threads: one clear error for too little memory, and thread counts for torch and the kernels."""
 
 from __future__ import annotations
 
@@ -8,18 +8,52 @@ from contextvars import ContextVar
 
 import torch
 
+from ...schemas import NotEnoughMemoryError
+
+_WORDS = ("out of memory", "not enough memory", "allocate memory")
+
+
+@contextmanager
+def enough_memory(tried: str, device: str, todo: str) -> Iterator[None]:
+    """Convert out-of-memory errors of torch, numpy or CUDA into one clear error.
+
+    Args:
+        tried: What needs the memory, with numbers and sizes.
+        device: Device whose memory is used: cpu or cuda.
+        todo: Advice that reduces the need for memory.
+
+    Raises:
+        NotEnoughMemoryError: If the memory does not suffice.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not ran_out_of_memory(error):
+            raise
+        elsewhere = "" if device == "cpu" else ", or --device cpu"
+        raise NotEnoughMemoryError(
+            f"The memory did not suffice on the device '{device}': {tried}.", todo=f"{todo}{elsewhere}."
+        ) from error
+
+
+def ran_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error reports too little memory; torch raises a plain RuntimeError on the CPU."""
+    text = str(error).lower().replace("_", " ")
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(word in text for word in _WORDS))
+
+
 _KERNEL_THREADS: ContextVar[int | None] = ContextVar("kernel_threads", default=None)
 
 
 @contextmanager
 def one_torch_thread(kernels_too: bool = False) -> Iterator[None]:
-    """Let torch work in one thread on the CPU, and the compiled kernels in as many as torch had; for a `with` or a def.
+    """Limit torch to one thread on the CPU, and compiled kernels to torch's previous number; a `with` or a decorator.
 
-    Tensors of some thousand numbers are too small to share out: beside other work, threads that wait for each other
-    made a diagnosis 3 times slower, and a dataset 20 times. Sums also come out the same on every machine then.
+    Tensors of some thousand values are too small for several threads: on a busy machine, waiting for each other made a
+    diagnosis 3 times slower, and a dataset 20 times. With one thread, sums are also equal on every machine.
 
     Args:
-        kernels_too: Let the kernels work in one thread, too.
+        kernels_too: Whether to limit the kernels to one thread, too.
     """
     before, torch_before = _KERNEL_THREADS.get(), torch.get_num_threads()
     token = _KERNEL_THREADS.set(1 if kernels_too else before or torch_before)
@@ -32,5 +66,5 @@ def one_torch_thread(kernels_too: bool = False) -> Iterator[None]:
 
 
 def kernel_threads() -> int:
-    """Return how many threads a compiled kernel may take."""
+    """Return the number of threads that a compiled kernel may use."""
     return _KERNEL_THREADS.get() or torch.get_num_threads()

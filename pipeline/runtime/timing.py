@@ -1,19 +1,24 @@
-"""Where a stage's time goes: seconds by part, and how long a GPU worked."""
+"""Timing of stages: wall time by part, and busy time of the GPU."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 
+from ...datasets.io.progress import note
+from ...schemas import CgwmError
+
 
 class Stopwatch:
-    """Adds up the seconds of a stage's parts; each part belongs to one thread.
+    """Stopwatch for the parts of a stage; each part belongs to one thread.
 
     Attributes:
-        seconds: By part. What a part gives to the GPU or to other threads goes on after it.
+        seconds: Wall time by part [s], without work of the GPU or of other threads that continues after the part.
     """
 
     def __init__(self) -> None:
@@ -22,7 +27,7 @@ class Stopwatch:
 
     @contextmanager
     def part(self, name: str, on_gpu: bool = False) -> Iterator[None]:
-        """Measure what is inside; `on_gpu` also measures on the device, from its first to its last kernel."""
+        """Measure the enclosed block; `on_gpu` also measures on the device, from the first to the last kernel."""
         events = (torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) if on_gpu else None
         if events is not None:
             events[0].record()
@@ -36,7 +41,7 @@ class Stopwatch:
                 self._events.append(events)
 
     def gpu_seconds(self) -> float:
-        """Return how long the GPU was busy with the measured parts: at most, as gaps within a part count as work."""
+        """Return an upper bound on the GPU's busy time in the measured parts [s]; gaps within a part count as busy."""
         if not self._events:
             return 0.0
         torch.cuda.synchronize()
@@ -47,3 +52,35 @@ class Stopwatch:
             busy += max(0.0, last - max(first, reached))
             reached = max(reached, last)
         return busy / 1e3
+
+
+@dataclass(frozen=True)
+class StagedRun:
+    """A run of `cgwm demo`, stage by stage."""
+
+    folder: Path
+    """Directory in which the stages write."""
+    name: Path
+    """Final name of the directory, which it gets when it is complete."""
+    seconds: dict[str, float] = field(default_factory=dict, kw_only=True)
+    """Wall time by stage [s]."""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Announce and time a stage, and add its name to its errors."""
+        note(f"demo: {name} ...")
+        began = time.perf_counter()
+        try:
+            yield
+        except CgwmError as error:
+            raise self._named(error, name) from None
+        self.seconds[name] = round(time.perf_counter() - began, 2)
+        note(f"demo: {name}: {self.seconds[name]:.1f} s")
+
+    def plain(self, message: str) -> str:
+        """Replace the temporary name of the directory in a message by the final one."""
+        return message.replace(str(self.folder), str(self.name))
+
+    def _named(self, error: CgwmError, stage: str) -> CgwmError:
+        found = f"the demo failed in the stage '{stage}' (nothing was left in {self.name}): {error.found}"
+        return type(error)(self.plain(found), self.plain(error.allowed), self.plain(error.todo))

@@ -1,4 +1,4 @@
-"""Candidate effects beside a model: all of them in one world at their neutral values, so that one Jacobian has all."""
+"""Candidate effects added to a model, all in one world at their neutral values, so that one Jacobian covers all."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ from .segments import Kind
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that may be missing; spec: what the user types."""
+    """An effect that may be missing in the model."""
 
     spec: str
+    """As the user types it."""
     effect: Effect
+    """The effect."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A candidate at one combination of its constants.
-
-    place: of the candidate among the candidates; active: the effect at neutral, under a name of its own; constants: by
-    name.
-    """
+    """A candidate at one combination of its constants."""
 
     place: int
+    """Index of the candidate among the candidates."""
     active: ActiveEffect
+    """The effect at its neutral values, under a unique name."""
     constants: dict[str, float]
+    """Values of the constants, by name."""
 
     @property
     def parameters(self) -> list[str]:
@@ -44,10 +45,10 @@ class Variant:
 
 
 def admissible(world: World, candidates: Sequence[Candidate], turned: bool) -> tuple[list[Candidate], dict[str, str]]:
-    """Return the candidates that can be tested with a world, and why the others cannot, by name.
+    """Return the candidates that can be tested with a world, and the reasons against the others, by name.
 
     Args:
-        world: The model's world; what it already has is no candidate.
+        world: The model's world; effects that it already has are no candidates.
         candidates: In any order.
         turned: Whether orientations were measured.
     """
@@ -61,8 +62,8 @@ def admissible(world: World, candidates: Sequence[Candidate], turned: bool) -> t
         "drag": any("drag" in active.effect.provides for active in world.effects),
     }
     words = {
-        "ground": "there is no ground",
-        "contact": "there is nothing to touch",
+        "ground": "the world has no ground",
+        "contact": "nothing can be touched",
         "spin": "no orientation was measured",
         "driven": "no body is driven",
         "drag": "the model has no drag, without which it does nothing",
@@ -76,7 +77,7 @@ def admissible(world: World, candidates: Sequence[Candidate], turned: bool) -> t
         elif lacking is not None:
             refused[effect.name] = words[lacking]
         elif driven and effect.phase == "measurement" and "driven" not in effect.needs:
-            refused[effect.name] = "the command of the driven body was measured alike"
+            refused[effect.name] = "the command of the driven body was measured in the same way"
         else:
             kept.append(candidate)
     return kept, refused
@@ -90,19 +91,19 @@ def variants_of(candidates: Sequence[Candidate], like: Tensor) -> list[Variant]:
         for values in itertools.product(*(constant.grid for constant in constants)):
             chosen = {constant.name: value for constant, value in zip(constants, values, strict=True)}
             own = copy.copy(candidate.effect)
-            # several copies of one effect stand side by side in a world, and parameters go by name
+            # a world may hold several copies of one effect, and parameters are found by name
             own.name = f"candidate_{len(found)}"  # pyright: ignore[reportAttributeAccessIssue]
             found.append(Variant(place, ActiveEffect.of(own, chosen, like), chosen))
     return found
 
 
 def acts_in(variant: Variant, kind: Kind) -> bool:
-    """Whether a candidate can change segments of a kind."""
+    """Return whether a candidate can change segments of a kind."""
     return kind == "contact" or variant.active.effect.phase != "contact"
 
 
 def with_variants(world: World, variants: Sequence[Variant], kind: Kind) -> tuple[World, list[Parameter]]:
-    """Return the world with all candidates at neutral, and their parameters in the same order."""
+    """Return the world with all candidates at their neutral values, and their parameters in the same order."""
     chosen = [variant for variant in variants if acts_in(variant, kind)]
     active = tuple(variant.active for variant in chosen)
     everything = replace(world, effects=(*world.effects, *active))
@@ -111,15 +112,15 @@ def with_variants(world: World, variants: Sequence[Variant], kind: Kind) -> tupl
 
 
 def without_effect(world: World, name: str) -> World:
-    """Return the world without an effect, and without what acts through it."""
+    """Return the world without an effect, and without the effects that act through it."""
     left = tuple(active for active in world.effects if active.effect.name != name)
     drag = any("drag" in active.effect.provides for active in left)
     return replace(world, effects=tuple(active for active in left if drag or "drag" not in active.effect.needs))
 
 
 def base_parameters(world: World, kind: Kind) -> list[Parameter]:
-    """Return the numbers of a model that are fitted along: those of its effects, and in contact those of contact."""
-    # sessions that have their own numbers keep them: they were fitted with a prior, which a refit here does not know
+    """Return the nuisance parameters of a model: those of its effects, and in contact those of the contact law."""
+    # group-specific parameters stay as fitted: a refit here does not know their prior
     own = [p for p in effect_parameters(world) if p.shared == "all" or not world.own]
     if kind == "flight":
         acting = {a.effect.name for a in world.effects if a.effect.phase != "contact"}
@@ -129,7 +130,7 @@ def base_parameters(world: World, kind: Kind) -> list[Parameter]:
 
 
 def base_values(world: World, parameters: Sequence[Parameter]) -> Tensor:
-    """Return the model's values (P,) of parameters in fitted coordinates; 0 for candidates and the ground's shift."""
+    """Return the model's values (P,) of parameters in fitted coordinates; 0 for candidates and the ground shift."""
     law = vars(world.contact)
     own = {f"{a.effect.name}.{name}": float(value[0]) for a in world.effects for name, value in a.values.items()}
     values = [p.encode(float(law[p.name][0])) if p.name in law else own.get(p.name, 0.0) for p in parameters]

@@ -1,13 +1,13 @@
-"""The phase of every measured frame: flight, impact, sliding, rolling, sticking, rest.
+"""Phase of every measured frame: flight, impact, sliding, rolling, sticking or rest.
 
-Flight is told from the tracks, the shape and the ground alone; what happens in contact from the forces that the
-fitted model has in its short rollouts.
+Flight follows from the tracks, the shape and the ground alone; phases of contact follow from the forces of the fitted
+model in its short rollouts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,96 +15,45 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..estimation.observations import Observations
-from ..estimation.warmup import FLIGHT_MARGIN_M, clearance
-from ..physics.rotation import quat_to_matrix
 from ..physics.world import Body, World
+from ..trajectories.observations import Observations
+from ..trajectories.segmentation import size_of
 
 if TYPE_CHECKING:
     from .segments import Segments
 
 PhaseName = Literal["flight", "impact", "sliding", "rolling", "sticking", "rest"]
 PHASES: tuple[PhaseName, ...] = ("flight", "impact", "sliding", "rolling", "sticking", "rest")
+"""All phases."""
 
-MOVE_SHARE = 0.75
-"""A point this share of its last or next move away from contact may have bounced between the two frames: whatever the
-bounce, one of its sides lies within half of a move (study of diagnosis, pitfall P1)."""
-NOISE_SIGMAS = 3.0
-"""Heights are measured; the margin of flight grows by so many of their standard deviations."""
 IMPACT_WEIGHTS = 3.0
-"""A normal impulse of more than so many times that of the weight over a frame is an impact; rolling over an edge
-reaches twice."""
+"""Minimum normal impulse of an impact, in impulses of the weight over a frame; rolling over an edge reaches twice that
+impulse."""
 IMPACT_M_S = 0.05
-"""Or, at frames so short that the weight gives nearly nothing, one that changes the speed by this."""
+"""Minimum change of speed [m/s] of an impact at frames so short that the impulse of the weight is negligible."""
 REST_M_S = 0.02
-"""A surface slower than this, noise apart, rests."""
+"""Maximum speed [m/s] of the surface of a body at rest, in addition to the noise."""
 ROUND_SHARE = 0.5
-"""A body rolls where the touching sphere's radius is more than this share of its size: a cube's corner sticks."""
+"""Minimum radius of the touching sphere, as a share of the body's size, for rolling: a cube sticks on its corner."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodePhases:
-    """The phases of an episode: time_s (T,); phase (T,) of `PHASES`; clear (T,): surely out of contact."""
+    """The phases of an episode of T frames."""
 
     episode: str
+    """Its name."""
     time_s: NDArray[np.float64]
+    """Frame times, shape (T,) [s]."""
     phase: NDArray[np.str_]
+    """One of `PHASES` for each frame, shape (T,)."""
     clear: NDArray[np.bool_]
-
-
-def size_of(body: Body) -> float:
-    """Return the largest distance [m] of a body's surface from its frame's origin."""
-    return float((body.centers[0].square().sum(-1).sqrt() + body.radii[0]).max())
+    """Airborne frames: surely without contact, shape (T,)."""
 
 
 def is_round(body: Body) -> bool:
-    """Whether a body is a ball about its frame's origin, so that its contacts do not depend on its orientation."""
+    """Return whether a body is a ball about its frame's origin: its contacts do not depend on its orientation."""
     return bool((body.centers[0].square().sum(-1).sqrt() < 1e-3 * body.radii[0].max()).all())
-
-
-def clear_frames(world: World, observations: Observations, noise: tuple[float, float]) -> Tensor:
-    """Return which frames (B, T) are surely free of contact, bounces between two frames included.
-
-    Args:
-        world: The world; without a ground, driven or further free bodies all is flight.
-        observations: Whole episodes, or windows of them.
-        noise: Of the tracks (position [m], rotation [rad]).
-    """
-    clear = observations.seen.amax(-1) > 0
-    if world.ground_normal is not None and world.ground_offset is not None:
-        for column, index in enumerate(observations.free):
-            heights = heights_of(world, world.bodies[index], observations, column)
-            margin = FLIGHT_MARGIN_M + NOISE_SIGMAS * float(np.hypot(noise[0], noise[1] * size_of(world.bodies[index])))
-            clear &= _apart(heights, margin)
-    others = clearance(replace(world, ground_normal=None), observations)
-    if bool(torch.isfinite(others).any()):
-        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise[0])
-    for a in range(len(observations.free)):
-        for b in range(a):
-            reach = size_of(world.bodies[observations.free[a]]) + size_of(world.bodies[observations.free[b]])
-            gap = (observations.position_m[:, :, a] - observations.position_m[:, :, b]).norm(dim=-1) - reach
-            clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise[0])
-    return clear
-
-
-def heights_of(world: World, body: Body, observations: Observations, column: int) -> Tensor:
-    """Return the heights (B, T, N) [m] of a body's spheres; of a ball around it where no orientation was measured."""
-    normal, offset = world.ground_normal, world.ground_offset
-    assert normal is not None and offset is not None
-    origin = observations.position_m[:, :, column] @ normal - offset[0]
-    chosen = slice(None) if body.on_plane is None else body.on_plane
-    along = quat_to_matrix(observations.quat_wxyz[:, :, column]).transpose(-1, -2) @ normal
-    own = origin[..., None] + along @ body.centers[0, chosen].T - body.radii[0, chosen]
-    ball = (origin - size_of(body))[..., None]
-    return torch.where(observations.turned[:, :, column, None] > 0, own, torch.minimum(own, ball))
-
-
-def _apart(gaps: Tensor, margin: float) -> Tensor:
-    """Return the frames (B, T) whose gaps (B, T, N) all exceed the margin and a share of their last and next move."""
-    moves = gaps.diff(dim=1).abs()
-    edge = torch.zeros_like(gaps[:, :1])
-    move = torch.maximum(torch.cat((edge, moves), 1), torch.cat((moves, edge), 1))
-    return (gaps > margin + MOVE_SHARE * move).all(-1)
 
 
 def contact_phases(contact: Segments) -> list[list[PhaseName]]:
@@ -114,7 +63,8 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
     """
     rollout = contact.rollout(record_contacts=True)
     record = rollout.contacts
-    assert record is not None
+    if record is None:
+        raise ValueError("the rollout did not record its contacts")
     world, seen = contact.world, contact.observations
     steps = seen.times_s.diff(dim=1)
     normal = (record.impulse_n_s * record.normal).sum(-1)  # (B, T, C)
@@ -156,13 +106,13 @@ def _surface_speeds(world: World, velocity: Tensor, omega: Tensor) -> Tensor:
 
 
 def _round_share(world: World, body_a: Tensor, normal: Tensor) -> Tensor:
-    """Return the share (B, T) of the normal impulse that large spheres carry."""
+    """Return the share (B, T) of the normal impulse that acts on large spheres."""
     large = []
     for index, body in enumerate(world.bodies):
         chosen = slice(None) if body.on_plane is None else body.on_plane
         big = (body.radii[0] > ROUND_SHARE * size_of(body))[chosen]
-        slots = int((body_a == index).sum())
-        large.append(big if len(big) == slots else torch.zeros(slots, dtype=torch.bool))
+        points = int((body_a == index).sum())
+        large.append(big if len(big) == points else torch.zeros(points, dtype=torch.bool))
     mask = torch.cat(large).to(normal) if large else normal.new_zeros(normal.shape[-1])
     if len(mask) != normal.shape[-1]:
         return normal.new_zeros(normal.shape[:-1])
@@ -177,7 +127,7 @@ def phases_of(
     Args:
         episodes: Their names.
         whole: The episodes (E).
-        clear: Frames that are surely in flight (E, T).
+        clear: Airborne frames (E, T).
         contact: The fitted contact segments; None where there are none.
     """
     places = torch.arange(1, whole.times_s.shape[1] + 1)

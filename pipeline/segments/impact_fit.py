@@ -1,4 +1,4 @@
-"""Fits of impacts: restitution, friction and an effect shared by all of them, by Gauss-Newton."""
+"""Impact fit: restitution, friction and an effect shared by all impacts, by Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -9,63 +9,83 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics.contact import ContactLaw
 from ..physics.effects.effect import changed_by_effects
+from ..physics.impulse_solver import tangent_axes
 from ..physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, Parameter, apply_parameters
-from ..physics.sweeps import tangent_axes
 from ..physics.world import World
-from .impact_law import Impact, after_impact, point_velocity, rebound_speed
-from .impacts import Impacts
+from ..trajectories.segmentation import GroundPlane
+from .candidates import Variant, base_values, with_variants
+from .impact_law import Impact, after_impact, contact_law, point_velocity, rebound_speed
+from .impact_velocities import Impacts
+from .sliding_fit import contact_effect_parameters
 
 Array = NDArray[np.float64]
 
 REBOUND_SHARE = 0.03
-"""Of its rebound an impact scatters by this share about any law (on development seeds, where nothing is hidden, 0.7 to
-5 %): without it the few impacts of a capture could pass for exact."""
+"""Model error of an impact: standard deviation of the rebound speed as a share of itself (0.7 to 5 % without hidden
+effects). Without it the few impacts of a capture could appear exact."""
 FRICTION_SHARE, IMPULSE_SHARE, SPIN_SHARE = 0.04, 0.002, 0.06
-"""And its impulse along the ground by these shares of itself and of that along the normal, for a slip that ends leaves
-some per cent; its change of spin by that share of itself, for the ground gives way and the arm is shorter."""
+"""Model error of an impact: standard deviation of the tangential impulse (4 % of itself plus 0.2 % of the normal
+impulse, because a slip that ends during the impact leaves some per cent) and of the change of spin (6 % of itself,
+because the ground deforms and shortens the arm)."""
 BASE = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
+"""Parameters of the contact law that every impact fit has."""
 STEP = 0.02
-"""Differences by parameters, in widths of their priors."""
+"""Difference step by parameters, in widths of their priors."""
 TWIST_STEPS = (1e-3, 1e-2)
-"""Differences by velocity [m/s] and angular velocity [rad/s]."""
+"""Difference steps by velocity [m/s] and angular velocity [rad/s]."""
 ITERATIONS, FALL = 12, 0.02
+"""Maximum number of steps, and the fall of the cost below which a fit ends."""
 SHARES = (1.0, 0.4, 0.1)
+"""Lengths of a step that are tried."""
+LEAST = 4
+"""Minimum number of impacts that determine more than a restitution."""
+WEIGH_AGAIN = 2
+"""Number of fits of the base, each with weights from the previous one."""
 
 
 @dataclass(frozen=True)
 class ImpactFit:
-    """Impacts fitted by a world: values (P,), information (P, P), residuals (n, 6) in sigmas.
-
-    The first residual of an impact is that of the rebound, the others are of what lies along the ground and of spin.
-    """
+    """Impacts (n) fitted by a world with P parameters."""
 
     values: Array
+    """Fitted parameters in fitted coordinates, shape (P,)."""
     information: Array
+    """Information on the parameters including the priors, shape (P, P)."""
     rows: Array
+    """Residuals in sigmas, shape (n, 6): first that of the rebound, then those along the ground and of the spin."""
     prior: float
+    """Sum of squares of the priors."""
 
     @property
     def chi2(self) -> Array:
-        """Chi2 (2,) of the rebounds and of the rest."""
+        """Chi2 (2,) of the rebounds and of the other residuals."""
         square = self.rows**2
         return np.array([square[:, 0].sum(), square[:, 1:].sum()])
 
 
 @dataclass(frozen=True, eq=False)
 class ImpactProblem:
-    """Impacts with the world of their candidate, and what whitens their residuals (n, 6, 6)."""
+    """Impacts (n) with the world of a candidate."""
 
     world: World
+    """World with the candidate at its neutral values."""
     parameters: tuple[Parameter, ...]
+    """What is fitted (P)."""
     impacts: Impacts
+    """The measured impacts (n)."""
     whitening: Tensor | None = None
+    """Inverse Cholesky factor of the residuals' covariance, shape (n, 6, 6); None until `whitened`."""
 
     def residuals(self, values: Tensor, before: Tensor | None = None, after: Tensor | None = None) -> Tensor:
-        """Return measured less predicted twists (K, n, 6) of K values (K, P): rebound, two along the ground, spin.
+        """Return measured less predicted twists (K, n, 6) [m/s] of values (K, P): rebound, two along the ground, spin.
 
-        [m/s] all: the spin as the speed of the surface.
+        The spin is the speed of the surface.
+
+        Args:
+            values: In fitted coordinates (K, P).
+            before: Twists before the impacts (K n, 6); the measured ones by default.
+            after: Twists after the impacts (K n, 6); the measured ones by default.
         """
         seen, count = self.impacts, len(values)
         before = seen.before.repeat(count, 1) if before is None else before
@@ -73,8 +93,7 @@ class ImpactProblem:
         decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(self.parameters)], -1)
         items = decoded.repeat_interleave(len(before) // count, 0)
         world = changed_by_effects(apply_parameters(self.world, self.parameters, items))
-        normal, law = world.ground_normal, world.contact
-        assert normal is not None and isinstance(law, ContactLaw)
+        normal, law = GroundPlane.of(world).normal, contact_law(world)
         impact = self._impact(world, before)
         point = point_velocity(torch.cat([after[:, :3] - before[:, :3], after[:, 3:] - before[:, 3:]], -1), impact.arm)
         mass = 1 / torch.einsum("i,nij,j->n", normal, impact.compliance, normal)
@@ -87,24 +106,24 @@ class ImpactProblem:
         return torch.cat([left[:, None], flat, size * missed[:, 3:]], -1).unflatten(0, (count, -1))
 
     def _impact(self, world: World, before: Tensor) -> Impact:
+        """Return the impacts of the given twists before (K n, 6) in a world, still without an impulse."""
         seen, body = self.impacts, world.bodies[0]
         times = len(before) // len(seen)
         turn = seen.rotation.repeat(times, 1, 1)
-        normal = world.ground_normal
-        assert normal is not None
+        normal = GroundPlane.of(world).normal
         count = len(before)
         arm = -body.radii[:, :1] * normal - (turn @ body.com[..., None])[..., 0]
         return Impact(
-            before,
-            torch.zeros(count).to(before),
-            seen.place.repeat(times, 1),
-            turn,
-            arm.expand(count, 3),
-            turn @ body.inertia @ turn.mT,
-            body.mass.expand(count),
-            normal,
-            -(world.gravity @ normal).expand(count),
-            body,
+            before=before,
+            impulse=torch.zeros(count).to(before),
+            place=seen.place.repeat(times, 1),
+            rotation=turn,
+            arm=arm.expand(count, 3),
+            inertia=turn @ body.inertia @ turn.mT,
+            mass=body.mass.expand(count),
+            normal=normal,
+            weight=-(world.gravity @ normal).expand(count),
+            body=body,
         )
 
     def whitened(self, values: Tensor) -> ImpactProblem:
@@ -126,10 +145,9 @@ class ImpactProblem:
         return replace(self, whitening=whitening)
 
     def _scatter(self) -> Tensor:
-        """Return the covariance (n, 6, 6) of what no law of an impact tells."""
+        """Return the covariance (n, 6, 6) of the model error of an impact."""
         seen, world = self.impacts, changed_by_effects(self.world)
-        impact, normal = self._impact(world, seen.before), world.ground_normal
-        assert normal is not None
+        impact, normal = self._impact(world, seen.before), GroundPlane.of(world).normal
         across = tangent_axes(normal)[1:]
         change = seen.after[:, :3] - seen.before[:, :3]
         along, up = (change @ across.T).norm(dim=-1), change @ normal
@@ -147,16 +165,21 @@ class ImpactProblem:
         return found
 
     def rows(self, values: Tensor) -> Tensor:
-        """Return residuals (K, n, 6) in sigmas."""
-        assert self.whitening is not None
+        """Return residuals (K, n, 6) in sigmas.
+
+        Raises:
+            ValueError: If the problem has no weights.
+        """
+        if self.whitening is None:
+            raise ValueError("the residuals have no weights yet: see `whitened`")
         found = (self.whitening @ self.residuals(values)[..., None])[..., 0]
         return torch.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6)
 
     def linear(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals (n, 6) in sigmas at a value (P,), and their differences (n, 6, P) by the parameters."""
+        """Return residuals (n, 6) in sigmas at a value (P,), and their derivatives (n, 6, P) by differences."""
         steps = STEP * torch.tensor([p.prior[1] for p in self.parameters]).to(value)
         high = torch.tensor([p.limits[1] for p in self.parameters]).to(value)
-        # towards the inside, where a step up would leave the bounds
+        # step inwards where a step up would leave the bounds
         steps = torch.where(value + steps > high, -steps, steps)
         rows = self.rows(torch.cat([value[None], value + torch.diag(steps)]))
         return rows[0], ((rows[1:] - rows[:1]) / steps[:, None, None]).movedim(0, -1)
@@ -170,8 +193,8 @@ def fit_impacts(
     Args:
         problem: With weights.
         start: Values (P,) in fitted coordinates.
-        weight: How much each impact counts (n,); 1 by default.
-        centre: Of the priors (P,); the start by default.
+        weight: Weight of each impact (n,); 1 by default.
+        centre: Centres of the priors (P,); the start by default.
     """
     parameters = problem.parameters
     width = torch.tensor([p.prior[1] for p in parameters]).to(start)
@@ -205,3 +228,58 @@ def fit_impacts(
     rows = problem.rows(value[None])[0]
     prior = float(((value - centre) / width).square().sum())
     return ImpactFit(value.numpy(), information.numpy(), rows.numpy(), prior)
+
+
+@dataclass(frozen=True, eq=False)
+class ImpactBase:
+    """The world without a candidate, fitted to the impacts: start and reference of every candidate."""
+
+    problem: ImpactProblem
+    """The impacts with their weights."""
+    centre: torch.Tensor
+    """Centres of the priors, shape (P,)."""
+    fit: ImpactFit
+    """The solution."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters of the contact law and of the world's contact effects."""
+        return self.problem.parameters
+
+    @staticmethod
+    def of(world: World, impacts: Impacts) -> ImpactBase:
+        """Fit the contact parameters of a world to impacts."""
+        known = contact_effect_parameters(world)
+        # not the model's fitted values: a missing effect has biased them
+        usual = torch.tensor([p.encode(p.prior[0]) for p in BASE]).to(world.gravity)
+        parameters, centre = (*BASE, *known), torch.cat([usual, base_values(world, known)])
+        problem, value = ImpactProblem(world, parameters, impacts), centre
+        for _ in range(WEIGH_AGAIN):
+            problem = problem.whitened(value)
+            fit = fit_impacts(problem, value, centre=centre)
+            value = torch.as_tensor(fit.values)
+        return ImpactBase(problem, centre, fit)
+
+    def beside(self, variant: Variant) -> tuple[ImpactProblem, torch.Tensor]:
+        """Return the problem with a candidate added, and values to start from."""
+        world, own = with_variants(self.problem.world, [variant], "contact")
+        zero = torch.zeros(len(own)).to(self.centre)
+        problem = replace(self.problem, world=world, parameters=(*self.parameters, *own))
+        return problem, torch.cat([torch.as_tensor(self.fit.values), zero])
+
+    def centre_of(self, start: torch.Tensor) -> torch.Tensor:
+        """Return the centres of the priors of a problem with a candidate."""
+        return torch.cat([self.centre, torch.zeros_like(start[len(self.centre) :])])
+
+    def gains(self, problem: ImpactProblem, value: Array) -> Array:
+        """Return the fall of each episode's chi2 by an effect whose parameters the other episodes determine."""
+        episode = self.problem.impacts.episode
+        start = torch.as_tensor(value)
+        gains = []
+        for own in np.unique(episode):
+            others = (episode != own).astype(np.float64)
+            without = fit_impacts(self.problem, torch.as_tensor(self.fit.values), others, self.centre)
+            fitted = fit_impacts(problem, start, others, self.centre_of(start))
+            parts = [(fit.rows[episode == own] ** 2).sum() for fit in (without, fitted)]
+            gains.append(float(parts[0] - parts[1]))
+        return np.array(gains)

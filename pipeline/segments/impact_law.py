@@ -1,10 +1,10 @@
-"""How a rigid body leaves the ground after one impact in one point: Routh's method, with what effects change.
+"""Velocities of a rigid body after one impact in one point: Routh's method, including effects.
 
-The normal impulse P grows from 0 to what was measured, the velocity u of the point that touches follows by
-du = K dp with K = 1/m - [r]x I^-1 [r]x, and the friction's part of dp lies against the slip, mu dP at most, or is what
-stops it where less does (Routh 1905, ch. 5; Stronge 2000, ch. 4). The rebound comes from a spring and damper, whose
-damping ratio gives the restitution (`contact.restitution`), followed in time where an effect changes them with the
-speed, so that an effect needs no formula of its own here: it is asked for the contact as a rollout would ask it.
+The normal impulse P grows from 0 to the measured one, the velocity u of the touching point follows by du = K dp with K
+= 1/m - [r]x I^-1 [r]x, and the friction part of dp is opposite to the slip, mu dP at most, or smaller where that stops
+the slip (Routh 1905, ch. 5; Stronge 2000, ch. 4). The rebound comes from a spring and damper, whose damping ratio gives
+the restitution (`contact.restitution`), integrated in time where an effect changes them with the speed, so that an
+effect needs no formula for impacts: its contact function is called as in a rollout.
 """
 
 from __future__ import annotations
@@ -15,38 +15,45 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..physics.contact import ContactLaw, Touch
+from ..physics.contact_law import ContactLaw, Touch
 from ..physics.effects.effect import ActiveEffect, BodyMotion
-from ..physics.sweeps import tangent_axes
-from ..physics.world import Body
+from ..physics.impulse_solver import tangent_axes
+from ..physics.world import Body, World
 
 SLICES = 24
-"""Of the normal impulse."""
+"""Number of increments of the normal impulse."""
 STEPS, STEP = 64, 0.055
-"""Of the spring and damper, in natural times: 3.5 of them hold every impact that ends."""
+"""Number of steps of the spring and damper, and their length in natural times: 3.5 of these cover every impact that
+ends."""
 REACH_M, REACH_STEPS = 0.01, 24
-"""Below this height an effect of contact may pull on a body that has left, or not yet reached, the ground."""
+"""Height [m] below which a contact effect may pull on a body before or after contact, and number of steps of that
+integral."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Impact:
-    """Impacts (n) of a body on the ground, world frame.
-
-    before (n, 6): velocity of the centre of mass [m/s] and angular velocity [rad/s]; impulse (n,) [N s] along the
-    normal; place (n, 3) [m] of the point; rotation (n, 3, 3), body to world; arm (n, 3) [m] from the centre of mass;
-    inertia (n, 3, 3) [kg m2] about it; mass (n,) [kg]; normal (3,); weight (n,) [m/s2] along it; body.
-    """
+    """Impacts (n) of a body on the ground, world frame."""
 
     before: Tensor
+    """Velocity of the centre of mass [m/s] and angular velocity [rad/s], shape (n, 6)."""
     impulse: Tensor
+    """Impulse along the normal, shape (n,) [N s]."""
     place: Tensor
+    """The touching point, shape (n, 3) [m]."""
     rotation: Tensor
+    """Rotation from body to world, shape (n, 3, 3)."""
     arm: Tensor
+    """Vector from the centre of mass to the point, shape (n, 3) [m]."""
     inertia: Tensor
+    """Inertia about the centre of mass, world axes, shape (n, 3, 3) [kg m2]."""
     mass: Tensor
+    """Mass, shape (n,) [kg]."""
     normal: Tensor
+    """Normal of the ground, shape (3,)."""
     weight: Tensor
+    """Gravity into the ground, shape (n,) [m/s2]."""
     body: Body
+    """The body that strikes the ground."""
 
     @property
     def compliance(self) -> Tensor:
@@ -54,6 +61,17 @@ class Impact:
         eye = torch.eye(3).to(self.arm)
         turns = torch.linalg.cross(self.arm[:, None].expand(-1, 3, -1), eye.expand(len(self.arm), 3, 3))  # r x e_k
         return eye / self.mass[:, None, None] + turns @ torch.linalg.solve(self.inertia, turns.mT)
+
+
+def contact_law(world: World) -> ContactLaw:
+    """Return the contact law of a world, which impacts and sliding need.
+
+    Raises:
+        TypeError: If the world has another law.
+    """
+    if not isinstance(world.contact, ContactLaw):
+        raise TypeError(f"impacts and sliding need a ContactLaw, not a {type(world.contact).__name__}")
+    return world.contact
 
 
 def point_velocity(twist: Tensor, arm: Tensor) -> Tensor:
@@ -64,9 +82,9 @@ def point_velocity(twist: Tensor, arm: Tensor) -> Tensor:
 def rebound_speed(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect]) -> Tensor:
     """Return the speed (n,) [m/s] along the normal at which the point leaves the ground.
 
-    x'' = -x / tau^2 - 2 zeta x' / tau - g - F / m until the ground would have to pull, with the numbers and the pull F
-    that effects make of them; on the way through the effects' reach their pull adds F dh / m to the square of the
-    speed before, and takes it after.
+    x'' = -x / tau^2 - 2 zeta x' / tau - g - F / m until the ground would have to pull, with tau, zeta and the pull F as
+    effects change them; on the way through the effects' reach their pull adds F dh / m to the square of the speed
+    before contact, and subtracts it after.
     """
     speed = -(point_velocity(impact.before, impact.arm) @ impact.normal)
     mass = 1 / torch.einsum("i,nij,j->n", impact.normal, impact.compliance, impact.normal)
@@ -111,7 +129,7 @@ def rebound_speed(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffec
 
 
 def after_impact(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect]) -> Tensor:
-    """Return the twists (n, 6) after the impacts, the impulse along the normal as given."""
+    """Return the twists (n, 6) after the impacts, with the given impulse along the normal."""
     k, normal = impact.compliance, impact.normal
     across = tangent_axes(normal)[1:]  # (2, 3)
     twist = impact.before
@@ -122,7 +140,7 @@ def after_impact(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect
     for _ in range(SLICES):
         u = point_velocity(twist, impact.arm)
         touch = _touched(impact, law, effects, u, twist[:, 3:])
-        # the impulse that would end the slip, less what the normal one does to it
+        # the impulse that would stop the slip, including the change of slip by the normal impulse
         slip = u @ across.T + by_slice
         wanted = (stopping @ slip[..., None])[..., 0]
         friction = within_cone(wanted, slip, _cone(touch), slice_)
@@ -146,8 +164,8 @@ def within_cone(wanted: Tensor, slip: Tensor, cone: Tensor, slice_: Tensor) -> T
 
 
 def _cone(touch: Touch) -> Tensor:
-    """Return M (n, 2, 2) of the friction: mu I, and what an effect gives it of a grain, [[a, b], [b, -a]]."""
-    friction = touch.friction.clamp_min(0.0)  # no sum of effects pushes a slider on
+    """Return M (n, 2, 2) of the friction: mu I, plus the grain of an effect, [[a, b], [b, -a]]."""
+    friction = touch.friction.clamp_min(0.0)  # friction never accelerates a slide
     cone = friction[..., None] * torch.eye(2).to(friction)
     grain = touch.anisotropy
     if grain is None:
@@ -157,7 +175,7 @@ def _cone(touch: Touch) -> Tensor:
 
 
 def _braked(impact: Impact, touch: Touch, slice_: Tensor, twist: Tensor) -> Tensor:
-    """Return the twists after a slice's torque against rolling and against spinning, which reverse neither."""
+    """Return the twists after one increment's torque against rolling and spinning, which reverses neither."""
     normal, omega = impact.normal, twist[:, 3:]
     spin = (omega @ normal)[:, None] * normal
     for size, part in ((touch.rolling_m, omega - spin), (touch.torsion_m, spin)):
@@ -181,16 +199,20 @@ def _touched(
 ) -> Touch:
     """Return the contact (n, one point) as effects change it for a velocity (n, 3) of the point."""
     count = len(u)
-    numbers = [x.expand(count)[:, None] for x in (law.friction, law.contact_time_s, law.damping_ratio)]
+    friction, contact_time_s, damping_ratio = (
+        x.expand(count)[:, None] for x in (law.friction, law.contact_time_s, law.damping_ratio)
+    )
     touch = Touch(
-        True,
-        impact.place[:, None],
-        impact.normal.expand(count, 1, 3),
-        torch.zeros(count, 1).to(u) if gap is None else gap[:, None],
-        u[:, None],
-        impact.before[:, 3:] if omega is None else omega,
-        STEP * numbers[1],
-        *numbers,
+        ground=True,
+        position=impact.place[:, None],
+        normal=impact.normal.expand(count, 1, 3),
+        gap=torch.zeros(count, 1).to(u) if gap is None else gap[:, None],
+        velocity=u[:, None],
+        spin_rad_s=impact.before[:, 3:] if omega is None else omega,
+        step_s=STEP * contact_time_s,
+        friction=friction,
+        contact_time_s=contact_time_s,
+        damping_ratio=damping_ratio,
     )
     for active in effects:
         if active.effect.has("contact"):
@@ -199,29 +221,30 @@ def _touched(
 
 
 def _changes_spring(touch: Touch, law: ContactLaw) -> bool:
-    """Whether effects made other numbers of the spring and damper; what they leave alone stays the law's memory."""
+    """Return whether effects changed the spring and damper; unchanged values share the law's memory."""
     same = (touch.contact_time_s, law.contact_time_s), (touch.damping_ratio, law.damping_ratio)
     return any(own.data_ptr() != given.data_ptr() for own, given in same)
 
 
 def _pulling(effects: Sequence[ActiveEffect]) -> bool:
+    """Return whether any contact effect applies a wrench."""
     return any(active.effect.phase == "contact" and active.effect.has("wrench") for active in effects)
 
 
 def _pull(impact: Impact, effects: Sequence[ActiveEffect], height: float) -> Tensor:
-    """Return the force (n,) [N] of effects of contact towards the ground, the body at a height [m] above it."""
+    """Return the force (n,) [N] of contact effects towards the ground, with the body at a height [m] above it."""
     com = impact.place - impact.arm + height * impact.normal
     motion = BodyMotion(
-        impact.body,
-        impact.mass,
-        impact.inertia,
-        com,
-        impact.rotation,
-        impact.before[:, :3],
-        impact.before[:, 3:],
-        impact.normal[None],
-        impact.normal[None],
-        (impact.place @ impact.normal),
+        body=impact.body,
+        mass=impact.mass,
+        inertia=impact.inertia,
+        com=com,
+        rotation=impact.rotation,
+        velocity=impact.before[:, :3],
+        omega=impact.before[:, 3:],
+        up=impact.normal[None],
+        normal=impact.normal[None],
+        ground_offset=(impact.place @ impact.normal),
     )
     pull = torch.zeros_like(impact.mass)
     for active in effects:

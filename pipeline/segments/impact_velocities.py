@@ -1,12 +1,13 @@
-"""Impacts measured without any law of contact: a ball's twist before and after, from the flights on both sides.
+"""Impacts measured without a contact law: twists of a ball before and after, from the flights on both sides.
 
-A flight is told by the model's own flight to a part of the noise of one frame, so that the velocities at the ground,
-where the lowest point reaches it, are known far better than two frames tell them.
+The model's own flight averages over all frames of a flight, so that the velocities at the ground, which the lowest
+point reaches between frames, are known far better than from two frames.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,47 +15,50 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..estimation.trajectory import STATE_SIZE, STATE_STEPS, state_prior
+from ..geometry.rotation import quat_to_matrix
 from ..physics.effects.effect import changed_by_effects
 from ..physics.rollout import Rollout
-from ..physics.rotation import quat_to_matrix
 from ..physics.world import World
-from .cuts import Segment
-from .phases import heights_of, is_round
-from .prepared import Prepared
+from ..trajectories.residuals import STATE_SIZE, STATE_STEPS, state_prior
+from ..trajectories.segmentation import GroundPlane, Segment, heights_of
+from .contact_phases import is_round
+from .prepare import Prepared
 from .segment_states import fit_states
 from .segments import Segments
 
 Array = NDArray[np.float64]
 
 CONTACT_S = 0.008
-"""So long after it reaches the ground a body may still touch it: frames in that time belong to no flight."""
+"""Maximum time [s] after reaching the ground for which a body may still touch it: these frames belong to no flight."""
 MIN_FRAMES = 4
-"""A flight between two impacts has at least so many frames."""
+"""Minimum number of frames of a flight between two impacts."""
 MISFIT_SIGMAS = 5.0
-"""A frame that lies this many standard deviations off a flight's parabola is not of that flight."""
+"""Distance from a flight's parabola, in sigmas, above which a frame does not belong to the flight."""
 BAD_FLIGHT = 2.5
-"""A flight with a larger chi2 / dof is none."""
+"""Maximum chi2 / dof of a flight."""
 LONGEST_S = 0.03
-"""Between the end of a flight and the begin of the next there is at most so much contact: more is no one impact."""
+"""Maximum time [s] between the end of a flight and the start of the next: a longer contact is not a single impact."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Impacts:
-    """Impacts (n) of a round body on the ground, world frame.
-
-    episode (n,): place among the episodes; place (n, 3) [m]: where it touches; rotation (n, 3, 3): body to world;
-    before, after (n, 6): velocity of the centre of mass [m/s] and angular velocity [rad/s] when the lowest point
-    reaches the ground and when it leaves it; covariance_before, covariance_after (n, 6, 6).
-    """
+    """Impacts (n) of a round body on the ground, world frame."""
 
     episode: NDArray[np.int64]
+    """Index of the episode, shape (n,)."""
     place: Tensor
+    """Point of contact, shape (n, 3) [m]."""
     rotation: Tensor
+    """Rotation from body to world, shape (n, 3, 3)."""
     before: Tensor
+    """Velocity of the centre of mass [m/s] and angular velocity [rad/s] when the lowest point reaches the ground, shape
+    (n, 6)."""
     after: Tensor
+    """The same when the lowest point leaves the ground, shape (n, 6)."""
     covariance_before: Tensor
+    """Covariance of `before`, shape (n, 6, 6)."""
     covariance_after: Tensor
+    """Covariance of `after`, shape (n, 6, 6)."""
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -63,55 +67,72 @@ class Impacts:
 def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
     """Return the impacts of all episodes between two flights; None where there are none.
 
-    Only a ball alone above a ground, whose orientation was measured: where another body touches is not known well.
+    Only for a single ball above a ground whose orientation was measured: contact points of other bodies are not known
+    well.
 
     Args:
         prepared: The episodes.
         world: In which flights are followed, with the effects that act in flight.
     """
-    whole = prepared.whole
-    alone = len(whole.free) == 1 and len(world.bodies) == 1 and world.ground_normal is not None
-    if not alone or not prepared.turned or prepared.flight is None or not is_round(world.bodies[whole.free[0]]):
+    if prepared.flight is None or not _measurable(prepared, world):
         return None
-    chains = _chains(prepared, world)
+    chains = _chains(prepared, world, prepared.flight)
     items = [item for chain in chains for item in chain]
     if not any(len(chain) > 1 for chain in chains):
         return None
     flights = fit_states(prepared.segments("flight", world, items))
     starts, ends, good = _ends(flights)
-    pairs, place = [], 0
-    for chain in chains:
-        pairs += [(place + k, place + k + 1) for k in range(len(chain) - 1)]
-        place += len(chain)
-    times = [(float(ends.time_s[a]), float(starts.time_s[b])) for a, b in pairs]
     kept = [
-        pair
-        for pair, (landed, left) in zip(pairs, times, strict=True)
-        if good[pair[0]] and good[pair[1]] and -CONTACT_S < left - landed < LONGEST_S
+        (before, after)
+        for before, after in _neighbours(chains)
+        if good[before]
+        and good[after]
+        and -CONTACT_S < float(starts.time_s[after]) - float(ends.time_s[before]) < LONGEST_S
     ]
     if not kept:
         return None
     a, b = (torch.tensor(side) for side in zip(*kept, strict=True))
     return Impacts(
-        np.array([items[k].episode for k in a.tolist()]),
-        ends.place[a],
-        ends.rotation[a],
-        ends.twist[a],
-        starts.twist[b],
-        ends.covariance[a],
-        starts.covariance[b],
+        episode=np.array([items[k].episode for k in a.tolist()]),
+        place=ends.place[a],
+        rotation=ends.rotation[a],
+        before=ends.twist[a],
+        after=starts.twist[b],
+        covariance_before=ends.covariance[a],
+        covariance_after=starts.covariance[b],
     )
 
 
-def _chains(prepared: Prepared, world: World) -> list[list[Segment]]:
-    """Return flights that follow each other with one impact between, by hopping from each to the next."""
-    assert prepared.flight is not None and world.ground_normal is not None
+def _measurable(prepared: Prepared, world: World) -> bool:
+    """Return whether the scene is a single ball above a ground with measured orientation."""
+    whole = prepared.whole
+    alone = len(whole.free) == 1 and len(world.bodies) == 1 and world.ground_normal is not None
+    return alone and prepared.turned and is_round(world.bodies[whole.free[0]])
+
+
+def _neighbours(chains: Sequence[Sequence[Segment]]) -> list[tuple[int, int]]:
+    """Return the indices of neighbouring flights of each chain, counted through all chains."""
+    pairs, place = [], 0
+    for chain in chains:
+        pairs += [(place + k, place + k + 1) for k in range(len(chain) - 1)]
+        place += len(chain)
+    return pairs
+
+
+def _chains(prepared: Prepared, world: World, flights: Segments) -> list[list[Segment]]:
+    """Return chains of flights with one impact between neighbours, by hopping from each to the next.
+
+    Args:
+        prepared: The episodes.
+        world: For the ground and gravity.
+        flights: The flight segments that chains start from.
+    """
     whole, body = prepared.whole, world.bodies[prepared.whole.free[0]]
     heights = heights_of(world, body, whole, 0).amin(-1).numpy()
-    fall = float(-(world.gravity[0] @ world.ground_normal))
+    fall = float(-(world.gravity[0] @ GroundPlane.of(world).normal))
     chains = []
     for episode in range(len(whole.names)):
-        seeds = sorted((i.first, i.last) for i in prepared.flight.items if i.episode == episode)
+        seeds = sorted((i.first, i.last) for i in flights.items if i.episode == episode)
         seen = np.flatnonzero(whole.seen[episode, :, 0].numpy() > 0)
         hops = _Hops(whole.times_s[episode].numpy()[seen], heights[episode][seen], fall, prepared.noise[0])
         done = -1
@@ -128,12 +149,16 @@ def _chains(prepared: Prepared, world: World) -> list[list[Segment]]:
 
 @dataclass(frozen=True, eq=False)
 class _Hops:
-    """Heights (T,) [m] of the lowest point at times (T,) [s]; fall [m/s2] of gravity; noise [m] of a height."""
+    """Heights of the lowest point of a body over an episode."""
 
     times: Array
+    """Frame times, shape (T,) [s]."""
     heights: Array
+    """Heights, shape (T,) [m]."""
     fall: float
+    """Acceleration of gravity into the ground [m/s2]."""
     noise: float
+    """Standard deviation of a height [m]."""
 
     def chain(self, first: int, last: int) -> list[tuple[int, int]]:
         """Return first and last frames of a flight and of those that follow it, impact by impact."""
@@ -156,7 +181,7 @@ class _Hops:
         return self._grown(a, b) if b - a + 1 >= MIN_FRAMES else None
 
     def _grown(self, a: int, b: int) -> tuple[int, int, float] | None:
-        """Return the frames of a flight, its last ones till it lands, and when [s] that is; infinite if unseen."""
+        """Return the frames of a flight, extended to its landing, and the landing time [s]; infinite if unseen."""
         landing = math.inf
         for _ in range(4):
             if b - a + 1 < MIN_FRAMES:
@@ -176,22 +201,26 @@ class _Hops:
         return a, b, landing if landing < self.times[-1] else math.inf
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Ends:
-    """Ends (n) of flights on the ground: time_s (n,), place (n, 3), rotation (n, 3, 3), twist (n, 6), covariance."""
+    """Ends (n) of flights on the ground, world frame."""
 
     time_s: Tensor
+    """Time at which the lowest point is on the ground, shape (n,)."""
     place: Tensor
+    """Point of contact, shape (n, 3) [m]."""
     rotation: Tensor
+    """Rotation from body to world, shape (n, 3, 3)."""
     twist: Tensor
+    """Velocity of the centre of mass [m/s] and angular velocity [rad/s], shape (n, 6)."""
     covariance: Tensor
+    """Covariance of the twist, shape (n, 6, 6)."""
 
 
 def _ends(flights: Segments) -> tuple[_Ends, _Ends, list[bool]]:
-    """Return the flights' begins and ends on the ground, and which of them were flights."""
+    """Return the starts and ends of flights on the ground, and which of them fit."""
     size, count = STATE_SIZE, len(flights.items)
     rows, jacobian = flights.residuals([], torch.zeros(0).to(flights.world.gravity))
-    assert jacobian is not None
     flat = jacobian.flatten(1, 2)
     prior = torch.diag(state_prior(1)).to(flat)
     spread = torch.linalg.inv(flat.mT @ flat + prior)
@@ -209,17 +238,26 @@ def _ends(flights: Segments) -> tuple[_Ends, _Ends, list[bool]]:
         slopes = (values[1 : 1 + size] - values[1 + size :]) / (2 * steps[:, None, None])  # (12, n, 10)
         slopes = slopes[..., 4:].permute(1, 2, 0)
         rotation = quat_to_matrix(motion.quat_wxyz[torch.arange(count), at[:count], index])
-        ends.append(_Ends(values[0, :, 0], values[0, :, 1:4], rotation, values[0, :, 4:], slopes @ spread @ slopes.mT))
+        ends.append(
+            _Ends(
+                time_s=values[0, :, 0],
+                place=values[0, :, 1:4],
+                rotation=rotation,
+                twist=values[0, :, 4:],
+                covariance=slopes @ spread @ slopes.mT,
+            )
+        )
     return ends[0], ends[1], good
 
 
 def _on_ground(every: Segments, motion: Rollout, index: int, at: Tensor, towards: int) -> Tensor:
     """Return time, place and twist (n, 10) where motions reach the ground before or after a frame.
 
-    From the frame on (towards -1) or back (towards 1) acceleration is that between the frame and its neighbour inside.
+    From the frame on (towards -1) or back (towards 1) the acceleration is that between the frame and its inner
+    neighbour.
     """
     world, seen = every.world, every.observations
-    assert world.ground_normal is not None and world.ground_offset is not None
+    normal, offset = GroundPlane.of(world)
     item, near = torch.arange(len(at)), at + towards
     body = changed_by_effects(world).bodies[index]
 
@@ -233,12 +271,12 @@ def _on_ground(every: Segments, motion: Rollout, index: int, at: Tensor, towards
     (own, arm), (other, _) = twist(at), twist(near)
     times = seen.times_s
     rate = (other - own) / (times[item, near] - times[item, at])[:, None]
-    normal, radius = world.ground_normal, body.radii[:, 0]
+    radius = body.radii[:, 0]
     center = motion.position_m[item, at, index]
-    gap = center @ normal - world.ground_offset[0] - radius
+    gap = center @ normal - offset[0] - radius
     moving = own[:, :3] - torch.linalg.cross(own[:, 3:], arm)
     speed, gain = moving @ normal, rate[:, :3] @ normal
-    # the root of gap + speed t + gain t^2 / 2 with the body falling at the end, rising at the begin
+    # the root of gap + speed t + gain t^2 / 2 with the body falling at the end, rising at the start
     root = (speed.square() - 2 * gain * gap).clamp_min(0.0).sqrt()
     t = (-speed + towards * root) / gain
     reached = own + rate * t[:, None]

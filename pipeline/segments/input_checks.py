@@ -1,6 +1,6 @@
-"""What no verdict can rest on: tracks, shapes and masses that do not belong together, and episodes that show nothing.
+"""Checks before a diagnosis: units, geometry and masses that belong together, and episodes that contain information.
 
-Each refusal says what was found, what would be usable, and what to do.
+Each refusal states what was found, what would be usable, and what to do.
 """
 
 from __future__ import annotations
@@ -8,74 +8,84 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.tracks import Track
+from ...datasets.capture.tracks import Track
 from ...schemas import InputDataError
-from ..estimation.noise import estimate_noise
-from ..estimation.observations import Observations
-from ..estimation.warmup import clearance
-from ..physics.world import World
-from .cuts import whole_episodes
-from .phases import size_of
-from .prepared import Prepared
+from ..physics.world import Body, World
+from ..trajectories.initial_state import clearance
+from ..trajectories.observations import Observations, refuse_slow_times
+from ..trajectories.segmentation import size_of, whole_episodes
+from ..trajectories.track_noise import estimate_noise
+from .prepare import Prepared
 
-LONGEST_STEP_S = 0.2
-"""Slower tracks show no flight; those in milliseconds look so."""
 MOST_OFF = 0.2
-"""A body whose lowest point lies deeper than this share of its size under the ground, or rests higher above it, has
-another shape or ground."""
+"""Maximum depth of a body's lowest point under the ground, or height at rest above it, as a share of its size; beyond
+it the shape or the ground is wrong."""
 NOISE_SIGMAS = 2.0
-"""Beyond it: 2 % of the frames of a body at rest are measured so much deeper, of a box, whose corners all may, 5 %."""
+"""Tolerance in sigmas in addition: 2 % of the frames of a body at rest are measured that much deeper; for a box, any of
+whose corners may be the lowest, 5 %."""
 MOST_TILT = 0.1
-"""Of the measured frame [rad], for a ground that is level in the manifest: an error of measurement that has a name."""
+"""Maximum tilt [rad] of the measured frame for a ground that is level in the manifest: such an error is a named
+effect."""
 ENVELOPE_ITERATIONS, ENVELOPE_WEIGHT = 20, 0.02
-"""Of the plane under all places: an expectile (Newey & Powell 1987), in which what lies above weighs so little."""
+"""Iterations, and weight of places above the plane, of the lower envelope of all places: an expectile (Newey & Powell
+1987)."""
 MOST_CARRIED = 0.2
-"""Of the frames, above the ground and yet not falling."""
+"""Maximum share of supported frames above the ground."""
 DENSEST_KG_M3 = 23000.0
-"""Osmium. No body is heavier than a ball of it about the whole shape."""
+"""Density of osmium [kg/m3]: no body is heavier than a ball of it that encloses the shape."""
 ALIKE_SIGMAS = 3.0
-"""Motions that differ by less, root mean square, are one motion measured several times."""
+"""Root mean square difference, in sigmas, below which motions are one motion measured several times."""
 LEAST_SEEN = 0.25
-"""Share of gravity: where no force below it could be told from the noise, nothing that is worth a name could."""
+"""Largest acceptable detection limit of a force in flight, as a share of gravity."""
 SHARE_OF_SIZE = 0.25
+"""Noise of the position, as a share of the body's size, above which that detection limit is required."""
 _BELONG_TOGETHER = (
     "a shape, a ground and tracks that belong together.",
     "check [[bodies]] shape, [world] ground, whether the tracks' frame is level, and which body was tracked.",
 )
+"""What would be usable and what to do, where tracks and geometry do not agree."""
 
 
-def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
-    """Refuse times in another unit, bodies that sink into the ground, and masses that no body of that shape has.
+def check_units_and_geometry(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
+    """Refuse times in another unit, bodies deep under the ground, and masses that no body of that shape has.
 
     Raises:
-        InputDataError: What is wrong, and what to look at.
+        InputDataError: What is wrong, and what to check.
     """
     free = [world.bodies[k].name for k in world.free]
     refuse_slow_times([t[b] for _, t in episodes for b in free if b in t], where)
     for index in world.free:
-        body = world.bodies[index]
-        mass, size = float(body.mass[0]), size_of(body)
-        most = DENSEST_KG_M3 * 4 / 3 * math.pi * size**3
-        if mass > most:
-            raise InputDataError(
-                f"{where}: '{body.name}' has {mass:.3g} kg within {1e3 * size:.0f} mm of its origin; a ball of osmium "
-                f"of that size has {most:.3g} kg.",
-                "a mass in kilograms, and a shape in metres.",
-                "check [[bodies]] mass_kg and shape.",
-            )
-        least, greatest = (float(v) for v in torch.linalg.eigvalsh(body.inertia[0])[[0, -1]])
-        reach = float(((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).max())
-        if least <= 0 or greatest > mass * reach**2:
-            raise InputDataError(
-                f"{where}: '{body.name}' has moments of inertia of {least:.3g} to {greatest:.3g} kg m2; with all its "
-                f"{mass:.3g} kg on its surface it would have {mass * reach**2:.3g} kg m2 at most.",
-                "inertia_kg_m2 of that mass and shape.",
-                "check [[bodies]] inertia_kg_m2, mass_kg and shape, or leave the inertia out.",
-            )
+        _check_mass(world.bodies[index], where)
+    _check_depth(world, episodes, where)
+
+
+def _check_mass(body: Body, where: str) -> None:
+    """Refuse a mass or moments of inertia that no body of that shape has."""
+    mass, size = float(body.mass[0]), size_of(body)
+    most = DENSEST_KG_M3 * 4 / 3 * math.pi * size**3
+    if mass > most:
+        raise InputDataError(
+            f"{where}: '{body.name}' has {mass:.3g} kg within {1e3 * size:.0f} mm of its origin; a ball of osmium "
+            f"of that size has {most:.3g} kg.",
+            "a mass in kilograms, and a shape in metres.",
+            "check [[bodies]] mass_kg and shape.",
+        )
+    least, greatest = (float(v) for v in torch.linalg.eigvalsh(body.inertia[0])[[0, -1]])
+    reach = float(((body.centers[0] - body.com[0]).square().sum(-1).sqrt() + body.radii[0]).max())
+    if least <= 0 or greatest > mass * reach**2:
+        raise InputDataError(
+            f"{where}: '{body.name}' has moments of inertia of {least:.3g} to {greatest:.3g} kg m2; with all its "
+            f"{mass:.3g} kg on its surface it would have {mass * reach**2:.3g} kg m2 at most.",
+            "inertia_kg_m2 of that mass and shape.",
+            "check [[bodies]] inertia_kg_m2, mass_kg and shape, or leave the inertia out.",
+        )
+
+
+def _check_depth(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
+    """Refuse bodies that lie deep under the ground, unless the ground is only tilted."""
     whole = whole_episodes(world, episodes)
     if world.ground_normal is None or not bool(whole.turned.any()):
         return
@@ -85,6 +95,7 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
     deep = float(torch.quantile(gap, 0.05))
     if deep >= -MOST_OFF * size:
         return
+    free = [world.bodies[k].name for k in world.free]
     position, rotation = estimate_noise([t[name] for _, t in episodes for name in free if name in t])
     most = MOST_OFF * size + NOISE_SIGMAS * math.hypot(position, rotation * size)
     if deep < -most and not _on_a_tilted_plane(gap, place, world.ground_normal, most):
@@ -96,19 +107,19 @@ def refuse_strange(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
 
 
 def _on_a_tilted_plane(gap: Tensor, place: Tensor, normal: Tensor, most: float) -> bool:
-    """Return whether gaps to the ground are those to one that is tilted about the origin: that has a name.
+    """Return whether gaps to the ground are explained by a tilt about the origin, which is a named effect.
 
     Args:
-        gap: Where the body is under the ground they are negative (n,) [m].
-        place: Where the body is (n, 3) [m], world.
-        normal: Of the ground (3,).
-        most: Depth [m] that may be left, and that may stay at the origin, where a ground at another height differs.
+        gap: Gap to the ground (n,) [m], negative under it.
+        place: Position of the body (n, 3) [m], world.
+        normal: Normal of the ground (3,).
+        most: Maximum residual depth [m], and maximum offset at the origin, which means a ground at another height.
     """
     under = gap < 0
-    along = place - (place @ normal)[:, None] * normal  # two numbers in three: the solution of least norm
+    along = place - (place @ normal)[:, None] * normal  # rank 2 of 3: the solution of least norm
     columns = torch.cat((along, torch.ones_like(gap)[:, None]), 1)
     plane = columns.new_zeros(4)
-    for _ in range(ENVELOPE_ITERATIONS):  # what flies low over the tilted ground lies above it
+    for _ in range(ENVELOPE_ITERATIONS):  # frames of low flight lie above the tilted ground
         weight = torch.where(gap[under] < columns[under] @ plane, 1.0, ENVELOPE_WEIGHT).sqrt()
         plane = torch.linalg.lstsq(weight[:, None] * columns[under], weight * gap[under], driver="gelsd").solution
     left = gap - columns @ plane
@@ -116,24 +127,8 @@ def _on_a_tilted_plane(gap: Tensor, place: Tensor, normal: Tensor, most: float) 
     return level and float(torch.quantile(left, 0.05)) >= -most
 
 
-def refuse_slow_times(tracks: Sequence[Track], where: str) -> None:
-    """Refuse tracks whose frames are too far apart to show a flight.
-
-    Raises:
-        InputDataError: They are probably in milliseconds.
-    """
-    step = float(np.median(np.concatenate([np.diff(track.time_s) for track in tracks]))) if tracks else 0.0
-    if step > LONGEST_STEP_S:
-        raise InputDataError(
-            f"{where}: the tracks have a frame every {step:.3g} s; if these are milliseconds, they are not "
-            "what the column time_s says.",
-            f"at most {LONGEST_STEP_S:g} s.",
-            "write time_s in seconds.",
-        )
-
-
-def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
-    """Refuse episodes that are one motion, that float or stand still, or that show nothing through their noise.
+def check_observability(world: World, prepared: Prepared, where: str) -> None:
+    """Refuse episodes that are one motion, that float or do not move, or whose noise hides everything.
 
     Raises:
         InputDataError: What is wrong, and what to record or check.
@@ -144,9 +139,9 @@ def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
     if seen > LEAST_SEEN * gravity and sigma > SHARE_OF_SIZE * size:
         what = f"no force below {100 * seen / gravity:.0f} % of the weight" if math.isfinite(seen) else "no force"
         raise InputDataError(
-            f"{where}: with a noise of {1e3 * sigma:.3g} mm on a body of {1e3 * size:.3g} mm {what} could be seen in "
-            "these flights, and no contact.",
-            f"noise or episodes that show {100 * LEAST_SEEN:.0f} % of the weight.",
+            f"{where}: with a noise of {1e3 * sigma:.3g} mm on a body of {1e3 * size:.3g} mm {what} could be detected "
+            "in these flights, and no contact.",
+            f"noise and episodes in which a force of {100 * LEAST_SEEN:.0f} % of the weight can be detected.",
             "record longer flights, more of them, or with less noise; check the unit of the positions.",
         )
     spread, alike = _travel(whole), _apart(whole)
@@ -159,7 +154,7 @@ def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
     if alike < ALIKE_SIGMAS * sigma:
         raise InputDataError(
             f"{where}: the {len(whole.names)} episodes are one motion: they differ by {1e3 * alike:.2g} mm, with a "
-            f"noise of {1e3 * sigma:.2g} mm. What helps one of them helps all, which proves nothing.",
+            f"noise of {1e3 * sigma:.2g} mm. An effect that fits one of them fits all, which is no evidence.",
             "episodes that differ: in speed, direction and spin.",
             "record others, and check that none is a copy.",
         )
@@ -167,6 +162,7 @@ def refuse_blind(world: World, prepared: Prepared, where: str) -> None:
 
 
 def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
+    """Refuse episodes in which the body is above the ground and not in free fall in many frames."""
     whole = prepared.whole
     if world.ground_normal is None or not prepared.turned or not bool(prepared.carried.any()):
         return
@@ -191,6 +187,7 @@ def _travel(whole: Observations) -> float:
 
 
 def _turns(whole: Observations, sigma: float) -> bool:
+    """Return whether any orientation changes by more than the noise [rad]."""
     known = (whole.turned[..., None] * whole.quat_wxyz).abs()
     spread = known.amax(1) - torch.where(whole.turned[..., None] > 0, known, torch.inf).amin(1)
     return bool((torch.nan_to_num(spread, neginf=0.0) > 2 * ALIKE_SIGMAS * sigma).any())

@@ -1,78 +1,205 @@
-"""The linear picture of every segment: information and score of parameters, the segment's own state projected out."""
+"""The Gauss-Newton linearization of all segments: parameters of the model and of all candidates, states eliminated."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from ..estimation.trajectory import state_prior
+from ..optimization.uncertainty import scaled_pinv
+from ..physics.fused.packing import reason_against
 from ..physics.parameters import Parameter
+from ..physics.world import World
+from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
+from .segment_fit import Linear, projected
 from .segments import Segments
 
-ROBUST_EXCESS = 20.0
-"""k of rho(e) = 2 k log(1 + e / 2k) for the excess e = chi2 - dof of a contact segment: what the contact law misses of
-an impact is one error, not one in each frame (study of diagnosis, section 3)."""
+Array = NDArray[np.float64]
+
+MEASURED = 0.04
+"""A direction counts as measured where its information times the parameters' prior variance exceeds this: a standard
+error below five widths of the priors."""
 
 
-@dataclass(frozen=True)
-class Linear:
-    """Segments linearised at their states and at given values of the parameters.
+PART_ROLLOUTS = 700
+"""Maximum number of rollouts of candidates in one world: more effects at once cost more than the calls they save."""
 
-    information (B, P, P) and score (B, P): M_i = Jp'Jp - B_i' A_i^-1 B_i and g_i = -(Jp'r - B_i' A_i^-1 Jx'r) of the
-    parameters, in fitted coordinates; state_step (B, S) and by_parameter (B, S, P): the states that go with a change d
-    of the parameters move by state_step - by_parameter d; chi2 (B,); dof (B,).
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Linearization:
+    """Gauss-Newton model of segments (B) in the parameters (P) of the model and all candidates."""
+
+    parameters: tuple[Parameter, ...]
+    """Parameters (P), those of the model first."""
+    base: int
+    """Number of the model's parameters."""
+    information: Array
+    """Information of each segment, unweighted, shape (B, P, P)."""
+    score: Array
+    """Score (negative gradient) of each segment, unweighted, shape (B, P)."""
+    weight: Array
+    """Weight of each segment, shape (B,)."""
+    episode: NDArray[np.int64]
+    """Index of the episode of each segment, shape (B,)."""
+    group: NDArray[np.int64]
+    """Session of each segment, shape (B,)."""
+    prior: Array
+    """Prior information on each parameter, shape (P,)."""
+    chi2: Array
+    """Chi-square of each segment, shape (B,)."""
+    dof: Array
+    """Degrees of freedom of each segment, shape (B,)."""
+
+    def columns(self, names: Sequence[str]) -> list[int]:
+        """Return the indices of parameters by name."""
+        place = {p.name: k for k, p in enumerate(self.parameters)}
+        return [place[name] for name in names]
+
+    def without_episode(self, episode: int) -> Linearization:
+        """Return the linearization in which one episode has no weight."""
+        return replace(self, weight=np.where(self.episode == episode, 0.0, self.weight))
+
+    def only_episode(self, episode: int) -> Linearization:
+        """Return the linearization in which only one episode has weight."""
+        return replace(self, weight=np.where(self.episode == episode, self.weight, 0.0))
+
+
+def linearize(
+    segments: Segments, world: World, variants: Sequence[Variant], groups: Sequence[int], robust: bool
+) -> Linearization:
+    """Return the linearization of fitted segments of one kind.
+
+    Args:
+        segments: With fitted states.
+        world: The model's world.
+        variants: The candidates.
+        groups: Session of each episode.
+        robust: Whether segments that fit badly get less weight.
+
+    Raises:
+        ValueError: If there is no parameter.
     """
-
-    information: Tensor
-    score: Tensor
-    state_step: Tensor
-    by_parameter: Tensor
-    chi2: Tensor
-    dof: Tensor
-
-    @property
-    def weight(self) -> Tensor:
-        """The robust weight (B,) of each segment."""
-        return robust_excess(self.chi2 - self.dof)[1]
-
-
-def linearised(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Linear:
-    """Return the linear picture of segments; values (P,) or (B, P) in fitted coordinates."""
-    rows, jacobian = segments.residuals(parameters, values)
-    assert jacobian is not None
-    return projected(segments, rows, jacobian, len(parameters))
+    base = base_parameters(world, segments.kind)
+    variants = [variant for variant in variants if acts_in(variant, segments.kind)]
+    parameters = [*base, *with_variants(world, variants, segments.kind)[1]]
+    if not parameters:
+        raise ValueError("no candidate acts in these segments")
+    at = segments.in_world(world)
+    rows, jacobian = at.residuals(base, base_values(world, base))
+    columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
+    # a candidate at neutral changes nothing, so that the parts can be computed in separate worlds
+    for part in _parts(variants, segments, at.world):
+        candidates_world, candidate_parameters = with_variants(world, part, segments.kind)
+        at = segments.in_world(candidates_world)
+        slopes = at.slopes(candidate_parameters, base_values(candidates_world, candidate_parameters), rows)
+        columns |= {p.name: slopes[..., k] for k, p in enumerate(candidate_parameters)}
+    own = torch.stack([columns[p.name] for p in parameters], -1)
+    linear = projected(segments, rows, torch.cat((own, jacobian[..., len(base) :]), -1), len(parameters))
+    return _linearization(linear, segments, parameters, len(base), groups, robust)
 
 
-def projected(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) -> Linear:
-    """Return the linear picture from residuals (B, F, 6) and their Jacobian (B, F, 6, P + S), with P = count."""
-    error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
-    flat = torch.nan_to_num(jacobian.flatten(1, 2), posinf=0.0, neginf=0.0)
-    by_value, by_state = flat[..., :count], flat[..., count:]
-    prior = torch.diag(state_prior(len(segments.observations.free))).to(error)
-    states = by_state.transpose(1, 2) @ by_state + prior
-    mixed = by_state.transpose(1, 2) @ by_value
-    slope = (by_state.transpose(1, 2) @ error[..., None]).squeeze(-1)
-    solved = torch.linalg.solve(states, torch.cat((mixed, slope[..., None]), -1))
-    by_parameter, state_step = solved[..., :-1], -solved[..., -1]
-    information = by_value.transpose(1, 2) @ by_value - mixed.transpose(1, 2) @ by_parameter
-    score = -(by_value.transpose(1, 2) @ error[..., None]).squeeze(-1) - (
-        mixed.transpose(1, 2) @ state_step[..., None]
-    ).squeeze(-1)
-    return Linear(information, score, state_step, by_parameter, rows.square().sum((1, 2)), segments.dof)
+def _parts(variants: Sequence[Variant], segments: Segments, world: World) -> list[list[Variant]]:
+    """Return candidates in parts of one batch each, because every rollout computes all effects of its world.
+
+    Candidates that the fused kernel supports are kept apart from the others, and it takes one of each type.
+    """
+    most = max(1, PART_ROLLOUTS // len(segments.items))
+    parts: list[tuple[bool, list[Variant]]] = []
+    for variant in variants:
+        fast = reason_against(replace(world, effects=(*world.effects, variant.active))) is None
+        part = next((part for kind, part in parts if kind == fast and _fits(part, variant, most, fast)), None)
+        if part is None:
+            parts.append((fast, [variant]))
+        else:
+            part.append(variant)
+    return [part for _, part in parts]
 
 
-def robust_excess(excess: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the loss rho and the weight rho' of excesses e = chi2 - dof, any shape: e below 0, a logarithm above."""
-    above = excess.clamp_min(0.0) / (2 * ROBUST_EXCESS)
-    loss = torch.where(excess < 0, excess, 2 * ROBUST_EXCESS * torch.log1p(above))
-    return loss, 1 / (1 + above)
+def _fits(part: Sequence[Variant], variant: Variant, most: int, one_of_a_kind: bool) -> bool:
+    """Return whether a part has room for one candidate more."""
+    alike = any(type(other.active.effect) is type(variant.active.effect) for other in part)
+    return sum(len(v.parameters) for v in (*part, variant)) <= most and not (one_of_a_kind and alike)
 
 
-def summed(values: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return the sum over segments (B, ...) with weights (B,)."""
-    if weight is None:
-        return values.sum(0)
-    return (values * weight.view(-1, *[1] * (values.ndim - 1))).sum(0)
+def _linearization(
+    linear: Linear,
+    segments: Segments,
+    parameters: Sequence[Parameter],
+    base: int,
+    groups: Sequence[int],
+    robust: bool,
+) -> Linearization:
+    """Return the linearization with the segments' weights, episodes and sessions."""
+    episode = np.array([item.episode for item in segments.items])
+    weight = linear.weight if robust else torch.ones_like(linear.chi2)
+    prior = np.array([1 / p.prior[1] ** 2 if k < base else 0.0 for k, p in enumerate(parameters)])
+    return Linearization(
+        parameters=tuple(parameters),
+        base=base,
+        information=linear.information.numpy(),
+        score=linear.score.numpy(),
+        weight=weight.numpy(),
+        episode=episode,
+        group=np.asarray(groups)[episode],
+        prior=prior,
+        chi2=linear.chi2.numpy(),
+        dof=linear.dof.numpy(),
+    )
+
+
+def sums(
+    linearization: Linearization, columns: Sequence[int], prior_information: Array | None = None
+) -> tuple[Array, Array]:
+    """Return information and score of chosen parameters, separate for each session or episode where they differ there.
+
+    Args:
+        linearization: Of the segments.
+        columns: Indices of the parameters.
+        prior_information: Of each value; that of the linearization by default.
+    """
+    chosen = list(columns)
+    m = linearization.information[:, chosen][:, :, chosen] * linearization.weight[:, None, None]
+    g = linearization.score[:, chosen] * linearization.weight[:, None]
+    places, prior = layout(linearization, chosen)
+    information, score = np.diag(prior if prior_information is None else prior_information), np.zeros(len(prior))
+    np.add.at(score, places, g)
+    np.add.at(information, (places[:, :, None], places[:, None, :]), m)
+    return information, score
+
+
+def layout(linearization: Linearization, columns: Sequence[int]) -> tuple[NDArray[np.int64], Array]:
+    """Return the index (B, k) of each parameter of each segment among all group values, and the prior information."""
+    places, count = np.zeros((len(linearization.episode), len(columns)), np.int64), 0
+    prior: list[float] = []
+    for k, column in enumerate(columns):
+        parameter = linearization.parameters[column]
+        places[:, k], number = count, 1
+        if parameter.shared != "all":
+            owner = linearization.group if parameter.shared == "group" else linearization.episode
+            places[:, k] += np.unique(owner, return_inverse=True)[1]
+            number = int(places[:, k].max()) - count + 1
+        count += number
+        # a prior ties the values of sessions to each other, about neutral
+        prior += [linearization.prior[column] if parameter.shared == "all" else 1 / parameter.prior[1] ** 2] * number
+    return places, np.array(prior)
+
+
+def widths(linearization: Linearization, columns: Sequence[int]) -> Array:
+    """Return the widths of the priors of the values that `sums` gives."""
+    places, prior = layout(linearization, columns)
+    widths = np.ones(len(prior))
+    for k, column in enumerate(columns):
+        widths[places[:, k]] = linearization.parameters[column].prior[1]
+    return widths
+
+
+def eliminate(information: Array, score: Array, count: int) -> tuple[Array, Array]:
+    """Return information and score of all but the first `count` values, with those projected out."""
+    if count == 0:
+        return information, score
+    inverse = scaled_pinv(information[:count, :count])
+    mixed = information[count:, :count] @ inverse
+    return information[count:, count:] - mixed @ information[:count, count:], score[count:] - mixed @ score[:count]

@@ -1,4 +1,4 @@
-"""Measured episodes made ready for a diagnosis: noise, outliers, and segments of flight and of contact."""
+"""Measured episodes prepared for a diagnosis or fit: noise, outliers, releases, and flight and contact segments."""
 
 from __future__ import annotations
 
@@ -11,63 +11,71 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..estimation.noise import estimate_noise
-from ..estimation.observations import Observations
 from ..physics.world import World
-from .carried import carried_frames
-from .cuts import Segment, cut_episodes, whole_episodes
-from .lasting import FORGETFUL, Memory, memory_of, told_memory
-from .noise import flight_noise, slow_noise, without_outliers
-from .phases import is_round
-from .releases import held_starts, told, without_held
+from ..trajectories.correlated_noise import WHITE, NoiseModel, estimate_noise_model, noise_model_warnings
+from ..trajectories.noise import flight_noise, slow_noise, without_outliers
+from ..trajectories.observations import Observations
+from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
+from ..trajectories.track_noise import estimate_noise
+from .contact_phases import is_round
+from .release_detection import held_starts, release_warnings, without_held
 from .segment_states import fit_states
 from .segments import Kind, Segments
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
 
 NOISE_DISAGREES = 1.3
-"""A given noise that differs from the measured one by this factor is not believed."""
+"""Ratio of given to measured noise (or its inverse) at and above which the two disagree."""
 
 SURE = 4.0
-"""A force is shown where it is so many of its standard errors."""
+"""Number of standard errors from which an acceleration counts as detected."""
 SMEARED = 3
-"""Frames beside a contact that count as contact where errors last: a filter of seven frames smears impacts so far."""
+"""Frames on both sides of a contact that count as contact where the noise is correlated: a filter of seven frames
+smears impacts this far."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """Episodes ready for tests.
-
-    names (E); groups (E): session of each episode; whole (E): all frames; clear (E, T): frames surely in flight;
-    carried (E, T): frames above the ground in which nothing falls; noise:
-    position [m], rotation [rad]; memory: how long errors last; slow: by what factor the variance of slow errors of a
-    centroid exceeds that of all, where that was not told by the memory;
-    flight: segments with fitted states, None where there are none; contact_items: the contact segments; outliers:
-    frames left out; turned: whether orientations were measured; warnings; released_s: of episodes that begin in a hand,
-    by name, the time [s] from which they fly freely: what comes before counts as not measured.
-    """
+    """Episodes ready for tests: their segments, noise and fitted flights."""
 
     names: tuple[str, ...]
+    """Names of the episodes (E)."""
     groups: tuple[int, ...]
+    """Session of each episode (E)."""
     whole: Observations
+    """All frames of all episodes (E)."""
     clear: Tensor
+    """Airborne frames (E, T)."""
     carried: Tensor
+    """Supported frames (E, T): the body is above the ground and not in free fall."""
     noise: tuple[float, float]
+    """Standard deviations of the tracks (position [m], rotation [rad])."""
     slow: float
+    """Factor by which the variance of slow errors of a centroid exceeds that of all errors; 1 where the noise model
+    covers it."""
     flight: Segments | None
+    """Flight segments with fitted states; None where no episode has any."""
     contact_items: tuple[Segment, ...]
+    """The contact segments."""
     outliers: int
+    """Number of frames left out as wrong measurements."""
     turned: bool
+    """Whether orientations were measured."""
     warnings: tuple[str, ...]
+    """Sentences for the user."""
     released_s: Mapping[str, float] = field(default_factory=dict)
-    memory: Memory = FORGETFUL
+    """Time [s] from which an episode that begins in a hand flies freely, by name; earlier frames count as not
+    measured."""
+    memory: NoiseModel = WHITE
+    """Correlation of the errors in time."""
 
     @property
     def least_force_m_s2(self) -> float:
-        """The acceleration that all flights together show, `SURE` of its standard errors; infinite without flight.
+        """Smallest acceleration [m/s2] that all flights together detect; infinite without flight.
 
-        A parabola through n points of noise s over a time T tells it within s (720 / (n T^4))^1/2.
+        It is `SURE` standard errors; that of the acceleration of a parabola through n points of noise s over a time T
+        is s (720 / (n T^4))^1/2.
         """
         information = 0.0
         for item in () if self.flight is None else self.flight.items:
@@ -86,7 +94,7 @@ class Prepared:
         return fit_states(self.segments("contact", world, self.contact_items))
 
     def pieces(self, world: World, longest_s: float) -> Segments | None:
-        """Return the flights cut into equal pieces of at most a length [s], states fitted; None for none."""
+        """Return the flights cut into equal pieces of at most a length [s], states fitted; None without flights."""
         if self.flight is None:
             return None
         items = [piece for item in self.flight.items for piece in _cut(item, self.whole, longest_s)]
@@ -99,85 +107,171 @@ def prepare(
     given: tuple[float | None, float | None] = (None, None),
     groups: Sequence[int] | None = None,
 ) -> Prepared:
-    """Cut episodes, measure their noise, and fit the states of their flights.
+    """Return episodes cut into segments, with their measured noise and the fitted states of their flights.
 
     Args:
         world: The model's world.
-        episodes: Name and tracks by body of each.
-        given: Noise of the tracks, where it is known; where the flights show more, that wins.
-        groups: Session of each episode; all the same by default.
+        episodes: Name and tracks by body of each episode.
+        given: Standard deviations of the tracks (position [m], rotation [rad]) where the user states them; a larger
+            one measured in flight is used instead.
+        groups: Session of each episode; the same for all by default.
     """
-    warnings: list[str] = []
-    free = [world.bodies[k].name for k in world.free]
-    rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
-    noise = (given[0] or rough[0], given[1] or rough[1])
-    whole = whole_episodes(world, episodes)
-    turned = bool(whole.turned.any())
-    flight, contact, clear = cut_episodes(world, whole, noise)
-    # with nothing to stand on, what does not fall falls as fast as its drag lets it
-    alone = world.ground_normal is None and len(world.bodies) == 1
-    carried = torch.zeros_like(clear) if alone else carried_frames(world, whole, flight, noise)
-    if bool(carried.any()):
-        flight, contact, clear = cut_episodes(world, whole, noise, carried)
-        warnings.append(
-            f"{int(carried.sum())} frames look like flight by the shape and the ground, but nothing falls in them: "
-            "they count as contact. Check the ground's height, the shape and where the marker is."
-        )
-    noise = _agreed(given, flight_noise(whole, flight), noise, warnings)
-    whole, outliers, touched = without_outliers(whole, flight, noise)
-    touched |= carried
-    if outliers or bool(touched.any()):
-        flight, contact, clear = cut_episodes(world, whole, noise, touched)
-        noise = _agreed(given, flight_noise(whole, flight), noise, [])
-    flight, contact, clear = cut_episodes(world, whole, noise, touched)
-    fitted = _flown(world, whole, flight, noise)
-    held: dict[int, int] = {}
-    while fitted is not None and (found := held_starts(fitted, whole)):
-        # the noise was measured with the hand in it, and hid other wrong frames
-        held |= found
-        whole = without_held(whole, held)
-        noise = _agreed(given, flight_noise(whole, cut_episodes(world, whole, noise, touched)[0]), noise, [])
-        whole, more, again = without_outliers(whole, cut_episodes(world, whole, noise, touched)[0], noise)
-        outliers, touched = outliers + more, touched | again
-        flight, contact, clear = cut_episodes(world, whole, noise, touched)
-        fitted = _flown(world, whole, flight, noise)
-    if outliers:
-        warnings.append(f"{outliers} frames of flight are no measurement of any motion and were left out.")
-    memory, lasting = memory_of(whole, flight)
-    if memory != FORGETFUL:
-        # what is given counts where it is more, as everywhere
-        noise = max(lasting[0] or noise[0], given[0] or 0.0), max(lasting[1] or noise[1], given[1] or 0.0)
-        flight, contact, clear = cut_episodes(world, whole, noise, touched | _smeared(whole, ~clear))
-        fitted = _flown(world, whole, flight, noise, memory)
-        warnings.append(told_memory(memory))
+    state = _State.of(world, episodes, given)
+    state.segment()
+    _mark_supported_frames(state)
+    _remove_outliers(state)
+    _remove_held_starts(state)
+    _model_correlated_noise(state)
+    turned = state.oriented
     if not turned and not all(is_round(world.bodies[k]) for k in world.free):
-        contact = []
-        warnings.append("no orientation was measured and the body is no ball: contacts cannot be looked at.")
-    released = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
-    warnings += told(released, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
+        state.contact = []
+        state.warnings.append("no orientation was measured and the body is not a ball: contacts cannot be examined.")
+    released = {episodes[k][0]: float(state.whole.times_s[k, first]) for k, first in state.held.items()}
+    starts = {episodes[k][0]: float(state.whole.times_s[k, 0]) for k in state.held}
     return Prepared(
-        tuple(name for name, _ in episodes),
-        tuple(groups or [0] * len(episodes)),
-        whole,
-        clear,
-        carried,
-        noise,
-        1.0 if memory.position.share else slow_noise(whole, flight),
-        fitted,
-        tuple(contact),
-        outliers,
-        turned,
-        tuple(warnings),
-        released,
-        memory,
+        names=tuple(name for name, _ in episodes),
+        groups=tuple(groups or [0] * len(episodes)),
+        whole=state.whole,
+        clear=state.clear,
+        carried=state.supported,
+        noise=state.noise,
+        slow=1.0 if state.memory.position.share else slow_noise(state.whole, state.flight),
+        flight=state.fitted,
+        contact_items=tuple(state.contact),
+        outliers=state.outliers,
+        turned=turned,
+        warnings=(*state.warnings, *release_warnings(released, starts)),
+        released_s=released,
+        memory=state.memory,
     )
 
 
-def _flown(
-    world: World, whole: Observations, items: Sequence[Segment], noise: tuple[float, float], memory: Memory = FORGETFUL
-) -> Segments | None:
-    """Return flights with states fitted by a world; None for none."""
-    return fit_states(Segments.of("flight", world, whole, items, noise, memory)) if items else None
+@dataclass(kw_only=True)
+class _State:
+    """What is known of the episodes so far; each step of :func:`prepare` refines it."""
+
+    world: World
+    """The model's world."""
+    given: tuple[float | None, float | None]
+    """Standard deviations that the user states (position [m], rotation [rad])."""
+    noise: tuple[float, float]
+    """Standard deviations in use (position [m], rotation [rad])."""
+    whole: Observations
+    """All frames of all episodes (E)."""
+    oriented: bool
+    """Whether any orientation was measured."""
+    flight: list[Segment] = field(default_factory=list)
+    """Flight segments of the last segmentation."""
+    contact: list[Segment] = field(default_factory=list)
+    """Contact segments of the last segmentation."""
+    clear: Tensor
+    """Airborne frames (E, T)."""
+    supported: Tensor
+    """Frames (E, T) above the ground in which the body is not in free fall."""
+    touched: Tensor
+    """Frames (E, T) that are known not to be flight."""
+    outliers: int = 0
+    """Number of frames removed as wrong measurements."""
+    held: dict[int, int] = field(default_factory=dict)
+    """First free frame of the episodes, by index, that begin in a hand."""
+    memory: NoiseModel = WHITE
+    """Correlation of the errors in time."""
+    fitted: Segments | None = None
+    """The flights with fitted states; None where there are none."""
+    warnings: list[str] = field(default_factory=list)
+    """Sentences for the user, in their order."""
+
+    @staticmethod
+    def of(
+        world: World,
+        episodes: Sequence[tuple[str, dict[str, Track]]],
+        given: tuple[float | None, float | None],
+    ) -> _State:
+        """Return the whole episodes with a rough estimate of their noise, not yet cut."""
+        free = [world.bodies[k].name for k in world.free]
+        rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
+        whole = whole_episodes(world, episodes)
+        nothing = torch.zeros_like(whole.seen[..., 0], dtype=torch.bool)
+        return _State(
+            world=world,
+            given=given,
+            noise=(given[0] or rough[0], given[1] or rough[1]),
+            whole=whole,
+            oriented=bool(whole.turned.any()),
+            clear=nothing,
+            supported=nothing,
+            touched=nothing,
+        )
+
+    def segment(self, touched: Tensor | None = None) -> None:
+        """Cut the episodes into flight and contact segments, with frames (E, T) that are known not to be flight."""
+        self.flight, self.contact, self.clear = cut_episodes(self.world, self.whole, self.noise, touched)
+
+    def measure_noise(self, flight: Sequence[Segment], warnings: list[str]) -> None:
+        """Measure the noise in flight, and choose between it and the given one."""
+        self.noise = _agreed(self.given, flight_noise(self.whole, flight), self.noise, warnings)
+
+    def fit_flights(self) -> None:
+        """Fit the states of the flights by the model's world."""
+        if not self.flight:
+            self.fitted = None
+            return
+        self.fitted = fit_states(Segments.of("flight", self.world, self.whole, self.flight, self.noise, self.memory))
+
+
+def _mark_supported_frames(state: _State) -> None:
+    """Count frames as contact in which a body above the ground is not in free fall; then measure the noise."""
+    world = state.world
+    # without anything that could support the body, drag alone may keep it from falling
+    alone = world.ground_normal is None and len(world.bodies) == 1
+    if not alone:
+        state.supported = supported_frames(world, state.whole, state.flight, state.noise)
+    if bool(state.supported.any()):
+        state.segment(state.supported)
+        state.warnings.append(
+            f"{int(state.supported.sum())} frames look airborne by the shape and the ground, but the body is not in "
+            "free fall: they count as contact. Check the ground's height, the shape and the position of the marker."
+        )
+    state.measure_noise(state.flight, state.warnings)
+
+
+def _remove_outliers(state: _State) -> None:
+    """Mark wrong measurements in flight as not seen, and cut and measure again without them."""
+    state.whole, state.outliers, touched = without_outliers(state.whole, state.flight, state.noise)
+    state.touched = touched | state.supported
+    if state.outliers or bool(state.touched.any()):
+        state.segment(state.touched)
+        state.measure_noise(state.flight, [])
+    state.segment(state.touched)
+
+
+def _remove_held_starts(state: _State) -> None:
+    """Fit the flights, and leave out first frames in which a hand still touches the body, until none is found."""
+    state.fit_flights()
+    while state.fitted is not None and (found := held_starts(state.fitted, state.whole)):
+        # frames in the hand inflated the noise, which then hid other wrong frames
+        state.held |= found
+        state.whole = without_held(state.whole, state.held)
+        state.measure_noise(cut_episodes(state.world, state.whole, state.noise, state.touched)[0], [])
+        flight = cut_episodes(state.world, state.whole, state.noise, state.touched)[0]
+        state.whole, more, again = without_outliers(state.whole, flight, state.noise)
+        state.outliers, state.touched = state.outliers + more, state.touched | again
+        state.segment(state.touched)
+        state.fit_flights()
+    if state.outliers:
+        state.warnings.append(f"{state.outliers} frames of flight are wrong measurements and were left out.")
+
+
+def _model_correlated_noise(state: _State) -> None:
+    """Estimate how errors are correlated in time; where they are, cut and fit again with that noise model."""
+    state.memory, correlated = estimate_noise_model(state.whole, state.flight)
+    if state.memory == WHITE:
+        return
+    position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))
+    state.noise = position, rotation
+    state.segment(state.touched | _smeared(state.whole, ~state.clear))
+    state.fit_flights()
+    state.warnings.append(noise_model_warnings(state.memory))
 
 
 def _smeared(whole: Observations, contact: Tensor) -> Tensor:
@@ -193,7 +287,14 @@ def _agreed(
     rough: tuple[float, float],
     warnings: list[str],
 ) -> tuple[float, float]:
-    """Return the noise to work with: what was given, unless the flights show more; else what they show."""
+    """Return the noise to use: the given one, or the measured one where that is larger by `NOISE_DISAGREES`.
+
+    Args:
+        given: Standard deviations that the user states (position [m], rotation [rad]).
+        found: Standard deviations measured in flight; None where too few frames are in flight.
+        rough: Used where neither is known.
+        warnings: Gets a sentence for each kind in which the two disagree.
+    """
     chosen = []
     for name, unit, said, seen, otherwise in zip(
         ("position", "rotation"), ("m", "rad"), given, found, rough, strict=True
@@ -201,8 +302,8 @@ def _agreed(
         if said is not None and seen is not None and said / seen >= NOISE_DISAGREES:
             warnings.append(
                 f"the {name} noise is given as {said:.2g} {unit}; neighbouring frames of a flight agree within "
-                f"{seen:.2g} {unit}. What is given counts, as errors that last are not seen there: effects below it "
-                "stay unseen."
+                f"{seen:.2g} {unit}. The given value is used, because slowly varying errors do not show between "
+                "neighbouring frames. Effects smaller than it cannot be detected."
             )
             chosen.append(said)
         elif said is not None and seen is not None and said / seen <= 1 / NOISE_DISAGREES:
@@ -216,6 +317,7 @@ def _agreed(
 
 
 def _cut(item: Segment, whole: Observations, longest_s: float) -> list[Segment]:
+    """Return a flight cut into equal pieces of at most a length [s] and at least six frames."""
     count = item.last - item.first + 1
     times = whole.times_s[item.episode, item.first : item.last + 1]
     number = max(1, min(round(float(times[-1] - times[0]) / longest_s + 0.49), count // 6))

@@ -1,77 +1,90 @@
-"""Numbers of effects that each session, or episode, has for its own, with a prior that ties them.
+"""Random effects: effect parameters that differ between groups (sessions or episodes), with a shared prior.
 
-A number of unit u is normal about the mean over units, with a standard deviation tau that is estimated along (a linear
-mixed model, Laird & Ware, "Random-effects models for longitudinal data", 1982). A descent with the widest prior finds
-where all numbers and states fit; there the problem is taken as linear, and expectation-maximisation gives means, tau
-and the numbers. A unit of which the data say little is drawn to the others.
+A parameter of group u is normally distributed about the mean over groups, with a standard deviation tau that is
+estimated too (a linear mixed model, Laird & Ware, "Random-effects models for longitudinal data", 1982). A descent with
+the widest prior finds where all parameters and states fit; there the problem is linearised, and
+expectation-maximisation gives means, tau and the parameters of the groups. A group with little information is shrunk
+towards the others.
 
-Residuals of neighbouring frames are no independent errors: what a model misses bends a whole episode. The variance of
-the residuals, and their correlation rho from frame to frame, make an episode count (1 - rho) / (1 + rho) of its frames
-(as for a first-order autoregression), and intervals are Student's, of so many degrees of freedom.
+Residuals of neighbouring frames are not independent errors: what a model misses bends a whole episode. The variance of
+the residuals and their correlation rho from frame to frame reduce the effective sample size of an episode to (1 - rho)
+/ (1 + rho) of its frames (as for a first-order autoregression), and intervals are Student's with these degrees of
+freedom.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.tracks import Track
-from ..schemas import InputDataError
-from .diagnosis.segments import PARAMETER_STEP
-from .estimation.least_squares import Solution, minimise
-from .estimation.noise import MAD_TO_STD
-from .estimation.observations import Observations
-from .estimation.trajectory import STATE_SIZE, TrajectoryResiduals, state_prior
-from .first_contacts import ITERATIONS, MODEL_ERROR, FirstContacts, correlation_of, described, windows_of
-from .physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
-from .physics.world import World
-from .tails import student_quantile
-from .window_errors import ROBUST_SCALE, WindowErrors
+from ...datasets.capture.tracks import Track
+from ...schemas import FittedParameter, InputDataError, ModelFile
+from ..optimization.levenberg_marquardt import Solution, minimise
+from ..optimization.uncertainty import correlation_of, student_quantile
+from ..physics.effects.registry import load_effect
+from ..physics.parameters import GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
+from ..physics.world import World
+from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors
+from ..trajectories.initial_state import flight_frames
+from ..trajectories.observations import Observations
+from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
+from ..trajectories.track_noise import MAD_TO_STD
+from .first_contact_fit import ITERATIONS, MODEL_ERROR, EffectEstimate, described, windows_of
+from .segments import PARAMETER_STEP
 
 Array = NDArray[np.float64]
 
 REST_S = 0.1
-"""The end of an episode, where a body that came to rest shows the ground's height and tilt."""
+"""Length [s] of the window at the end of an episode, where a body at rest shows the ground's height and tilt."""
 FIRST_ITERATIONS = 6
-"""Before it is known how large residuals usually are."""
+"""Steps of the first descent, which measures how large residuals are."""
 ROUNDS = 300
+"""Number of iterations of expectation-maximisation."""
 LEAST_SHARE = 1e-3
-"""Of the widest prior: where units do not differ, tau goes to 0 and is held here."""
+"""Lower bound of tau, as a share of the widest prior: where groups do not differ, tau would go to 0."""
 STATE_INFORMATION = 1e-4
-"""Of the usual prior on states: a straight line through a few frames of a long fall begins far from where it did."""
+"""Weight of the prior on states relative to the usual one: the start of a long fall is far from the line through its
+first frames."""
 
 
 @dataclass(frozen=True)
-class Ties:
-    """The prior of own numbers that a fit has found: mean and standard deviation by `effect.parameter`."""
+class GroupPrior:
+    """The prior of group-specific parameters that a fit has found."""
 
     mean: Mapping[str, float]
+    """Mean over groups, by `effect.parameter`."""
     spread: Mapping[str, float]
+    """Standard deviation between groups in fitted coordinates, by `effect.parameter`."""
 
 
-def unit_of(shared: str, episode: str, groups: Mapping[str, str]) -> str:
-    """Return the unit that an episode belongs to, for numbers that are shared so.
+def group_of(shared: str, episode: str, groups: Mapping[str, str]) -> str:
+    """Return the group that an episode belongs to, for parameters shared within `shared`.
+
+    Args:
+        shared: "all", "group" or "episode".
+        episode: Name of the episode.
+        groups: Group of each episode that belongs to one.
 
     Raises:
-        InputDataError: If the numbers are those of a group and the episode has none.
+        InputDataError: If the parameter is one of groups and the episode belongs to none.
     """
     if shared == "episode":
         return episode
     if shared == "group" and episode not in groups:
         raise InputDataError(
-            f"an effect has numbers of its own for each group, and episode '{episode}' belongs to none.",
+            f"an effect has separate parameters for each group, and episode '{episode}' belongs to no group.",
             f"[episodes.{episode}] group in capture.toml, for every episode.",
-            "name the groups, or let each episode have its own: NAME@episode.",
+            "name the groups, or give each episode separate parameters: NAME@episode.",
         )
     return groups[episode] if shared == "group" else ""
 
 
-def fit_own_numbers(
+def fit_random_effects(
     world: World,
     episodes: Sequence[tuple[str, dict[str, Track]]],
     groups: Mapping[str, str],
@@ -80,84 +93,156 @@ def fit_own_numbers(
     noise: tuple[float, float],
     flying: bool,
     after_s: float,
-    ties: Ties | None = None,
-) -> FirstContacts:
-    """Fit parameters to flight, first contacts and the ends of episodes, with the windows' states.
+    ties: GroupPrior | None = None,
+) -> EffectEstimate:
+    """Fit parameters to flight, first contacts and ends of episodes, together with the states of the windows.
 
     Args:
         world: The world.
         episodes: Name and tracks by body of each episode.
         groups: Group of each episode that belongs to one.
-        wanted: What is to be found, and the values that it starts from.
-        along: What is fitted along, one value for all.
-        noise: Of the tracks (position [m], rotation [rad]).
-        flying: Whether nothing ever touches anything.
-        after_s: How long a window goes on after the first contact [s]; 0 for flight alone, which is smooth.
-        ties: The prior of own numbers, for episodes that the fit has not seen; None to estimate it.
+        wanted: Parameters to estimate, and the values to start from.
+        along: Nuisance parameters, with one value for all.
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
+        flying: Whether no body ever touches anything.
+        after_s: Time [s] that a window continues after the first contact; 0 for flight alone, which is smooth.
+        ties: The prior of group-specific parameters, for episodes that the fit has not seen; None to estimate it.
 
     Raises:
-        InputDataError: If an episode belongs to no group, and a number is one of the group's.
+        InputDataError: If an episode belongs to no group, and a parameter differs between groups.
         NotConvergedError: If the rollouts diverge at the start.
     """
     batch, ends, stds = _batch(world, episodes, noise, flying, after_s)
-    start = [*wanted, *along]
-    numbers = [p for p, _ in start]
-    units = [[unit_of(p.shared, name, groups) for name in batch.names] for p in numbers]
-    names = [list(dict.fromkeys(column)) for column in units]
-    first = np.cumsum([0, *(len(column) for column in names)])
-    place = np.stack([[first[k] + names[k].index(u) for u in column] for k, column in enumerate(units)], 1)
-    owner = np.repeat(np.arange(len(numbers)), [len(column) for column in names])
-    steps = [(0.0, PARAMETER_STEP * p.prior[1]) for p in numbers]
-    given = {p.name: p.encode(value) for p, value in start} | dict(ties.mean if ties else {})
-    width = np.array([numbers[k].prior[1] for k in owner])
-    centre = np.array([given[numbers[k].name] for k in owner])
-    shared, states = torch.as_tensor(centre), torch.zeros(len(batch.names), STATE_SIZE * len(batch.free))
-    states, prior = states.to(world.gravity), (torch.as_tensor(centre), torch.as_tensor(width**-2.0))
-    for iterations in (FIRST_ITERATIONS, ITERATIONS):
-        residuals = TrajectoryResiduals(world, numbers, batch, *stds, True, steps)
-        problem = _Gathered(residuals, torch.as_tensor(place), len(owner))
+    layout = _Layout.of([*wanted, *along], batch.names, groups, ties)
+    solution, rows = _descend(world, batch, ends, stds, layout)
+    errors = WindowErrors.of(rows, solution, batch, ends)
+    found = _tied(solution, errors, layout, None if ties is None else layout.known_tau(ties))
+    result = _result(world, wanted, layout, found, batch.names, groups, solution)
+    if flying or GROUND_SHIFT not in layout.parameters:
+        return result
+    return _with_ground_shift(result, layout, found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """The place of every parameter of every group in one vector of N values, with the widest priors."""
+
+    parameters: list[Parameter]
+    """Parameters (P)."""
+    groups: list[list[str]]
+    """Groups of each parameter, in the order of their values; one empty name for a parameter shared by all."""
+    place: NDArray[np.int64]
+    """Index of the value that each item uses, shape (B, P)."""
+    owner: NDArray[np.int64]
+    """Index of the parameter of each value, shape (N,)."""
+    centre: Array
+    """Prior means in fitted coordinates, shape (N,)."""
+    width: Array
+    """Widest prior standard deviations, shape (N,)."""
+
+    @staticmethod
+    def of(
+        start: Sequence[tuple[Parameter, float]],
+        episodes: Sequence[str],
+        groups: Mapping[str, str],
+        ties: GroupPrior | None,
+    ) -> _Layout:
+        """Lay out parameters, with the values that they start from, for items of the given episodes (B)."""
+        parameters = [p for p, _ in start]
+        units = [[group_of(p.shared, name, groups) for name in episodes] for p in parameters]
+        names = [list(dict.fromkeys(column)) for column in units]
+        first = np.cumsum([0, *(len(column) for column in names)])
+        place = np.stack([[first[k] + names[k].index(u) for u in column] for k, column in enumerate(units)], 1)
+        owner = np.repeat(np.arange(len(parameters)), [len(column) for column in names])
+        given = {p.name: p.encode(value) for p, value in start} | dict(ties.mean if ties else {})
+        return _Layout(
+            parameters=parameters,
+            groups=names,
+            place=place,
+            owner=owner,
+            centre=np.array([given[parameters[k].name] for k in owner]),
+            width=np.array([parameters[k].prior[1] for k in owner]),
+        )
+
+    def places(self, parameter: int) -> NDArray[np.int64]:
+        """Return the indices of the values of a parameter."""
+        return np.flatnonzero(self.owner == parameter)
+
+    def tied(self) -> list[NDArray[np.int64]]:
+        """Return the indices of the values of each parameter that differs between groups."""
+        return [self.places(k) for k, p in enumerate(self.parameters) if p.shared != "all"]
+
+    def known_tau(self, ties: GroupPrior) -> Array:
+        """Return the prior standard deviations (N,) that an earlier fit has found."""
+        return np.array([ties.spread.get(self.parameters[k].name, self.width[i]) for i, k in enumerate(self.owner)])
+
+
+def _descend(
+    world: World, batch: Observations, ends: NDArray[np.bool_], stds: tuple[Tensor, Tensor], layout: _Layout
+) -> tuple[Solution, Tensor]:
+    """Return the solution with the widest priors, and its residuals (B, F, 6) in sigmas.
+
+    Args:
+        world: The world.
+        batch: The windows (B).
+        ends: Which windows (B,) are ends of episodes.
+        stds: Standard deviations of the rows (B, F, 1) of position [m] and rotation [rad] to begin with.
+        layout: The values that are fitted.
+    """
+    parameters = layout.parameters
+    steps = [(0.0, PARAMETER_STEP * p.prior[1]) for p in parameters]
+    shared, states = torch.as_tensor(layout.centre), torch.zeros(len(batch.names), STATE_SIZE * len(batch.free))
+    states, prior = states.to(world.gravity), (torch.as_tensor(layout.centre), torch.as_tensor(layout.width**-2.0))
+
+    def descended(
+        shared: Tensor, states: Tensor, stds: tuple[Tensor, Tensor], iterations: int
+    ) -> tuple[Solution, Tensor]:
+        residuals = TrajectoryResiduals(world, parameters, batch, *stds, differences=True, parameter_steps=steps)
+        problem = _Gathered(residuals, torch.as_tensor(layout.place), len(layout.owner))
         solution = minimise(
             problem,
             shared,
             states,
-            torch.tensor([numbers[k].limits for k in owner]).to(world.gravity),
+            torch.tensor([parameters[k].limits for k in layout.owner]).to(world.gravity),
             robust_scale=ROBUST_SCALE,
             iterations=iterations,
             prior_information=STATE_INFORMATION * state_prior(len(batch.free)),
             shared_prior=prior,
         )
-        shared, states = solution.shared, solution.states
-        rows, _ = problem(shared, states, False)
-        if iterations == ITERATIONS:
-            break
-        # where all frames are missed by more than the noise, none of them is an outlier
-        scale = _usual(rows, ends)
-        stds = (stds[0] * scale, stds[1] * scale)
-    tied = [np.flatnonzero(owner == k) for k, p in enumerate(numbers) if p.shared != "all"]
-    known = (
-        None if ties is None else np.array([ties.spread.get(numbers[k].name, width[i]) for i, k in enumerate(owner)])
-    )
-    found = _tied(solution, WindowErrors.of(rows, solution, batch, ends), centre, width, tied, known)
-    result = _result(world, wanted, names, owner, found, batch.names, groups, solution)
-    if flying or GROUND_SHIFT not in numbers or result.world.ground_offset is None:
+        return solution, problem(solution.shared, solution.states, False)[0]
+
+    first, rows = descended(shared, states, stds, FIRST_ITERATIONS)
+    # where all residuals exceed the noise, none of them is an outlier
+    scale = _usual(rows, ends)
+    return descended(first.shared, first.states, (stds[0] * scale, stds[1] * scale), ITERATIONS)
+
+
+def _with_ground_shift(result: EffectEstimate, layout: _Layout, found: _Tied) -> EffectEstimate:
+    """Return the estimate with the ground moved to the height that the ends of episodes show."""
+    world = result.world
+    if world.ground_offset is None:
         return result
-    at = int(np.flatnonzero(owner == numbers.index(GROUND_SHIFT))[0])
+    at = int(layout.places(layout.parameters.index(GROUND_SHIFT))[0])
     z, std = float(found.values[at]), float(np.sqrt(found.covariance[at, at]))
     ground = described(GROUND_SHIFT, z, std, student_quantile(0.975, found.dof))
-    moved = replace(result.world, ground_offset=result.world.ground_offset + ground.estimate)
+    moved = replace(world, ground_offset=world.ground_offset + ground.estimate)
     record = result.record | {"ground_shift_m": ground.estimate}
     return replace(result, world=moved, ground=ground, record=record)
 
 
 @dataclass(frozen=True)
 class _Gathered:
-    """Residuals in which each item picks its numbers among those of all units: place (B, P) of `size` numbers."""
+    """Residuals in which each item picks its parameters among the values of all groups."""
 
     problem: TrajectoryResiduals
+    """Residuals of items (B) with separate parameters (B, P)."""
     place: Tensor
+    """Index of the value that each item uses, shape (B, P)."""
     size: int
+    """Number of values N."""
 
     def __call__(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
+        """Return residuals (B, F, 6) and, their Jacobian (B, F, 6, N + S) for values (N,) and states (B, S)."""
         rows, jacobian = self.problem(shared[self.place], states, with_jacobian)
         if jacobian is None:
             return rows, None
@@ -169,7 +254,7 @@ class _Gathered:
 
 
 def _usual(rows: Tensor, ends: NDArray[np.bool_]) -> Tensor:
-    """Return by what factor (B, 1, 1) the usual residual of each kind of window exceeds its standard deviation."""
+    """Return the factor (B, 1, 1) by which the typical residual of each kind of window exceeds its sigma."""
     size = rows.abs()
     factor = torch.ones(len(rows)).to(rows)
     for kind in (False, True):
@@ -186,7 +271,7 @@ def _batch(
     flying: bool,
     after_s: float,
 ) -> tuple[Observations, NDArray[np.bool_], tuple[Tensor, Tensor]]:
-    """Return the windows, which of them are ends, and the standard deviations of their rows (B, F, 1)."""
+    """Return the windows, which of them are ends of episodes, and the standard deviations of their rows (B, F, 1)."""
     picked, windows, contact = windows_of(world, episodes, None, after_s)
     ends = [False] * len(picked)
     if after_s == 0:
@@ -196,7 +281,7 @@ def _batch(
         windows, ends = [*windows, *((t - REST_S, t + 1e-9) for t in last)], [*ends, *(True for _ in last)]
         picked, contact = [*picked, *picked], [*contact, *(np.inf for _ in last)]
     batch = Observations.of(world, picked, windows)
-    # a flight is followed to the noise, and a rest as well as it turns out; what a contact law misses comes between
+    # model error is added after the first contact; flight and the rest at the end have the tracks' noise alone
     free = batch.times_s < torch.tensor(contact)[:, None].to(batch.times_s)
     free = free.repeat_interleave(len(batch.free), 1)[..., None]
     rough = [float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True)]
@@ -204,30 +289,30 @@ def _batch(
     return batch, np.array(ends), (stds[0], stds[1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Tied:
-    """Numbers (n,) with their covariance, means and tau (n,) of their priors, degrees of freedom, effective errors."""
+    """Values of all groups (N) with their estimated prior."""
 
     values: Array
+    """Values in fitted coordinates, shape (N,)."""
     covariance: Array
+    """Their covariance, shape (N, N)."""
     mean: Array
+    """Prior means, shape (N,)."""
     tau: Array
+    """Prior standard deviations, shape (N,)."""
     dof: float
+    """Degrees of freedom."""
     errors: Array
+    """Factor by which the error variance of each item exceeds that of independent errors, shape (B,)."""
 
 
-def _tied(
-    solution: Solution,
-    errors: WindowErrors,
-    centre: Array,
-    width: Array,
-    tied: Sequence[NDArray[np.int64]],
-    known_tau: Array | None,
-) -> _Tied:
-    """Return numbers and priors where the likelihood of the linearised problem is largest.
+def _tied(solution: Solution, errors: WindowErrors, layout: _Layout, known_tau: Array | None) -> _Tied:
+    """Return parameters and priors that maximise the likelihood of the linearised problem.
 
-    The size of the errors is that of the widest prior: drawn to the others, units fit worse, and would count for less.
+    The error variance is that found with the widest prior: shrunk groups fit worse, and would be weighted down for it.
     """
+    centre, width, tied = layout.centre, layout.width, layout.tied()
     parts, slopes, at = solution.by_item.numpy(), solution.scores.numpy(), solution.shared.numpy()
     factor = _factors(parts, slopes, at, errors, centre, width)
     matrix = (parts / factor[:, None, None]).sum(0)
@@ -242,11 +327,11 @@ def _tied(
                 tau[places] = np.clip(np.sqrt(square), LEAST_SHARE * width[places], width[places])
         values, covariance = _solved(matrix, right, mean, tau)
     dof = float(errors.independent.sum()) - len(values)
-    return _Tied(values, covariance, mean, tau, max(dof, 1.0), factor)
+    return _Tied(values=values, covariance=covariance, mean=mean, tau=tau, dof=max(dof, 1.0), errors=factor)
 
 
 def _factors(parts: Array, slopes: Array, at: Array, errors: WindowErrors, centre: Array, width: Array) -> Array:
-    """Return by what factor the errors of each item (B,) exceed independent ones of its standard deviations."""
+    """Return the factor (B,) by which the error variance of each item exceeds that of independent errors."""
     factor = np.ones(len(parts))
     for _ in range(10):
         matrix = (parts / factor[:, None, None]).sum(0)
@@ -259,67 +344,173 @@ def _factors(parts: Array, slopes: Array, at: Array, errors: WindowErrors, centr
         for k in np.unique(errors.kind):
             some = errors.kind == k
             pooled = max(chi2[some].sum(), 1e-12) / max(free[some].sum(), 1.0)
-            # an episode that fits worse than the others counts less than they do
+            # an episode that fits worse than the others gets less weight
             factor[some] = np.maximum(pooled, chi2[some] / np.maximum(free[some], 1.0))
     return factor
 
 
 def _solved(matrix: Array, right: Array, mean: Array, tau: Array) -> tuple[Array, Array]:
+    """Return the posterior mean and covariance of a linear problem with a normal prior."""
     covariance = np.linalg.inv(matrix + np.diag(tau**-2.0))
     return (covariance @ (right + mean / tau**2)).astype(np.float64), covariance.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class _Reported:
+    """The wanted parameters as `model.json` has them."""
+
+    rows: list[FittedParameter] = field(default_factory=list)
+    """Parameters, and those of groups after their mean."""
+    centres: list[float] = field(default_factory=list)
+    """Value of each wanted parameter, or mean over its groups, in fitted coordinates."""
+    own: dict[str, dict[str, float]] = field(default_factory=dict)
+    """By group, values of the parameters that differ between groups."""
+    spread: dict[str, float] = field(default_factory=dict)
+    """By parameter, standard deviation between groups in fitted coordinates."""
+
+    def add_shared(self, p: Parameter, z: Array, std: Array, reach: float) -> None:
+        """Add a parameter with one value for all."""
+        self.rows.append(described(p, float(z[0]), float(std[0]), reach))
+        self.centres.append(float(z[0]))
+
+    def add_groups(
+        self, p: Parameter, groups: Sequence[str], z: Array, std: Array, prior: tuple[float, float], reach: float
+    ) -> None:
+        """Add a parameter that differs between groups: its mean, and its value in each.
+
+        Args:
+            p: The parameter.
+            groups: Names (n).
+            z: Values (n,) in fitted coordinates.
+            std: Their standard errors (n,).
+            prior: Mean and standard deviation between groups.
+            reach: Half of the interval, in standard errors.
+        """
+        count, (mean, tau) = len(groups), prior
+        centre = float(np.clip(mean, *p.limits))
+        self.spread[p.name] = tau
+        error = float(np.sqrt((tau**2 + (std**2).mean()) / count))
+        row = described(p, centre, error, student_quantile(0.975, max(count - 1, 1)))
+        note = f"mean over {count} {p.shared}s, which differ by {tau:.3g} {p.unit} (standard deviation)"
+        self.rows.append(row.model_copy(update={"note": note}))
+        self.centres.append(centre)
+        for group, value, error in zip(groups, z, std, strict=True):
+            self.own.setdefault(group, {})[p.name] = float(p.decode(torch.tensor(value)))
+            if p.shared == "group":
+                one = described(p, float(value), float(error), reach)
+                update = {"name": f"{p.name}[{group}]", "note": f"of {group} alone"}
+                self.rows.append(one.model_copy(update=update))
+
+
+def _reported(wanted: Sequence[Parameter], layout: _Layout, found: _Tied) -> _Reported:
+    """Return the wanted parameters, which come first in the layout, with intervals."""
+    reach, reported = student_quantile(0.975, found.dof), _Reported()
+    for k, p in enumerate(wanted):
+        at = layout.places(k)
+        z = np.clip(found.values[at], *p.limits)
+        std = np.sqrt(np.diag(found.covariance)[at])
+        if p.shared == "all":
+            reported.add_shared(p, z, std, reach)
+        else:
+            prior = float(found.mean[at[0]]), float(found.tau[at[0]])
+            reported.add_groups(p, layout.groups[k], z, std, prior, reach)
+    return reported
 
 
 def _result(
     world: World,
     wanted: Sequence[tuple[Parameter, float]],
-    names: Sequence[Sequence[str]],
-    owner: NDArray[np.int64],
+    layout: _Layout,
     found: _Tied,
     episodes: Sequence[str],
     groups: Mapping[str, str],
     solution: Solution,
-) -> FirstContacts:
-    reach, rows, centres = student_quantile(0.975, found.dof), [], []
-    own: dict[str, dict[str, float]] = {}
-    spread: dict[str, float] = {}
-    for k, (p, _) in enumerate(wanted):
-        at = np.flatnonzero(owner == k)
-        z = np.clip(found.values[at], *p.limits)
-        std = np.sqrt(np.diag(found.covariance)[at])
-        if p.shared == "all":
-            rows.append(described(p, float(z[0]), float(std[0]), reach))
-            centres.append(float(z[0]))
-            continue
-        centre, count = float(np.clip(found.mean[at[0]], *p.limits)), len(at)
-        spread[p.name] = float(found.tau[at[0]])
-        error = float(np.sqrt((found.tau[at[0]] ** 2 + (std**2).mean()) / count))
-        mean = described(p, centre, error, student_quantile(0.975, max(count - 1, 1)))
-        note = f"mean over {count} {p.shared}s, which differ by {spread[p.name]:.3g} {p.unit} (standard deviation)"
-        rows.append(mean.model_copy(update={"note": note}))
-        centres.append(centre)
-        for unit, value, error in zip(names[k], z, std, strict=True):
-            own.setdefault(unit, {})[p.name] = float(p.decode(torch.tensor(value)))
-            if p.shared == "group":
-                one = described(p, float(value), float(error), reach)
-                rows.append(one.model_copy(update={"name": f"{p.name}[{unit}]", "note": f"of {unit} alone"}))
-    numbers = [p for p, _ in wanted]
-    values = torch.stack([p.decode(torch.tensor(z).to(world.gravity)) for p, z in zip(numbers, centres, strict=True)])
+) -> EffectEstimate:
+    """Return the estimate: the world with the parameters found, and how they and the fit are reported."""
+    parameters = [p for p, _ in wanted]
+    reported = _reported(parameters, layout, found)
+    centres, own = reported.centres, reported.own
+    values = torch.stack(
+        [p.decode(torch.tensor(z).to(world.gravity)) for p, z in zip(parameters, centres, strict=True)]
+    )
     by_episode = {
-        name: {p.name: own[unit_of(p.shared, name, groups)][p.name] for p in numbers if p.shared != "all"}
+        name: {p.name: own[group_of(p.shared, name, groups)][p.name] for p in parameters if p.shared != "all"}
         for name in dict.fromkeys(episodes)
     }
-    moved = replace(apply_parameters(world, numbers, values[None]), own=dict(world.own) | by_episode)
+    moved = replace(apply_parameters(world, parameters, values[None]), own=dict(world.own) | by_episode)
     record = {
         "windows": len(episodes),
         "costs": solution.costs,
         "converged": solution.converged,
         "errors_variance": found.errors.tolist(),
         "degrees_of_freedom": found.dof,
-        "spread": spread,
+        "spread": reported.spread,
     }
-    single = [k for k, p in enumerate(numbers) if p.shared == "all"]
-    places = [int(np.flatnonzero(owner == k)[0]) for k in single]
+    single = [k for k, p in enumerate(parameters) if p.shared == "all"]
+    places = [int(layout.places(k)[0]) for k in single]
     blocks = (
-        [correlation_of([numbers[k].name for k in single], found.covariance[np.ix_(places, places)])] if single else []
+        [correlation_of([parameters[k].name for k in single], found.covariance[np.ix_(places, places)])]
+        if single
+        else []
     )
-    return FirstContacts(moved, tuple(rows), record, tuple(blocks), own=own, spread=spread)
+    return EffectEstimate(
+        world=moved,
+        parameters=tuple(reported.rows),
+        record=record,
+        correlations=tuple(blocks),
+        own=own,
+        spread=reported.spread,
+    )
+
+
+def with_known_groups(world: World, file: ModelFile, episodes: Sequence[str], groups: Mapping[str, str]) -> World:
+    """Return the world in which episodes of groups that the fit has seen use the parameters of their group.
+
+    Other episodes use the mean over the groups of the fit.
+    """
+    own = {name: _known(world, file, name, groups) for name in episodes}
+    return replace(world, own={name: values for name, values in own.items() if values})
+
+
+def with_fitted_groups(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    file: ModelFile,
+    groups: Mapping[str, str],
+    noise: tuple[float, float],
+) -> World:
+    """Return the world in which every episode has group-specific parameters: known from the fit, else fitted.
+
+    Parameters fitted to an episode make no prediction of it: like its fitted initial state, they use its data.
+    """
+    own = group_parameters(world)
+    known = with_known_groups(world, file, [name for name, _ in episodes], groups)
+    unknown = [(name, tracks) for name, tracks in episodes if len(known.own.get(name, {})) < len(own)]
+    if not own or not unknown:
+        return known
+    centre = {f"{a.effect.name}.{name}": float(value) for a in world.effects for name, value in a.values.items()}
+    spread = {f"{load_effect(e.name).name}.{name}": std for e in file.effects for name, std in e.spread.items()}
+    whole = Observations.of(known, unknown, [(-float("inf"), float("inf"))] * len(unknown))
+    flying = bool(flight_frames(known, whole)[whole.seen.amax(-1) > 0].all())
+    ties = GroupPrior({p.name: centre[p.name] for p in own}, spread)
+    found = fit_random_effects(known, unknown, groups, [(p, centre[p.name]) for p in own], (), noise, flying, 0.0, ties)
+    return replace(known, own=dict(found.world.own))
+
+
+def group_parameters(world: World) -> list[Parameter]:
+    """Return the parameters that differ between groups or episodes."""
+    return [p for p in effect_parameters(world) if p.shared != "all"]
+
+
+def _known(world: World, file: ModelFile, episode: str, groups: Mapping[str, str]) -> dict[str, float]:
+    """Return the group-specific parameters that the fit knows of an episode, by `effect.parameter`."""
+    found: dict[str, float] = {}
+    by_effect = {load_effect(effect.name).name: effect.own for effect in file.effects if effect.own}
+    for p in group_parameters(world):
+        effect, _, number = p.name.partition(".")
+        if p.shared == "group" and episode not in groups:
+            continue
+        value = by_effect.get(effect, {}).get(group_of(p.shared, episode, groups), {}).get(number)
+        if value is not None:
+            found[p.name] = value
+    return found

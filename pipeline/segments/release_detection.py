@@ -1,9 +1,10 @@
-"""Throws that begin before the body was let go: the first frames turn otherwise than all the rest of the flight.
+"""Detection of episodes that begin before the release: in the first frames the body turns differently from the rest.
 
-A hand, or a machine, that still touches a body when a recording begins gives it a torque for some frames. A body in
-free flight turns by its inertia alone, whatever forces act on its centre of mass, so its orientation tells without
-knowing drag, wind or tilts. What a model misses all along a flight (a wrong inertia, damping of the spin) is missed as
-much without the last frames as without the first ones, and is no hand; nor is what all flights show.
+A hand or a machine that still touches a body when a recording begins applies a torque for some frames. In free flight a
+body turns by its inertia alone, whatever forces act on its centre of mass, so the orientation shows the release without
+knowledge of drag, wind or tilt. A model error that lasts the whole flight (a wrong inertia, damping of the spin) is
+equally large without the last frames as without the first ones, and is not taken for a hand; neither is an error that
+all flights share.
 """
 
 from __future__ import annotations
@@ -15,29 +16,30 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..estimation.noise import estimate_noise
-from ..estimation.observations import Observations
-from .cuts import Segment, cut_episodes, whole_episodes
+from ..trajectories.observations import Observations
+from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
+from ..trajectories.track_noise import estimate_noise
 from .segment_states import fit_states
 from .segments import Segments
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
     from ..physics.world import World
 
 HELD_CHI2 = 3.0
-"""Of rotation, reduced, and in units of that of most flights: a flight that fits worse may have begun in a hand. Of
-349 measured tosses of a cube 12 fit 20 times as well without the first third of their flight, none without the last."""
+"""Reduced chi-square of the rotation, relative to that of most flights, above which a flight may begin in a hand. Of
+349 measured tosses of a cube, 12 fit 20 times as well without the first third of their flight, none without the
+last."""
 FREE_CHI2 = 2.0
-"""The same of what is left without the first frames: free."""
+"""Largest relative reduced chi-square of the rotation without the first frames for which the rest is free flight."""
 SKEW = 3.0
-"""Without as many last frames instead, the flight fits worse than without the first ones by this factor."""
+"""Minimum factor by which the fit without as many last frames is worse than the fit without the first ones."""
 LEAST_FREE = 8
-"""So many frames are left of the flight, and at least half of it."""
+"""Minimum number of frames that remain of the flight; at least half of it must remain, too."""
 
 
 def held_starts(flight: Segments, whole: Observations) -> dict[int, int]:
-    """Return the first free frame of the episodes, by their places, that begin in a hand.
+    """Return the first free frame of each episode that begins in a hand, by index of the episode.
 
     Args:
         flight: All flights, with fitted states.
@@ -68,12 +70,12 @@ def held_starts(flight: Segments, whole: Observations) -> dict[int, int]:
 def find_releases(
     world: World, episodes: Sequence[tuple[str, dict[str, Track]]], noise: tuple[float | None, float | None]
 ) -> tuple[dict[str, float], list[str]]:
-    """Return the times [s] from which episodes that begin in a hand fly freely, by name, and what to tell of them.
+    """Return release times [s] of episodes that begin in a hand, by name, and warnings about them.
 
     Args:
         world: With the shape, the ground and the inertia.
-        episodes: Name and tracks by body of each.
-        noise: Of the tracks (position [m], rotation [rad]); estimated where None.
+        episodes: Name and tracks by body of each episode.
+        noise: Standard deviations of the tracks (position [m], rotation [rad]); estimated where None.
     """
     free = [world.bodies[k].name for k in world.free]
     found = [tracks[name] for _, tracks in episodes for name in free if name in tracks]
@@ -87,11 +89,11 @@ def find_releases(
         return {}, []
     held = held_starts(fit_states(Segments.of("flight", world, whole, items, std)), whole)
     released_s = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
-    return released_s, told(released_s, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
+    return released_s, release_warnings(released_s, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
 
 
 def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
-    """Return the episodes without the frames before their release: these count as not measured."""
+    """Return the episodes with the frames before each release (`held`, by episode) marked as not measured."""
     seen, turned = whole.seen.clone(), whole.turned.clone()
     for episode, first in held.items():
         seen[episode, :first], turned[episode, :first] = 0.0, 0.0
@@ -101,24 +103,30 @@ def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
 def after_release(
     episodes: Iterable[tuple[str, dict[str, Track]]], released_s: Mapping[str, float]
 ) -> list[tuple[str, dict[str, Track]]]:
-    """Return episodes from the times [s] on at which their bodies were let go."""
+    """Return the episodes cut to start at their release times [s], where they have one."""
     return [
         (name, {body: track.window(released_s.get(name)) for body, track in tracks.items()})
         for name, tracks in episodes
     ]
 
 
-def told(released_s: Mapping[str, float], starts_s: Mapping[str, float]) -> list[str]:
-    """Return a warning for each episode that begins in a hand: released_s, starts_s: times [s] by name."""
+def release_warnings(released_s: Mapping[str, float], starts_s: Mapping[str, float]) -> list[str]:
+    """Return a warning for each episode that begins in a hand.
+
+    Args:
+        released_s: Time [s] of the release, by name.
+        starts_s: Time [s] of the first frame, by name.
+    """
     return [
         f"episode '{name}' begins in a hand: for the first {1e3 * (at - starts_s[name]):.0f} ms of its flight it turns "
-        "otherwise than after them, as if something still touched it or the tracker had yet to find it. These frames "
-        f"are left out; begin the recording there ([episodes] start_s in capture.toml: {at:.3f} on the track's clock)."
+        "differently from the rest, as if something still touched it or the tracker had not found it yet. These frames "
+        f"are left out; start the recording there ([episodes] start_s in capture.toml: {at:.3f} on the track's clock)."
         for name, at in released_s.items()
     ]
 
 
 def _fitted(flight: Segments, whole: Observations, items: Sequence[Segment]) -> Segments:
+    """Return segments of the same kind as given flights, with fitted states."""
     return fit_states(Segments.of("flight", flight.world, whole, items, flight.noise, flight.memory))
 
 

@@ -1,4 +1,4 @@
-"""The residual wrench: the constant acceleration that a model lacks in each short window, and what organises it."""
+"""The residual wrench: the constant acceleration that a model lacks in each short window, and its covariates."""
 
 from __future__ import annotations
 
@@ -10,46 +10,50 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..estimation.observations import Observations
+from ..geometry.rotation import quat_rotate
+from ..optimization.uncertainty import chi2_tail
 from ..physics.effects.effect import ActiveEffect
+from ..physics.effects.residual_wrench import ResidualWrench
 from ..physics.parameters import effect_parameters
-from ..physics.residual_wrench import ResidualWrench
-from ..physics.rotation import quat_rotate
 from ..physics.world import World
-from ..tails import chi2_tail
-from .cuts import Segment
-from .lasting import FORGETFUL, Memory
-from .linear import linearised
+from ..trajectories.correlated_noise import WHITE, NoiseModel
+from ..trajectories.observations import Observations
+from ..trajectories.segmentation import Segment
+from .segment_fit import linearised
 from .segment_states import fit_states
 from .segments import Segments
 
 Array = NDArray[np.float64]
 
 WINDOW_S = 0.14
-"""Length of the half-overlapping windows; at 0.06 s the error of an acceleration is 6 m/s2, and nothing is seen."""
+"""Length [s] of the half-overlapping windows; at 0.06 s the error of an acceleration is 6 m/s2, too large to show
+anything."""
 BINS = 4
-"""Bins of equal counts along a coordinate."""
+"""Number of bins, of equal counts, along a coordinate."""
 COORDINATES = ("time", "x", "y", "height", "heading", "speed", "spin", "episode")
+"""Coordinates that may explain the residual wrench."""
 WEAK_STD = 1e4
-"""Prior of an acceleration [m/s2, rad/s2]: holds those that were not measured (a centroid has no spin)."""
+"""Prior standard deviation of an acceleration [m/s2, rad/s2]: fixes those that were not measured (a centroid has no
+spin)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ResidualWrenches:
-    """Residual wrenches of windows (n), each with its own free state.
-
-    wrench (n, 6): acceleration [m/s2] and angular acceleration [rad/s2], world frame; information (n, 6, 6): inverse of
-    its covariance; segments: the windows; coordinates: what may organise it, by name, (n,): time in the episode [s],
-    x, y and height [m], heading [rad], speed [m/s], spin [rad/s], episode; velocity (n, 3) [m/s] of the frame's origin
-    and omega (n, 3) [rad/s], world, in the middle of the window.
-    """
+    """Residual wrenches of windows (n), each with a free state."""
 
     segments: tuple[Segment, ...]
+    """The windows."""
     wrench: Array
+    """Acceleration [m/s2] and angular acceleration [rad/s2], world frame, shape (n, 6)."""
     information: Array
+    """Inverse covariance of the wrench, shape (n, 6, 6)."""
     coordinates: dict[str, Array]
+    """Possible covariates by name, shape (n,): time in the episode [s], x, y and height [m], heading [rad], speed
+    [m/s], spin [rad/s], episode."""
     velocity: Array
+    """Velocity of the frame's origin in the middle of the window, world, shape (n, 3) [m/s]."""
     omega: Array
+    """Angular velocity in the middle of the window, world, shape (n, 3) [rad/s]."""
 
     @property
     def covariance(self) -> Array:
@@ -59,24 +63,31 @@ class ResidualWrenches:
 
 @dataclass(frozen=True)
 class Omnibus:
-    """Whether anything is missing in flight: mean chi2 per number (1 if nothing), its degrees of freedom and p-value.
+    """The test whether anything is missing in flight.
 
     The p-value assumes noise that is normal, independent from frame to frame and of the stated size.
     """
 
     statistic: float
+    """Mean chi2 per degree of freedom; 1 if nothing is missing."""
     dof: float
+    """Degrees of freedom."""
     p_value: float
+    """Probability of at least this chi2 if nothing is missing."""
 
 
 @dataclass(frozen=True)
-class Organiser:
-    """How much of the excess of chi2 a wrench that is constant in bins of a coordinate explains; "constant": in all."""
+class Covariate:
+    """Share of the excess of chi2 explained by a wrench that is constant within bins of a coordinate."""
 
     coordinate: str
+    """One of `COORDINATES`, or "constant": one wrench everywhere."""
     share: float
+    """Share of the excess, 0 to 1."""
     gain: float
+    """Fall of chi2."""
     p_value: float
+    """Probability of at least this gain by chance."""
 
 
 def residual_wrenches(segments: Segments) -> ResidualWrenches:
@@ -90,7 +101,14 @@ def residual_wrenches(segments: Segments) -> ResidualWrenches:
     weak = torch.eye(6).to(linear.information) / WEAK_STD**2
     wrench = torch.linalg.solve(linear.information + weak, linear.score)
     coordinates, velocity, omega = coordinates_of(segments)
-    return ResidualWrenches(segments.items, wrench.numpy(), linear.information.numpy(), coordinates, velocity, omega)
+    return ResidualWrenches(
+        segments=segments.items,
+        wrench=wrench.numpy(),
+        information=linear.information.numpy(),
+        coordinates=coordinates,
+        velocity=velocity,
+        omega=omega,
+    )
 
 
 def wrench_windows(
@@ -98,9 +116,9 @@ def wrench_windows(
     whole: Observations,
     flight: Sequence[Segment],
     noise: tuple[float, float],
-    memory: Memory = FORGETFUL,
+    memory: NoiseModel = WHITE,
 ) -> ResidualWrenches | None:
-    """Return the residual wrenches of half-overlapping windows of the flights, their states fitted; None for none."""
+    """Return the residual wrenches of half-overlapping windows of flights, states fitted; None without windows."""
     windows: list[Segment] = []
     for segment in flight:
         times = whole.times_s[segment.episode, segment.first : segment.last + 1]
@@ -113,7 +131,12 @@ def wrench_windows(
 
 
 def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:
-    """Return the test that all residual wrenches vanish; of windows that do not overlap, see `dispersion`."""
+    """Return the test that all residual wrenches vanish, for windows that do not overlap.
+
+    Args:
+        found: The residual wrenches.
+        scatter: Factor of the noise variance, see `dispersion`.
+    """
     score = np.einsum("nij,nj->ni", found.information, found.wrench)
     chi2 = float(np.einsum("ni,ni->", score, found.wrench)) / scatter
     dof = float(np.einsum("nij,nji->", found.information, found.covariance))
@@ -121,7 +144,7 @@ def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:
 
 
 def dispersion(segments: Segments, found: ResidualWrenches) -> float:
-    """Return by what factor short pieces scatter more than the stated noise, whatever wrench acts on each; at least 1.
+    """Return the factor, at least 1, by which short pieces scatter more than the stated noise under any wrench.
 
     Noise that is correlated from frame to frame, as of filtered tracks, shows here.
     """
@@ -131,15 +154,15 @@ def dispersion(segments: Segments, found: ResidualWrenches) -> float:
     return max(1.0, (chi2 - gained) / max(float(segments.dof.sum()) - taken, 1.0))
 
 
-def organisers(found: ResidualWrenches) -> list[Organiser]:
-    """Return which coordinates organise the residual wrench, the largest share first.
+def covariates_of(found: ResidualWrenches) -> list[Covariate]:
+    """Return the coordinates that explain the residual wrench, the largest share first.
 
-    The gain in chi2 of a wrench that is constant within bins, over one that is constant everywhere, less its numbers,
-    over the whole excess of chi2; of "constant", the gain over none.
+    The gain in chi2 of a wrench that is constant within bins, over one that is constant everywhere, less its degrees of
+    freedom, divided by the whole excess of chi2; for "constant", the gain over none.
     """
     score = np.einsum("nij,nj->ni", found.information, found.wrench)
     chi2 = float(np.einsum("ni,ni->", score, found.wrench))
-    # of an excess that chance alone makes there is nothing to share
+    # at least the excess that chance may cause: shares of less have no meaning
     excess = max(chi2 - 6 * len(score), 3 * np.sqrt(12 * len(score)))
 
     def gain(groups: Array) -> float:
@@ -151,27 +174,29 @@ def organisers(found: ResidualWrenches) -> list[Organiser]:
         return total
 
     everywhere = gain(np.zeros(len(score)))
-    results = [Organiser("constant", _share(everywhere - 6, excess), everywhere, chi2_tail(everywhere, 6))]
+    results = [Covariate("constant", _share(everywhere - 6, excess), everywhere, chi2_tail(everywhere, 6))]
     for name, values in found.coordinates.items():
         groups = values if name == "episode" else _bins(values)
         numbers = 6 * (len(np.unique(groups)) - 1)
         if numbers:
             more = gain(groups) - everywhere
-            results.append(Organiser(name, _share(more - numbers, excess), more, chi2_tail(more, numbers)))
+            results.append(Covariate(name, _share(more - numbers, excess), more, chi2_tail(more, numbers)))
     return sorted(results, key=lambda one: -one.share)
 
 
 def _share(gain: float, excess: float) -> float:
+    """Return a gain as a share of the excess, 0 to 1."""
     return float(np.clip(gain / excess, 0.0, 1.0))
 
 
 def _bins(values: Array) -> Array:
+    """Return the bin of each value."""
     edges = np.quantile(values, np.arange(1, BINS) / BINS)
     return np.searchsorted(edges, values).astype(np.float64)
 
 
 def coordinates_of(segments: Segments) -> tuple[dict[str, Array], Array, Array]:
-    """Return coordinates by name (n,), velocities (n, 3) and angular velocities (n, 3), world, half-way."""
+    """Return coordinates by name (n,), velocities (n, 3) and angular velocities (n, 3), world, in mid-window."""
     motion, body = segments.rollout(), segments.observations.free[0]
     item = torch.arange(len(segments.items))
     middle = torch.tensor([n // 2 for n in segments.lengths])

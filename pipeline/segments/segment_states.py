@@ -1,4 +1,4 @@
-"""The states of segments, fitted to their frames by a world."""
+"""States of segments, fitted to their frames in a given world."""
 
 from __future__ import annotations
 
@@ -7,26 +7,27 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..estimation.trajectory import STATE_SIZE, state_prior
 from ..physics.parameters import Parameter
 from ..physics.world import State
+from ..trajectories.residuals import STATE_SIZE, state_prior
 from .segments import START_FRAMES, Segments, line_state
 
 BAD_FIT = 1.3
-"""A contact segment that fits worse than this [chi2 / dof] is fitted again from other starts."""
+"""Chi2 / dof above which a contact segment is fitted again from other starts."""
 DRAWS, STARTS = 32, 3
-"""States that are drawn about the fitted one, and so many of them and of the straight lines, the best, that are fitted.
-
-Whether a corner strikes before or after the next one makes minima of their own; what is left there would be taken for
-the model's fault (pitfall P2)."""
+"""States drawn about the fitted one, and number of the best starts (drawn ones and straight lines) that are fitted.
+Which corner strikes first makes separate minima; the residual of a wrong one would be attributed to the model (pitfall
+P2)."""
 DRAW_SPREAD = 3.0
-"""Of the draws, in units of what the noise makes of a state between two frames."""
+"""Standard deviation of the draws, in units of the noise of a state between two frames."""
 FALL, MAX_DAMPING = 0.02, 1e3
-"""A descent ends when chi2 falls by less, or no step but a tiny one lowers it."""
+"""Fall of chi2 below which a descent ends, and damping above which it ends, as only tiny steps would lower chi2."""
 ITERATIONS = {"flight": 5, "contact": 5}
+"""Maximum number of steps by kind of segment."""
 SEARCHES, SEARCH_ITERATIONS = 2, 6
+"""Number of thorough searches, and steps of each fit of a usual one."""
 THOROUGH_STARTS, THOROUGH_ITERATIONS = 8, 8
-"""Of a thorough search."""
+"""Starts that are fitted in a thorough search, and steps of each fit."""
 
 
 def fit_states(
@@ -37,17 +38,17 @@ def fit_states(
     search: bool = True,
     thorough: bool = False,
 ) -> Segments:
-    """Fit the state of each segment by Levenberg-Marquardt, each with a damping of its own.
+    """Fit the state of each segment by Levenberg-Marquardt, with a separate damping for each.
 
     Args:
         segments: With states to start from.
-        parameters: Numbers of the world that are set, not fitted.
+        parameters: Parameters of the world that are set, not fitted.
         values: Their values in fitted coordinates, (P,) or (B, P).
-        iterations: Most steps.
-        search: Whether, through contact, to start from straight lines through several numbers of frames too, and to
-            fit those that still fit badly from other starts.
+        iterations: Maximum number of steps.
+        search: Whether, through contact, to start from straight lines through several numbers of frames too, and to fit
+            those that still fit badly from other starts.
         thorough: Whether to search several times, and for every segment that fits badly; else only for those that fit
-            worse than most, for where the law misses everything by far more than the noise, only those can be at the
+            worse than most: where the contact law misses all of them by far more than the noise, only those can be at a
             wrong minimum.
     """
     given = torch.zeros(0).to(segments.world.gravity) if values is None else values
@@ -75,7 +76,7 @@ def costs_of(segments: Segments, parameters: Sequence[Parameter], values: Tensor
 
 
 def best_of(segments: Segments, others: Sequence[State], parameters: Sequence[Parameter], values: Tensor) -> Segments:
-    """Return the segments, each in its own state or the one of others that fits better; all are rolled out at once."""
+    """Return the segments, each in its state or the one of others that fits better, all rolled out at once."""
     every = segments.in_states([segments.observations.state, *others])
     chosen = values if values.ndim == 1 else values.repeat(1 + len(others), 1)
     place = costs_of(every, parameters, chosen).unflatten(0, (1 + len(others), -1)).argmin(0)
@@ -110,14 +111,14 @@ def _searched(
 
 
 def _draws(segments: Segments, seed: int) -> Tensor:
-    """Return changes of states (D, B, S) drawn about nothing, of the size that the noise of two frames makes."""
+    """Return random changes of states (D, B, S) of the size that the noise of two frames makes."""
     position, rotation = segments.noise
     step = float(segments.observations.times_s.diff(dim=1).median())
     spread = [std for std in (position, rotation, position / step, rotation / step) for _ in range(3)]
     bodies = len(segments.observations.free)
     width = DRAW_SPREAD * torch.tensor(spread).to(segments.world.gravity).repeat(bodies)
     generator = torch.Generator().manual_seed(seed)
-    # the draws of a segment do not depend on which others are drawn for
+    # the draws of a segment do not depend on the other segments of the batch
     drawn = torch.randn(DRAWS, 1, STATE_SIZE * bodies, generator=generator, dtype=torch.float64).to(width)
     return (width * drawn).expand(-1, len(segments.items), -1)
 
@@ -125,14 +126,13 @@ def _draws(segments: Segments, seed: int) -> Tensor:
 def _descended(
     segments: Segments, parameters: Sequence[Parameter], values: Tensor, iterations: int
 ) -> tuple[Segments, Tensor]:
-    """Return the segments with their states at a minimum near by, and the costs (B,) there."""
+    """Return the segments with their states at a nearby minimum, and the costs (B,) there."""
     prior = torch.diag(state_prior(len(segments.observations.free))).to(segments.world.gravity)
     rows, jacobian = segments.residuals(parameters, values)
     cost = _costs(rows)
     damping = torch.full_like(cost, 1e-4)
     active = list(range(len(segments.items)))
     for _ in range(iterations):
-        assert jacobian is not None
         flat = torch.nan_to_num(jacobian[..., len(parameters) :].flatten(1, 2), posinf=0.0, neginf=0.0)
         error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
         normal = flat.transpose(1, 2) @ flat + prior
@@ -142,7 +142,6 @@ def _descended(
         some = segments.select(active)
         trial = some.moved(step)
         new_rows, slopes = trial.residuals(parameters, values if values.ndim == 1 else values[active])
-        assert slopes is not None
         fall = cost[active] - _costs(new_rows)
         better = fall > 0
         segments = _placed(segments, active, _merged(better, trial, some))
@@ -158,6 +157,7 @@ def _descended(
 
 
 def _costs(rows: Tensor) -> Tensor:
+    """Return the sum of squares (B,); infinite where a rollout diverged."""
     return torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
 
 
@@ -175,4 +175,5 @@ def _placed(segments: Segments, places: Sequence[int], some: Segments) -> Segmen
 
 
 def _put(values: Tensor, places: Sequence[int], some: Tensor) -> Tensor:
+    """Return values with some of them replaced."""
     return values.index_copy(0, torch.tensor(places), some)

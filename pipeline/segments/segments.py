@@ -1,56 +1,58 @@
-"""Segments of episodes as a batch, each with a state of its own: their residuals under a world, and the Jacobian."""
+"""Segments of episodes as a batch, each with its state: their residuals under a world, and the Jacobian."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, overload
 
 import torch
 from torch import Tensor
 
-from ..estimation.observations import Observations
-from ..estimation.trajectory import STATE_SIZE, TrajectoryResiduals, retract
-from ..physics.contact import ContactLaw
-from ..physics.dispatch import rollout as rolled_out
-from ..physics.dispatch import rollouts_at_once
-from ..physics.measured import measure, true_times
+from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..physics.contact_law import ContactLaw
+from ..physics.engine import rollout as rolled_out
+from ..physics.engine import rollouts_at_once
+from ..physics.observation_model import measure, true_times
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
-from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..physics.world import State, World
-from .cuts import Segment
-from .lasting import FORGETFUL, Memory, without_memory
+from ..trajectories.correlated_noise import WHITE, NoiseModel, innovations
+from ..trajectories.observations import Observations
+from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, retract
+from ..trajectories.segmentation import Segment
 
 Kind = Literal["flight", "contact"]
 
 FLIGHT_STEP_S, FLIGHT_STEP_NOISE_M = 0.0025, 2e-4
-"""Largest step in flight, where nothing is stiff, and the noise down to which it serves: the error of a drag of 1 / s
-is 0.1 %, some 0.1 mm, which through a noise of 0.05 mm looks like an effect of its own."""
+"""Maximum step [s] in flight, where nothing is stiff, and the noise [m] down to which it suffices: the error of a drag
+of 1 / s is 0.1 %, about 0.1 mm, which with a noise of 0.05 mm looks like a separate effect."""
 LEAST_STEP_S = 2.5e-4
+"""Minimum step [s] in flight."""
 START_FRAMES = (2, 4, 7)
-"""A contact segment's state is searched from straight lines through so many frames (pitfall P2)."""
+"""Numbers of frames of the straight lines from which a contact segment's state is searched (pitfall P2)."""
 PARAMETER_STEP = 0.04
-"""Differences by parameters in contact, in widths of their priors: a fifth of what matters."""
+"""Difference step by parameters in contact, in widths of their priors: a fifth of a relevant change."""
 CONTACT_STEP_S = 0.002
-"""Largest step in contact, and at most half the contact time: the law does not depend on the step."""
+"""Maximum step [s] in contact, which is also at most half the contact time: the law does not depend on the step."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Segments:
-    """Segments of one kind as a batch.
-
-    kind; world: in which they are rolled out; items (B); observations (B): their frames, padded, with the state that
-    is the best known; noise: standard deviations of the tracks (position [m], rotation [rad]); memory: how long their
-    errors last.
-    """
+    """Segments (B) of one kind as a batch."""
 
     kind: Kind
+    """Kind of the segments: flight or contact."""
     world: World
+    """World in which they are rolled out."""
     items: tuple[Segment, ...]
+    """Episode and frames of each segment (B)."""
     observations: Observations
+    """Frames of the segments, padded, with the best known state of each."""
     noise: tuple[float, float]
-    memory: Memory = FORGETFUL
+    """Standard deviations of the tracks (position [m], rotation [rad])."""
+    memory: NoiseModel = WHITE
+    """Correlation of the errors in time."""
 
     @staticmethod
     def of(
@@ -59,11 +61,18 @@ class Segments:
         whole: Observations,
         items: Sequence[Segment],
         noise: tuple[float, float],
-        memory: Memory = FORGETFUL,
+        memory: NoiseModel = WHITE,
     ) -> Segments:
         """Cut whole episodes; the states are first guesses, see :func:`fit_states`."""
         cut = _windows(whole, items)
-        found = Segments(kind, world_for(kind, world, noise[0]), tuple(items), cut, noise, memory)
+        found = Segments(
+            kind=kind,
+            world=world_for(kind, world, noise[0]),
+            items=tuple(items),
+            observations=cut,
+            noise=noise,
+            memory=memory,
+        )
         return found.with_state(line_state(found, START_FRAMES[1]))
 
     @property
@@ -73,7 +82,7 @@ class Segments:
 
     @property
     def dof(self) -> Tensor:
-        """Degrees of freedom (B,) of each segment: its numbers measured, less those of its state that they show.
+        """Degrees of freedom (B,) of each segment: measured coordinates less those used up by its state.
 
         A coordinate that is the same in all frames was not measured.
         """
@@ -93,7 +102,7 @@ class Segments:
         return replace(self, observations=replace(self.observations, state=state))
 
     def in_world(self, world: World) -> Segments:
-        """Return the segments in another world, stepped as their kind wants."""
+        """Return the segments in another world, with the step that their kind needs."""
         return replace(self, world=world_for(self.kind, world, self.noise[0]))
 
     def in_states(self, states: Sequence[State]) -> Segments:
@@ -102,24 +111,34 @@ class Segments:
         return every.with_state(State.joined(*states))
 
     def chunks(self, directions: int) -> list[list[int]]:
-        """Return the places of the segments in equal parts that fit one batch with so many directions."""
+        """Return the indices of the segments in equal parts; each fits one batch with `directions` variations."""
         count = len(self.items)
         number = max(1, -(-count * directions // rollouts_at_once(self.world)))
         size = -(-count // number)
         return [list(range(k, min(k + size, count))) for k in range(0, count, size)]
+
+    @overload
+    def residuals(
+        self, parameters: Sequence[Parameter], values: Tensor, jacobian: Literal[True] = True
+    ) -> tuple[Tensor, Tensor]: ...
+
+    @overload
+    def residuals(
+        self, parameters: Sequence[Parameter], values: Tensor, jacobian: Literal[False]
+    ) -> tuple[Tensor, None]: ...
 
     def residuals(
         self, parameters: Sequence[Parameter], values: Tensor, jacobian: bool = True
     ) -> tuple[Tensor, Tensor | None]:
         """Return residuals (B, T nf, 6) in sigmas and, if wanted, their Jacobian (B, T nf, 6, P + S).
 
-        Of errors that last they are the innovations, see `lasting`.
+        With correlated noise they are the innovations, see `correlated_noise`.
 
-        It is one of differences: in contact they see past the roughness of a step, and in flight, which is smooth,
-        they cost a third of exact derivatives and agree with them to 1e-4.
+        The Jacobian is one of differences: in contact they smooth the roughness of a step, and in flight, which is
+        smooth, they cost a third of exact derivatives and agree with them to 1e-4.
 
         Args:
-            parameters: Which numbers of the world are differentiated.
+            parameters: Parameters of the world that are differentiated.
             values: In fitted coordinates, shape (P,), or (B, P) for values of each segment.
             jacobian: Whether it is wanted; columns of parameters first, then of the state change.
         """
@@ -128,7 +147,9 @@ class Segments:
         parts = []
         for places in self.chunks(2 * size + len(parameters) + 1 if jacobian else 1):
             some = self.observations.select(places)
-            problem = TrajectoryResiduals(self.world, parameters, some, *self.noise, True, steps)
+            problem = TrajectoryResiduals(
+                self.world, parameters, some, *self.noise, differences=True, parameter_steps=steps
+            )
             shared = values if values.ndim == 1 else values[places]
             rows, slopes = problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian)
             fresh = None if slopes is None else _innovations(some, slopes, self.memory)
@@ -137,11 +158,11 @@ class Segments:
         return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
 
     def innovations(self, rows: Tensor) -> Tensor:
-        """Return rows (B, T nf, 6, ...) less what the errors of earlier frames, which last, make one expect."""
+        """Return rows (B, T nf, 6, ...) as innovations: less what the correlated errors of earlier frames predict."""
         return _innovations(self.observations, rows, self.memory)
 
     def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
-        """Return differences (B, T nf, 6, P) of the residuals by parameters alone.
+        """Return derivatives (B, T nf, 6, P) of the residuals by parameters alone, by one-sided differences.
 
         Args:
             parameters: By which.
@@ -166,7 +187,7 @@ class Segments:
         """Return the positions (B, T, nf, 3) [m] of the free bodies as they would be measured.
 
         Args:
-            parameters: Numbers of the world that are set.
+            parameters: Parameters of the world that are set.
             values: Their values in fitted coordinates, (B, P).
         """
         seen = self.observations
@@ -182,21 +203,22 @@ class Segments:
         return self.with_state(retract(self.observations.state, change, self.observations.free))
 
 
-def _innovations(seen: Observations, rows: Tensor, memory: Memory) -> Tensor:
-    if memory == FORGETFUL:
+def _innovations(seen: Observations, rows: Tensor, memory: NoiseModel) -> Tensor:
+    """Return the innovations of rows (B, T nf, 6, ...) for each free body."""
+    if memory == WHITE:
         return rows
     bodies = len(seen.free)
     by_body = rows.unflatten(1, (-1, bodies)).movedim(2, 1).flatten(0, 1)  # (B nf, T, 6, ...)
     times = seen.times_s.repeat_interleave(bodies, 0)
     parts = [
-        part if lasting.share == 0 else without_memory(part, times, mask.movedim(2, 1).flatten(0, 1), lasting)
-        for part, mask, lasting in zip(by_body.split(3, 2), (seen.seen, seen.turned), memory, strict=True)
+        part if noise.share == 0 else innovations(part, times, mask.movedim(2, 1).flatten(0, 1), noise)
+        for part, mask, noise in zip(by_body.split(3, 2), (seen.seen, seen.turned), memory, strict=True)
     ]
     return torch.cat(parts, 2).unflatten(0, (-1, bodies)).movedim(1, 2).flatten(1, 2)
 
 
 def _difference(parameter: Parameter) -> tuple[float, float]:
-    """Return how far down and up a parameter is moved for its derivative; up alone, as many may not be below 0."""
+    """Return how far down and up a parameter is moved for its derivative; only up, as many may not be below 0."""
     return 0.0, PARAMETER_STEP * parameter.prior[1]
 
 
@@ -237,7 +259,7 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
 
 
 def line_state(segments: Segments, frames: int) -> State:
-    """Return states at the first frames from straight lines through so many frames; in flight with gravity."""
+    """Return states at the first frames from straight lines through some frames; in flight with gravity."""
     seen, world = segments.observations, segments.world
     state = seen.state
     fields = [value.clone() for value in vars(state).values()]

@@ -1,8 +1,8 @@
-"""Glides: stretches in which a body stays on the ground without an impact, sliding, rolling or spinning.
+"""Sliding segments: a body stays on the ground without an impact, sliding, rolling or spinning.
 
-There the normal force is the weight whatever the law of contact, so that engines that differ by far at an impact agree,
-and the information about a friction grows with the fourth power of the time as it does in flight. So glides are cut
-long, where other contacts are cut short.
+There the normal force is the weight whatever the contact law, so that engines that differ widely in an impact agree,
+and the information about a friction grows with the fourth power of the time as in flight. So sliding segments are cut
+long, while other contacts are cut short.
 """
 
 from __future__ import annotations
@@ -15,36 +15,40 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..estimation.observations import Observations
-from ..physics.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
-from ..physics.sweeps import tangent_axes
+from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ..physics.impulse_solver import tangent_axes
 from ..physics.world import State, World
-from .cuts import GAP, Segment, without_rest
-from .phases import heights_of, is_round, size_of
+from ..trajectories.observations import Observations
+from ..trajectories.segmentation import GAP, GroundPlane, Segment, heights_of, size_of, without_rest
+from .contact_phases import is_round
 from .segments import Segments
 
 Array = NDArray[np.float64]
 
 LONGEST_S, SHORTEST_S = 0.5, 0.15
-"""A glide is cut into equal parts of at most this length; a shorter one is left to the other contacts."""
+"""Maximum and minimum length [s]: longer ones are cut into equal parts, shorter ones are left to the contact
+segments."""
 NEAR_M, NEAR_SIGMAS = 0.0015, 3.0
-"""On the ground: the lowest point lies below this height, and so many standard deviations of the noise."""
+"""Maximum height of the lowest point on the ground: this length [m], and this many sigmas of the noise."""
 SIDE_S, SIDE_FRAMES = 0.04, 3
-"""An impact is a jump of the velocity along the normal, or of tilting, between so much before and after it."""
+"""Time [s] and minimum number of frames on both sides over which a jump of a velocity is measured."""
 TILTING_RAD_S = 0.3
-"""A body that is not round and tilts faster than this, or so many standard deviations (below), turns over an edge."""
+"""Rate [rad/s] of tilting above which a body that is not round turns over an edge; or `JUMP_SIGMAS` where that is
+more."""
 JUMP_M_S, JUMP_SIGMAS = 0.12, 4.0
-"""A jump of any point of the body by this speed, or so many standard deviations where those are more, is an impact."""
+"""Jump of the velocity [m/s] of any point of the body that is an impact, or this many sigmas where that is more."""
 
 
-def glides_of(world: World, whole: Observations, clear: Tensor, noise: tuple[float, float]) -> list[Segment]:
-    """Return the glides of whole episodes; none without a ground or with several free bodies.
+def find_sliding_segments(
+    world: World, whole: Observations, clear: Tensor, noise: tuple[float, float]
+) -> list[Segment]:
+    """Return the sliding segments of whole episodes; none without a ground or with several bodies.
 
     Args:
         world: For shape and ground.
         whole: The episodes (E).
-        clear: Frames (E, T) that are surely in flight.
-        noise: Of the tracks (position [m], rotation [rad]).
+        clear: Airborne frames (E, T).
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
     """
     if world.ground_normal is None or len(whole.free) != 1 or len(world.bodies) != 1:
         return []
@@ -54,7 +58,7 @@ def glides_of(world: World, whole: Observations, clear: Tensor, noise: tuple[flo
     on = (lowest < margin) & ~clear & (whole.seen[:, :, 0] > 0)
     found = []
     for episode, times in enumerate(whole.times_s):
-        seen = (whole.seen[episode].amax(-1) > 0).nonzero()[:, 0]  # the first may be hidden, and any of the others
+        seen = (whole.seen[episode].amax(-1) > 0).nonzero()[:, 0]  # any frame may be hidden, the first included
         if len(seen) < 2:
             continue
         steady = on[episode, seen].numpy() & ~_impacts(world, whole, episode, seen, noise)
@@ -65,11 +69,10 @@ def glides_of(world: World, whole: Observations, clear: Tensor, noise: tuple[flo
     return without_rest(whole, found, noise)
 
 
-def settled(segments: Segments, state: State) -> State:
-    """Return states with the body on the ground as it lies on average, and no speed along the normal."""
+def grounded_states(segments: Segments, state: State) -> State:
+    """Return states with the body on the ground in its mean orientation, without speed along the normal."""
     seen, world = segments.observations, segments.world
-    assert world.ground_normal is not None and world.ground_offset is not None
-    normal, index = world.ground_normal, seen.free[0]
+    (normal, offset), index = GroundPlane.of(world), seen.free[0]
     fields = [value.clone() for value in vars(state).values()]
     weight = seen.turned[:, :, 0, None]
     up = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
@@ -81,7 +84,7 @@ def settled(segments: Segments, state: State) -> State:
     body = world.bodies[index]
     chosen = slice(None) if body.on_plane is None else body.on_plane
     along = quat_to_matrix(fields[1][:, index]).transpose(-1, -2) @ normal
-    low = (fields[0][:, index] @ normal - world.ground_offset[0])[:, None] + along @ body.centers[0, chosen].T
+    low = (fields[0][:, index] @ normal - offset[0])[:, None] + along @ body.centers[0, chosen].T
     low = (low - body.radii[0, chosen]).amin(-1)
     fields[0][:, index] -= low[:, None] * normal
     fields[2][:, index] -= (fields[2][:, index] @ normal)[:, None] * normal
@@ -91,12 +94,11 @@ def settled(segments: Segments, state: State) -> State:
 def _impacts(
     world: World, whole: Observations, episode: int, seen: Tensor, noise: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """Return which of the seen frames are within one of a jump of the speed along the normal, or of the tilting."""
-    assert world.ground_normal is not None
-    body = world.bodies[whole.free[0]]
-    height = (whole.position_m[episode, seen, 0] @ world.ground_normal)[:, None].numpy()
+    """Return the seen frames within one frame of a jump of the speed along the normal, or of the tilting."""
+    body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
+    height = (whole.position_m[episode, seen, 0] @ normal)[:, None].numpy()
     quat, turned = whole.quat_wxyz[episode, seen, 0], whole.turned[episode, seen, 0].numpy() > 0
-    level = tangent_axes(world.ground_normal)[1:]
+    level = tangent_axes(normal)[1:]
     jumps = np.zeros(len(seen), np.bool_)
     for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
         if (t < 0).sum() < 2 or (t > 0).sum() < 2:
@@ -105,7 +107,7 @@ def _impacts(
         spread = float(np.linalg.norm(inverse))
         jumps[k] = np.abs(inverse @ height[frames]).max() > max(JUMP_M_S, JUMP_SIGMAS * noise[0] * spread)
         if is_round(body) or not turned[frames].all():
-            continue  # no impact changes only how a ball spins
+            continue  # an impact of a ball never changes its spin alone
         turns = quat_log(quat_multiply(quat[frames], quat_conjugate(quat[k : k + 1])))  # world axes
         tilting = np.linalg.norm(inverse @ (turns @ level.T).numpy())
         jumps[k] |= tilting > max(JUMP_M_S / size_of(body), JUMP_SIGMAS * noise[1] * spread)
@@ -116,10 +118,10 @@ def _impacts(
 
 
 def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float) -> NDArray[np.bool_]:
-    """Return about which of the seen frames the body does not stay on one of its sides."""
-    assert world.ground_normal is not None
+    """Return the seen frames at which the body does not stay on one of its sides."""
+    normal = GroundPlane.of(world).normal
     turned = whole.turned[episode, seen, 0].numpy() > 0
-    up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ world.ground_normal).numpy()
+    up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ normal).numpy()
     tilts = np.zeros(len(seen), np.bool_)
     for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
         known = turned[frames]
@@ -132,7 +134,7 @@ def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, nois
 
 
 def _windows(times: Array) -> Iterator[tuple[int, slice, Array]]:
-    """Yield the place of each frame (at least two), the frames no further from it than some steps, and how far [s]."""
+    """Yield the index of each frame (at least two), the frames within some steps of it, and their distance [s]."""
     step = float(np.median(np.diff(times)))
     side = max(SIDE_FRAMES, round(SIDE_S / step))
     reach = (side + 0.5) * step

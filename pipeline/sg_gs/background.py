@@ -1,4 +1,4 @@
-"""What is no body: the spheres of the background, and the camera poses that a fit of them tells."""
+"""Fit of the background spheres, and refinement of the camera poses by such a fit."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import time
 from dataclasses import asdict, replace
 from typing import Any
 
-from ..schemas import InputDataError
-from .sfm.points import POINTS_NAME
-from .sg_gs_stage import Stage
-from .splats.adaptive import fit_adaptively
-from .splats.colors import mean_colors
-from .splats.fit import Rates, Trainable, descend, detached, thinned
-from .splats.losses import behind, scene_loss
-from .splats.poses import Motions, motion_record, moved_for_good
-from .splats.seeds import scene_seeds, shows_bodies, to_spheres
-from .splats.spheres import Spheres
+from ...datasets.capture.sparse_points import POINTS_NAME
+from ...schemas import InputDataError
+from ..geometry.spheres import Spheres
+from .camera_refinement import Motions, motion_record, moved_for_good
+from .colors import mean_colors
+from .context import Stage
+from .initialization import scene_seeds, shows_bodies, to_spheres
+from .losses import behind, scene_loss
+from .mcmc import fit_adaptively
+from .optimize import Rates, Trainable, descend, detached, thinned
 
 _START_SHARE = 0.3
-"""Of a budget: spheres of the background at the beginning."""
+"""Number of background spheres at the start of a fit, as a share of the budget."""
 _POSE_STEPS = 2.0
-"""Steps that refine the cameras' poses without a budget of spheres, in units of the setting `iterations`."""
+"""Number of steps that refine the camera poses without a budget of spheres, in units of the setting `iterations`."""
 
 
 def fit_background(stage: Stage, bodies: list[Spheres]) -> Spheres:
-    """Fit the background with the bodies' visual spheres (world frame) standing in it."""
+    """Fit the background spheres behind the visual spheres of the bodies (world frame), which stay fixed."""
     started = time.perf_counter()
     standing = Spheres.joined(bodies) if bodies else None
     spheres, record = _background_spheres(stage, standing, "background", None)
@@ -34,7 +34,7 @@ def fit_background(stage: Stage, bodies: list[Spheres]) -> Spheres:
 
 
 def refine_poses(stage: Stage) -> None:
-    """Move the cameras to where the photos say that they were, by a fit of the background that is then thrown away."""
+    """Refine the camera poses by a fit of the background, whose spheres are then discarded."""
     started = time.perf_counter()
     motions = Motions(stage.train, stage.spread)
     _background_spheres(stage, None, "camera poses", motions)
@@ -46,7 +46,7 @@ def refine_poses(stage: Stage) -> None:
 def _background_spheres(
     stage: Stage, bodies: Spheres | None, what: str, motions: Motions | None
 ) -> tuple[Spheres, dict[str, Any]]:
-    """Fit the spheres of the background, of which there are ever more where there is a budget; return how it went."""
+    """Return the fitted background spheres, whose number grows where a budget is set, and a record of the fit."""
     config = stage.config
     loss = scene_loss(bodies, stage.exposures, motions)
     slot = stage.slot(what)
@@ -75,7 +75,7 @@ def _background_spheres(
 
 
 def _background_seeds(stage: Stage, count: int, bodies: Spheres | None) -> Spheres:
-    """Return spheres where the background begins: on the ground, on SfM points or depth maps, and far away."""
+    """Return the initial background spheres: on the ground, on SfM points or depth maps, and far away."""
     if stage.points is None and stage.ground is None:
         where = "lies on a shell far away" if shows_bodies(stage.train) else "starts from random points"
         warning = f"No {POINTS_NAME} and no ground: the background {where}."

@@ -1,4 +1,4 @@
-"""Bodies from photos: their solid, the spheres that are seen, and the spheres that collide."""
+"""Bodies from photos: the solid, the visual spheres and the collision spheres of each."""
 
 from __future__ import annotations
 
@@ -12,46 +12,43 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..datasets.ply import Splats
-from ..schemas import Body, InputDataError, Pose, SplatConfig
-from .sampling import rotation_matrix
-from .sg_gs_stage import Stage
-from .splats.collision import distil, shape_to_spheres
-from .splats.colors import mean_colors
-from .splats.fit import Rates, Trainable, descend, detached, thinned
-from .splats.hull import carve
-from .splats.losses import body_loss, geometry_loss
-from .splats.overlap import require_body_in_masks
-from .splats.seeds import body_seeds, to_spheres
-from .splats.shapes import shape_mass_properties, shape_volume
-from .splats.spheres import Spheres
-from .splats.stereo import refine
-from .splats.surface import Union
-from .splats.views import View, body_windows
-from .splats.volume import Array, MassProperties, Volume, grid_points
+from ...datasets.shapes.ply import Splats
+from ...schemas import Body, InputDataError, Pose, SplatConfig
+from ..geometry.primitives import shape_mass_properties, shape_volume
+from ..geometry.solid_grid import Array, MassProperties, Volume, grid_points
+from ..geometry.spheres import Spheres
+from ..geometry.surface_distance import Union
+from ..geometry.viewpoint import rotation_matrix
+from .collision_spheres import distil, shape_to_spheres
+from .colors import mean_colors
+from .context import Stage
+from .depth_refinement import refine
+from .initialization import body_seeds, to_spheres
+from .losses import body_loss, geometry_loss
+from .optimize import Rates, Trainable, descend, detached, thinned
+from .view_overlap import require_body_in_masks
+from .views import View, body_windows
+from .visual_hull import carve
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BodyResult:
-    """One body, in its body frame.
-
-    Attributes:
-        visual: What it looks like; None where nothing shows it (no photos).
-        collision: What it collides with: spheres of radius `radius_factor` times the scale.
-        collision_distance_m: Largest distance between the colliding spheres' surface and the body's solid [m].
-        photo_pose: T_world_body while the photos were taken.
-        mass_properties: Of a solid of uniform density.
-    """
+    """One body, in its body frame."""
 
     visual: Splats | None
+    """Visual spheres; None where no photo shows the body."""
     collision: Splats
+    """Collision spheres, of radius `radius_factor` times the scale."""
     collision_distance_m: float
+    """Largest distance between the surface of the collision spheres and the solid of the body [m]."""
     photo_pose: Pose
+    """Pose T_world_body while the photos were taken."""
     mass_properties: MassProperties
+    """Mass properties of the solid at uniform density."""
 
 
 def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres | None]:
-    """Return a body in its frame, and its visual spheres in the world frame where it has any."""
+    """Fit a body; return it in its body frame, and its visual spheres in the world frame if it has any."""
     masked = [view for view in stage.train if view.cover is not None and bool((view.cover[index] > 0.5).any())]
     if body.shape is None and not masked:
         raise InputDataError(
@@ -59,35 +56,14 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
             f"shape = {{ box | sphere | mesh | splats }} in capture.toml, or masks/ with label {index + 1}.",
             "add one of them.",
         )
-    solid = None
     T_world_body = _pose_matrix(body.photo_pose or Pose())
-    if body.shape is None:
-        solid = _hull(stage, index, body)
-    elif masked:
-        solid = _moved(shape_volume(body.shape, stage.capture.root, stage.config.radius_factor), T_world_body)
-        require_body_in_masks(solid.surface, masked, index, body.name)
-    elif stage.train:
-        stage.warnings.append(
-            f"body '{body.name}': no mask shows it, so that it has a shape for contact and no looks; masks/ with label "
-            f"{index + 1} would give it some."
-        )
+    solid = _solid(stage, index, body, masked, T_world_body)
     world = None if solid is None else _fit_spheres(stage, index, body, solid)
     if body.photo_pose is None and body.shape is None and world is not None:
         T_world_body = np.eye(4)
         T_world_body[:3, 3] = world.means.double().mean(0).cpu().numpy()
     T_body_world = np.linalg.inv(T_world_body)
-    if body.shape is not None:
-        collision, distance = shape_to_spheres(
-            body.shape, stage.capture.root, stage.config.max_collision_spheres, stage.config.radius_factor
-        )
-        mass_properties = shape_mass_properties(body.shape, stage.capture.root, stage.config.radius_factor)
-    else:
-        assert solid is not None
-        local = _moved(solid, T_body_world)
-        spheres = distil(local, stage.config.max_collision_spheres, seed=stage.config.seed)
-        collision, distance = spheres.splats(stage.config.radius_factor), spheres.distance_m
-        mass_properties = _turned(solid.mass_properties(), T_body_world)
-        stage.record[body.name]["collision"] = {"support_error_m": spheres.support_error_m}
+    collision, distance, mass_properties = _contact_properties(stage, body, solid, T_body_world)
     visual = None
     if world is not None and solid is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
@@ -98,14 +74,57 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
             distance = float(_union(visual, stage.config).distance(_moved(solid, T_body_world).surface).max())
         _record_collision(stage, body.name, collision, visual, distance)
     pose = body.photo_pose or _pose(T_world_body)
-    return BodyResult(visual, collision, distance, pose, mass_properties), world
+    return BodyResult(
+        visual=visual,
+        collision=collision,
+        collision_distance_m=distance,
+        photo_pose=pose,
+        mass_properties=mass_properties,
+    ), world
+
+
+def _solid(stage: Stage, index: int, body: Body, masked: Sequence[View], T_world_body: Array) -> Volume | None:
+    """Return the solid of a body in the world frame: its visual hull, or its shape where masks show it, else None."""
+    if body.shape is None:
+        return _hull(stage, index, body)
+    if masked:
+        solid = _moved(shape_volume(body.shape, stage.capture.root, stage.config.radius_factor), T_world_body)
+        require_body_in_masks(solid.surface, masked, index, body.name)
+        return solid
+    if stage.train:
+        stage.warnings.append(
+            f"body '{body.name}': no mask shows it, so it has collision spheres and no visual spheres. To get visual "
+            f"spheres, add masks/ with label {index + 1}."
+        )
+    return None
+
+
+def _contact_properties(
+    stage: Stage, body: Body, solid: Volume | None, T_body_world: Array
+) -> tuple[Splats, float, MassProperties]:
+    """Return collision spheres, their largest distance from the solid [m] and mass properties, in the body frame.
+
+    Raises:
+        ValueError: If the body has neither a shape nor a solid.
+    """
+    config = stage.config
+    if body.shape is not None:
+        collision, distance = shape_to_spheres(
+            body.shape, stage.capture.root, config.max_collision_spheres, config.radius_factor
+        )
+        return collision, distance, shape_mass_properties(body.shape, stage.capture.root, config.radius_factor)
+    if solid is None:
+        raise ValueError(f"body '{body.name}' has neither a shape nor a solid.")
+    spheres = distil(_moved(solid, T_body_world), config.max_collision_spheres, seed=config.seed)
+    stage.record[body.name]["collision"] = {"support_error_m": spheres.support_error_m}
+    return spheres.splats(config.radius_factor), spheres.distance_m, _turned(solid.mass_properties(), T_body_world)
 
 
 def _hull(stage: Stage, index: int, body: Body) -> Volume:
     silhouettes = [view.silhouette(index) for view in stage.train]
     hull = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
     if any(view.depth_map is not None for view in stage.train):
-        return hull  # depth maps have carved it where photos would have to be compared
+        return hull  # The depth maps have carved it already, so the photos need not be compared.
     solid, refinement = refine(
         hull, [view for view in stage.train if view.labels is not None], index, stage.config.seed
     )
@@ -114,7 +133,7 @@ def _hull(stage: Stage, index: int, body: Body) -> Volume:
 
 
 def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres:
-    """Fit a body's visual spheres: geometry and colours together, or geometry first, which alone looks at maps."""
+    """Fit the visual spheres of a body: geometry and colours together, or geometry first (the only use of maps)."""
     config, device = stage.config, stage.device
     started = time.perf_counter()
     centers, scales, surface_count = body_seeds(solid, config.max_body_spheres, config.radius_factor, config.seed)
@@ -151,7 +170,7 @@ def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres
 def _fit_geometry(
     stage: Stage, index: int, body: Body, solid: Volume, start: Spheres, windows: Sequence[View], rates: Rates
 ) -> tuple[Spheres, list[float]]:
-    """Fit centres, scales and opacities to silhouettes and to what geometry maps there are."""
+    """Fit centres, scales and opacities to the silhouettes and the available geometry maps."""
     with_features = [view for view in windows if view.features is not None]
     codes = start.means.new_zeros(len(start), 0)
     if with_features:
@@ -172,7 +191,7 @@ def _fit_geometry(
 
 
 def _record_collision(stage: Stage, name: str, collision: Splats, visual: Splats, distance: float) -> None:
-    """Record how far what collides is from the solid, and from what is seen."""
+    """Record the distances of the collision spheres from the solid and from the visual spheres."""
     record: dict[str, Any] = {"set": stage.config.collision, "spheres": len(collision), "surface_distance_m": distance}
     if collision is not visual:
         there, back = _union(collision, stage.config).gaps(_union(visual, stage.config))
@@ -214,7 +233,7 @@ def _pose_matrix(pose: Pose) -> Array:
 
 
 def _pose(T_world_body: Array) -> Pose:
-    """Return a pose without rotation: only bodies whose frame has the world's axes come here."""
+    """Return the pose of a body whose frame has the axes of the world."""
     x, y, z = (float(value) for value in T_world_body[:3, 3])
     return Pose(position_m=(x, y, z))
 

@@ -1,9 +1,10 @@
-"""Separating bodies from a scene without masks: by a box in the manifest, or by the ground and clustering.
+"""Separation of bodies from a scene without masks: by a box in the manifest, or by the ground and clustering.
 
 Spheres are fitted to all photos at a small size: some on the ground and far away, others on a grid in the space where a
-body may be, which begin nearly transparent and become opaque where the photos want something. What stands on the
-ground is clustered, and fitted again by a finer grid about the cluster alone; a box in the manifest saves the first
-step. That shows where a body is to about the grid's spacing, and `outlines` finds its border in every photo.
+body may be. The spheres of the grid start nearly transparent and become opaque where the photos require it. The opaque
+spheres above the ground are clustered, and a finer grid is fitted around the chosen cluster alone; a box in the
+manifest replaces this first step. The result locates a body to about the spacing of the grid; `mask_segmentation` then
+finds its border in every photo.
 """
 
 from __future__ import annotations
@@ -21,80 +22,74 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
-from ...datasets.capture import Capture
-from ...schemas import Body, Ground, InputDataError, SplatConfig
+from ...datasets.capture.capture import Capture
+from ...schemas import Body, Ground, InputDataError, PhotoBox, SplatConfig
+from ..geometry.directions import upright_axes
+from ..geometry.solid_grid import Array
+from ..geometry.spheres import Spheres
 from .colors import mean_colors
-from .directions import upright_axes
-from .exposures import Exposures
-from .fit import Rates, Trainable, descend
+from .initialization import scene_seeds, to_spheres
 from .losses import scene_loss
-from .outlines import Blob, outline
-from .seeds import scene_seeds, to_spheres
-from .spheres import Spheres
+from .mask_segmentation import Blob, outline
+from .optimize import Rates, Trainable, descend
+from .photo_exposure import Exposures
 from .views import View, focus_of, render_view
-from .volume import Array
 
 _SIZE = 160
-"""Most pixels of the longer side of the photos that the spheres are fitted to."""
+"""Maximum length of the longer side of the photos that the spheres are fitted to [px]."""
 _ROUGH, _FINE = 0.4, 0.75
-"""Shares of the iterations: looking for a body on the ground, and fitting what is in a box."""
+"""Shares of the iterations for the search for a body on the ground and for the fit inside a box."""
 _GRID_SPHERES, _OTHER_SPHERES = 2000, 1500
-"""At most; fewer where the settings allow a body or a background fewer."""
+"""Maximum number of spheres in the grid and elsewhere; fewer where the settings allow a body or a background fewer."""
 _START_OPACITY = 0.1
 _OPACITY_WEIGHT = 0.002
-"""Weight of the mean opacity of the grid's spheres: what no photo needs fades away."""
+"""Weight of the mean opacity of the grid's spheres, which makes spheres fade that no photo requires."""
 _SCALE = 0.4
-"""Scale of a sphere of the grid, in units of its spacing."""
+"""Scale of a sphere of the grid, in units of the grid spacing."""
 _SOLID = 0.15
-"""A sphere of the grid that has become more opaque than this is part of something."""
+"""Opacity above which a sphere of the grid counts as part of an object."""
 _REACH = 1.8
-"""Two spheres touch when their distance is less than this many times the sum of their scales."""
+"""Distance below which two spheres touch, in units of the sum of their scales."""
 _SEARCHED = 0.6
-"""Radius of the space in which bodies are looked for, in units of the cameras' distance from where they look."""
+"""Radius of the search space for bodies, in units of the distance between the cameras and their common focus."""
 _MARGIN = 1.2
-"""Width of the space about a cluster in which it is fitted again, in units of the first grid's spacing."""
+"""Margin around a cluster in which it is fitted again, in units of the first grid's spacing."""
 _FAINT = 0.15
-"""What fills less than this share of the largest cluster's pixels is dust."""
+"""Minimum number of pixels of a cluster, as a share of those of the largest; smaller clusters are ignored."""
 _LEAST = 5e-4
-"""Least mean share of a photo that a body fills."""
+"""Minimum mean share of a photo that a body fills."""
 _CENTRAL = 0.35
-"""Pixels count less the farther they are from a photo's middle: standard deviation in units of its longer side."""
+"""Standard deviation of the Gaussian weight of pixels around the middle of a photo, in units of its longer side."""
 _POOR = 0.9
-"""Agreement below which the picture ought to be looked at."""
+"""Agreement of the masks below which a warning asks the user to check the picture."""
 
 
 @dataclass(frozen=True)
 class BodyRecord:
-    """How one body was separated.
-
-    Attributes:
-        method: By the box in the manifest, or by the ground and clustering.
-        clusters: How many things stood on the ground, or in the box.
-        share: Mean share of a photo's pixels.
-        agreement: Mean IoU of the masks and of the solid that they leave together, as the photos see it.
-    """
+    """How one body was separated."""
 
     method: Literal["box", "ground"]
+    """How the body was found: by the box in the manifest, or by the ground and clustering."""
     clusters: int
+    """Number of objects found on the ground, or in the box."""
     share: float
+    """Mean share of the pixels of a photo that the body fills."""
     agreement: float
+    """Mean IoU of the masks and the projections of the solid that is carved by all of them."""
 
 
 @dataclass(frozen=True)
 class Separation:
-    """Masks for bodies that had none.
-
-    Attributes:
-        train: The photos to fit, with masks.
-        test: The held-out ones, with masks; they took no part in finding the bodies.
-        record: `BodyRecord` by body, for fit.json.
-        warnings: What the user should know.
-    """
+    """Photos with masks of bodies that had none."""
 
     train: list[View]
+    """The photos to fit, with masks."""
     test: list[View]
+    """The held-out photos, with masks; they were not used to find the bodies."""
     record: dict[str, dict[str, Any]]
+    """`BodyRecord` by body, for fit.json."""
     warnings: tuple[str, ...]
+    """Messages for the user."""
 
 
 def separate(
@@ -105,7 +100,7 @@ def separate(
     points: Array | None,
     config: SplatConfig,
 ) -> Separation | None:
-    """Find the bodies that have neither masks nor a shape, or a box and no masks, and give the photos masks of them.
+    """Segment the bodies without masks that have a box or no shape, and add their masks to the photos.
 
     Args:
         capture: The capture.
@@ -116,10 +111,10 @@ def separate(
         config: Settings of the stage.
 
     Returns:
-        The photos with masks, or None where no body needs that, or there are no photos.
+        The photos with masks, or None if no body needs masks or the capture has no photos.
 
     Raises:
-        InputDataError: If a body has neither a box nor a ground to stand on, or nothing is found.
+        InputDataError: If a body can be found neither by a box nor by the ground, or nothing is found.
     """
     bodies = capture.manifest.bodies
     wanted = [index for index, body in enumerate(bodies) if _wants(body, index, train)] if train else []
@@ -128,7 +123,7 @@ def separate(
     _refuse_the_unknowable(capture, [bodies[index] for index in wanted], ground)
     small = [_small(view) for view in train]
     scene = _Scene(capture, small, ground, points, config)
-    boxes = {index: _box(bodies[index]) for index in wanted if bodies[index].photo_box is not None}
+    boxes = {index: _region(box) for index in wanted if (box := bodies[index].photo_box) is not None}
     regions, counts = dict(boxes), {}
     for index in wanted:
         if index not in boxes:
@@ -164,14 +159,15 @@ def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Gro
     todo = f"give each a photo_box = {{ min_m = [x, y, z], max_m = [x, y, z] }} ({unit}, world frame) in capture.toml."
     if boxless and ground is None:
         raise InputDataError(
-            f"{capture.root}: body '{boxless[0]}' has neither a shape nor masks, nor a box or a ground to find it by.",
-            "masks/ with its label, a shape, a photo_box, or (with metric cameras) a ground that it stands on.",
+            f"{capture.root}: body '{boxless[0]}' has neither a shape nor masks, and can be found neither by a box nor "
+            "by the ground.",
+            "masks/ with its label, a shape, a photo_box, or (with metric cameras) a ground below it.",
             todo,
         )
     if len(boxless) > 1:
         raise InputDataError(
-            f"{capture.root}: bodies {', '.join(repr(name) for name in boxless)} have neither masks, shapes nor boxes; "
-            "which is which cannot be seen.",
+            f"{capture.root}: bodies {', '.join(repr(name) for name in boxless)} have neither masks, shapes nor boxes, "
+            "so they cannot be distinguished.",
             "one such body.",
             todo,
         )
@@ -180,52 +176,54 @@ def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Gro
 def _remarks(name: str, entry: BodyRecord) -> list[str]:
     where = "in its box" if entry.method == "box" else "on the ground"
     remarks = [
-        f"body '{name}' has no masks: it was separated by what is {where}. separation.png shows what was taken for "
-        "it, and the held-out figures within the mask rest on that."
+        f"body '{name}' has no masks: it was separated by what is {where}. separation.png shows the result; the "
+        "held-out figures within the mask depend on it."
     ]
     if entry.method == "ground" and entry.clusters > 1:
         remarks.append(
-            f"body '{name}': {entry.clusters} things stand on the ground, and the one most in view was taken; "
-            "photo_box in capture.toml would choose another."
+            f"body '{name}': {entry.clusters} objects were found on the ground, and the one most in view was "
+            "chosen. To choose another, set photo_box in capture.toml."
         )
     if entry.agreement < _POOR:
         remarks.append(
-            f"body '{name}': its masks agree with each other by {entry.agreement:.2f} only (IoU with the solid that "
-            f"they leave; {_POOR:g} or more is good). Look at separation.png; masks/ or a tighter photo_box would help."
+            f"body '{name}': its masks agree with each other by {entry.agreement:.2f} only (IoU with the solid carved "
+            f"by them; {_POOR:g} or more is good). Check separation.png; masks/ or a tighter photo_box would help."
         )
     return remarks
 
 
 @dataclass(frozen=True)
 class _Region:
-    """A box in which a body is looked for: `low` and `high` [m] along the rows of `axes` (3, 3), world frame."""
+    """A box that is searched for a body."""
 
     axes: Array
+    """Unit vectors along the sides of the box, world frame, one per row, shape (3, 3)."""
     low: Array
+    """Lower bounds along these axes [m], shape (3,)."""
     high: Array
+    """Upper bounds along these axes [m], shape (3,)."""
 
     def corners(self) -> Array:
-        """Return the corners, world frame [m], (8, 3)."""
+        """Return the corners [m], world frame, shape (8, 3)."""
         sides = np.stack(np.meshgrid(*np.stack([self.low, self.high], 1), indexing="ij"), -1)
         return sides.reshape(-1, 3) @ self.axes
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points (n, 3) lie inside."""
+        """Return whether each point (n, 3) lies inside, shape (n,)."""
         local = points @ self.axes.T
         return np.asarray(((local >= self.low) & (local <= self.high)).all(1))
 
 
-def _box(body: Body) -> _Region:
-    assert body.photo_box is not None
-    return _Region(np.eye(3), np.array(body.photo_box.min_m), np.array(body.photo_box.max_m))
+def _region(box: PhotoBox) -> _Region:
+    return _Region(np.eye(3), np.array(box.min_m), np.array(box.max_m))
 
 
 class _Scene:
-    """The photos, and what is fitted to them.
+    """The reduced photos of a scene and the fits of spheres to them.
 
     Args:
-        capture: For messages.
-        views: The photos, small.
+        capture: The capture, for messages.
+        views: The reduced photos.
         ground: The ground, or None.
         points: Sparse points, world frame, (n, 3), or None.
         config: Settings of the stage.
@@ -239,20 +237,20 @@ class _Scene:
         self._up = np.array([0.0, 0.0, 1.0]) if ground is None else np.array(ground.normal)
 
     def standing(self, body: Body, taken: Sequence[_Region]) -> tuple[_Region, int]:
-        """Return the space about the thing on the ground that is most in view, and how many things stand there.
+        """Return the region of the object on the ground that is most in view, and the number of such objects.
 
         Args:
-            body: The body that is looked for.
+            body: The body to find.
             taken: Boxes of other bodies.
 
         Raises:
-            InputDataError: If nothing stands on the ground, or only things that reach out of the space searched.
+            InputDataError: If no object is found on the ground, or only objects that extend beyond the searched space.
         """
         middle = focus_of(self._views)
         reach = _SEARCHED * float(np.median([np.linalg.norm(view.camera.center - middle) for view in self._views]))
         axes = upright_axes(self._up)
         space = _Region(axes, axes @ middle - reach, axes @ middle + reach)
-        spheres, count, pitch = self._fitted([space], _ROUGH, f"{body.name}: looking for it")
+        spheres, count, pitch = self._fitted([space], _ROUGH, f"{body.name}: search")
         clusters = [
             members
             for members in self._clusters(spheres, count, pitch)
@@ -262,29 +260,29 @@ class _Scene:
         most = max(weights, default=0.0)
         if most < _LEAST:
             raise InputDataError(
-                f"{self._root}: body '{body.name}' has neither masks nor a shape, and nothing that stands on the "
-                f"ground was found within {reach:.2g} m of where the cameras look.",
-                "a thing that stands free on the ground, seen from all around.",
+                f"{self._root}: body '{body.name}' has neither masks nor a shape, and no object on the ground was "
+                f"found within {reach:.2g} m of where the cameras look.",
+                "a free-standing object on the ground, photographed from all sides.",
                 "give the body a photo_box in capture.toml, or masks/.",
             )
         local = spheres.means[clusters[weights.index(most)]].numpy() @ axes.T
         low, high = local.min(0), local.max(0)
         if (low[:2] < space.low[:2] + 0.5 * pitch).any() or (high > space.high - 0.5 * pitch).any():
             raise InputDataError(
-                f"{self._root}: body '{body.name}' has neither masks nor a shape, and what is most in view above the "
-                f"ground reaches farther than {reach:.2g} m from where the cameras look: it is no single body.",
-                "a thing that stands free on the ground, seen from all around.",
+                f"{self._root}: body '{body.name}' has neither masks nor a shape, and the object most in view above "
+                f"the ground extends farther than {reach:.2g} m from where the cameras look, so it is no single body.",
+                "a free-standing object on the ground, photographed from all sides.",
                 "give the body a photo_box in capture.toml, or masks/.",
             )
         region = _Region(axes, low - _MARGIN * pitch, high + _MARGIN * pitch)
         return region, sum(weight > _FAINT * most for weight in weights)
 
     def contents(self, regions: dict[str, _Region]) -> tuple[Spheres, float, list[tuple[NDArray[np.int64], int]]]:
-        """Fit what is in the regions of bodies by a fine grid.
+        """Fit the content of the regions of bodies with a fine grid.
 
         Returns:
-            All spheres, the grid's spacing [m], and for each body its spheres' indices, and how many things it was
-            chosen from.
+            All spheres, the spacing of the grid [m], and for each body the indices of its spheres and the number of
+            objects it was chosen from.
 
         Raises:
             InputDataError: If a region is empty.
@@ -306,7 +304,7 @@ class _Scene:
         return spheres, pitch, found
 
     def empty(self, name: str, region: _Region) -> InputDataError:
-        """Return the error that nothing was found in a region."""
+        """Return the error for a region in which nothing was found."""
         return InputDataError(
             f"{self._root}: the photos show nothing solid where body '{name}' is looked for, "
             f"from {np.round(region.low, 3).tolist()} to {np.round(region.high, 3).tolist()}.",
@@ -315,7 +313,7 @@ class _Scene:
         )
 
     def _fitted(self, regions: Sequence[_Region], share: float, what: str) -> tuple[Spheres, int, float]:
-        """Fit the scene; return the spheres, how many of the first are the grid's, and its spacing [m]."""
+        """Fit the scene; return the spheres, the number of grid spheres (the first ones), and the grid spacing [m]."""
         seed, steps = self._config.seed, max(1, round(share * self._config.iterations))
         rng = np.random.default_rng(seed)
         count = min(_GRID_SPHERES, self._config.max_body_spheres)
@@ -348,20 +346,20 @@ class _Scene:
         return float(sides.prod() * (self._height(samples) > 0).mean())
 
     def _grid(self, region: _Region, pitch: float, rng: np.random.Generator) -> Array:
-        """Return points of a region above the ground, about a pitch apart [m], world frame, (n, 3)."""
+        """Return points of a region above the ground with a spacing of about `pitch` [m], world frame, (n, 3)."""
         ticks = [np.arange(a + 0.5 * pitch, b, pitch) for a, b in zip(region.low, region.high, strict=True)]
         local = np.stack(np.meshgrid(*ticks, indexing="ij"), -1).reshape(-1, 3)
         points = (local + rng.uniform(-0.3, 0.3, local.shape) * pitch) @ region.axes
         return points[self._height(points) > 0]
 
     def _height(self, points: Array) -> Array:
-        """Return the height of points (n, 3) above the ground [m]; infinite where there is none."""
+        """Return the height of points (n, 3) above the ground [m]; infinite without a ground."""
         if self._ground is None:
             return np.full(len(points), np.inf)
         return points @ self._up - self._ground.offset_m
 
     def _clusters(self, spheres: Spheres, count: int, pitch: float) -> list[NDArray[np.int64]]:
-        """Return the grid's spheres that are solid and clear of the ground, by what touches."""
+        """Return the connected clusters of the grid's spheres that are solid and clear of the ground."""
         means, scales = spheres.means.numpy(), spheres.scales.numpy()
         solid = (spheres.opacities[:count].numpy() > _SOLID) & (self._height(means[:count]) > 0.2 * pitch)
         chosen = np.flatnonzero(solid)
@@ -378,9 +376,9 @@ class _Scene:
 
     @torch.no_grad()
     def _in_view(self, spheres: Spheres, clusters: Sequence[NDArray[np.int64]]) -> list[float]:
-        """Return how many pixels without a label each cluster fills; those in the middle of a photo count most.
+        """Return the weighted number of unlabelled pixels that each cluster fills, as a mean share of a photo.
 
-        As a mean share of a photo.
+        Pixels in the middle of a photo have the largest weight.
         """
         if not clusters:
             return []
@@ -403,7 +401,7 @@ class _Scene:
 
 
 def _small(view: View) -> View:
-    """Return a view reduced for the fit of spheres."""
+    """Return a view at the reduced size of the fit of spheres."""
     width, height = view.size
     scale = min(1.0, _SIZE / max(width, height))
     size = round(scale * height), round(scale * width)

@@ -1,4 +1,4 @@
-"""Small errors of the photos' camera poses, found by a fit of spheres that carries motions of the cameras along."""
+"""Corrections of the photos' camera poses, learned together with a fit of spheres."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checkpoint import State
-from .exposures import least_squares_gain
-from .losses import photometric
-from .spheres import Spheres
+from ..geometry.spheres import Spheres
+from ..rendering.image_metrics import photometric
+from ..runtime.checkpoint import State
+from .photo_exposure import least_squares_gain
 from .views import View, render_view
 
 RATE, LAST_RATE = 1e-3, 1e-4
-"""Adam's step size at the beginning and at the end; of angles [rad], of movements in units of the cameras' spread."""
+"""Step size of Adam at the start and at the end: angles in rad, translations in units of the cameras' spread."""
 WAITING = 0.1
-"""Share of a fit during which the cameras stay, for there is nothing yet to stand right before."""
+"""Share of a fit during which the cameras stay fixed, because the spheres do not show the scene yet."""
 _SPREAD = 0.02
-"""Standard deviation that the prior gives an angle [rad], or a movement in units of the cameras' spread."""
+"""Standard deviation of the prior: of an angle [rad], and of a translation in units of the cameras' spread."""
 _PRIOR = 1e-4
 _SINGLE_RATE, _SINGLE_STEPS = 1e-3, 60
 
 
 class Motions:
-    """A small motion of the camera for each photo, learned while spheres are fitted.
+    """A small rigid motion of the camera of each photo, learned while spheres are fitted.
 
     Args:
         views: The photos.
-        spread: Size of the cameras' arrangement [m], the unit of their movements.
+        spread: Size of the cameras' arrangement [m], the unit of their translations.
     """
 
     def __init__(self, views: Sequence[View], spread: float) -> None:
@@ -40,24 +40,24 @@ class Motions:
         self._adam = torch.optim.Adam(list(self._twists.values()), RATE)
 
     def moved(self, view: View) -> View:
-        """Return a photo as its camera stands now, connected to what is learned; its `camera` stays."""
+        """Return a photo with the current pose of its camera, differentiable; the field `camera` stays."""
         return moved(view, _motion(self._twists[view.name], self._spread))
 
     def prior(self, view: View) -> Tensor:
-        """Return the penalty of a photo's motion, ()."""
+        """Return the prior penalty of the motion of a photo's camera, shape ()."""
         return _prior(self._twists[view.name])
 
     def step(self, share: float) -> None:
-        """Move the cameras whose photos were looked at; `share` of the fit is over."""
+        """Move the cameras whose photos were rendered, when `share` of the fit is over."""
         self._adam.param_groups[0]["lr"] = 0.0 if share < WAITING else RATE * (LAST_RATE / RATE) ** share
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
     @torch.no_grad()
     def found(self, views: Sequence[View]) -> dict[str, Tensor]:
-        """Return new camera frame from old one (4, 4) by photo; the cameras as a whole stand where they stood.
+        """Return the transform from the old to the new camera frame (4, 4) of each photo, without their common motion.
 
-        Photos alone do not tell a motion of all cameras from one of the world.
+        Photos alone cannot distinguish a motion of all cameras from one of the world.
         """
         return _anchored(views, {view.name: _motion(self._twists[view.name], self._spread) for view in views})
 
@@ -70,19 +70,19 @@ class Motions:
 
     @torch.no_grad()
     def restore(self, state: State) -> None:
-        """Take up what `state` returned."""
+        """Restore what `state` returned."""
         for name, twist in self._twists.items():
             twist.copy_(state["twists"][name])
         self._adam.load_state_dict(state["adam"])
 
 
 def find_motion(spheres: Spheres, view: View, weight: Tensor, spread: float) -> Tensor:
-    """Return new camera frame from old one (4, 4) of a photo against spheres that stay as they are.
+    """Fit the transform from the old to the new camera frame (4, 4) of a photo to fixed spheres.
 
     Args:
         spheres: The spheres, world frame.
         view: The photo.
-        weight: How much each pixel counts, shape (H, W).
+        weight: Weight of each pixel, shape (H, W).
         spread: Size of the cameras' arrangement [m].
     """
     twist = view.image.new_zeros(6, requires_grad=True)
@@ -99,19 +99,19 @@ def find_motion(spheres: Spheres, view: View, weight: Tensor, spread: float) -> 
 
 
 def moved(view: View, T_new_old: Tensor) -> View:
-    """Return a photo whose camera stands elsewhere; for the renderer alone, its `camera` stays."""
+    """Return a photo with a moved camera for the renderer alone; the field `camera` stays."""
     return replace(view, viewmat=T_new_old @ view.viewmat)
 
 
 def moved_for_good(view: View, T_new_old: Tensor) -> View:
-    """Return a photo whose camera stands elsewhere."""
+    """Return a photo with a moved camera, including the field `camera`."""
     there = moved(view, T_new_old)
     T_world_cam = np.linalg.inv(there.viewmat.double().cpu().numpy())
     return replace(there, camera=replace(view.camera, T_world_cam=T_world_cam))
 
 
 def motion_record(motions: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return how far the cameras moved, as plain numbers for fit.json."""
+    """Return the sizes of the camera motions, as plain numbers for fit.json."""
     moves = {name: T.double().cpu().numpy() for name, T in motions.items()}
     return {
         "moved_m": {name: round(float(np.linalg.norm(T[:3, 3])), 6) for name, T in moves.items()},
@@ -124,7 +124,7 @@ def _prior(twist: Tensor) -> Tensor:
 
 
 def _motion(twist: Tensor, spread: float) -> Tensor:
-    """Return exp of a twist: angles [rad] and movement in units of the spread [m], (6,), as a transform (4, 4)."""
+    """Return the exponential (4, 4) of a twist (6,): angles [rad], then translation in units of the spread [m]."""
     x, y, z = twist[:3]
     zero = torch.zeros_like(x)
     turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
@@ -133,7 +133,7 @@ def _motion(twist: Tensor, spread: float) -> Tensor:
 
 
 def _anchored(views: Sequence[View], motions: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Take off what moves all cameras alike: their mean turn, and scale and shift of their centres."""
+    """Remove the common motion of all cameras: mean rotation, and scale and translation of their centres."""
     old = np.stack([np.linalg.inv(view.viewmat.double().cpu().numpy()) for view in views])
     moves = np.stack([motions[view.name].double().cpu().numpy() for view in views])
     new = old @ np.linalg.inv(moves)

@@ -1,8 +1,8 @@
-"""The few spheres that collide, distilled from a solid so that planes touch them where they touch the solid.
+"""Collision spheres: a few spheres, distilled from a solid, that planes touch where they touch the solid.
 
-Contact with a plane sees nothing of a solid but its support function h(n) = max n . x; contact between bodies
-sees the surface. So spheres are chosen first where the support function lacks most, then where the surface is
-covered worst, each as large as fits inside the solid, and then to fill the inside, so that a deep query still
+Contact with a plane depends on the support function h(n) = max n . x of a solid alone; contact between bodies depends
+on its surface. So spheres are chosen first where the error of the support function is largest, then where the surface
+is covered worst, each as large as fits inside the solid, and then to fill the interior, so that a deep query still
 finds a body there.
 """
 
@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from ...datasets.ply import Splats, read_splats
+from ...datasets.shapes.ply import Splats, read_splats
 from ...schemas import InputDataError, Shape
-from .directions import fibonacci_directions
-from .mesh import mesh_volume, read_mesh
-from .surface import union_distance
-from .volume import Array, Volume, crossings, grid_points
+from ..geometry.directions import fibonacci_directions
+from ..geometry.mesh import mesh_volume, read_mesh
+from ..geometry.primitives import spheres_volume
+from ..geometry.solid_grid import Array, Volume, grid_points
+from ..geometry.surface_distance import union_distance
 
 DIRECTIONS = 1500
-"""Number of directions in which the support function is held."""
+"""Number of directions in which the support function is matched."""
 _SUPPORT_TOLERANCE = 1e-3  # of the solid's size
 _MEAN_TOLERANCE, _MOST_TOLERANCE = 2e-3, 7.5e-3
 """Mean and largest gap, in units of the solid's size, below which no more spheres are added."""
@@ -37,7 +38,7 @@ _CORNER_RADIUS_M = 2.5e-4
 
 
 class Solid(Protocol):
-    """What is distilled: `Volume` is one."""
+    """A solid to be distilled, such as `Volume`."""
 
     @property
     def surface(self) -> Array:
@@ -51,7 +52,7 @@ class Solid(Protocol):
 
     @property
     def tolerance(self) -> float:
-        """How accurate the signed distance is [m]."""
+        """Accuracy of the signed distance [m]."""
         ...
 
     def at(self, points: Array) -> Array:
@@ -65,19 +66,16 @@ class Solid(Protocol):
 
 @dataclass(frozen=True)
 class CollisionSpheres:
-    """Spheres that stand for a solid in contact.
-
-    Attributes:
-        centers: Centres in the body frame [m], shape (n, 3).
-        radii: Collision radii [m], shape (n,).
-        distance_m: Largest distance between the union of the spheres and the solid's surface [m], both ways.
-        support_error_m: Largest difference of the support functions over `DIRECTIONS` directions [m].
-    """
+    """Spheres that represent a solid in contact."""
 
     centers: Array
+    """Centres in the body frame [m], shape (n, 3)."""
     radii: Array
+    """Collision radii [m], shape (n,)."""
     distance_m: float
+    """Largest distance between the union of the spheres and the solid's surface [m], both ways."""
     support_error_m: float
+    """Largest difference between the support functions over `DIRECTIONS` directions [m]."""
 
     def splats(self, radius_factor: float) -> Splats:
         """Return the spheres as Gaussians of scale radius / radius_factor, opaque and grey."""
@@ -93,19 +91,19 @@ class CollisionSpheres:
 def shape_to_spheres(
     shape: Shape, capture_root: Path, max_spheres: int, radius_factor: float = 2.0
 ) -> tuple[Splats, float]:
-    """Return colliding spheres for a shape that the manifest gives.
+    """Return the collision spheres of a shape given in the manifest.
 
-    A box has its corners first: 8 small spheres that touch three faces each, so that planes meet them where they meet
-    the box; with `max_spheres` = 8 it has no others. A ball is one sphere.
+    The first spheres of a box are its corners: 8 small spheres that touch three faces each, so that planes touch them
+    where they touch the box; with `max_spheres` = 8 it has no others. A ball is one sphere.
 
     Args:
         shape: The shape, in the body frame.
         capture_root: Directory that the shape's path is relative to.
-        max_spheres: Largest number of spheres, at least 8.
+        max_spheres: Maximum number of spheres, at least 8.
         radius_factor: Collision radius in units of the Gaussian scale.
 
     Returns:
-        The spheres in the body frame, and the largest distance between their surface and the shape's [m].
+        The spheres in the body frame, and the largest distance between their surface and that of the shape [m].
 
     Raises:
         InputDataError: If the shape's file is missing or not readable.
@@ -125,12 +123,12 @@ def shape_to_spheres(
 
 
 def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = None, seed: int = 0) -> CollisionSpheres:
-    """Choose spheres inside a solid that support and cover it as it does itself.
+    """Choose spheres inside a solid that match its support function and cover its surface.
 
     Args:
         solid: The solid.
-        max_spheres: Largest number of spheres.
-        first: Centres (k, 3) and radii (k,) of spheres that support the solid [m]; chosen here where left out.
+        max_spheres: Maximum number of spheres.
+        first: Centres (k, 3) and radii (k,) of spheres that support the solid [m]; chosen here by default.
         seed: Seed of the choice of surface samples.
     """
     size = solid.size()
@@ -182,7 +180,7 @@ class _Chosen:
 
 
 def _add_support(chosen: _Chosen, solid: Solid, limit: int, tolerance: float) -> None:
-    """Add spheres where the support function lacks most, until it lacks less than `tolerance`."""
+    """Add spheres where the support function is too small, until the error is below `tolerance` [m]."""
     directions = fibonacci_directions(DIRECTIONS)
     extreme = np.array([int(np.argmax(solid.surface @ direction)) for direction in directions])
     points = solid.surface[extreme]
@@ -198,15 +196,15 @@ def _add_support(chosen: _Chosen, solid: Solid, limit: int, tolerance: float) ->
 
 
 def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, limit: int) -> None:
-    """Add spheres that touch the surface from inside until its points are near to one, on average and each.
+    """Add spheres that touch the surface from inside until the mean and largest gap are within tolerance.
 
-    The gap of a point is its distance from all spheres so far. First each sphere is the one that lessens the sum of the
-    gaps most; what it lessens it by can only fall while others are added (the sum is submodular), so a candidate is
-    weighed anew only when its old worth is the greatest. Then each is the one that comes nearest to the worst point.
+    The gap of a point is its distance from all spheres so far. At first, each added sphere reduces the sum of the gaps
+    most; this gain can only fall while others are added (the sum is submodular), so the gain of a candidate is
+    recomputed only when its old value is the largest. Later, each is the one that comes nearest to the worst point.
     """
     radii = inscribed_radii(solid, points, normals)
     centers = points - radii[:, None] * normals
-    # at a notch or a tip even the smallest sphere may stick out
+    # At a notch or a tip even the smallest sphere may protrude.
     inside = solid.at(centers) + radii <= 2 * solid.tolerance
     radii, centers = radii[inside], centers[inside]
     size = solid.size()
@@ -232,7 +230,7 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
 
 
 def _gaps(centers: Array, radii: Array, points: Array) -> NDArray[np.float32]:
-    """Return how far each sphere leaves each point outside [m], shape (spheres, points)."""
+    """Return the distance of each point from each sphere [m], shape (spheres, points)."""
     result = np.empty((len(radii), len(points)), np.float32)
     for rows in np.array_split(np.arange(len(radii)), max(1, len(radii) // 500)):
         result[rows] = np.maximum(cdist(centers[rows], points) - radii[rows, None], 0)
@@ -240,7 +238,7 @@ def _gaps(centers: Array, radii: Array, points: Array) -> NDArray[np.float32]:
 
 
 def _add_fill(chosen: _Chosen, solid: Volume, limit: int) -> None:
-    """Add the largest inscribed spheres around points deep inside that no sphere holds yet."""
+    """Add the largest inscribed spheres around interior points that no sphere contains yet."""
     every_other = solid.distance[::2, ::2, ::2]
     points = grid_points(every_other.shape, solid.origin, 2 * solid.pitch)
     depth = -every_other.reshape(-1)
@@ -256,7 +254,7 @@ def _add_fill(chosen: _Chosen, solid: Volume, limit: int) -> None:
 def inscribed_radii(solid: Solid, points: Array, normals: Array) -> Array:
     """Return the radius of the largest sphere that touches the surface at each point and lies inside, shape (n,).
 
-    It may stick out by the solid's own tolerance.
+    It may protrude by the tolerance of the solid.
     """
     size = solid.size()
     steps = size * np.geomspace(_SMALLEST_RADIUS, 0.5, 40)
@@ -277,7 +275,7 @@ def inscribed_radii(solid: Solid, points: Array, normals: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Box:
-    """A box about the origin, with exact distances."""
+    """A box centred at the origin, with exact distances."""
 
     half: Array
     surface: Array
@@ -320,13 +318,3 @@ def _from_splats(splats: Splats, max_spheres: int, radius_factor: float) -> Coll
     if radii.shape[0] <= max_spheres:
         return CollisionSpheres(centers, radii, 0.0, 0.0)
     return distil(spheres_volume(centers, radii), max_spheres)
-
-
-def spheres_volume(centers: Array, radii: Array, resolution: int = 72) -> Volume:
-    """Put the union of spheres on a grid whose longest side has about `resolution` points."""
-    low, high = (centers - radii[:, None]).min(0), (centers + radii[:, None]).max(0)
-    pitch = float((high - low).max()) / (resolution - 6)
-    origin = low - 3 * pitch
-    shape = tuple(int(n) for n in np.ceil((high - origin) / pitch).astype(int) + 4)
-    field = union_distance(centers, radii, grid_points(shape, origin, pitch)).reshape(shape)
-    return Volume.from_inside(field < 0, origin, pitch, crossings(field, origin, pitch))

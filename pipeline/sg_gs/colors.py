@@ -1,4 +1,4 @@
-"""Colours of spheres whose geometry is known: what the photos show where a sphere is seen."""
+"""Colours of spheres of known geometry, averaged over the photos."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..geometry.spheres import Spheres
 from .losses import cover_of
-from .spheres import Spheres
 from .views import View, render_view
 
 
 def mean_colors(spheres: Spheres, views: Sequence[View], body: int | None = None) -> Tensor:
-    """Return each sphere's mean colour over the pixels that show it, weighted by how much they do, shape (N, F).
+    """Return the mean colour of each sphere over the pixels that show it, weighted by its contribution, shape (N, F).
 
     The derivative of sum(render * photo) by the colours is sum over pixels of weight * photo. A sphere that no photo
-    shows takes the colour of the nearest ones that are seen.
+    shows gets the mean colour of the nearest visible ones.
 
     Args:
         spheres: The spheres, world frame.
-        views: The photos; what stands in `image`, of any number of channels F, is taken as colours.
-        body: Count only pixels of this body's mask; all where left out.
+        views: The photos; the channels of `image`, of any number F, are taken as colours.
+        body: Use only the pixels in the mask of this body; None uses all.
     """
     channels = views[0].image.shape[-1]
     features = torch.zeros(len(spheres), channels + 1, device=spheres.means.device, requires_grad=True)
@@ -44,14 +44,14 @@ def sphere_weights(spheres: Spheres, view: View) -> Tensor:
 
 
 def spread_colors(means: Tensor, colors: Tensor, seen: Tensor, least: float = 0.5, neighbours: int = 4) -> Tensor:
-    """Give spheres that are hardly seen the mean colour of the nearest ones that are.
+    """Return the colours, with those of hardly visible spheres replaced by the mean of the nearest visible ones.
 
     Args:
         means: Centres [m], shape (N, 3).
         colors: Colours, shape (N, F).
         seen: Total weight over all pixels of all photos [px], shape (N,).
-        least: Spheres with less weight than this are not seen.
-        neighbours: Number of seen spheres that are averaged.
+        least: Minimum weight of a visible sphere [px].
+        neighbours: Number of visible spheres that are averaged.
     """
     known = (seen >= least).nonzero()[:, 0]
     unknown = (seen < least).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""What the steps of the stage sg-gs share: settings, photos, and what is found on the way."""
+"""Shared state of the steps of the stage sg-gs: settings, photos and intermediate results."""
 
 from __future__ import annotations
 
@@ -8,42 +8,51 @@ from typing import Any
 
 import torch
 
-from ..datasets.capture import Capture
-from ..schemas import Ground, SplatConfig
-from .checkpoint import Checkpoint, Slot
-from .sfm.points import POINTS_NAME, read_points
-from .splats.exposures import Exposures
-from .splats.overlap import require_points_in_view
-from .splats.seeds import points_of_depth
-from .splats.views import View, spread_of
-from .splats.volume import Array
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.sparse_points import POINTS_NAME, read_points
+from ...schemas import Ground, SplatConfig
+from ..geometry.solid_grid import Array
+from ..runtime.checkpoint import Checkpoint, Slot
+from .initialization import points_of_depth
+from .photo_exposure import Exposures
+from .view_overlap import require_points_in_view
+from .views import View, spread_of
 
 _FEW_IN_VIEW = 0.5
 _DEPTH_POINTS = 20_000
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Stage:
-    """What the steps of the stage share."""
+    """Shared state of the steps of the stage."""
 
     capture: Capture
+    """The capture."""
     config: SplatConfig
+    """Settings of the stage."""
     device: torch.device
+    """Device of the fits."""
     checkpoint: Checkpoint | None
+    """Checkpoints of the descents; None keeps none."""
     ground: Ground | None
+    """The ground; None where the capture has none or its place among the photos is unknown."""
     train: list[View]
+    """The photos to fit."""
     test: list[View]
+    """The held-out photos."""
     record: dict[str, Any] = field(default_factory=dict)
+    """Losses, timings and other figures for fit.json."""
     warnings: list[str] = field(default_factory=list)
+    """Messages for the user."""
 
     @cached_property
     def exposures(self) -> Exposures:
-        """What is known of the photos' exposures so far."""
+        """Current estimates of the photos' exposures."""
         return Exposures(self.train, self.config.exposure)
 
     @cached_property
     def points(self) -> Array | None:
-        """Points of the scene, world frame, (n, 3): from structure from motion, or from depth maps; or None."""
+        """Points of the scene [m], world frame, (n, 3), from structure from motion or depth maps, or None."""
         path = self.capture.root / POINTS_NAME
         if not path.is_file():
             return points_of_depth(self.train, _DEPTH_POINTS, self.config.seed)
@@ -59,7 +68,7 @@ class Stage:
         return spread_of(self.train)
 
     def slot(self, name: str) -> Slot | None:
-        """Return where the checkpoints of a descent go, or None where none are kept."""
+        """Return the checkpoint file of a descent, or None if no checkpoints are kept."""
         return None if self.checkpoint is None else self.checkpoint.slot(name)
 
     def steps(self, share: float) -> int:

@@ -1,10 +1,10 @@
-"""Refining a visual hull by what the photos show on its surface.
+"""Refinement of a visual hull by the photo-consistency of its surface.
 
 Silhouettes bound a flat or hollow surface only where some view grazes it; elsewhere the hull bulges. So patches of the
 surface are moved along the normal to where the photos agree on them (normalised cross-correlation, as in multi-view
-stereo), and the hull is carved down to there. Where there is no texture to tell, the hull stays; and so do edges and
-corners: every point of a hull is on the outline of some photo, but one that is on the outlines of many is on the body,
-and patches that reach around an edge would tell otherwise.
+stereo), and the hull is carved down to there. The hull stays where the surface has no texture. Edges and corners stay
+too: every point of a hull is on the outline of some photo, but a point on the outlines of many photos is on the body,
+and patches that reach around an edge would suggest otherwise.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
-from .hull import signed_distance_px
+from ..geometry.solid_grid import Array, Volume, crossings, grid_points
 from .views import View
-from .volume import Array, Volume, crossings, grid_points
+from .visual_hull import signed_distance_px
 
 _POINTS = 3000
 _PATCH = 7
@@ -37,35 +37,32 @@ _PRIOR = 0.02
 _PASSES = 2
 _RIM_PX = 1.2
 _RIM_SHARE, _RIM_LEAST = 0.2, 4
-"""A point within `_RIM_PX` of the outline in more than this share and number of photos is on the body, and stays."""
+"""Share and number of photos above which a point within `_RIM_PX` of their outlines is on the body and stays."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What the refinement found.
-
-    Attributes:
-        moved_mean_m: Mean movement of the surface, inwards negative [m].
-        moved_most_m: Largest inward movement [m], as a negative number.
-        confident: Share of the surface samples whose place the photos tell.
-    """
+    """Summary of a refinement."""
 
     moved_mean_m: float
+    """Mean displacement of the surface, inwards negative [m]."""
     moved_most_m: float
+    """Largest inward displacement [m], as a negative number."""
     confident: float
+    """Share of the surface samples whose position the photos determine."""
 
 
 def refine(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[Volume, Refinement]:
-    """Carve a hull down to where its surface looks the same from all sides.
+    """Carve a hull down to where the photos agree on its surface.
 
     Args:
         solid: The hull, world frame.
         views: The photos, with masks.
-        body: The body's place in the manifest.
+        body: Index of the body in the manifest.
         seed: Seed of the choice of samples.
 
     Returns:
-        The refined solid and what was changed.
+        The refined solid and a summary of the changes.
     """
     record = Refinement(0.0, 0.0, 0.0)
     for attempt in range(_PASSES):
@@ -99,7 +96,7 @@ def _pass(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[V
 
 
 def _outlined(points: Array, views: Sequence[View], body: int) -> Array:
-    """Return in how many photos each point (n, 3) lies on the body's outline, shape (n,)."""
+    """Return the number of photos in which each point (n, 3) lies on the outline of the body, shape (n,)."""
     count = np.zeros(len(points))
     for view in views:
         silhouette = view.silhouette(body)
@@ -112,7 +109,7 @@ def _outlined(points: Array, views: Sequence[View], body: int) -> Array:
 
 
 def _smooth_normals(solid: Volume, index: Array) -> Array:
-    """Return normals averaged over a neighbourhood of two pitches: the hull's own are rough."""
+    """Return normals averaged over a neighbourhood of two pitches, because those of the hull are rough."""
     _, near = KDTree(solid.surface).query(solid.surface[index], k=12)
     normals = solid.normals[near]
     alike = np.einsum("id,ijd->ij", solid.normals[index], normals) > 0.7
@@ -123,7 +120,7 @@ def _smooth_normals(solid: Volume, index: Array) -> Array:
 def _agreement(
     solid: Volume, points: Array, normals: Array, offsets: Array, views: Sequence[View], body: int
 ) -> tuple[Array, Array]:
-    """Return the mean pairwise correlation of patches for each point and offset, (n, K), and the pairs' number (n,)."""
+    """Return the mean pairwise correlation of patches by point and offset, (n, K), and the number of pairs (n,)."""
     cosine, footprint = _visibility(solid, points, normals, views, body)
     ranked = np.argsort(-cosine, axis=1)[:, :_VIEWS]
     chosen = np.zeros_like(cosine, dtype=bool)
@@ -152,7 +149,7 @@ def _agreement(
 
 
 def _visibility(solid: Volume, points: Array, normals: Array, views: Sequence[View], body: int) -> tuple[Array, Array]:
-    """Return for each point and view the cosine of the viewing angle, or -1 where hidden, and a pixel's width [m]."""
+    """Return cosine of the viewing angle (-1 where hidden) and width of a pixel [m], by point and view."""
     cosine = np.full((len(points), len(views)), -1.0)
     footprint = np.zeros_like(cosine)
     reach = 0.5 * solid.size()
@@ -195,13 +192,13 @@ def _look_up(view: View, where: Array) -> Tensor:
 
 
 def _normalised(patches: Tensor) -> Tensor:
-    """Return patches (..., P) with zero mean and, where there is more than noise, unit norm."""
+    """Return patches (..., P) with zero mean and, where they exceed the noise, unit norm."""
     centred = patches - patches.mean(-1, keepdim=True)
     return centred / (centred.square().sum(-1, keepdim=True) + patches.shape[-1] * _NOISE**2).sqrt()
 
 
 def _peaks(scores: Array, offsets: Array) -> tuple[Array, Array]:
-    """Return the best offset (n,) [m], to a part of a step by a parabola, and a confidence (n,), 0 where unclear."""
+    """Return the best offset (n,) [m], interpolated by a parabola, and a confidence (n,), 0 where ambiguous."""
     best = np.clip(scores.argmax(1), 1, len(offsets) - 2)
     rows = np.arange(len(scores))
     low, mid, high = scores[rows, best - 1], scores[rows, best], scores[rows, best + 1]
@@ -214,7 +211,7 @@ def _peaks(scores: Array, offsets: Array) -> tuple[Array, Array]:
 
 
 def _smoothed(shift: Array, confidence: Array, near: Array, alike: Array) -> Array:
-    """Return shifts that agree with their neighbours; without evidence they go to 0."""
+    """Return shifts that are smoothed over their neighbours and tend to 0 without evidence."""
     # A sample that contradicts the median of its neighbours is an outlier.
     known = np.where(alike & (confidence[near] > 0), shift[near], np.nan)
     with np.errstate(all="ignore"):
@@ -235,7 +232,7 @@ def _tangents(normals: Array) -> tuple[Array, Array]:
 
 
 def _deformed(solid: Volume, points: Array, shift: Array) -> Volume:
-    """Move the surface by `shift` [m] along its normals, as given at some of its points."""
+    """Return the solid with its surface moved along the normals by `shift` [m], given at some points."""
     where = grid_points(solid.distance.shape, solid.origin, solid.pitch)
     distance: Array = solid.distance.reshape(-1)
     touched: Array = np.abs(distance) < 2 * _DEEPEST * solid.size()
@@ -243,7 +240,7 @@ def _deformed(solid: Volume, points: Array, shift: Array) -> Volume:
     field[touched] -= _interpolated(points, shift, where[touched], solid.pitch)
     field = field.reshape(solid.distance.shape)
     surface = crossings(field, solid.origin, solid.pitch)
-    # A tip stands where silhouettes meet: it stays unless the photos say that the surface there is elsewhere.
+    # A tip lies where silhouettes meet: it stays unless the photos show the surface elsewhere.
     tips = solid.corners
     if len(tips):
         moved = _interpolated(points, shift, tips, solid.pitch)
@@ -252,7 +249,7 @@ def _deformed(solid: Volume, points: Array, shift: Array) -> Volume:
 
 
 def _interpolated(points: Array, values: Array, where: Array, softening: float) -> Array:
-    """Return values given at points, at other places (n, 3): weighted by 1 / distance over the nearest four."""
+    """Return values at points (n, 3), interpolated from the nearest four given ones with weights 1 / distance."""
     away, near = KDTree(points).query(where, k=min(4, len(points)))
     weight = 1 / (away + softening)
     return (weight * values[near]).sum(1) / weight.sum(1)

@@ -1,4 +1,4 @@
-"""Photos that the fit did not see: figures, and a contact sheet of photo, render and error."""
+"""Evaluation on held-out photos: figures, and a contact sheet of photo, render and error."""
 
 from __future__ import annotations
 
@@ -11,40 +11,37 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .reporting.pictures import SHEET_BYTES, compared, small_png
-from .splats.exposures import least_squares_gain
-from .splats.losses import psnr, ssim_map
-from .splats.poses import find_motion, moved
-from .splats.spheres import Spheres
-from .splats.views import View, as_bytes, camera_center, render_view
+from ..geometry.spheres import Spheres
+from ..rendering.contact_sheets import SHEET_BYTES, compared, small_png
+from ..rendering.image_metrics import psnr, ssim_map
+from .camera_refinement import find_motion, moved
+from .photo_exposure import least_squares_gain
+from .views import View, as_bytes, camera_center, render_view
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Quality on photos that the fit did not see.
-
-    Attributes:
-        figures: Means over the photos, for fit.json: `psnr_db` and `ssim` of the whole picture, `psnr_object_db` and
-            `mask_iou` where masks show a body; `psnr_right_half_db`, that of the right half of each picture, and
-            `psnr_right_half_corrected_db`, with the photo's exposure (and its pose, where poses were refined) found on
-            its left half: what differs from photo to photo is not the scene's fault.
-        sheet: Contact sheet, PNG, or None without photos.
-    """
+    """Quality of the fit on held-out photos."""
 
     figures: dict[str, Any]
+    """Means over the photos, for fit.json: `psnr_db` and `ssim` of the whole picture, `psnr_object_db` and `mask_iou`
+    where masks show a body; `psnr_right_half_db` of the right half of each picture; and
+    `psnr_right_half_corrected_db` of the same with the exposure of the photo (and its pose, where poses were refined)
+    estimated on its left half, which excludes differences between photos that are no error of the scene."""
     sheet: bytes | None
+    """Contact sheet, PNG, or None without photos."""
 
 
 @torch.no_grad()
 def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, spread: float, *, poses: bool) -> HeldOut:
-    """Compare photos with what the spheres show.
+    """Compare held-out photos with renders of the spheres.
 
     Args:
         views: The photos.
         bodies: Visual spheres of the bodies, world frame.
         scene: The background, or None.
         spread: Size of the cameras' arrangement [m].
-        poses: Whether the cameras of the photos that were fitted were moved.
+        poses: Whether the cameras of the fitted photos were refined.
     """
     everything = Spheres.joined([*bodies, *([] if scene is None else [scene])])
     label = torch.zeros(len(everything), 1, device=everything.means.device)
@@ -85,9 +82,9 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
 
 
 def _corrected(spheres: Spheres, view: View, picture: Tensor, spread: float, poses: bool) -> Tensor:
-    """Return the render of a photo in its own exposure (and from its own pose), both found on its left half.
+    """Return the render of a photo with its exposure (and its pose), both estimated on its left half.
 
-    `picture` (H, W, 3) is the render from the pose as given.
+    `picture` (H, W, 3) is the render from the given pose.
     """
     left = torch.zeros_like(view.image[..., 0])
     left[:, : left.shape[1] // 2] = 1.0

@@ -1,4 +1,4 @@
-"""Where the spheres of a fit begin: bodies inside their solids, the background on the ground and on SfM points."""
+"""Initial spheres of a fit: bodies inside their solids, the background on the ground and on SfM points."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import torch
 from scipy.spatial import KDTree
 
 from ...schemas import Ground
-from .collision import inscribed_radii
-from .directions import fibonacci_directions, upright_axes
+from ..geometry.directions import fibonacci_directions, upright_axes
+from ..geometry.solid_grid import Array, Volume, grid_points
+from ..geometry.spheres import Spheres
+from .collision_spheres import inscribed_radii
 from .losses import scene_weight
-from .spheres import Spheres
 from .views import View, focus_of
-from .volume import Array, Volume, grid_points
 
 _SURFACE_SHARE = 0.9
 _COVER_FACTOR = 1.05  # collision radius in units of the spacing: neighbours overlap without a gap
@@ -31,17 +31,17 @@ _THINNEST = 0.35  # of the radius elsewhere: smaller spheres would leave gaps
 
 
 def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int) -> tuple[Array, Array, int]:
-    """Return spheres whose union, at the collision radius, is a solid: an even layer inside its surface, and a filling.
+    """Return spheres whose union, at the collision radius, fills a solid: a layer inside its surface, and a filling.
 
     Args:
         solid: The solid.
-        max_spheres: Largest number of spheres.
+        max_spheres: Maximum number of spheres.
         radius_factor: Collision radius in units of the scale.
         seed: Seed.
 
     Returns:
-        Centres [m] in the solid's frame, shape (n, 3), scales [m], shape (n,), and how many of them, at the
-        beginning, are on the surface.
+        Centres [m] in the frame of the solid, shape (n, 3), scales [m], shape (n,), and the number of spheres at the
+        surface, which are the first ones.
     """
     count = max(8, int(_SURFACE_SHARE * max_spheres))
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int)
 
 
 def farthest_points(points: Array, count: int) -> tuple[np.ndarray, float]:
-    """Choose points that are evenly spread: each the farthest from those before.
+    """Choose evenly spread points, each the farthest from those chosen before.
 
     Returns:
         Indices (min(count, n),), and the distance of the last one from its nearest neighbour [m].
@@ -79,7 +79,7 @@ def farthest_points(points: Array, count: int) -> tuple[np.ndarray, float]:
 
 
 def _filling(solid: Volume, centers: Array, radii: Array, limit: int) -> tuple[Array, Array]:
-    """Return spheres for the inside, the largest first, that stay a layer's thickness below the surface."""
+    """Return spheres for the interior, the largest first, that stay a layer's thickness below the surface."""
     points = grid_points(solid.distance.shape, solid.origin, solid.pitch)
     depth = -solid.distance.reshape(-1)
     layer = float(radii[0])
@@ -92,25 +92,25 @@ def _filling(solid: Volume, centers: Array, radii: Array, limit: int) -> tuple[A
         deepest = int(np.argmax(np.where(bare, depth, 0.0)))
         found.append(deepest)
         bare &= np.linalg.norm(points - points[deepest], axis=1) > 0.8 * depth[deepest]
-    # A Gaussian shines 1.7 times farther than its collision radius: shrunk, it stays behind the layer.
+    # A Gaussian is visible to 1.7 times its collision radius: shrunk, it stays behind the layer.
     return points[found], 0.8 * depth[found]
 
 
 def scene_seeds(
     views: Sequence[View], ground: Ground | None, points: Array | None, max_spheres: int, seed: int
 ) -> tuple[Array, Array]:
-    """Return spheres for what is not a body: ground, SfM points, and a shell far away.
+    """Return spheres for the background: on the ground, on SfM points, and on a distant shell.
 
-    Ground that the photos show is covered by cells, small where its picture has detail; elsewhere SfM points stand for
-    the surfaces. Where there is neither, random points do, but not around a body that masks show: whatever stands
-    before one camera would hide the body from its neighbours. Rays that meet nothing end on a shell, which is closed,
-    so that no view looks out of the world.
+    Ground that the photos show is covered by cells, small where its picture has detail; elsewhere SfM points represent
+    the surfaces. Without either, random points do, but not around a body that masks show: spheres in front of one
+    camera would hide the body from its neighbours. Rays that meet nothing end on a shell, which is closed, so that no
+    view looks out of the world.
 
     Args:
         views: The photos; pixels of bodies are left out.
         ground: The ground, or None.
         points: SfM points, world frame, shape (n, 3), or None.
-        max_spheres: Largest number of spheres.
+        max_spheres: Maximum number of spheres.
         seed: Seed.
 
     Returns:
@@ -140,12 +140,12 @@ def scene_seeds(
 
 
 def shows_bodies(views: Sequence[View]) -> bool:
-    """Tell whether a mask shows a body."""
+    """Return whether a mask shows a body."""
     return any(view.cover is not None and bool((view.cover > 0.5).any()) for view in views)
 
 
 def _on_bodies(points: Array, views: Sequence[View]) -> Array:
-    """Return which points lie in the masks of most views that have them in the picture, (n,): they are on a body."""
+    """Return whether each point lies on a body (in the masks of most views that contain it), shape (n,)."""
     inside, seen = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         if view.cover is None:
@@ -159,7 +159,7 @@ def _on_bodies(points: Array, views: Sequence[View]) -> Array:
 
 
 def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Array:
-    """Return points in a ball around where the cameras look, (count, 3): a start where nothing else is known."""
+    """Return random points in a ball around the focus of the cameras (count, 3), used where nothing else is known."""
     focus = focus_of(views)
     radius = float(np.median([np.linalg.norm(view.camera.center - focus) for view in views]))
     directions = rng.normal(size=(count, 3))
@@ -168,7 +168,7 @@ def _random_points(views: Sequence[View], count: int, rng: np.random.Generator) 
 
 
 def points_of_depth(views: Sequence[View], count: int, seed: int) -> Array | None:
-    """Return points of the background that the photos' depth maps show, world frame, (n, 3), or None without any."""
+    """Return points of the background from the depth maps [m], world frame, (n, 3), or None without depth maps."""
     rng = np.random.default_rng(seed)
     known = [view for view in views if view.depth is not None]
     parts = []
@@ -187,11 +187,14 @@ def points_of_depth(views: Sequence[View], count: int, seed: int) -> Array | Non
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Pixels that show no body: unit rays (n, 3), origins [m] (n, 3), colours (n, 3)."""
+    """Pixels of the background, world frame."""
 
     rays: Array
+    """Unit vectors along the rays, shape (n, 3)."""
     origins: Array
+    """Origins of the rays [m], shape (n, 3)."""
     colors: Array
+    """Colours, shape (n, 3)."""
 
     def chosen(self, mask: Array) -> _Pixels:
         return _Pixels(self.rays[mask], self.origins[mask], self.colors[mask])
@@ -216,7 +219,7 @@ def _background_pixels(views: Sequence[View], rng: np.random.Generator) -> _Pixe
 
 
 def _on_ground(sample: _Pixels, ground: Ground, farthest: float) -> tuple[Array, Array]:
-    """Return which rays meet the ground no farther than `farthest` [m], and where those do, (hits, 3)."""
+    """Return whether each ray meets the ground within `farthest` [m], and the points where it does, (hits, 3)."""
     normal = np.array(ground.normal)
     down = np.minimum(sample.rays @ normal, -1e-6)
     distance = (ground.offset_m - sample.origins @ normal) / down
@@ -225,10 +228,10 @@ def _on_ground(sample: _Pixels, ground: Ground, farthest: float) -> tuple[Array,
 
 
 def _ground_cover(points: Array, colors: Array, normal: Array, budget: int) -> tuple[Array, Array]:
-    """Cover a plane by the leaves of a quadtree that is split, again and again, where colours differ most.
+    """Cover a plane with the leaves of a quadtree that is split repeatedly where colours differ most.
 
     Each sample is a pixel, so the sum of squared deviations in a cell is its error in the pictures: far ground, which
-    few pixels show, gets few cells without further ado.
+    few pixels show, automatically gets few cells.
     """
     if len(points) == 0 or budget < 1:
         return np.zeros((0, 3)), np.zeros(0)
@@ -268,7 +271,7 @@ def _quadtree(unit: Array, colors: Array, budget: int) -> Array:
 
 
 def _with_neighbour_scales(points: Array, budget: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return at most `budget` of the points, each as wide as half the distance to its third neighbour."""
+    """Return at most `budget` of the points, with scales of half the distance to the third neighbour."""
     kept = points[rng.permutation(len(points))[:budget]]
     away, _ = KDTree(kept).query(kept, k=min(4, len(kept)))
     scale = 0.5 * away[:, -1]
@@ -276,7 +279,7 @@ def _with_neighbour_scales(points: Array, budget: int, rng: np.random.Generator)
 
 
 def _shell(sample: _Pixels, cameras: Array, points: Array | None, budget: int) -> tuple[Array, Array]:
-    """Return spheres on a shell around everything: a closed coarse one, and a finer one where rays meet it."""
+    """Return spheres on a shell around the scene: a closed coarse layer, and a finer one where rays meet it."""
     center = cameras.mean(0)
     radius = _FAR_FACTOR * _spread(cameras)
     if points is not None and len(points):
@@ -301,7 +304,7 @@ def _spread(points: Array) -> float:
 
 
 def to_spheres(centers: Array, scales: Array, opacity: float, device: torch.device) -> Spheres:
-    """Return grey spheres of one opacity as tensors."""
+    """Return grey spheres of equal opacity as tensors."""
     count = len(scales)
     return Spheres(
         torch.as_tensor(centers, dtype=torch.float32, device=device),

@@ -1,4 +1,4 @@
-"""What a fit of spheres to photos compares: pictures, silhouettes, and geometry maps."""
+"""Losses of a fit of spheres to photos: pictures, silhouettes and geometry maps."""
 
 from __future__ import annotations
 
@@ -10,70 +10,34 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from .exposures import Exposures
-from .spheres import Spheres
+from ..geometry.spheres import Spheres
+from ..rendering.image_metrics import photometric
+from .photo_exposure import Exposures
 from .views import View, render_view
 
 if TYPE_CHECKING:
-    from .poses import Motions
+    from .camera_refinement import Motions
 
 Loss = Callable[[Spheres, View, torch.Generator], tuple[Tensor, Tensor]]
-"""The loss of one view [1], given a generator for whatever is random in it, and the mean square error of what was
-compared (the picture, or the silhouette), which has no derivative."""
+"""Function that returns the loss of one view [1] and the mean square error of the compared picture or silhouette,
+which is not differentiated; the generator supplies random numbers."""
 
-DSSIM_WEIGHT = 0.2
-"""Share of D-SSIM in the photometric loss, as in 3D Gaussian splatting (arXiv 2308.04079, equation 7)."""
 DEPTH_WEIGHT, NORMAL_WEIGHT, FEATURE_WEIGHT = 1.0, 0.02, 0.1
-"""Of the geometry maps beside the silhouette; depth in units of the body's size."""
+"""Weights of the geometry maps relative to the silhouette; depth is in units of the body size."""
 _OUTLYING = 0.05
-"""A depth error of this, in units of the body's size, is large."""
-_SSIM_WINDOW = 7
+"""Scale of large depth errors, in units of the body size."""
 _NORMAL_WINDOW = 5
 
 
-def photometric(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return (1 - w) L1 + w (1 - SSIM) / 2 of two pictures (H, W, 3), weighted by pixel (H, W) where asked."""
-    absolute = (image - target).abs().mean(-1)
-    similar = 0.5 * (1 - ssim_map(image, target))
-    both = (1 - DSSIM_WEIGHT) * absolute + DSSIM_WEIGHT * similar
-    return both.mean() if weight is None else (both * weight).sum() / weight.sum().clamp_min(1.0)
-
-
-def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Return the structural similarity at each pixel (H, W), over windows of 7 x 7 (Wang et al. 2004)."""
-
-    def mean(values: Tensor) -> Tensor:
-        return functional.avg_pool2d(values, _SSIM_WINDOW, 1, _SSIM_WINDOW // 2, count_include_pad=False)
-
-    a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    mean_a, mean_b, aa, bb, ab = mean(torch.stack([a, b, a * a, b * b, a * b])).unbind(0)
-    c1, c2 = 0.01**2, 0.03**2
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
-    structure = (2 * (ab - mean_a * mean_b) + c2) / (aa - mean_a**2 + bb - mean_b**2 + c2)
-    return (luminance * structure).mean(0)
-
-
-@torch.no_grad()
-def psnr(image: Tensor, target: Tensor, chosen: Tensor | None = None) -> float:
-    """Return the peak signal-to-noise ratio [dB] of values in [0, 1], over chosen pixels (H, W) or all."""
-    square = (image - target).square().mean(-1)
-    return psnr_of(square.mean() if chosen is None else square[chosen].mean())
-
-
-def psnr_of(mean_square: Tensor) -> float:
-    """Return the peak signal-to-noise ratio [dB] that a mean square error of values in [0, 1] has."""
-    return float(-10 * torch.log10(mean_square.clamp_min(1e-10)))
-
-
 def geometry_loss(body: int, size_m: float, radius_factor: float) -> Loss:
-    """Return the loss of stage I's geometry: silhouette, and depth, normals and features where the photos have them.
+    """Return the loss of a body's geometry: silhouette, and depth, normals and features where the photos have them.
 
-    The spheres' colours are their features (N, F) where a view has a feature map, and are not looked at elsewhere.
+    The colours of the spheres are their features (N, F) where a view has a feature map, and are not used elsewhere.
 
     Args:
-        body: The body's place in the manifest.
-        size_m: The body's size [m], the unit of depth errors.
-        radius_factor: Collision radius in units of the scale: depth is that of the surface that collides.
+        body: Index of the body in the manifest.
+        size_m: Size of the body [m], the unit of depth errors.
+        radius_factor: Collision radius in units of the scale; depth is that of the collision surface.
     """
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -100,9 +64,9 @@ def geometry_loss(body: int, size_m: float, radius_factor: float) -> Loss:
 
 
 def depth_error(depth: Tensor, target: Tensor, chosen: Tensor, unit: Tensor | float) -> Tensor:
-    """Return the mean over all pixels (H, W) of the chosen depth errors in a unit [m].
+    """Return the mean over all pixels (H, W) of the chosen depth errors, in units of `unit` [m].
 
-    Large errors count by their logarithm: they are outliers, or another surface that shows at a border.
+    Large errors enter logarithmically: they are outliers, or another surface that is visible at a border.
     """
     error = _OUTLYING * ((depth - target).abs() / (unit * _OUTLYING)).log1p()
     return (error * (chosen & (target > 0))).mean()
@@ -111,7 +75,7 @@ def depth_error(depth: Tensor, target: Tensor, chosen: Tensor, unit: Tensor | fl
 def normals_of(depth: Tensor, K: Tensor) -> Tensor:
     """Return the unit normals (H, W, 3), camera axes, of a surface at a depth [m] (H, W), towards the camera.
 
-    The depth of spheres is rough from pixel to pixel, so that it is smoothed over windows of 5 x 5 first.
+    The depth of spheres varies from pixel to pixel, so it is smoothed over windows of 5 x 5 first.
     """
     smooth = functional.avg_pool2d(depth[None, None], _NORMAL_WINDOW, 1, _NORMAL_WINDOW // 2, count_include_pad=False)
     height, width = depth.shape
@@ -126,12 +90,12 @@ def normals_of(depth: Tensor, K: Tensor) -> Tensor:
 
 
 def _front(spheres: Spheres, view: View, radius_factor: float) -> Tensor:
-    """Return the depth of each sphere's point that is nearest to the camera [m], (N,)."""
+    """Return the depth of the point of each sphere that is nearest to the camera [m], shape (N,)."""
     return spheres.means @ view.viewmat[2, :3] + view.viewmat[2, 3] - radius_factor * spheres.scales
 
 
 def body_loss(body: int, exposures: Exposures) -> Loss:
-    """Return the loss of a body's appearance before a random background, which alpha has to hide or to show."""
+    """Return the loss of a body's appearance in front of a random background, which constrains alpha."""
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         background = torch.rand(3, generator=generator).to(view.image)
@@ -141,7 +105,7 @@ def body_loss(body: int, exposures: Exposures) -> Loss:
         exposures.follow(view, output.features[0].detach(), cover[body] > 0.95)
         picture = exposures.gain(view) * output.features[0] + (1 - output.alpha[0])[..., None] * background
         others = (cover.sum(0) - cover[body])[..., None]
-        # Mixed pixels of the border show both; what the body's share of them looks like is not known.
+        # Pixels at the border mix body and background; the colour of the body in them is unknown.
         target = torch.where(mine > 0.95, view.image, mine * picture.detach() + (1 - mine) * background)
         sure = (1 - others[..., 0]) * ((mine[..., 0] > 0.95) | (mine[..., 0] < 0.05))
         edge = ((output.alpha[0] - mine[..., 0]).abs() * (1 - others[..., 0])).mean()
@@ -152,18 +116,18 @@ def body_loss(body: int, exposures: Exposures) -> Loss:
 
 
 def behind(bodies: Spheres | None, spheres: Spheres) -> Spheres:
-    """Return the bodies, if there are any, and the spheres of the background behind them."""
+    """Return the spheres of the bodies (if any) and of the background as one set."""
     return spheres if bodies is None else Spheres.joined([bodies, spheres])
 
 
 def scene_loss(bodies: Spheres | None, exposures: Exposures, motions: Motions | None = None) -> Loss:
-    """Return the loss of the background, with the bodies standing in it as they are; depth counts where it is known.
+    """Return the loss of the background with the bodies fixed in it; depth enters where it is known.
 
     Args:
-        bodies: Visual spheres of the bodies, world frame, or None. Without them, pixels that masks give to bodies do
-            not count.
-        exposures: Gains of the photos, learned along.
-        motions: Motions of the cameras, where they are to be learned along.
+        bodies: Visual spheres of the bodies, world frame, or None. Without them, pixels inside the masks of bodies
+            are ignored.
+        exposures: Gains of the photos, learned at the same time.
+        motions: Motions of the cameras, if they are learned at the same time.
     """
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -183,12 +147,12 @@ def scene_loss(bodies: Spheres | None, exposures: Exposures, motions: Motions | 
 
 
 def scene_weight(view: View) -> Tensor:
-    """Return how much each pixel shows of what is no body, (H, W); 1 without a mask."""
+    """Return the share of the background in each pixel, shape (H, W); 1 without a mask."""
     return torch.ones_like(view.image[..., 0]) if view.cover is None else 1 - view.cover.sum(0)
 
 
 def cover_of(view: View) -> Tensor:
-    """Return the share of each pixel that each body covers, (bodies, H, W), of a view that has a mask."""
+    """Return the share of each pixel that each body covers, shape (bodies, H, W), for a view with a mask."""
     if view.cover is None:
         raise ValueError(f"{view.name} has no mask")
     return view.cover

@@ -1,9 +1,9 @@
-"""Borders of bodies in photos, from where they roughly are in space.
+"""Segmentation of bodies in photos, from their approximate positions in space.
 
 Each photo is cut into body and background by GrabCut (Rother, Kolmogorov, Blake 2004: colour models of both, and a
-minimal cut along the edges), first in a wide band about the spheres that stand for the body. The masks together leave a
-solid, more exact than each of them: what one photo took for the body and the others did not is gone. Seen by each
-photo, it starts a second cut in a narrow band.
+minimal cut along the edges), first in a wide band around the spheres of the body. The masks together carve a solid that
+is more exact than each of them, because it excludes what only one photo assigned to the body. Its projection into each
+photo initialises a second cut in a narrow band.
 """
 
 from __future__ import annotations
@@ -18,56 +18,57 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from ...datasets.cameras import Camera
-from ...datasets.capture import Capture
+from ...datasets.capture.cameras import Camera
+from ...datasets.capture.capture import Capture
 from ...schemas import Ground
-from .hull import largest_component, signed_distance_px
-from .render import render
-from .spheres import Spheres
+from ..geometry.solid_grid import Array, crossings, grid_points
+from ..geometry.spheres import Spheres
+from ..rendering.render import render
 from .views import View, with_labels
-from .volume import Array, crossings, grid_points
+from .visual_hull import largest_component, signed_distance_px
 
 Mask = NDArray[np.bool_]
 
 _SIZE = 800
-"""Photos are reduced to this longer side [px]; masks are brought back to the photos' own."""
+"""Maximum longer side of the reduced photos [px]; masks are resized to the original size afterwards."""
 _RENDERED = 240
 _WINDOW_PX = 400
-"""A cut is made at no more than this size of the body's window [px]."""
+"""Maximum size of the window of a body for a cut [px]."""
 _SURROUNDINGS = 0.25
-"""Width of the background about the band that the colour model of the background learns from, of the band's size."""
+"""Width of the surroundings of the band that the background's colour model learns from, in units of its size."""
 _CUTS = 4
 _NARROW = 3.0
-"""Half width of the second band, in units of the solid's grid."""
+"""Half width of the second band, in units of the grid spacing of the solid."""
 _GRID = 72
 _OUTVOTED = 0.05
-"""Share of the photos that may find a point outside the body and be wrong."""
+"""Share of the photos that may exclude a point of the body and are outvoted."""
 _MIN_VIEWS = 3
 
 
 @dataclass(frozen=True)
 class Blob:
-    """Where a body roughly is.
-
-    Attributes:
-        index: The body's place in the manifest.
-        members: Which spheres are part of it, shape (n,).
-        corners: Of a box that holds all of it, world frame [m], shape (8, 3), or None.
-    """
+    """Approximate position of a body."""
 
     index: int
+    """Index of the body in the manifest."""
     members: NDArray[np.int64]
+    """Indices of the spheres of the body, shape (n,)."""
     corners: Array | None
+    """Corners of a box that contains the body [m], world frame, shape (8, 3), or None."""
 
 
 @dataclass(frozen=True)
 class Outlined:
-    """The photos with masks, and of each body its mean share of the pixels and the agreement of its masks."""
+    """Photos with masks, and figures of the masks of each body."""
 
     train: list[View]
+    """The photos to fit, with masks."""
     test: list[View]
+    """The held-out photos, with masks."""
     shares: list[float]
+    """Mean share of the pixels, by body."""
     agreements: list[float]
+    """Mean IoU of the masks and the solid carved by them, by body."""
 
 
 def outline(
@@ -79,16 +80,16 @@ def outline(
     blobs: Sequence[Blob],
     ground: Ground | None,
 ) -> Outlined:
-    """Give photos masks of bodies; labels that they have stay.
+    """Add masks of bodies to photos, and keep the labels that these have.
 
     Args:
-        capture: Where the photos are.
-        train: The photos that tell the bodies' solids.
-        test: Others.
+        capture: The capture with the photos.
+        train: The photos that carve the solids.
+        test: Other photos to segment.
         spheres: The whole scene, world frame.
-        pitch: How exactly they show where a body ends [m].
+        pitch: Accuracy of the spheres as borders of a body [m].
         blobs: The bodies.
-        ground: The ground, on which they stand and which they do not enter, or None.
+        ground: The ground below the bodies, which they do not enter, or None.
     """
     views = [*train, *test]
     pictures = [_Picture.read(capture, view) for view in views]
@@ -119,11 +120,14 @@ def outline(
 
 @dataclass(frozen=True)
 class _Picture:
-    """A photo without distortion, uint8 RGB (H, W, 3), its camera, and the labels that it came with (H, W)."""
+    """A photo without distortion."""
 
     image: NDArray[np.uint8]
+    """RGB, shape (H, W, 3)."""
     camera: Camera
+    """Camera of the photo."""
     given: NDArray[np.uint8]
+    """Labels given with the capture, shape (H, W)."""
 
     @staticmethod
     def read(capture: Capture, view: View) -> _Picture:
@@ -140,26 +144,29 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Band:
-    """What is known of a mask: pixels surely inside, surely outside, and where to begin between the two, (H, W)."""
+    """Constraints on a mask."""
 
     inside: Mask
+    """Pixels certainly inside, shape (H, W)."""
     outside: Mask
+    """Pixels certainly outside, shape (H, W)."""
     start: Mask
+    """Initial mask, shape (H, W)."""
 
     def without(self, other: Mask) -> _Band:
-        """Return the band with other pixels that are surely outside."""
+        """Return the band with further pixels that are certainly outside."""
         return _Band(self.inside & ~other, self.outside | other, self.start & ~other)
 
     @staticmethod
     def about(start: Mask, core: Mask, width_px: float) -> _Band:
-        """Return a band that reaches so far out from `start`, and so far into `core`."""
+        """Return a band that extends by `width_px` outside of `start` and inside of `core`."""
         return _Band(_eroded(core, width_px), ~_dilated(start, width_px), start)
 
 
 def _wide_bands(
     picture: _Picture, spheres: Spheres, pitch: float, blobs: Sequence[Blob], ground: Ground | None
 ) -> list[_Band]:
-    """Return a band about each body as the spheres show it, down to the ground: its lowest part is none of theirs."""
+    """Return a band around the spheres of each body, extended down to the ground."""
     seen = _rendered(picture.camera, spheres, blobs)
     bands = []
     for k, blob in enumerate(blobs):
@@ -178,7 +185,7 @@ def _wide_bands(
 
 @torch.no_grad()
 def _rendered(camera: Camera, spheres: Spheres, blobs: Sequence[Blob]) -> Array:
-    """Return how much of each body the spheres show in each pixel, in [0, 1], (H, W, bodies)."""
+    """Return the rendered share of each body in each pixel, in [0, 1], shape (H, W, bodies)."""
     scale = min(1.0, _RENDERED / max(camera.width, camera.height))
     small = camera.resized(round(scale * camera.width), round(scale * camera.height))
     label = torch.zeros(len(spheres), len(blobs))
@@ -193,7 +200,7 @@ def _rendered(camera: Camera, spheres: Spheres, blobs: Sequence[Blob]) -> Array:
 
 
 def _columns(points: Array, pitch: float, ground: Ground) -> Array:
-    """Return points under given ones (n, 3), down to the ground, half a pitch apart."""
+    """Return points below given ones (n, 3), down to the ground, half a pitch apart."""
     normal = np.array(ground.normal)
     heights = np.maximum(points @ normal - ground.offset_m, 0)
     steps = np.arange(0, heights.max() + 0.5 * pitch, 0.5 * pitch)
@@ -202,12 +209,12 @@ def _columns(points: Array, pitch: float, ground: Ground) -> Array:
 
 
 def _beyond(blob: Blob, picture: _Picture) -> Mask:
-    """Return the pixels in which nothing of the body's box can lie."""
+    """Return the pixels outside the projection of the body's box."""
     shape = picture.given.shape
     if blob.corners is None:
         return np.zeros(shape, bool)
     pixel, depth = picture.camera.project(blob.corners)
-    if (depth <= 0).any():  # the camera is in the box, or close beside it
+    if (depth <= 0).any():  # The camera is in the box, or close to it.
         return np.zeros(shape, bool)
     within = np.zeros(shape, np.uint8)
     cv2.fillConvexPoly(within, cv2.convexHull(np.round(pixel).astype(np.int32)), 1)
@@ -215,7 +222,7 @@ def _beyond(blob: Blob, picture: _Picture) -> Mask:
 
 
 def _cut(image: NDArray[np.uint8], band: _Band) -> Mask:
-    """Return the body's mask within a band, by GrabCut in a window about it."""
+    """Return the mask of a body within a band, by GrabCut in a window around it."""
     rows, columns = np.nonzero(~band.outside)
     if len(rows) == 0 or not band.start.any():
         return np.zeros(band.start.shape, bool)
@@ -235,7 +242,7 @@ def _cut(image: NDArray[np.uint8], band: _Band) -> Mask:
         state = cv2.resize(state, size, interpolation=cv2.INTER_NEAREST)
     part, state = np.ascontiguousarray(part), np.ascontiguousarray(state)
     outer = (state == cv2.GC_BGD) | (state == cv2.GC_PR_BGD)
-    if not outer.any() or outer.all():  # GrabCut needs colours of both
+    if not outer.any() or outer.all():  # GrabCut needs colours of both.
         return band.start & ~band.outside
     cv2.setRNGSeed(0)
     cv2.grabCut(part, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), _CUTS, cv2.GC_INIT_WITH_MASK)
@@ -247,10 +254,12 @@ def _cut(image: NDArray[np.uint8], band: _Band) -> Mask:
 
 @dataclass(frozen=True)
 class _Solid:
-    """What several masks leave of space: points on its surface, world frame [m], (n, 3), and their spacing [m]."""
+    """A solid carved by several masks."""
 
     surface: Array
+    """Points on the surface [m], world frame, shape (n, 3)."""
     pitch: float
+    """Spacing of the points [m]."""
 
     @staticmethod
     def left_by(
@@ -261,9 +270,10 @@ class _Solid:
         margin: float,
         ground: Ground | None,
     ) -> _Solid:
-        """Carve a grid about points that are near the body, (n, 3), and a margin [m], down to the ground.
+        """Carve a grid around points near the body (n, 3) and a margin [m], down to the ground.
 
-        Unlike `hull.carve` it lets a few masks be outvoted, and does not carve where another body may hide this one.
+        Unlike `visual_hull.carve`, this tolerates a few outvoted masks and does not carve where another body may hide
+        this one.
         """
         low, high = near.min(0) - 1.5 * margin, near.max(0) + 1.5 * margin
         if ground is not None:
@@ -285,23 +295,23 @@ class _Solid:
         return _Solid(crossings(field, low - pitch, pitch), pitch)
 
     def seen_by(self, camera: Camera) -> Mask:
-        """Return the solid's mask in a photo."""
+        """Return the mask of the solid in a photo."""
         metre = _pixels_per_metre(camera, self.surface)
         if metre is None:
             return np.zeros((camera.height, camera.width), bool)
-        # The points lie on the surface: discs that close the gaps between them are taken off again at the border.
+        # The points lie on the surface: discs close the gaps between them and are eroded again at the border.
         radius = 0.9 * self.pitch * metre + 0.5
         return _eroded(_dilated(_marked(camera, self.surface), radius), radius)
 
     def band(self, camera: Camera) -> _Band:
-        """Return a narrow band about the solid's border in a photo."""
+        """Return a narrow band around the border of the solid in a photo."""
         mask = self.seen_by(camera)
         width = _NARROW * self.pitch * (_pixels_per_metre(camera, self.surface) or 0.0)
         return _Band.about(mask, mask, width)
 
 
 def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera) -> None:
-    """Write into `row` (n,) how far inside a mask points (n, 3) lie [m], where the photo may show them."""
+    """Write the depth of points (n, 3) inside a mask [m] into `row` (n,), where the photo may show them."""
     signed = signed_distance_px(mask)
     pixel, depth = camera.project(points)
     seen = (depth > 0) & (pixel > 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
@@ -311,13 +321,13 @@ def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera
 
 
 def _largest_part(field: Array, pitch: float) -> Array:
-    """Return a field (X, Y, Z) that is positive in its largest connected part alone."""
+    """Return a field (X, Y, Z) that is positive only in its largest connected part."""
     part = largest_component(field > 0)
     return field if part is None else np.where(part, field, np.minimum(field, -1e-3 * pitch))
 
 
 def _agreement(solid: _Solid, pictures: Sequence[_Picture], masks: Sequence[Mask], hidden: Sequence[Mask]) -> float:
-    """Return the mean IoU of masks and of the solid in the same photos; photos that show neither do not count."""
+    """Return the mean IoU of masks and the solid in the same photos; photos that show neither are omitted."""
     values = []
     for picture, mask, other in zip(pictures, masks, hidden, strict=True):
         seen = solid.seen_by(picture.camera) & ~other
@@ -327,7 +337,7 @@ def _agreement(solid: _Solid, pictures: Sequence[_Picture], masks: Sequence[Mask
 
 
 def _pixels_per_metre(camera: Camera, points: Array) -> float | None:
-    """Return the size of a metre [px] at the depth of points (n, 3), or None if they are not before the camera."""
+    """Return the size of a metre [px] at the depth of points (n, 3), or None if they are behind the camera."""
     depth = points @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
     middle = float(np.median(depth)) if len(depth) else 0.0
     return camera.K[0, 0] / middle if middle > 0 else None
@@ -346,7 +356,7 @@ def _dilated(mask: Mask, radius_px: float) -> Mask:
 
 
 def _eroded(mask: Mask, radius_px: float) -> Mask:
-    # What lies beyond the picture is unknown: the border of a body that leaves it is not eroded there.
+    # Space beyond the picture is unknown: a body that extends beyond it is not eroded at that border.
     return np.asarray(cv2.erode(mask.astype(np.uint8), _disc(radius_px), borderValue=1)) > 0
 
 

@@ -1,8 +1,8 @@
-"""Fitting a scene with spheres that go where they are needed, up to a budget.
+"""Fit of a scene with an adaptive set of spheres, up to a budget.
 
-3D Gaussian splatting as Markov chain Monte Carlo (Kheradmand et al. 2024, arXiv 2404.09591): spheres wander by noise
-while they are faint, those that have become transparent move to where others are opaque, and the number grows to the
-budget. A sphere that splits keeps the picture as it was, by its opacities exactly and by its scales on average.
+3D Gaussian splatting as Markov chain Monte Carlo (Kheradmand et al. 2024, arXiv 2404.09591): noise moves faint spheres,
+those that have become transparent move to where others are opaque, and the number grows to the budget. A split
+preserves the picture: exactly in the opacities, on average in the scales.
 """
 
 from __future__ import annotations
@@ -14,47 +14,52 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.ply import SH_C0
-from ...datasets.progress import progress
-from ..checkpoint import Slot, State
-from .exposures import Exposures
-from .fit import require_finite
-from .harmonics import term_count
-from .losses import Loss, psnr_of
-from .poses import Motions
-from .spheres import Spheres
+from ...datasets.io.progress import progress
+from ...datasets.shapes.ply import SH_C0
+from ..geometry.spheres import Spheres
+from ..geometry.spherical_harmonics import term_count
+from ..rendering.image_metrics import psnr_of
+from ..runtime.checkpoint import Slot, State
+from .camera_refinement import Motions
+from .losses import Loss
+from .optimize import require_finite
+from .photo_exposure import Exposures
 from .views import View
 
 DEAD = 0.005
-"""A sphere of less opacity is dead, and moves to where others live."""
+"""Opacity below which a sphere is dead and moves to a living one."""
 REFINED_EVERY = 100
 REFINED_FROM, REFINED_UNTIL = 0.07, 0.85
-"""Shares of the iterations between which spheres move and multiply."""
+"""Shares of the iterations between which dead spheres move and new ones are added."""
 GROWTH = 1.05
 NOISE = 5e5
 MOST_COPIES = 51
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01
-"""Weights of the mean opacity, and of the mean scale in units of the cameras' spread: they make spheres die."""
+"""Weights of the mean opacity and of the mean scale (in units of the cameras' spread), which remove spheres."""
 RATES = {"means": 1.6e-4, "log_scales": 5e-3, "logits": 5e-2, "colors": 2.5e-3 * SH_C0, "harmonics": 1.25e-4}
-"""Adam's step sizes; of the means in units of the cameras' spread, falling to a hundredth."""
+"""Step sizes of Adam; that of the means is in units of the cameras' spread and falls to a hundredth."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a fit is: iteration, spheres, mean loss and PSNR [dB] of the last iterations."""
+    """Progress of a fit."""
 
     iteration: int
+    """Number of the iteration, from 0."""
     spheres: int
+    """Number of spheres."""
     loss: float
+    """Mean loss since the last entry [1]."""
     psnr_db: float
+    """PSNR of the last photo [dB]."""
 
 
 class Population:
-    """Spheres in the coordinates that Adam moves in, whose number may change.
+    """Spheres in the coordinates of the optimiser, in a number that may change.
 
     Args:
-        spheres: The start.
-        degree: Of the harmonics of the colours, 0 to 3.
+        spheres: The initial spheres.
+        degree: Degree of the harmonics of the colours, 0 to 3.
         spread: Greatest distance of a camera from their mean [m].
     """
 
@@ -78,22 +83,26 @@ class Population:
         return len(self._values["means"])
 
     def spheres(self) -> Spheres:
-        """Return the spheres as they are now, connected to what is optimised."""
+        """Return the current spheres, differentiable with respect to the optimised coordinates."""
         value = self._values
         higher = value["harmonics"] if value["harmonics"].shape[1] else None
         return Spheres(
-            value["means"], value["log_scales"].exp(), torch.sigmoid(value["logits"]), value["colors"], higher
+            means=value["means"],
+            scales=value["log_scales"].exp(),
+            opacities=torch.sigmoid(value["logits"]),
+            colors=value["colors"],
+            harmonics=higher,
         )
 
     def state(self) -> State:
-        """Return all that the spheres and Adam are made of, for a checkpoint."""
+        """Return the state of the spheres and of Adam, for a checkpoint."""
         return {
             "values": {name: value.detach() for name, value in self._values.items()},
             "adam": {name: adam.state_dict() for name, adam in self._adam.items()},
         }
 
     def restore(self, state: State) -> None:
-        """Take up what `state` returned; the number of spheres may differ from the start's."""
+        """Restore what `state` returned; the number of spheres may differ from the initial one."""
         for name, value in state["values"].items():
             self._values[name] = value.requires_grad_()
             if name in self._adam:
@@ -101,7 +110,7 @@ class Population:
                 self._adam[name].load_state_dict(state["adam"][name])
 
     def step(self, share: float, generator: torch.Generator) -> None:
-        """Move by the gradients, and by noise; `share` of the fit is over."""
+        """Move by the gradients and by noise, when `share` of the fit is over."""
         rate = self._rate("means") * 0.01**share
         self._adam["means"].param_groups[0]["lr"] = rate
         for adam in self._adam.values():
@@ -115,7 +124,7 @@ class Population:
 
     @torch.no_grad()
     def refine(self, budget: int, generator: torch.Generator) -> None:
-        """Move dead spheres to living ones, and add some up to the budget."""
+        """Move dead spheres to living ones, and add new ones up to the budget."""
         opacity = torch.sigmoid(self._values["logits"])
         dead = (opacity <= DEAD).nonzero()[:, 0]
         alive = (opacity > DEAD).nonzero()[:, 0]
@@ -132,7 +141,7 @@ class Population:
         return RATES[name] * (self.spread if name == "means" else 1.0)
 
     def _split(self, sources: Tensor, targets: Tensor | None) -> None:
-        """Make of each source as many equal spheres as it is named times, and itself; in place of targets, or new."""
+        """Split each source into equal spheres, one per mention and itself, which replace the targets or are new."""
         copies = torch.bincount(sources, minlength=len(self)) + 1
         split = (copies > 1).nonzero()[:, 0]
         opacity, scale = torch.sigmoid(self._values["logits"][split]), self._values["log_scales"][split].exp()
@@ -148,7 +157,7 @@ class Population:
                 self._replace(name, value, torch.cat([split, targets]))
 
     def _replace(self, name: str, value: Tensor, forgotten: Tensor) -> None:
-        """Put a tensor in the place of another, with Adam's moments, which of forgotten rows are 0."""
+        """Replace a parameter tensor and Adam's moments; the moments of forgotten rows are 0."""
         old, new = self._values[name], value.requires_grad_()
         self._values[name] = new
         adam = self._adam.get(name)
@@ -167,10 +176,10 @@ class Population:
 
 
 def shared_among(opacity: Tensor, scale: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Return opacity and scale (n,) of each of `copies` (n,) equal spheres that stand for one, arXiv 2404.09591, eq. 9.
+    """Return opacity and scale (n,) of each of `copies` (n,) equal spheres that replace one, arXiv 2404.09591, eq. 9.
 
-    The alpha of a ray through the centre stays, 1 - (1 - new)^copies = old, and so does the integral of alpha over a
-    line across it.
+    Both the alpha of a ray through the centre, 1 - (1 - new)^copies = old, and the integral of alpha over a line across
+    it are preserved.
     """
     copies = copies.clamp_max(MOST_COPIES)
     new = 1 - (1 - opacity.double()) ** (1 / copies.double())
@@ -202,24 +211,24 @@ def fit_adaptively(
     motions: Motions | None = None,
     slot: Slot | None = None,
 ) -> tuple[Spheres, list[Progress]]:
-    """Fit spheres to photos, one photo an iteration.
+    """Fit an adaptive set of spheres to photos, one photo per iteration.
 
     Args:
-        start: The spheres at the beginning, at most the budget.
+        start: The initial spheres, at most `budget`.
         views: The photos; each round goes through all of them in a new order.
-        loss: The loss of one view, with whatever stands before the spheres.
-        budget: Most spheres.
-        degree: Of the harmonics of the colours.
+        loss: The loss of one view, including bodies in front of the spheres.
+        budget: Maximum number of spheres.
+        degree: Degree of the harmonics of the colours.
         iterations: Number of steps.
         spread: Greatest distance of a camera from their mean [m].
         seed: Seed.
         what: Name of the stage, for the progress bar.
-        exposures: What the loss learns of the photos' exposures, to be kept in checkpoints.
-        motions: What it learns of the cameras' poses.
-        slot: Where checkpoints go, and from where an interrupted fit is taken up.
+        exposures: The photos' exposures that the loss learns, kept in checkpoints.
+        motions: The motions of the cameras that it learns.
+        slot: The checkpoint file, from which an interrupted fit resumes.
 
     Returns:
-        The spheres, and how it went, every `REFINED_EVERY` iterations.
+        The spheres, and the progress every `REFINED_EVERY` iterations.
 
     Raises:
         NotConvergedError: If the loss or a sphere is no longer finite.
@@ -232,29 +241,30 @@ def fit_adaptively(
         spheres = run.population.spheres()
         value, wrong = loss(spheres, view, run.shuffle)
         value = value + OPACITY_WEIGHT * spheres.opacities.mean() + SCALE_WEIGHT * spheres.scales.mean() / spread
-        value.backward()
-        run.losses.append(value.detach())
-        run.population.step(iteration / iterations, run.noise)
-        if motions is not None:
-            motions.step(iteration / iterations)
+        run.step(value, iteration / iterations)
         if iteration % REFINED_EVERY == 0 or iteration == iterations - 1:
             require_finite(run.losses, iteration, iterations, what)
             run.note(iteration, wrong)
-            bar.set_postfix_str(run.told())
+            bar.set_postfix_str(run.summary())
             if REFINED_FROM * iterations <= iteration < REFINED_UNTIL * iterations:
                 run.population.refine(budget, run.noise)
             if slot is not None and slot.due():
                 slot.write(run.state(iteration + 1))
-    fitted = run.population.spheres()
+    fitted = _detached(run.population.spheres())
     total = fitted.means.sum() + fitted.scales.sum() + fitted.colors.sum()
-    require_finite([total.detach()], iterations - 1, iterations, what)
-    higher = None if fitted.harmonics is None else fitted.harmonics.detach()
-    plain = (fitted.means, fitted.scales, fitted.opacities, fitted.colors)
-    return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher), run.history
+    require_finite([total], iterations - 1, iterations, what)
+    return fitted, run.history
+
+
+def _detached(spheres: Spheres) -> Spheres:
+    """Return the spheres without their gradients."""
+    higher = None if spheres.harmonics is None else spheres.harmonics.detach()
+    plain = (spheres.means, spheres.scales, spheres.opacities, spheres.colors)
+    return Spheres(*(tensor.detach() for tensor in plain), harmonics=higher)
 
 
 class _Run:
-    """What a fit carries from one iteration to the next."""
+    """State of a fit that passes from one iteration to the next."""
 
     def __init__(self, population: Population, exposures: Exposures, motions: Motions | None, seed: int) -> None:
         self.population, self.exposures, self.motions = population, exposures, motions
@@ -268,12 +278,22 @@ class _Run:
         self.order = self.order or torch.randperm(count, generator=self.shuffle).tolist()
         return self.order.pop()
 
+    def step(self, value: Tensor, share: float) -> None:
+        """Move against the gradient of a loss when `share` of the fit is over, and record the loss."""
+        value.backward()
+        self.losses.append(value.detach())
+        self.population.step(share, self.noise)
+        if self.motions is not None:
+            self.motions.step(share)
+
     def note(self, iteration: int, wrong: Tensor) -> None:
+        """Add an entry to the history from the losses since the last one and a mean square error."""
         mean = float(torch.stack(self.losses).mean())
         self.history.append(Progress(iteration, len(self.population), mean, psnr_of(wrong)))
         self.losses = []
 
-    def told(self) -> str:
+    def summary(self) -> str:
+        """Return the last entry of the history, for the progress bar."""
         last = self.history[-1]
         return f"{last.spheres} spheres, loss {last.loss:.4f}, {last.psnr_db:.1f} dB"
 
@@ -290,7 +310,7 @@ class _Run:
         }
 
     def restore(self, slot: Slot | None) -> int:
-        """Take up the last checkpoint; return how many iterations are done."""
+        """Restore the last checkpoint; return the number of completed iterations."""
         state = slot.read(self.noise.device) if slot is not None else None
         if state is None:
             return 0

@@ -1,4 +1,4 @@
-"""Fitting spheres to photos by gradient descent through the renderer."""
+"""Fit of spheres to photos by gradient descent through the renderer."""
 
 from __future__ import annotations
 
@@ -8,40 +8,39 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.progress import progress
+from ...datasets.io.progress import progress
 from ...schemas import NotConvergedError
-from ..checkpoint import Slot, State
-from .exposures import Exposures
-from .losses import Loss, psnr_of
-from .poses import Motions
-from .spheres import Spheres
+from ..geometry.spheres import Spheres
+from ..rendering.image_metrics import psnr_of
+from ..runtime.checkpoint import Slot, State
+from .camera_refinement import Motions
+from .losses import Loss
+from .photo_exposure import Exposures
 from .views import View
 
-_LOOKED_EVERY = 20
+_CHECK_INTERVAL = 20
+"""Number of iterations between two checks that the loss is finite."""
 _MAX_OPACITY = 0.995
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's step sizes; 0 freezes a quantity.
-
-    Attributes:
-        means: In units of each sphere's own initial scale.
-        log_scales: [1]
-        logits: Of the opacities.
-        colors: [1]
-    """
+    """Step sizes of Adam; 0 freezes a quantity."""
 
     means: float = 0.0
+    """Step size of the means, in units of each sphere's initial scale."""
     log_scales: float = 0.0
+    """Step size of the logarithms of the scales [1]."""
     logits: float = 0.0
+    """Step size of the logits of the opacities [1]."""
     colors: float = 0.0
+    """Step size of the colours [1]."""
 
 
 class Trainable:
-    """Spheres in the coordinates that the optimiser moves in.
+    """Spheres in the coordinates of the optimiser.
 
-    Means move in units of the spheres' own scales, scales by their logarithm, opacities by their logit.
+    Means are in units of the initial scales, scales are logarithms, opacities are logits.
     """
 
     def __init__(self, spheres: Spheres, rates: Rates) -> None:
@@ -61,7 +60,7 @@ class Trainable:
         self.groups = [{"params": [tensor], "lr": rate} for tensor, rate in groups if rate > 0]
 
     def spheres(self) -> Spheres:
-        """Return the spheres as they are now, connected to what is optimised."""
+        """Return the current spheres, differentiable with respect to the optimised coordinates."""
         start = self._start
         return Spheres(
             start.means + self.shift * start.scales[:, None],
@@ -71,7 +70,7 @@ class Trainable:
         )
 
     def state(self) -> State:
-        """Return all that the spheres are made of, for a checkpoint."""
+        """Return the state of the spheres, for a checkpoint."""
         start = self._start
         tensors = (start.means, start.scales, start.opacities, start.colors)
         moving = (self.shift, self.log_scale, self.logit, self.colors)
@@ -79,13 +78,13 @@ class Trainable:
 
     @torch.no_grad()
     def restore(self, state: State) -> None:
-        """Take up what `state` returned."""
+        """Restore what `state` returned."""
         self._start = Spheres(*state["start"])
         for tensor, value in zip((self.shift, self.log_scale, self.logit, self.colors), state["moving"], strict=True):
             tensor.copy_(value)
 
     def drift(self) -> Tensor:
-        """Return how far the geometry is from its start: mean square of shifts and logarithms of scales [1]."""
+        """Return the drift of the geometry from its start: mean square of shifts and logarithms of scales [1]."""
         return self.shift.square().sum(1).mean() + self.log_scale.square().mean()
 
 
@@ -101,82 +100,113 @@ def descend(
     motions: Motions | None = None,
     slot: Slot | None = None,
 ) -> list[float]:
-    """Run Adam, one view an iteration, with step sizes that fall to a tenth.
+    """Minimise a loss with Adam, one view per iteration, with step sizes that fall to a tenth.
 
     Args:
-        trainable: What moves.
+        trainable: The spheres to optimise.
         views: The photos; each round goes through all of them in a new order.
         loss: The loss of one view.
         iterations: Number of steps.
         seed: Seed.
         what: Name of the stage, for the progress bar.
         drift_weight: Weight of `Trainable.drift`.
-        exposures: What the loss learns of the photos' exposures, to be kept in checkpoints.
-        motions: What it learns of the cameras' poses.
-        slot: Where checkpoints go, and from where an interrupted descent is taken up.
+        exposures: The photos' exposures that the loss learns, kept in checkpoints.
+        motions: The motions of the cameras that it learns.
+        slot: The checkpoint file, from which an interrupted descent resumes.
 
     Returns:
         The loss by iteration.
 
     Raises:
-        NotConvergedError: If the loss or what moves is no longer finite.
+        NotConvergedError: If the loss or a sphere is no longer finite.
     """
-    generator = torch.Generator().manual_seed(seed)
-    optimiser = torch.optim.Adam(trainable.groups, eps=1e-12)
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(iterations, 1)))
-    losses: list[Tensor] = []
-    order: list[int] = []
-    state = slot.read(trainable.shift.device) if slot is not None else None
-    if state is not None:
-        trainable.restore(state["spheres"])
-        optimiser.load_state_dict(state["adam"])
-        decay.load_state_dict(state["decay"])
-        generator.set_state(state["generator"].cpu())
-        losses, order = list(state["losses"].unbind()), state["order"]
-        for carried, name in ((exposures, "exposures"), (motions, "motions")):
-            if carried is not None:
-                carried.restore(state[name])
-    bar = progress(range(len(losses), iterations), what, total=iterations, initial=len(losses))
+    run = _Run(trainable, exposures, motions, iterations, seed)
+    first = run.restore(slot)
+    bar = progress(range(first, iterations), what, total=iterations, initial=first)
     for iteration in bar:
-        if not order:
-            order = torch.randperm(len(views), generator=generator).tolist()
-        value, wrong = loss(trainable.spheres(), views[order.pop()], generator)
+        value, wrong = loss(trainable.spheres(), views[run.next_photo(len(views))], run.generator)
         if drift_weight > 0:
             value = value + drift_weight * trainable.drift()
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        decay.step()
-        if motions is not None:
-            motions.step(iteration / iterations)
-        losses.append(value.detach())
-        # not oftener, for on a GPU a look waits until it is ready
-        if iteration % _LOOKED_EVERY == 0 or iteration == iterations - 1:
-            require_finite(losses, iteration, iterations, what)
+        run.step(value, iteration / iterations)
+        # On a GPU each check waits for the result, so the loss is not checked at every iteration.
+        if iteration % _CHECK_INTERVAL == 0 or iteration == iterations - 1:
+            require_finite(run.losses, iteration, iterations, what)
             bar.set_postfix_str(
-                f"{len(trainable.shift)} spheres, loss {float(losses[-1]):.4f}, {psnr_of(wrong):.1f} dB"
+                f"{len(trainable.shift)} spheres, loss {float(run.losses[-1]):.4f}, {psnr_of(wrong):.1f} dB"
             )
         if slot is not None and slot.due():
-            require_finite(losses, iteration, iterations, what)
-            slot.write(
-                {
-                    "spheres": trainable.state(),
-                    "adam": optimiser.state_dict(),
-                    "decay": decay.state_dict(),
-                    "generator": generator.get_state(),
-                    "losses": torch.stack(losses),
-                    "order": order,
-                    "exposures": None if exposures is None else exposures.state(),
-                    "motions": None if motions is None else motions.state(),
-                }
-            )
+            require_finite(run.losses, iteration, iterations, what)
+            slot.write(run.state())
     sums = [group["params"][0].detach().sum() for group in trainable.groups]
     require_finite([torch.stack(sums).sum()], iterations - 1, iterations, what)
-    return torch.stack(losses).tolist()
+    return torch.stack(run.losses).tolist()
+
+
+class _Run:
+    """State of a descent that passes from one iteration to the next."""
+
+    def __init__(
+        self,
+        trainable: Trainable,
+        exposures: Exposures | None,
+        motions: Motions | None,
+        iterations: int,
+        seed: int,
+    ) -> None:
+        self.trainable, self.exposures, self.motions = trainable, exposures, motions
+        self.generator = torch.Generator().manual_seed(seed)
+        self.adam = torch.optim.Adam(trainable.groups, eps=1e-12)
+        self.decay = torch.optim.lr_scheduler.ExponentialLR(self.adam, 0.1 ** (1 / max(iterations, 1)))
+        self.losses: list[Tensor] = []
+        self.order: list[int] = []
+
+    def next_photo(self, count: int) -> int:
+        """Return the index of the next of `count` photos; each round has a new order."""
+        if not self.order:
+            self.order = torch.randperm(count, generator=self.generator).tolist()
+        return self.order.pop()
+
+    def step(self, value: Tensor, share: float) -> None:
+        """Move against the gradient of a loss when `share` of the descent is over, and record the loss."""
+        self.adam.zero_grad()
+        value.backward()
+        self.adam.step()
+        self.decay.step()
+        if self.motions is not None:
+            self.motions.step(share)
+        self.losses.append(value.detach())
+
+    def state(self) -> State:
+        """Return the state, for a checkpoint."""
+        return {
+            "spheres": self.trainable.state(),
+            "adam": self.adam.state_dict(),
+            "decay": self.decay.state_dict(),
+            "generator": self.generator.get_state(),
+            "losses": torch.stack(self.losses),
+            "order": self.order,
+            "exposures": None if self.exposures is None else self.exposures.state(),
+            "motions": None if self.motions is None else self.motions.state(),
+        }
+
+    def restore(self, slot: Slot | None) -> int:
+        """Restore the last checkpoint; return the number of completed iterations."""
+        state = slot.read(self.trainable.shift.device) if slot is not None else None
+        if state is None:
+            return 0
+        self.trainable.restore(state["spheres"])
+        self.adam.load_state_dict(state["adam"])
+        self.decay.load_state_dict(state["decay"])
+        self.generator.set_state(state["generator"].cpu())
+        self.losses, self.order = list(state["losses"].unbind()), state["order"]
+        for learned, name in ((self.exposures, "exposures"), (self.motions, "motions")):
+            if learned is not None:
+                learned.restore(state[name])
+        return len(self.losses)
 
 
 def require_finite(values: Sequence[Tensor], iteration: int, iterations: int, what: str) -> None:
-    """Check losses of successive iterations, or sums of what moves, the last of which belongs to `iteration`.
+    """Check that losses of successive iterations, or sums of parameters, are finite; the last is of `iteration`.
 
     Raises:
         NotConvergedError: If one is not finite.
@@ -191,11 +221,11 @@ def require_finite(values: Sequence[Tensor], iteration: int, iterations: int, wh
 
 
 def detached(spheres: Spheres) -> Spheres:
-    """Return the spheres apart from what optimised them."""
+    """Return the spheres without their gradients."""
     return Spheres(spheres.means.detach(), spheres.scales.detach(), spheres.opacities.detach(), spheres.colors.detach())
 
 
 def thinned(losses: list[float], count: int = 50) -> list[float]:
-    """Return the losses averaged over equal stretches of iterations, for the record."""
+    """Return the losses averaged over equal intervals of iterations, for the record."""
     parts = torch.tensor(losses, dtype=torch.float64).tensor_split(min(count, len(losses)))
     return [round(float(part.mean()), 6) for part in parts]

@@ -8,24 +8,24 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..checkpoint import State
+from ..runtime.checkpoint import State
 from .views import View
 
 _FOLLOWING = 0.3
-"""Share of the way to the least-squares gain that a photo's gain takes each time the photo is looked at."""
+"""Share of the way to the least-squares gain that the gain of a photo moves each time the photo is rendered."""
 _LEAST, _MOST = 0.1, 10.0
 
 
 class Exposures:
-    """A gain of each colour channel for each photo: photo = gain * what the spheres show.
+    """A gain of each colour channel for each photo: photo = gain * render.
 
-    The best gain for spheres as they are is a least-squares factor, so no descent is needed: whenever a photo is
-    looked at, its gain goes a part of the way there. The geometric mean of the gains stays 1, for photos do not tell
-    a bright scene from a long exposure.
+    The best gain for the current spheres is a least-squares factor, so no descent is needed: whenever a photo is
+    rendered, its gain moves part of the way there. The geometric mean of the gains stays 1, because photos cannot
+    distinguish a bright scene from a long exposure.
 
     Args:
         views: The photos.
-        learned: Whether gains follow the photos; otherwise all stay 1.
+        learned: Whether gains are learned; otherwise all stay 1.
     """
 
     def __init__(self, views: Sequence[View], learned: bool) -> None:
@@ -34,16 +34,16 @@ class Exposures:
         self._log_gains = views[0].image.new_zeros(len(views), 3)
 
     def gain(self, view: View) -> Tensor:
-        """Return a photo's brightness by channel relative to the mean photo, (3,)."""
+        """Return the brightness of a photo relative to the mean photo, by channel, shape (3,)."""
         return self._log_gains[self._place[view.name]].exp()
 
     def follow(self, view: View, picture: Tensor, weight: Tensor) -> None:
-        """Look at a photo once more.
+        """Update the gain of a photo with a new render.
 
         Args:
             view: The photo, or a window of it.
-            picture: What the spheres show of it at gain 1, shape (H, W, 3).
-            weight: How much each pixel counts, shape (H, W).
+            picture: The render at gain 1, shape (H, W, 3).
+            weight: Weight of each pixel, shape (H, W).
         """
         if not self.learned:
             return
@@ -52,7 +52,7 @@ class Exposures:
         self._log_gains -= self._log_gains.mean(0)
 
     def even(self, view: View) -> View:
-        """Return a photo brought to the mean exposure."""
+        """Return a photo scaled to the mean exposure."""
         return replace(view, image=view.image / self.gain(view)) if self.learned else view
 
     def record(self) -> dict[str, list[float]]:
@@ -65,13 +65,13 @@ class Exposures:
         return {"log_gains": self._log_gains}
 
     def restore(self, state: State) -> None:
-        """Take up what `state` returned."""
+        """Restore what `state` returned."""
         self._log_gains = state["log_gains"]
 
 
 @torch.no_grad()
 def least_squares_gain(picture: Tensor, photo: Tensor, weight: Tensor) -> Tensor:
-    """Return the factor of each channel that brings a picture (H, W, 3) nearest to a photo, weighted by pixel, (3,)."""
+    """Return the least-squares factor (3,) of each channel from a render (H, W, 3) to a photo, weighted by pixel."""
     weighted = picture * weight[..., None]
     square = (weighted * picture).sum((0, 1))
     return torch.where(square > 0, (weighted * photo).sum((0, 1)) / square.clamp_min(1e-12), 1.0).clamp(_LEAST, _MOST)

@@ -1,4 +1,4 @@
-"""Stage sg-gs: from photos, masks and cameras to spherical Gaussians of every body and of the background."""
+"""The stage sg-gs: fit spherical Gaussians of every body and of the background to photos, masks and cameras."""
 
 from __future__ import annotations
 
@@ -6,64 +6,59 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-
-from ..datasets.cameras import posed
-from ..datasets.capture import Capture
-from ..datasets.ply import Splats
-from ..schemas import CamerasFile, InputDataError, SplatConfig, UsageError
-from .checkpoint import Checkpoint
+from ...datasets.capture.cameras import posed
+from ...datasets.capture.capture import Capture
+from ...datasets.shapes.ply import Splats
+from ...schemas import CamerasFile, InputDataError, SplatConfig, UsageError
+from ..geometry.spheres import Spheres
+from ..rendering.contact_sheets import SHEET_BYTES, separated, small_png
+from ..runtime.checkpoint import Checkpoint
+from ..runtime.device import resolve_device
+from .background import fit_background, refine_poses
+from .bodies import BodyResult, fit_body
+from .body_separation import separate
+from .context import Stage
 from .held_out import HeldOut, look
-from .reporting.pictures import SHEET_BYTES, separated, small_png
-from .sg_gs_background import fit_background, refine_poses
-from .sg_gs_bodies import BodyResult, fit_body
-from .sg_gs_stage import Stage
-from .splats.separation import separate
-from .splats.spheres import Spheres
-from .splats.views import as_bytes, load_views
 from .turntable import turntable, upward
+from .views import as_bytes, load_views
 
 _MIN_PHOTOS = 3
 _UNEVEN_DB = 1.0
-"""Photos that gain so much from an exposure each were not taken at one."""
+"""Threshold on the PSNR gain by individual exposures [dB], above which the photos differ in exposure."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SgGsResult:
-    """What the stage makes.
-
-    Attributes:
-        bodies: By name, in the manifest's order.
-        scene: The background, world frame, or None without photos.
-        radius_factor: Collision radius in units of the Gaussian scale.
-        record: Losses, timings and held-out figures, for fit.json.
-        warnings: What the user should know.
-        pictures: What there is to look at, by file name: a contact sheet of the photos that the fit did not see, a
-            film around what was fitted.
-        cameras: The photos' cameras as they were refined, or None where they stayed.
-    """
+    """Result of the stage."""
 
     bodies: dict[str, BodyResult]
+    """Bodies by name, in the order of the manifest."""
     scene: Splats | None
+    """Background spheres, world frame, or None without photos."""
     radius_factor: float
+    """Collision radius in units of the Gaussian scale."""
     record: dict[str, Any]
+    """Losses, timings and held-out figures, for fit.json."""
     warnings: tuple[str, ...] = ()
+    """Messages for the user."""
     pictures: dict[str, bytes] = field(default_factory=dict)
+    """Pictures by file name: a contact sheet of the held-out photos, a turntable film, masks found by separation."""
     cameras: CamerasFile | None = None
+    """Refined cameras of the photos, or None if they were not refined."""
 
 
 def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: Checkpoint | None = None) -> SgGsResult:
     """Fit spheres to the photos of a capture.
 
-    Bodies need masks or a shape, or else a box or the ground to be separated by. With masks, a body's solid is its
-    visual hull (or its shape); its spheres are fitted geometry first, to silhouettes and geometry maps, then
-    appearance. Everything else becomes the background. Without photos, bodies get colliding spheres from their shapes
-    and no visual ones.
+    Bodies need masks or a shape, or else a box or the ground that separates them. With masks, the solid of a body is
+    its visual hull (or its shape); the geometry of its spheres is fitted first, to silhouettes and geometry maps, then
+    their appearance. Everything else becomes the background. Without photos, bodies get collision spheres from their
+    shapes and no visual ones.
 
     Args:
         capture: The capture, calibrated where it has photos; the cameras may be unscaled.
         config: Settings.
-        checkpoint: Where the state of the descents goes, and from where they are taken up; None keeps none.
+        checkpoint: Checkpoints of the descents, from which they resume; None keeps none.
 
     Raises:
         InputDataError: If a body has none of these, photos have no cameras, or points and shapes lie where
@@ -74,7 +69,7 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     stage = _open(capture, config, checkpoint)
     if config.collision == "visual" and not stage.train:
         raise UsageError(
-            "--collision visual: no photos, so that there are no visual spheres to collide.",
+            "--collision visual: no photos, hence no visual spheres to collide.",
             "distilled (the default): spheres made from the shapes in capture.toml.",
             "leave the option out, or add photos and masks.",
         )
@@ -89,43 +84,57 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
             placed.append(world)
     scene = fit_background(stage, placed) if stage.train else None
     if stage.train:
-        held_out = look(stage.test, placed, scene, stage.spread, poses=config.refine_poses)
-        if config.exposure:
-            stage.record["exposure_gain_rgb"] = stage.exposures.record()
-        stage.record["held_out"] = held_out.figures
-        stage.warnings += _uneven(held_out, config)
-        if held_out.sheet is not None:
-            pictures["held_out.png"] = held_out.sheet
-        if config.turntable:
-            up = upward(stage.train, stage.ground and stage.ground.normal)
-            pictures["turntable.mp4"] = turntable(stage.train, placed, scene, up)
+        pictures |= _checked(stage, placed, scene)
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     splats = None if scene is None else scene.to_numpy()
-    cameras = _refined_cameras(stage) if stage.train and config.refine_poses else None
-    return SgGsResult(results, splats, config.radius_factor, stage.record, tuple(stage.warnings), pictures, cameras)
+    cameras = capture.cameras if stage.train and config.refine_poses else None
+    if cameras is not None:
+        cameras = posed(cameras, {view.name: view.camera.T_world_cam for view in stage.train})
+    return SgGsResult(
+        bodies=results,
+        scene=splats,
+        radius_factor=config.radius_factor,
+        record=stage.record,
+        warnings=tuple(stage.warnings),
+        pictures=pictures,
+        cameras=cameras,
+    )
+
+
+def _checked(stage: Stage, bodies: list[Spheres], scene: Spheres | None) -> dict[str, bytes]:
+    """Record the errors on held-out photos; return their contact sheet and the turntable film by file name."""
+    config, pictures = stage.config, {}
+    held_out = look(stage.test, bodies, scene, stage.spread, poses=config.refine_poses)
+    if config.exposure:
+        stage.record["exposure_gain_rgb"] = stage.exposures.record()
+    stage.record["held_out"] = held_out.figures
+    stage.warnings += _uneven(held_out, config)
+    if held_out.sheet is not None:
+        pictures["held_out.png"] = held_out.sheet
+    if config.turntable:
+        up = upward(stage.train, stage.ground and stage.ground.normal)
+        pictures["turntable.mp4"] = turntable(stage.train, bodies, scene, up)
+    return pictures
 
 
 def _uneven(held_out: HeldOut, config: SplatConfig) -> list[str]:
-    """Return a warning where photos differ in exposure and the fit took them as they are."""
+    """Return a warning if the photos differ in exposure and the fit did not correct it."""
     before, after = (held_out.figures[f"psnr_right_half_{name}db"] for name in ("", "corrected_"))
     if config.exposure or before is None or after - before < _UNEVEN_DB:
         return []
     return [
-        f"Photos that the fit did not see agree {after - before:.1f} dB better when each has its own exposure: "
+        f"The held-out photos agree {after - before:.1f} dB better with an individual exposure each: "
         "fit again with --exposure."
     ]
-
-
-def _refined_cameras(stage: Stage) -> CamerasFile:
-    assert stage.capture.cameras is not None
-    return posed(stage.capture.cameras, {view.name: view.camera.T_world_cam for view in stage.train})
 
 
 def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) -> Stage:
     device = resolve_device(config.device)
     ground = capture.manifest.world.ground
     names = capture.photos()
-    stage = Stage(capture, config, device, checkpoint, ground, [], [])
+    stage = Stage(
+        capture=capture, config=config, device=device, checkpoint=checkpoint, ground=ground, train=[], test=[]
+    )
     if not names:
         return stage
     if capture.cameras is None:
@@ -141,7 +150,9 @@ def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) 
         stage.warnings.append(f"{len(names) - len(known)} of {len(names)} photos have no camera and were not used.")
     if ground is not None and capture.cameras.scale.kind == "unscaled":
         stage.ground = None
-        stage.warnings.append("The cameras are unscaled, so the ground's place among the photos is not known.")
+        stage.warnings.append(
+            "The cameras are unscaled, so the position of the ground relative to the photos is unknown."
+        )
     views = load_views(capture, known, config.image_size, device)
     held_out = len(views) > config.test_every
     stage.test = views[:: config.test_every] if held_out else []
@@ -150,19 +161,8 @@ def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) 
     return stage
 
 
-def resolve_device(name: str) -> torch.device:
-    """Return the torch device for auto, cpu or cuda.
-
-    Raises:
-        UsageError: If CUDA was asked for and is not there.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise UsageError("--device cuda: no CUDA device was found.", "auto, cpu, cuda.", "run 'cgwm doctor'.")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
 def _separated(stage: Stage) -> dict[str, bytes]:
-    """Give the photos masks of bodies that have none; return a picture of them, by its file's name."""
+    """Add masks of bodies that have none to the photos; return a picture of the masks by file name."""
     found = separate(stage.capture, stage.train, stage.test, stage.ground, stage.points, stage.config)
     if found is None:
         return {}

@@ -1,4 +1,4 @@
-"""A film around what was fitted: one turn about the bodies, or about where the cameras looked."""
+"""Turntable film: one turn around the bodies, or around the focus of the cameras."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ..datasets.progress import progress
-from ..datasets.video import encoded_video
-from .sampling import look_at
-from .splats.directions import upright_axes
-from .splats.render import render
-from .splats.spheres import Spheres
-from .splats.views import View, as_bytes, focus_of
-from .splats.volume import Array
+from ...datasets.capture.video import encoded_video
+from ...datasets.io.progress import progress
+from ..geometry.directions import upright_axes
+from ..geometry.solid_grid import Array
+from ..geometry.spheres import Spheres
+from ..geometry.viewpoint import look_at
+from ..rendering.render import render
+from .views import View, as_bytes, focus_of
 
 FRAMES, FRAME_RATE_HZ = 60, 20.0
 _WIDTH = 320
-_LEAST_HEIGHT = 0.25  # of the distance: the film looks down a little even if all cameras stood level
+_LEAST_HEIGHT = 0.25  # of the distance: the film looks down a little even if all cameras were level
 
 
 @torch.no_grad()
 def turntable(views: Sequence[View], bodies: Sequence[Spheres], scene: Spheres | None, up: Array) -> bytes:
-    """Return an MP4 of one turn, seen from as far and as high as the photos.
+    """Return an MP4 of one turn, from the distance and height of the photos.
 
     Args:
-        views: The photos; the first one's camera makes the film.
+        views: The photos; the film uses the intrinsics of the first.
         bodies: Visual spheres of the bodies, world frame.
         scene: The background, or None.
-        up: The axis of the turn, a unit vector, world frame, shape (3,).
+        up: Unit vector along the axis of the turn, world frame, shape (3,).
     """
     everything = Spheres.joined([*bodies, *([] if scene is None else [scene])])
     focus = _focus(views, bodies)
@@ -56,13 +56,13 @@ def turntable(views: Sequence[View], bodies: Sequence[Spheres], scene: Spheres |
 
 
 def upward(views: Sequence[View], normal: Sequence[float] | None) -> Array:
-    """Return the axis that points up, world frame: the ground's normal, or the mean of the cameras' own up."""
+    """Return the axis that points up, world frame: the normal of the ground, or the mean of the cameras' up axes."""
     up = np.mean([-view.camera.T_world_cam[:3, 1] for view in views], axis=0) if normal is None else np.array(normal)
     return up / np.linalg.norm(up)
 
 
 def _focus(views: Sequence[View], bodies: Sequence[Spheres]) -> Array:
-    """Return the bodies' middle, or the point that the cameras' axes pass nearest to [m], (3,)."""
+    """Return the middle of the bodies, or the point nearest to the optical axes [m], world frame, shape (3,)."""
     if bodies:
         return torch.cat([body.means for body in bodies]).double().mean(0).cpu().numpy()
     return focus_of(views)

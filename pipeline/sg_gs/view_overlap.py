@@ -1,4 +1,4 @@
-"""Whether photos show what they are said to show: a wrong convention or scale of the cameras would fit nonsense."""
+"""Checks that photos show the given points and shapes, which detect wrong conventions or scales of the cameras."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...schemas import InputDataError
+from ..geometry.solid_grid import Array
 from .views import View
-from .volume import Array
 
 LEAST_SHARE = 0.05
-"""Of points in view of some photo: fewer are no overlap."""
+"""Minimum share of the points that lie in view of some photo."""
 LEAST_COVERED = 0.1
-"""Of what photos see of a shape, inside of its masks: less than this, others before it would have to hide it nearly."""
+"""Minimum share of a shape's visible surface that lies inside its masks; below it shape and masks do not agree."""
 _HINT = (
     "compare the conventions: poses camera to world with OpenCV axes (x right, y down, z forward), and one unit of "
     "length for all; 'cgwm validate' reprojects what it can."
@@ -21,10 +21,10 @@ _HINT = (
 
 
 def require_points_in_view(points: Array, views: Sequence[View], what: str) -> float:
-    """Return the share of points (n, 3), world frame, that some photo has in its picture.
+    """Return the share of points (n, 3), world frame, that lie in view of some photo.
 
     Raises:
-        InputDataError: If it is less than `LEAST_SHARE`.
+        InputDataError: If the share is less than `LEAST_SHARE`.
     """
     share = float(np.mean(np.any([view.camera.pixels_of(points)[0] for view in views], 0))) if len(points) else 1.0
     if share < LEAST_SHARE:
@@ -37,16 +37,16 @@ def require_points_in_view(points: Array, views: Sequence[View], what: str) -> f
 
 
 def require_body_in_masks(surface: Array, views: Sequence[View], body: int, name: str) -> None:
-    """Check that a body's shape, where it is said to be, is where the masks show it.
+    """Check that the shape of a body, at its given pose, lies inside its masks.
 
     Args:
-        surface: Points of its surface, world frame, shape (n, 3).
+        surface: Points of its surface [m], world frame, shape (n, 3).
         views: Photos with masks that show it.
-        body: Its place in the manifest.
-        name: Its name.
+        body: Index of the body in the manifest.
+        name: Name of the body.
 
     Raises:
-        InputDataError: If less than `LEAST_COVERED` of what the photos have of it in view lies inside its masks.
+        InputDataError: If less than `LEAST_COVERED` of its surface in view lies inside its masks.
     """
     seen, covered = 0, 0
     for view in views:

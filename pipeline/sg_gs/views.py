@@ -1,4 +1,4 @@
-"""Photos as the fit sees them: undistorted, reduced, with soft masks, geometry maps and pinhole cameras."""
+"""Photos prepared for the fit: undistorted, reduced, with soft masks, geometry maps and pinhole cameras."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.cameras import Camera
-from ...datasets.capture import Capture
-from ...datasets.geometry_maps import GeometryMaps
-from ...datasets.progress import progress
+from ...datasets.capture.cameras import Camera
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.geometry_maps import GeometryMaps
+from ...datasets.io.progress import progress
 from ...schemas import InputDataError
-from .hull import Silhouette
-from .render import RenderOutput, render
-from .spheres import Spheres
-from .volume import Array
+from ..geometry.solid_grid import Array
+from ..geometry.spheres import Spheres
+from ..rendering.render import RenderOutput, render
+from .visual_hull import Silhouette
 
 _FINE_SIZE = 800
 _MARGIN_PX = 6
@@ -27,35 +27,32 @@ _MARGIN_PX = 6
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One photo.
-
-    Attributes:
-        name: Path relative to images/.
-        image: sRGB values in [0, 1], shape (H, W, 3).
-        cover: Share of each pixel that each body covers, in [0, 1], shape (bodies, H, W); None without a mask.
-        K: Camera matrix at this size [px], shape (3, 3).
-        viewmat: T_cam_world, shape (4, 4).
-        camera: The camera at the photo's own size, without distortion.
-        labels: Mask at the photo's own size, without distortion, or None.
-        grey: Grey values in [0, 1], longer side at most 800 px, on the CPU, shape (h, w).
-        depth: Depth along the optical axis [m], 0 where unknown, shape (H, W); None without a map.
-        normals: Outward unit normals, camera axes, zero where unknown, shape (H, W, 3); None without a map.
-        features: Feature map, each channel scaled to [0, 1] over all photos, shape (H, W, F); None without one.
-        depth_map: Depth at the photo's own size, without distortion, or None.
-    """
+    """One prepared photo."""
 
     name: str
+    """Path relative to images/."""
     image: Tensor
+    """sRGB values in [0, 1], shape (H, W, 3)."""
     cover: Tensor | None
+    """Share of each pixel that each body covers, in [0, 1], shape (bodies, H, W); None without a mask."""
     K: Tensor
+    """Camera matrix at this size [px], shape (3, 3)."""
     viewmat: Tensor
+    """T_cam_world, shape (4, 4)."""
     camera: Camera
+    """Camera at the original size, without distortion."""
     labels: NDArray[np.uint8] | None
+    """Mask at the original size, without distortion, or None."""
     grey: Tensor
+    """Grey values in [0, 1], longer side at most 800 px, on the CPU, shape (h, w)."""
     depth: Tensor | None = None
+    """Depth along the optical axis [m], 0 where unknown, shape (H, W); None without a map."""
     normals: Tensor | None = None
+    """Outward unit normals, camera axes, zero where unknown, shape (H, W, 3); None without a map."""
     features: Tensor | None = None
+    """Feature map, each channel scaled to [0, 1] over all photos, shape (H, W, F); None without one."""
     depth_map: NDArray[np.float32] | None = None
+    """Depth at the original size, without distortion [m], shape (h, w), or None."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,13 +60,13 @@ class View:
         return self.image.shape[1], self.image.shape[0]
 
     def silhouette(self, body: int) -> Silhouette | None:
-        """Return the mask of a body (its place in the manifest), at the photo's own size."""
+        """Return the mask of a body (index in the manifest) at the original size, or None without a mask."""
         if self.labels is None:
             return None
         return Silhouette(self.labels == body + 1, self.camera.K, self.camera.T_cam_world, self.depth_map)
 
     def crop(self, left: int, top: int, width: int, height: int) -> View:
-        """Return a window of the view [px]; its camera's principal point is moved."""
+        """Return a window of the view [px], with the principal point of its camera moved."""
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
@@ -83,7 +80,7 @@ class View:
 
 
 def load_views(capture: Capture, names: Sequence[str], image_size: int, device: torch.device) -> list[View]:
-    """Read photos, masks and maps, take the distortion out, and reduce them to a longer side of `image_size` [px]."""
+    """Read photos, masks and maps, undistort them, and reduce them to a longer side of `image_size` [px]."""
     bodies = len(capture.manifest.bodies)
     views = []
     for name in progress(names, "reading photos"):
@@ -99,25 +96,25 @@ def load_views(capture: Capture, names: Sequence[str], image_size: int, device: 
         depth, normals, features = _reduced_maps(maps, width, height)
         views.append(
             View(
-                name,
-                _tensor(_reduced(image.astype(np.float32) / 255, width, height), device),
-                None if cover is None else _tensor(cover, device),
-                _tensor(small.K, device),
-                _tensor(small.T_cam_world, device),
-                camera,
-                labels,
-                _grey(image),
-                None if depth is None else _tensor(depth, device),
-                None if normals is None else _tensor(normals, device),
-                None if features is None else _tensor(features, device),
-                maps.depth_m,
+                name=name,
+                image=_tensor(_reduced(image.astype(np.float32) / 255, width, height), device),
+                cover=None if cover is None else _tensor(cover, device),
+                K=_tensor(small.K, device),
+                viewmat=_tensor(small.T_cam_world, device),
+                camera=camera,
+                labels=labels,
+                grey=_grey(image),
+                depth=None if depth is None else _tensor(depth, device),
+                normals=None if normals is None else _tensor(normals, device),
+                features=None if features is None else _tensor(features, device),
+                depth_map=maps.depth_m,
             )
         )
     return _with_features_scaled(views)
 
 
 def render_view(spheres: Spheres, view: View, background: Tensor | None = None) -> RenderOutput:
-    """Render spheres (world frame) as a view sees them."""
+    """Render spheres (world frame) from the camera of a view."""
     width, height = view.size
     spheres = spheres.seen_from(camera_center(view.viewmat))
     return render(
@@ -134,7 +131,7 @@ def render_view(spheres: Spheres, view: View, background: Tensor | None = None) 
 
 
 def as_bytes(picture: Tensor) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) with values about [0, 1] as uint8 on the CPU."""
+    """Return a picture (H, W, 3) with values in about [0, 1] as uint8 on the CPU."""
     return (picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
@@ -144,7 +141,7 @@ def camera_center(viewmat: Tensor) -> Tensor:
 
 
 def body_windows(views: Sequence[View], body: int) -> list[View]:
-    """Return the views' windows around a body's mask; views that do not show it are left out."""
+    """Return windows of the views around the mask of a body; views without it are omitted."""
     windows = []
     for view in views:
         if view.cover is None or not bool((view.cover[body] > 0.5).any()):
@@ -158,7 +155,7 @@ def body_windows(views: Sequence[View], body: int) -> list[View]:
 
 
 def focus_of(views: Sequence[View]) -> Array:
-    """Return the point that the cameras' axes pass nearest to, world frame [m], (3,)."""
+    """Return the point nearest to the optical axes [m], world frame, shape (3,)."""
     axes = np.stack([view.camera.T_world_cam[:3, 2] for view in views])
     across = np.eye(3) - np.einsum("ni,nj->nij", axes, axes)
     centers = np.stack([view.camera.center for view in views])
@@ -166,13 +163,13 @@ def focus_of(views: Sequence[View]) -> Array:
 
 
 def spread_of(views: Sequence[View]) -> float:
-    """Return the greatest distance of a camera from the cameras' mean, and a tenth, as a scale of the scene [m]."""
+    """Return 1.1 times the largest distance of a camera from the mean of the cameras, a scale of the scene [m]."""
     centers = np.stack([view.camera.center for view in views])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
 def _undistorted_maps(maps: GeometryMaps, camera: Camera) -> GeometryMaps:
-    """Take the distortion out of the maps; unknown depths and normals must not be mixed into known ones."""
+    """Undistort the maps without mixing unknown depths and normals into known ones."""
 
     def straight(values: NDArray[np.float32] | None, nearest: bool) -> NDArray[np.float32] | None:
         if values is None:
@@ -180,7 +177,7 @@ def _undistorted_maps(maps: GeometryMaps, camera: Camera) -> GeometryMaps:
         at_size = camera.resized(values.shape[1], values.shape[0])
         if values.ndim == 2:
             return at_size.undistorted(values, nearest)[0]
-        # OpenCV takes no more than four channels at once
+        # OpenCV takes at most four channels at once.
         channels = [values[..., k] for k in range(values.shape[2])]
         return np.stack([at_size.undistorted(np.ascontiguousarray(one), nearest)[0] for one in channels], -1)
 
@@ -190,7 +187,7 @@ def _undistorted_maps(maps: GeometryMaps, camera: Camera) -> GeometryMaps:
 def _reduced_maps(maps: GeometryMaps, width: int, height: int) -> list[NDArray[np.float32] | None]:
     """Return depth, normals and features at the fit's size.
 
-    Depth and normals are those of the pixel in the middle: a mean over a border would lie on neither side of it.
+    Depth and normals are those of the middle pixel: a mean across a border would lie on neither side of it.
     """
     size = (width, height)
     nearest = [
@@ -208,7 +205,7 @@ def _reduced_maps(maps: GeometryMaps, width: int, height: int) -> list[NDArray[n
 
 
 def _with_features_scaled(views: list[View]) -> list[View]:
-    """Bring each channel of the feature maps to [0, 1], by its range over all photos.
+    """Scale each channel of the feature maps to [0, 1] by its range over all photos.
 
     Raises:
         InputDataError: If the photos' features have different numbers of channels.
@@ -229,7 +226,7 @@ def _with_features_scaled(views: list[View]) -> list[View]:
 
 
 def with_labels(view: View, labels: NDArray[np.uint8], bodies: int) -> View:
-    """Return a view with other labels (h, w), of any size of the same shape; they are brought to the photo's own."""
+    """Return a view with other labels (h, w) of the same aspect ratio, resized to the original size of the photo."""
     width, height = view.camera.width, view.camera.height
     if labels.shape != (height, width):
         own = np.zeros((height, width), np.uint8)

@@ -1,7 +1,7 @@
 """Visual hulls: the largest solid that all silhouettes allow.
 
-A point lies in the hull when every view that sees it finds it inside the mask. Here it is a continuous field, the least
-over the views of the signed distance from the mask's border, so that the surface is not bound to the grid.
+A point lies in the hull if it is inside the mask of every view that contains it. The hull is a continuous field, the
+minimum over the views of the signed distance from the mask's border, so its surface is not bound to the grid.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import label, map_coordinates
 
 from ...schemas import Ground, InputDataError
-from .directions import fibonacci_directions
-from .volume import Array, Volume, crossings, grid_points
+from ..geometry.directions import fibonacci_directions
+from ..geometry.solid_grid import Array, Volume, crossings, grid_points
 
 _COARSE = 40
 _FINEST = 128
@@ -27,34 +27,33 @@ _BORDER_BIAS_PX = 0.5
 _TIP_DIRECTIONS = 500
 _MIN_VIEWS = 3
 _TRUNCATION_PX = 4.0
-"""Beyond so many pixel widths behind its surface a depth map says nothing; before it, only that there is nothing."""
+"""Truncation distance of a depth map behind its surface, in pixel widths; in front of the surface space is empty."""
 _LEAST_COSINE = 0.25
-"""Depth on surfaces that are seen at a more grazing angle changes too fast within a pixel."""
+"""Minimum cosine of the viewing angle; at more grazing angles depth changes too fast within a pixel."""
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A mask and its camera.
-
-    Attributes:
-        mask: Whether each pixel shows the body, shape (H, W).
-        K: Camera matrix [px], shape (3, 3); the centre of the top-left pixel is (0.5, 0.5); no distortion.
-        T_cam_world: World to camera, OpenCV axes, shape (4, 4).
-        depth_m: Depth along the optical axis [m], 0 where unknown, shape (H, W); None without a depth map.
-    """
+    """A mask and its camera."""
 
     mask: NDArray[np.bool_]
+    """Whether each pixel shows the body, shape (H, W)."""
     K: Array
+    """Camera matrix [px], shape (3, 3); the centre of the top-left pixel is (0.5, 0.5); no distortion."""
     T_cam_world: Array
+    """World to camera, OpenCV axes, shape (4, 4)."""
     depth_m: NDArray[np.float32] | None = None
+    """Depth along the optical axis [m], 0 where unknown, shape (H, W); None without a depth map."""
 
     @cached_property
-    def facing(self) -> Array:
-        """Return the cosine between each pixel's ray and the normal of the depth map's surface, shape (H, W)."""
-        assert self.depth_m is not None
+    def surface(self) -> tuple[NDArray[np.float32], Array] | None:
+        """Return depth [m] and cosine between each pixel's ray and the surface normal, (H, W); None without a map."""
+        if self.depth_m is None:
+            return None
         depth = np.where(self.depth_m > 0, self.depth_m, np.nan).astype(float)
         down, right = (slope / depth for slope in np.gradient(depth))
-        return np.nan_to_num(1 / np.sqrt(1 + (self.K[1, 1] * down) ** 2 + (self.K[0, 0] * right) ** 2))
+        cosine = np.nan_to_num(1 / np.sqrt(1 + (self.K[1, 1] * down) ** 2 + (self.K[0, 0] * right) ** 2))
+        return self.depth_m, cosine
 
     def pixel_at(self, point: Array) -> float:
         """Return the width of a pixel [m] at the depth of a point, world frame, shape (3,)."""
@@ -63,14 +62,14 @@ class Silhouette:
 
 
 def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = "body") -> Volume:
-    """Return the visual hull of a body, in the world frame, carved further by depth maps where views have them.
+    """Carve the visual hull of a body, world frame, by masks and by depth maps where views have them.
 
-    Views whose mask is empty are left out; what lies beyond a picture's border is unknown there and not carved.
+    Views with an empty mask are omitted; space beyond the border of a picture is unknown there and not carved.
 
     Args:
         silhouettes: The views.
         ground: Half space that the body does not enter; it bounds the underside, which no view sees.
-        name: The body's name, for errors.
+        name: Name of the body, for errors.
 
     Raises:
         InputDataError: If fewer than 3 views show the body, or no point is inside all masks.
@@ -105,9 +104,9 @@ def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = 
 
 
 def _tips(surface: Array, pitch: float, field: Callable[[Array], Array]) -> Array:
-    """Return points of the hull beyond the grid's surface in the directions in which it reaches farthest, (k, 3).
+    """Return points of the hull beyond the grid's surface in directions in which it extends farthest, (k, 3).
 
-    A corner lies between grid points and is cut off by their spacing; a plane that the body lands on meets it first.
+    A corner lies between grid points and is cut off by their spacing, but it touches a plane first in contact.
     """
     directions = fibonacci_directions(_TIP_DIRECTIONS)
     extreme = np.unique([int(np.argmax(surface @ direction)) for direction in directions])
@@ -130,7 +129,7 @@ def _refined(
     fields: Sequence[Array],
     ground: Ground | None,
 ) -> tuple[Array, Array, float]:
-    """Cut the grid to the body and refine it, twice; only points near the surface are looked up again."""
+    """Crop the grid to the body and refine it, twice; only points near the surface are evaluated again."""
     # A grid finer than the pixels would hold nothing more.
     pixel = float(np.median([view.pixel_at(origin + 0.5 * pitch * np.array(coarse.shape)) for view in views]))
     for level in range(2):
@@ -157,15 +156,15 @@ def signed_distance_px(mask: NDArray[np.bool_]) -> Array:
     inner = cv2.distanceTransform(np.pad(image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outer = cv2.distanceTransform(np.pad(1 - image, 1, mode="edge"), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     signed = np.where(mask, inner[1:-1, 1:-1] - 0.5, 0.5 - outer[1:-1, 1:-1])
-    # The border runs in steps between pixel centres; a little smoothing takes them out of slanted edges. The least of
-    # many such distances, each uncertain by a part of a pixel, is too small, most of all at edges and corners, which
-    # are on the outlines of many views: the bias was measured there, on known solids with calibrated cameras. With
-    # exact cameras a smooth body comes out larger by a third of a pixel.
+    # The border runs in steps between pixel centres; a little smoothing removes them from slanted edges. The minimum of
+    # many such distances, each uncertain by a fraction of a pixel, is too small, mainly at edges and corners, which are
+    # on the outlines of many views: the bias was measured there, on known solids with calibrated cameras. With
+    # exact cameras a smooth body becomes larger by a third of a pixel.
     return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BORDER_SMOOTHING_PX), np.float64) + _BORDER_BIAS_PX
 
 
 def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], ground: Ground | None) -> Array:
-    """Return about the distance from the hull's surface at points (n, 3) [m], positive inside, shape (n,)."""
+    """Return the approximate signed distance of points (n, 3) from the hull [m], positive inside, shape (n,)."""
     result = np.full(points.shape[0], np.inf)
     seen = np.zeros(points.shape[0], dtype=np.int32)
     fused = _FusedDepth(points.shape[0])
@@ -179,8 +178,8 @@ def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], 
         metres = signed * depth[visible] / np.sqrt(view.K[0, 0] * view.K[1, 1])
         result[visible] = np.minimum(result[visible], metres)
         seen[visible] += 1
-        if view.depth_m is not None:
-            fused.add(view, visible, u[visible], v[visible], depth[visible])
+        if view.surface is not None:
+            fused.add(view, view.surface, visible, u[visible], v[visible], depth[visible])
     far = np.abs(result[np.isfinite(result)]).max(initial=1.0)
     result = np.where(seen >= min(_MIN_VIEWS, len(views)), result, -far)
     result = np.minimum(result, fused.depth_behind_m())
@@ -192,20 +191,36 @@ def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], 
 class _FusedDepth:
     """Mean depth of points behind the surfaces that depth maps show, positive inside the body.
 
-    Truncated signed distances, averaged over the maps with the cosine of the angle of sight as weight (Curless and
-    Levoy 1996, "A volumetric method for building complex models from range images"): noise averages out, where the
-    least of many noisy depths would eat thin walls away.
+    Truncated signed distances, averaged over the maps with the cosine of the viewing angle as weight (Curless and
+    Levoy 1996, "A volumetric method for building complex models from range images"): noise averages out, whereas the
+    minimum of many noisy depths would erode thin walls.
     """
 
     def __init__(self, count: int) -> None:
         self._sum, self._weight = np.zeros(count), np.zeros(count)
         self._most = np.inf
 
-    def add(self, view: Silhouette, index: NDArray[np.bool_], u: Array, v: Array, depth: Array) -> None:
-        """Add a map: points (count,) that are in the picture, their pixels [px] and depths [m]."""
-        assert view.depth_m is not None
+    def add(
+        self,
+        view: Silhouette,
+        depth_map: tuple[NDArray[np.float32], Array],
+        index: NDArray[np.bool_],
+        u: Array,
+        v: Array,
+        depth: Array,
+    ) -> None:
+        """Add the depth map of a view.
+
+        Args:
+            view: The view.
+            depth_map: Its `Silhouette.surface`.
+            index: Whether each point lies inside the image, shape (count,).
+            u: Column of each such point [px].
+            v: Row of each such point [px].
+            depth: Depth of each such point along the optical axis [m].
+        """
         rows, columns = v.astype(int), u.astype(int)
-        surface, cosine = view.depth_m[rows, columns], view.facing[rows, columns]
+        surface, cosine = depth_map[0][rows, columns], depth_map[1][rows, columns]
         reach = _TRUNCATION_PX * depth / view.K[0, 0]
         below = (depth - surface) * cosine
         counts = (surface > 0) & view.mask[rows, columns] & (cosine > _LEAST_COSINE) & (below < reach)
@@ -215,14 +230,14 @@ class _FusedDepth:
         self._most = min(self._most, float(reach.min(initial=np.inf)))
 
     def depth_behind_m(self) -> Array:
-        """Return the mean (count,); infinite where no map says anything, or only that a point is well inside."""
+        """Return the mean [m], shape (count,); infinite where no map shows a surface near the point."""
         known = self._weight > 0
         mean = self._sum / np.where(known, self._weight, 1.0)
         return np.where(known & (mean < 0.9 * self._most), mean, np.inf)
 
 
 def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:
-    """Return a point near the body's middle [m] and a radius [m] around it that holds the body."""
+    """Return centre [m] and radius [m] of a ball that contains the body, world frame."""
     system, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         rotation = view.T_cam_world[:3, :3]
@@ -247,7 +262,7 @@ def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:
 
 
 def largest_component(inside: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    """Return the largest connected part, or None where nothing is inside."""
+    """Return the largest connected part of a grid, or None if nothing is inside."""
     labels, count = label(inside)  # type: ignore[misc]
     if count == 0:
         return None

@@ -7,12 +7,12 @@ import math
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from ..schemas import Distribution
-from ..schemas.plan import CUT_OFF
+from ...schemas import Distribution
+from ...schemas.plan import CUT_OFF
 
 
 def draw(distribution: Distribution, rng: np.random.Generator) -> float:
-    """Return a draw; what is fixed takes no random number, anything else one."""
+    """Return a draw; a fixed value consumes no random number, any other distribution one."""
     if distribution.fixed is not None:
         return distribution.fixed
     if distribution.uniform is not None:
@@ -24,5 +24,5 @@ def draw(distribution: Distribution, rng: np.random.Generator) -> float:
         mean, std = distribution.normal
         tail = ndtr(-CUT_OFF)
         return mean + std * float(ndtri(tail + rng.random() * (1 - 2 * tail)))
-    assert distribution.choice is not None  # one kind is given
-    return distribution.choice[int(rng.integers(len(distribution.choice)))]
+    values = distribution.choice or ()
+    return values[int(rng.integers(len(values)))]

@@ -1,39 +1,46 @@
-"""What is drawn for one rollout: its physics, its start, its cameras, its light."""
+"""Random draws of one rollout: physical parameters, start, cameras and light."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..datasets.cameras import Camera
-from ..datasets.models import Model
-from ..datasets.rollouts import RolloutParameter
-from ..schemas import SamplingPlan, SynthesizeConfig
-from .lights import Lighting, draw_lighting
-from .posterior import draw_parameters
-from .sampling import Start, draw_start, look_at_cameras, up_direction
+from ...datasets.capture.cameras import Camera
+from ...datasets.models.model import Model
+from ...datasets.rollouts.rollouts import RolloutParameter
+from ...schemas import Exposure, Light, ModelFile, SamplingPlan, SynthesizeConfig
+from .distributions import draw
+from .parameters import draw_parameters
+from .plan import up_direction
+from .start_states import Start, draw_start
+from .viewpoints import look_at_cameras
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Draw:
-    """A rollout before it is simulated.
-
-    index: its global number; attempt: how often that was drawn before; model: with this rollout's parameters.
-    """
+    """Draws of a rollout before its simulation."""
 
     index: int
+    """Global number of the rollout."""
     attempt: int
+    """Number of earlier draws of this rollout."""
     model: Model
+    """The model with the parameters of this rollout."""
     parameters: tuple[RolloutParameter, ...]
+    """Physical parameters of this rollout."""
     start: Start
+    """Initial state, and motions of the driven bodies."""
     cameras: Mapping[str, Camera]
+    """Cameras by name."""
     lighting: Lighting
+    """Light of the rollout and exposures of its cameras."""
 
 
 def seed_of(seed: int, index: int, attempt: int) -> np.random.SeedSequence:
-    """Return the source of all that is drawn for a rollout at an attempt, counted from 0."""
+    """Return the seed sequence of all draws of a rollout at an attempt, counted from 0."""
     return np.random.SeedSequence(seed, spawn_key=(index, attempt) if attempt else (index,))
 
 
@@ -46,16 +53,16 @@ def draw_rollout(
     index: int,
     attempt: int = 0,
 ) -> Draw:
-    """Draw a rollout from the seed, its number and the attempt alone.
+    """Draw a rollout as a function of the seed, its number and the attempt alone.
 
     Args:
         model: The fitted model.
         plan: A resolved plan.
         config: The seed, and the size of the images.
-        cameras: Those that all rollouts share; none where there is nothing to see.
+        cameras: Cameras that all rollouts share; empty for a model without visual spheres.
         duration_s: Length of the rollout [s].
-        index: Its global number.
-        attempt: How often it was drawn before.
+        index: Global number of the rollout.
+        attempt: Number of earlier draws of it.
     """
     rng = np.random.default_rng(seed_of(config.seed, index, attempt))
     file, parameters = draw_parameters(model.file, plan.parameter_spread, rng, plan.parameters)
@@ -64,4 +71,60 @@ def draw_rollout(
     if cameras and plan.moving_views:
         cameras = look_at_cameras(model, plan, config, rng)
     lighting = draw_lighting(file, up_direction(file), plan, cameras, rng)
-    return Draw(index, attempt, drawn, parameters, start, cameras, lighting)
+    return Draw(
+        index=index,
+        attempt=attempt,
+        model=drawn,
+        parameters=parameters,
+        start=start,
+        cameras=cameras,
+        lighting=lighting,
+    )
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light of a rollout and exposures of its cameras."""
+
+    light: Light | None
+    """Lamp and sky that shade the moving bodies; None if the model has no light."""
+    gain_rgb: np.ndarray
+    """Brightness of the light relative to the photos by colour channel [1], shape (3,)."""
+    exposures: dict[str, Exposure]
+    """Exposure by camera: its image is gain * picture + offset, including the gain of the light."""
+
+    @property
+    def plain(self) -> bool:
+        """Whether the pictures remain unchanged."""
+        return all(exposure == Exposure() for exposure in self.exposures.values())
+
+
+def draw_lighting(
+    file: ModelFile, up: np.ndarray, plan: SamplingPlan, cameras: Iterable[str], rng: np.random.Generator
+) -> Lighting:
+    """Draw the light of a rollout and the exposure of each camera.
+
+    Args:
+        file: The model.
+        up: Normal of the ground, world frame, shape (3,).
+        plan: A resolved plan.
+        cameras: Names of the cameras.
+        rng: Source of randomness.
+    """
+    light, angle = file.light, math.radians(draw(plan.light_turn_deg, rng))
+    if light is not None and angle:
+        lamp = np.asarray(light.lamp)
+        # Rodrigues' formula for the unit vector `up`
+        turned = (
+            lamp * math.cos(angle) + np.cross(up, lamp) * math.sin(angle) + up * (up @ lamp) * (1 - math.cos(angle))
+        )
+        light = light.model_copy(update={"lamp": (float(turned[0]), float(turned[1]), float(turned[2]))})
+    gain = draw(plan.light_gain, rng) * np.array([draw(plan.light_tint, rng) for _ in range(3)])
+    exposures = {}
+    for name in cameras:
+        own = gain * draw(plan.exposure_gain, rng) * [draw(plan.exposure_tint, rng) for _ in range(3)]
+        offset = draw(plan.exposure_offset, rng)
+        exposures[name] = Exposure(
+            gain_rgb=(float(own[0]), float(own[1]), float(own[2])), offset_rgb=(offset, offset, offset)
+        )
+    return Lighting(light, gain, exposures)

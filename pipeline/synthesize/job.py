@@ -1,4 +1,4 @@
-"""What all rollouts of a shard share: the model, the resolved plan, the cameras, and who simulates and renders."""
+"""Shared inputs of all rollouts of a shard: model, resolved plan, cameras, simulator and renderer."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from ..datasets.atomic import sha256
-from ..datasets.cameras import Camera
-from ..datasets.models import Model, read_model
-from ..schemas import DatasetManifest, InputDataError, SamplingPlan, SynthesizeConfig, UsageError
-from .labels import LabelRenderer
-from .physics.world import World
-from .posterior import DERIVED, not_varied, require_admissible, with_correlations
+from ...datasets.capture.cameras import Camera
+from ...datasets.io.atomic import sha256
+from ...datasets.models.model import Model, read_model
+from ...schemas import DatasetManifest, InputDataError, SamplingPlan, SynthesizeConfig, UsageError
+from ..physics.world import World
+from ..rendering.label_renderer import LabelRenderer
+from ..runtime.device import resolve_device
+from .parameters import DERIVED, not_varied, require_admissible, with_correlations
+from .plan import resolve_plan
 from .rejection import Rejection
-from .rollout_batches import Simulator
-from .sampling import look_at_cameras, resolve_plan
+from .simulator import Simulator
+from .viewpoints import look_at_cameras
 
 STATE_ONLY = (
     "state only: the model has no visual spheres, so there is nothing to render; "
@@ -27,26 +28,35 @@ STATE_ONLY = (
 )
 RECORDED_PACKAGES = ("cgwm", "h5py", "hdf5plugin", "mujoco", "numpy", "torch")
 NOT_CONTENT = {"shard", "batch"}
-"""Settings that change no rollout."""
+"""Settings that do not affect the content of rollouts."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Job:
-    """What all rollouts of a shard share."""
+    """Shared inputs of all rollouts of a shard."""
 
     model: Model
+    """The fitted model."""
     config: SynthesizeConfig
+    """Settings of the dataset."""
     plan: SamplingPlan
+    """The resolved plan."""
     times_s: np.ndarray
+    """Times of the frames [s], shape (T,)."""
     cameras: Mapping[str, Camera]
+    """Cameras by name; empty for a model without visual spheres."""
     renderer: LabelRenderer | None
+    """Renderer of the labels; None for a model without visual spheres."""
     simulator: Simulator
+    """Simulator of the rollouts."""
     rejection: Rejection
+    """Rules that reject rollouts."""
     device: str
+    """Device of simulation and rendering: cpu or cuda."""
 
 
 def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
-    """Return a plan with what it leaves out filled in for a model.
+    """Return a plan with its missing entries filled in for a model.
 
     Args:
         model: MODEL.
@@ -67,14 +77,14 @@ def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
             todo="fit it again: cgwm fit CAPTURE --out MODEL.",
         )
     if model.file.contact is None:
-        World.from_model(model)  # says what is missing, and how to get it
+        World.from_model(model)  # raises an error that names missing physics
     model = replace(model, file=with_correlations(model))
     require_admissible(model.file, plan.parameters)
     return model, resolve_plan(model, plan)
 
 
 def prepared(path: Path, config: SynthesizeConfig) -> Job:
-    """Read the model and make ready what all rollouts share.
+    """Read the model and prepare the shared inputs of all rollouts.
 
     Raises:
         InputDataError: If `path` is no model, has no fitted physics, or the plan does not fit it.
@@ -86,7 +96,7 @@ def prepared(path: Path, config: SynthesizeConfig) -> Job:
         raise UsageError(
             f"{config.duration_s:g} s at {config.frame_rate_hz:g} frames/s is one frame.", "two frames or more."
         )
-    device = device_of(config)
+    device = str(resolve_device(config.device))
     visible = bool(model.body_splats)
     if plan.reject.unseen_share is not None and not visible:
         raise InputDataError(
@@ -97,20 +107,17 @@ def prepared(path: Path, config: SynthesizeConfig) -> Job:
     renderer = LabelRenderer(model, cameras, device) if visible else None
     times = np.arange(count) / config.frame_rate_hz
     simulator, rejection = Simulator(model, times, device), Rejection.of(model, plan.reject)
-    return Job(model, config, plan, times, cameras, renderer, simulator, rejection, device)
-
-
-def device_of(config: SynthesizeConfig) -> str:
-    """Return cpu or cuda.
-
-    Raises:
-        UsageError: If CUDA is asked for and not there.
-    """
-    if config.device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if config.device == "cuda" and not torch.cuda.is_available():
-        raise UsageError("--device cuda: no CUDA device is there.", "auto, cpu.", "see 'cgwm doctor'.")
-    return config.device
+    return Job(
+        model=model,
+        config=config,
+        plan=plan,
+        times_s=times,
+        cameras=cameras,
+        renderer=renderer,
+        simulator=simulator,
+        rejection=rejection,
+        device=device,
+    )
 
 
 def manifest_of(path: Path, job: Job, notes: tuple[str, ...]) -> DatasetManifest:
@@ -129,7 +136,7 @@ def manifest_of(path: Path, job: Job, notes: tuple[str, ...]) -> DatasetManifest
 
 
 def notes_of(job: Job) -> tuple[str, ...]:
-    """Return what users ought to know of the rollouts."""
+    """Return the notes on the rollouts for the user."""
     notes = [] if job.renderer is not None else [STATE_ONLY]
     kept = not_varied(job.model.file)
     if kept and job.plan.parameter_spread > 0:

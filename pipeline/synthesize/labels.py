@@ -1,4 +1,4 @@
-"""What a dataset says of a simulated rollout, all but its images."""
+"""Labels of a simulated rollout, except its images."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..datasets.mjcf import mujoco_states, write_mjcf
-from ..datasets.rollouts import RolloutLabels
-from ..schemas import ModelFile, SamplingPlan
-from .net_forces import contact_force_n, contact_torque_n_m
-from .rollout_batches import Motion
-from .sampling import Start
+from ...datasets.models.mjcf import mujoco_states, write_mjcf
+from ...datasets.rollouts.rollouts import RolloutLabels
+from ...schemas import ModelFile, SamplingPlan
+from ..physics.net_contact_wrench import contact_force_n, contact_torque_n_m
+from .pusher_paths import commanded_velocity
+from .simulator import Motion
+from .start_states import Start
 
 
 def labels_of(motion: Motion, plan: SamplingPlan, seed: int, times_s: np.ndarray) -> RolloutLabels:
     """Return the labels of a motion.
 
     Args:
-        motion: What was simulated.
-        plan: The resolved plan that it was drawn from.
+        motion: The simulated motion.
+        plan: The resolved plan of its draws.
         seed: The root seed.
         times_s: Times of the frames, shape (T,).
     """
@@ -61,7 +62,7 @@ def labels_of(motion: Motion, plan: SamplingPlan, seed: int, times_s: np.ndarray
 
 
 def _actions(file: ModelFile, start: Start, plan: SamplingPlan, times_s: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return the commands (T, A): velocities of the driven bodies over the plan's largest push speed."""
+    """Return the actions (T, A), velocities of the driven bodies over the largest push speed, and a description."""
     driven = [index for index, body in enumerate(file.bodies) if body.motion == "driven"]
     if not driven:
         return np.zeros((len(times_s), 1)), "No body is driven: zero."
@@ -70,7 +71,6 @@ def _actions(file: ModelFile, start: Start, plan: SamplingPlan, times_s: np.ndar
     commands = []
     for index in driven:
         track = start.driven[file.bodies[index].name]
-        assert track.velocity_m_s is not None  # a push has it
-        commands.append(track.velocity_m_s[np.searchsorted(track.time_s, times_s, side="right") - 1])
+        commands.append(commanded_velocity(track)[np.searchsorted(track.time_s, times_s, side="right") - 1])
     text = f"Velocity command of {names}, world axes, in units of {scale:g} m/s."
     return np.concatenate(commands, axis=1) / scale, text

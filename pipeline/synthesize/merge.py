@@ -1,4 +1,4 @@
-"""Joining shards: one index over all of them, by HDF5 virtual datasets. Nothing is copied or moved."""
+"""Merge of shards: one index over all of them, by HDF5 virtual datasets. No data are copied or moved."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..datasets.atomic import new_directory, new_file, sha256
-from ..datasets.dataset import (
+from ...datasets.io.atomic import new_directory, new_file, sha256
+from ...datasets.io.progress import progress
+from ...datasets.io.room import enough_room
+from ...datasets.rollouts.dataset import (
     MANIFEST,
     MODEL_FOLDER,
     difference,
@@ -19,22 +21,22 @@ from ..datasets.dataset import (
     settings_text,
     write_manifest,
 )
-from ..datasets.index import INDEX, index_fault, write_index
-from ..datasets.progress import progress
-from ..datasets.room import enough_room
-from ..datasets.shards import entry_file, foreign, ranges, shard_fault, shard_name, tidied
-from ..schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
-from .doctor import cpu_cores
+from ...datasets.rollouts.index import INDEX, index_fault, write_index
+from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, tidied
+from ...schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
+from ..runtime.doctor import cpu_cores
 
 SHOWN_FAULTS = 20
 
 
 @dataclass(frozen=True)
 class _Shard:
-    """A shard and the dataset directory that it lies in."""
+    """A shard and its dataset directory."""
 
     root: Path
+    """The dataset directory."""
     entry: ShardEntry
+    """The entry of the shard in the manifest."""
 
     @property
     def file(self) -> Path:
@@ -44,20 +46,20 @@ class _Shard:
 def merge(
     sources: Sequence[Path], out: Path | None = None, overwrite: bool = False, hashes: bool = True
 ) -> MergeSummary:
-    """Join the shards of one dataset, in one directory or in several, into an index.
+    """Merge the shards of one dataset, in one directory or in several, into an index.
 
     Args:
         sources: DATASET directories. Several hold different shards of one dataset, made on machines that share no disk.
         out: A file (``.h5``, ``.hdf5``) for the index alone, or a directory for a dataset with the index and links to
-            the shards, which stay where they are. Default: ``index.h5`` in the one source.
+            the shards, which are not moved. Default: ``index.h5`` in the one source.
         overwrite: Replace an output that exists.
         hashes: Compare every byte with the shards' hashes; otherwise only the sizes.
 
     Raises:
         UsageError: If the output exists, or there are several sources and no output.
-        InputDataError: If a source is no dataset; or with all faults: shards that are missing, damaged, twice there
-            or of another model, seed, plan or version.
-        NotEnoughSpaceError: If there is no room for the index.
+        InputDataError: If a source is no dataset, or if shards are missing, damaged, duplicate or of another model,
+            seed, plan or version; the message lists all faults.
+        NotEnoughSpaceError: If the disk has no room for the index.
     """
     if not sources:
         raise UsageError("no dataset to merge.", "one directory or more.")
@@ -95,7 +97,7 @@ def merge(
 def _joined(
     sources: Sequence[Path], manifests: Sequence[DatasetManifest], hashes: bool
 ) -> tuple[list[_Shard], list[str]]:
-    """Return the shards of all sources, by number, each checked, and what is worth telling."""
+    """Return the checked shards of all sources in the order of their numbers, and notes for the user."""
     faults = list(_differing(sources, manifests))
     found: dict[int, _Shard] = {}
     notes: list[str] = []
@@ -149,7 +151,7 @@ def _shard_faults(shards: Sequence[_Shard], manifest: DatasetManifest, hashes: b
             return f"{shard.entry.file}: its entry has the number {shard.entry.index}."
         return shard_fault(shard.file, shard.entry, hashes)
 
-    # Hashing leaves Python's lock, so threads share the cores and hide the latency of a network file system.
+    # Hashing releases Python's lock, so threads use all cores and hide the latency of a network file system.
     with ThreadPoolExecutor(min(8, cpu_cores())) as pool:
         results = list(progress(pool.map(fault, shards), "check", len(shards), "shard"))
     found = [f"{shard.root}/{result}" for shard, result in zip(shards, results, strict=True) if result]
@@ -181,7 +183,7 @@ def _index_inside(
 
 
 def _fold(source: Path, manifest: DatasetManifest) -> None:
-    """Put the entries of the shards into the manifest, and remove their own files, unless they changed meanwhile."""
+    """Move the entries of the shards into the manifest and remove their files, unless these changed meanwhile."""
     write_manifest(source, manifest)
     for entry in manifest.shards:
         file = entry_file(source, entry.file)
@@ -209,7 +211,7 @@ def _dataset_of_links(out: Path, manifest: DatasetManifest, shards: Sequence[_Sh
 
 
 def _write(path: Path, final: Path, shards: Sequence[_Shard], overwrite: bool) -> None:
-    """Write an index; its paths are relative to the folder of `final`."""
+    """Write an index with paths relative to the folder of `final`."""
     folder = final.parent.resolve()
     named = [(shard.file, _relative(shard.file, folder), shard.entry) for shard in shards]
     with new_file(path, overwrite) as temporary:

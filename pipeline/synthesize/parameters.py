@@ -1,4 +1,4 @@
-"""Physical parameters of a rollout, drawn from what the fit knows about them."""
+"""Physical parameters of a rollout, drawn from the posterior of the fit."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import torch
 from pydantic import ValidationError
 from scipy.special import ndtr, ndtri
 
-from ..datasets.models import Model
-from ..datasets.rollouts import RolloutParameter
-from ..schemas import (
+from ...datasets.models.model import Model
+from ...datasets.rollouts.rollouts import RolloutParameter
+from ...schemas import (
     BodyModel,
     ContactParameters,
     Correlation,
     Distribution,
     EffectModel,
+    FittedParameter,
     InputDataError,
     ModelFile,
-    Parameter,
     did_you_mean,
 )
+from ..physics.contact_law import restitution
+from ..physics.effects.registry import load_effect
 from .distributions import draw
-from .physics.contact import restitution
-from .physics.effects.registry import load_effect
 
 _UNITS = {"friction": "1", "contact_time_s": "s", "damping_ratio": "1", "ground_offset_m": "m", "mass_kg": "kg"}
 
@@ -33,22 +33,21 @@ _UNITS = {"friction": "1", "contact_time_s": "s", "damping_ratio": "1", "ground_
 def draw_parameters(
     file: ModelFile, spread: float, rng: np.random.Generator, replaced: Mapping[str, Distribution] | None = None
 ) -> tuple[ModelFile, tuple[RolloutParameter, ...]]:
-    """Draw the physical parameters of a rollout from what the fit knows about them together.
+    """Draw the physical parameters of a rollout from their joint posterior in the fit.
 
-    Each is normal about its estimate with its standard error, cut off at its bounds; where the bounds are positive, the
-    logarithm is normal, as in the fit. Parameters that were fitted together are drawn together, by a Gaussian copula
-    (Nelsen, An Introduction to Copulas, 2nd ed., 2.3): where no bound is near, that is the joint normal posterior of
-    the fit, and near a bound each still has its own distribution.
+    Each is normal around its estimate with its standard error, truncated at its bounds; where the bounds are positive,
+    the logarithm is normal, as in the fit. Parameters that were fitted together are drawn jointly by a Gaussian copula
+    (Nelsen, An Introduction to Copulas, 2nd ed., 2.3): far from the bounds this is the joint normal posterior of the
+    fit, and near a bound each marginal distribution is preserved.
 
     Args:
         file: The model.
         spread: Factor of the standard errors.
-        rng: Source of randomness; one number is drawn for each parameter, varied or not, then those of `replaced`.
+        rng: Source of randomness; one number is drawn for each parameter, varied or not, then for `replaced`.
         replaced: Distributions of parameters by name, in place of the fit's.
 
     Returns:
-        The model with these parameters, and the parameters; numbers that follow from others (restitution, ...) fit
-        them.
+        The model with these parameters, and the parameters; derived ones (restitution, ...) are consistent with them.
     """
     replaced = replaced or {}
     quantiles = {parameter.name: float(rng.random()) for parameter in file.parameters}
@@ -66,14 +65,16 @@ def draw_parameters(
             drawn = with_parameter(drawn, name, values[name])
     entries = []
     for name in [*known, *sorted(set(values) - set(known))]:
-        old = known.get(name) or Parameter(name=name, unit=_unit(file, name), estimate=_present(file, name))
+        old = known.get(name) or FittedParameter(name=name, unit=_unit(file, name), estimate=_present(file, name))
         value = values.get(name, _derived(drawn, name, old.estimate))
-        entries.append(RolloutParameter(name, old.unit, value, old.estimate, old.std_error))
+        entries.append(
+            RolloutParameter(name=name, unit=old.unit, value=value, estimate=old.estimate, std_error=old.std_error)
+        )
     return drawn, tuple(entries)
 
 
 def with_correlations(model: Model) -> ModelFile:
-    """Return the model's file with the correlations of its fit, also of models that have them in `fit.json` only."""
+    """Return the file of a model with the correlations of its fit, including those stored in `fit.json` only."""
     found = model.fit.stages.get("phys-geo", {}).get("correlation")
     if model.file.correlations or not found:
         return model.file
@@ -83,10 +84,10 @@ def with_correlations(model: Model) -> ModelFile:
 
 
 def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution]) -> None:
-    """Check that a plan's distributions of parameters name what the model has, and stay within what is admissible.
+    """Check that a plan's distributions are of existing parameters and stay within the admissible ranges.
 
     Raises:
-        InputDataError: If not, with the name, what is admissible and what was found.
+        InputDataError: If not, with the name, the admissible range and the given one.
     """
     legal = settable(file)
     for name, distribution in replaced.items():
@@ -122,13 +123,13 @@ def settable(file: ModelFile) -> list[str]:
 
 
 def _root(block: Correlation) -> np.ndarray:
-    """Return the symmetric square root of a correlation matrix: it is unique, and rounding below 0 does not matter."""
+    """Return the symmetric square root of a correlation matrix, which is unique and robust to rounding below 0."""
     values, vectors = np.linalg.eigh(np.asarray(block.matrix))
     return (vectors * np.sqrt(values.clip(0))) @ vectors.T
 
 
 def _bounds(file: ModelFile, name: str) -> tuple[float, float]:
-    """Return the admissible range of a parameter: the fit's, or an effect's own."""
+    """Return the admissible range of a parameter: from the fit or from an effect."""
     listed = next((parameter.bounds for parameter in file.parameters if parameter.name == name), None)
     if listed is not None:
         return listed
@@ -151,7 +152,7 @@ def _unit(file: ModelFile, name: str) -> str:
 
 
 def _present(file: ModelFile, name: str) -> float:
-    """Return the value of a parameter that the model's list does not have."""
+    """Return the value of a parameter that is not in the model's list of fitted ones."""
     if name == "ground_offset_m" and file.ground is not None:
         return file.ground.offset_m
     if file.contact is not None and name in type(file.contact).model_fields:
@@ -165,7 +166,7 @@ def _present(file: ModelFile, name: str) -> float:
 
 
 def _derived(file: ModelFile, name: str, estimate: float) -> float:
-    """Return a number that follows from the drawn ones; another's estimate. Formulas as in the stage phys-geo."""
+    """Return a derived parameter from the drawn ones, else its estimate; formulas as in the stage phys-geo."""
     law = file.contact
     mass = next((body.mass_kg for body in file.bodies if body.motion == "free"), None)
     if law is None or mass is None or name not in DERIVED:
@@ -178,10 +179,10 @@ def _derived(file: ModelFile, name: str, estimate: float) -> float:
 
 
 DERIVED = ("restitution", "stiffness_n_m", "damping_n_s_m")
-"""What follows from the numbers of the contact and a mass."""
+"""Parameters that are derived from the contact parameters and a mass."""
 
 
-def _draw(parameter: Parameter, spread: float, quantile: float) -> float:
+def _draw(parameter: FittedParameter, spread: float, quantile: float) -> float:
     """Return the quantile of the truncated normal (or log-normal) distribution of a parameter."""
     estimate, error = parameter.estimate, spread * (parameter.std_error or 0.0)
     low, high = parameter.bounds or (-math.inf, math.inf)
@@ -198,7 +199,7 @@ def _draw(parameter: Parameter, spread: float, quantile: float) -> float:
 
 
 def can_vary(file: ModelFile, name: str) -> bool:
-    """Whether a parameter's name is one that :func:`with_parameter` can set."""
+    """Return whether :func:`with_parameter` can set a parameter."""
     if name == "ground_offset_m":
         return file.ground is not None
     if file.contact is not None and name in type(file.contact).model_fields:
@@ -212,12 +213,12 @@ def can_vary(file: ModelFile, name: str) -> bool:
 
 
 def _own_name(effect: EffectModel) -> str:
-    """Return the name that an effect gives itself, which its parameters carry."""
+    """Return the name of an effect as it occurs in the names of its parameters."""
     return load_effect(effect.name).name if ":" in effect.name or "@" in effect.name else effect.name
 
 
 def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
-    """Return the model with one physical parameter set; a mass takes the inertia along in proportion.
+    """Return the model with one physical parameter set; the inertia scales with the mass.
 
     Raises:
         InputDataError: If the model has no such parameter.
@@ -235,7 +236,9 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
         else effect
         for effect in file.effects
     )
-    if number.startswith("moment_"):  # a factor of what the model had before the fit; its inertia has the estimate
+    if number.startswith(
+        "moment_"
+    ):  # a factor of the value before the fit; the inertia of the model contains the estimate
         value /= next(parameter.estimate for parameter in file.parameters if parameter.name == name)
     bodies = tuple(_with_number(body, number, value) if body.name == owner else body for body in file.bodies)
     return file.model_copy(update={"bodies": bodies, "effects": effects})
@@ -261,5 +264,5 @@ def _with_number(body: BodyModel, number: str, value: float) -> BodyModel:
 
 
 def not_varied(file: ModelFile) -> list[str]:
-    """Return the names of fitted parameters that rollouts keep at their estimate, because nothing here sets them."""
+    """Return the names of fitted parameters that rollouts keep at their estimate, because they cannot be set."""
     return [p.name for p in file.parameters if p.std_error and p.name not in DERIVED and not can_vary(file, p.name)]

@@ -1,6 +1,6 @@
-"""What a dataset looks like: a contact sheet and a film of its first rollouts, with the contacts drawn in.
+"""Preview of a dataset: a contact sheet and a film of its first rollouts with their contacts.
 
-Both are made from a finished shard, through the reader that users have, and lie beside it: they are part of no hash.
+Both are made from a finished shard through the public reader and stored next to it; no hash includes them.
 """
 
 from __future__ import annotations
@@ -14,43 +14,46 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.atomic import new_file
-from ..datasets.cameras import Camera
-from ..datasets.loader import RolloutReader
-from ..datasets.video import encoded_webm
-from ..schemas import CgwmError, DatasetSummary, InputDataError
-from .reporting.pictures import Image, contact_sheet, encoded, evenly, resized
-from .viewing.contact_marks import SLIDING_RGB, STICKING_RGB, ContactMarks, arrow_scale, contact_marks
+from ...datasets.capture.cameras import Camera
+from ...datasets.capture.video import encoded_webm
+from ...datasets.io.atomic import new_file
+from ...datasets.rollouts.loader import RolloutReader
+from ...schemas import CgwmError, DatasetSummary, InputDataError
+from ..rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB, ContactMarks, arrow_scale, contact_marks
+from ..rendering.contact_sheets import Image, contact_sheet, encoded, evenly, resized
 
 SHEET, FILM = "preview.png", "preview.webm"
 ROLLOUTS = 4
-"""Rollouts that are shown; with fewer in the shard, further cameras of them take the room."""
+"""Number of rollouts shown; with fewer in the shard, further cameras of them fill the space."""
 MOMENTS = 5
 SLOWER = 3.0
-"""The film runs this many times slower than the motion."""
+"""Slow-motion factor of the film."""
 _TILE_WIDTH_PX = (320, 480)
-"""Smaller pictures are enlarged to the first, larger ones reduced to the second."""
+"""Minimum and maximum width of a tile [px]; other pictures are resized."""
 _LONGEST_ARROW = 0.4
-"""Length of the arrow of the largest impulse, of the height of a picture."""
+"""Length of the arrow of the largest impulse, as a share of the height of a picture."""
 _MOST_FILM_FRAMES = 240
 _INK, _PAPER = (29, 33, 41), (255, 255, 255)
 _STRIP_PX = 34
 _FONT, _TEXT = cv2.FONT_HERSHEY_SIMPLEX, 0.48
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Shot:
-    """One rollout as one camera sees it, T frames."""
+    """One rollout in one camera, T frames."""
 
     name: str
+    """Title of the tile."""
     camera: Camera
-    """At the size of the tiles."""
+    """Camera at the size of the tiles."""
     times_s: NDArray[np.float64]
+    """Times of the frames [s], shape (T,)."""
     images: Image
-    """As they lie in the shard, shape (T, H, W, 3)."""
+    """Images as stored in the shard, shape (T, H, W, 3)."""
     marks: tuple[ContactMarks, ...]
+    """Contacts to draw, by frame."""
     strength_n_s: NDArray[np.float64]
-    """Sum of the magnitudes of a frame's impulses [N s], shape (T,)."""
+    """Sum of the magnitudes of the impulses of each frame [N s], shape (T,)."""
 
     def tile(self, frame: int) -> Image:
         """Return a frame with its contacts and its time, shape (height, width, 3) of the camera."""
@@ -61,9 +64,9 @@ class _Shot:
 
 
 def with_preview(summary: DatasetSummary) -> DatasetSummary:
-    """Write the pictures of the shard that was just made beside it, and return its summary with their names.
+    """Write the preview of a new shard next to it, and return its summary with the names of the files.
 
-    A dataset is complete without them: where they cannot be made, a note in the summary says why.
+    A dataset is complete without a preview: if it cannot be made, a note in the summary gives the reason.
     """
     folder = Path(summary.dataset)
     if summary.up_to_date and all((folder / name).is_file() for name in (SHEET, FILM)):
@@ -100,7 +103,7 @@ def preview(shard: Path) -> tuple[bytes, bytes]:
 
 
 def telling_frames(strength_n_s: NDArray[np.float64], wanted: int) -> list[int]:
-    """Return up to `wanted` frames: the first, and of each later stretch of equal length the one with most impulse.
+    """Return up to `wanted` frames: the first, and in each later interval of equal length that with most impulse.
 
     >>> telling_frames(np.array([0.0, 0.0, 3.0, 0.0, 1.0, 2.0, 0.0]), 3)
     [0, 2, 5]
@@ -117,7 +120,7 @@ def telling_frames(strength_n_s: NDArray[np.float64], wanted: int) -> list[int]:
 
 
 def draw_contacts(picture: Image, camera: Camera, marks: ContactMarks) -> None:
-    """Draw a frame's contacts into a picture of that camera, in place: arrows first, points above them."""
+    """Draw the contacts of a frame into a picture of the camera, in place: arrows first, points above them."""
     if not len(marks):
         return
     pixels, depths = camera.project(marks.segments_m.reshape(-1, 3))
@@ -132,7 +135,7 @@ def draw_contacts(picture: Image, camera: Camera, marks: ContactMarks) -> None:
 
 
 def _shots(reader: RolloutReader) -> tuple[list[_Shot], float]:
-    """Return the shots that are shown, and the largest impulse in them [N s]."""
+    """Return the shown shots and their largest impulse [N s]."""
     numbers = range(min(ROLLOUTS, len(reader)))
     cameras = reader.cameras(0)
     if not cameras:
@@ -164,7 +167,7 @@ def _tile_camera(camera: Camera) -> Camera:
 
 
 def _metres_across(camera: Camera, points_m: NDArray[np.float64]) -> float:
-    """Return the height of what a camera sees at the distance of some points [m]; where it stands without any."""
+    """Return the height of the field of view at the median depth of the points [m], or at 1 m without points."""
     depths = camera.project(points_m)[1] if len(points_m) else np.zeros(0)
     depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
     return depth * camera.height / float(camera.K[1, 1])
@@ -190,13 +193,13 @@ def _grids(shots: list[_Shot], shown: list[int], columns: int) -> Iterator[Image
 
 
 def _even(picture: Image) -> Image:
-    """Return a picture with even sides, as the video codecs want them."""
+    """Return a picture with even sides, as video codecs require."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
 
 
 def _legend(width: int, largest_n_s: float, also: str) -> Image:
-    """Return a strip that says what the colours and arrows mean; in two lines where one is too short."""
+    """Return a legend of the colours and arrows, in two lines if one is too short."""
     entries = [("dot", STICKING_RGB, "contact, sticking"), ("dot", SLIDING_RGB, "contact, sliding")]
     longest = f", at most {largest_n_s:.2g} N s" if largest_n_s > 0 else ""
     entries += [("arrow", _INK, f"impulse since the frame before{longest}"), *([("", _INK, also)] if also else [])]
@@ -236,13 +239,13 @@ def _arrow(
 
 
 def _sixteenths(pixel: NDArray[np.float64]) -> tuple[int, int]:
-    """Return a place for OpenCV with 4 bits of fraction; its pixel centres lie at integers, ours at .5."""
+    """Return pixel coordinates for OpenCV with 4 fractional bits; its pixel centres are at integers, ours at .5."""
     x, y = np.clip(np.round((pixel - 0.5) * 16), -1e8, 1e8)
     return int(x), int(y)
 
 
 def _title(picture: Image, text: str) -> None:
-    """Write into the top left corner, white on a darkened ground, in place."""
+    """Write a title into the top left corner, white on a darkened background, in place."""
     wide = cv2.getTextSize(text, _FONT, _TEXT, 1)[0][0]
     ground = picture[:24, : wide + 16]
     ground[:] = ground // 3

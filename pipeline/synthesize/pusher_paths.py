@@ -1,4 +1,4 @@
-"""The path of a pusher: a line or an arc at constant speed, of some length or without end."""
+"""Paths of pushers: a line or an arc at constant speed, of finite or unlimited length."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from ..datasets.tracks import Track
+from ...datasets.capture.tracks import Track
 
 STEP_RAD = 0.02
-"""Turn of an arc from one sample to the next: the chord misses the arc by 5e-5 of its radius."""
+"""Turn of an arc between two samples [rad]: the chord deviates from the arc by 5e-5 of its radius."""
 
 
 def push_track(
@@ -23,18 +23,18 @@ def push_track(
     length_m: float | None,
     duration_s: float,
 ) -> Track:
-    """Return the motion of a pusher that passes `aim_m` with a heading, in a fixed orientation.
+    """Return the motion of a pusher that passes through a point with a heading, at a fixed orientation.
 
     Args:
-        aim_m: Where its frame's origin would be when it is at the object [m], world, shape (3,).
-        quat_wxyz: Its orientation, shape (4,).
-        heading: Level unit vector of its motion there, shape (3,).
-        left: Level unit vector to the left of that, shape (3,).
-        run_up_m: Length of the path from the start to there [m].
-        speed_m_s: Along the path [m/s].
-        curvature_1_m: Of the path [1/m], positive to the left.
-        length_m: Length of the path, after which the pusher stands still [m]; None: it goes on.
-        duration_s: Of the rollout [s].
+        aim_m: Position of the origin of its body frame at the object [m], world frame, shape (3,).
+        quat_wxyz: Orientation (body to world), shape (4,).
+        heading: Horizontal unit vector along its motion there, world frame, shape (3,).
+        left: Horizontal unit vector to the left of the heading, world frame, shape (3,).
+        run_up_m: Length of the path from the start to the object [m].
+        speed_m_s: Speed along the path [m/s].
+        curvature_1_m: Curvature of the path [1/m], positive to the left.
+        length_m: Length of the path, after which the pusher stops [m]; None for an unlimited path.
+        duration_s: Duration of the rollout [s].
     """
     moving = duration_s if length_m is None or speed_m_s == 0 else min(duration_s, length_m / speed_m_s)
     count = 1 + max(1, math.ceil(abs(curvature_1_m) * speed_m_s * moving / STEP_RAD))
@@ -48,4 +48,21 @@ def push_track(
         velocity = speed_m_s * (np.cos(turn) * heading + np.sin(turn) * left)
     if moving < duration_s:
         velocity[-1] = 0.0
-    return Track(times, path, np.repeat(quat_wxyz[None], count, axis=0), velocity, np.zeros((count, 3)))
+    return Track(
+        time_s=times,
+        position_m=path,
+        quat_wxyz=np.repeat(quat_wxyz[None], count, axis=0),
+        velocity_m_s=velocity,
+        omega_body_rad_s=np.zeros((count, 3)),
+    )
+
+
+def commanded_velocity(track: Track) -> np.ndarray:
+    """Return the velocities of a pusher [m/s], world frame, shape (T, 3).
+
+    Raises:
+        ValueError: If the track has none.
+    """
+    if track.velocity_m_s is None:
+        raise ValueError("the motion of a driven body has no velocities.")
+    return track.velocity_m_s

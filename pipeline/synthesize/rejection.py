@@ -1,4 +1,4 @@
-"""Which rollouts a plan draws again, and the loop that draws until enough are accepted.
+"""Rejection of rollouts by the rules of a plan, and the loop that draws until each rollout is accepted.
 
 A rollout's draws depend on the seed, its number and the attempt alone, so neither sharding nor batches change them.
 """
@@ -12,17 +12,18 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..datasets.models import Model
-from ..datasets.rollouts import RolloutLabels
-from ..schemas import NotConvergedError, RejectionRules
-from .rollout_batches import Diverged
-from .sampling import Extent, extent, rotation_matrix, up_direction
+from ...datasets.models.model import Model
+from ...datasets.rollouts.rollouts import RolloutLabels
+from ...schemas import NotConvergedError, RejectionRules
+from ..geometry.viewpoint import rotation_matrix
+from .plan import Extent, extent, up_direction
+from .simulator import Diverged
 
 DrawT = TypeVar("DrawT")
 DIVERGED = "diverged"
-"""What a draw that did not stay finite is counted as, beside those that broke a rule."""
+"""Key under which diverged draws are counted, next to the names of the rules."""
 MOST_DIVERGED = 5
-"""Draws of one rollout that may diverge: then the fault is in the model, not in the draw."""
+"""Maximum number of diverged draws of one rollout; above it the fault is in the model, not in the draw."""
 REMEDY = {
     "off_table_m": "slow the starts down, shorten the rollouts or raise off_table_m",
     "no_contact": "start lower, aim the pusher better (push_miss) or lengthen the rollouts",
@@ -34,19 +35,16 @@ REMEDY = {
 
 @dataclass(frozen=True)
 class Rejection:
-    """The rules of a plan for a model.
-
-    Attributes:
-        rules: The rules.
-        extents: Bounding spheres of the bodies.
-        home_m: Where the photos show the middles of the bodies' bounding spheres [m], world, shape (B, 3).
-        up: The ground's normal, shape (3,).
-    """
+    """Rejection rules of a plan, prepared for a model."""
 
     rules: RejectionRules
+    """Rules of the plan."""
     extents: tuple[Extent, ...]
+    """Bounding spheres of the bodies."""
     home_m: np.ndarray
+    """Centres of the bounding spheres at the poses of the photos [m], world frame, shape (B, 3)."""
     up: np.ndarray
+    """Normal of the ground, world frame, shape (3,)."""
 
     @staticmethod
     def of(model: Model, rules: RejectionRules) -> Rejection:
@@ -62,7 +60,7 @@ class Rejection:
         return Rejection(rules, extents, home, up_direction(model.file))
 
     def reason(self, labels: RolloutLabels) -> str | None:
-        """Return the name of the first rule that a rollout breaks; None where it is accepted."""
+        """Return the name of the first rule that a rollout violates; None if it is accepted."""
         free = [index for index, motion in enumerate(labels.motions) if motion == "free"]
         centers = {
             index: labels.position_m[:, index]
@@ -122,19 +120,19 @@ def accepted_rollouts(
     attempts: int,
     rejected: Counter[str],
 ) -> Iterator[tuple[DrawT, RolloutLabels]]:
-    """Yield the accepted rollout of each number, in order: what is rejected is drawn again, the batch's rest waits.
+    """Yield the accepted rollout of each number, in order; rejected rollouts of the batch are drawn again.
 
     Args:
         indices: Global numbers of the rollouts of a batch.
-        draw: Draws the rollout of a number at an attempt.
-        simulate: Simulates draws, in their order.
-        reason: Names the rule that a rollout breaks, or None.
-        attempts: Most draws for one rollout.
-        rejected: Counts the rejected draws by rule, in place; those that diverged under `DIVERGED`.
+        draw: Function that draws the rollout of a number at an attempt.
+        simulate: Function that simulates draws, in their order.
+        reason: Function that returns the name of the rule that a rollout violates, or None.
+        attempts: Maximum number of draws for one rollout.
+        rejected: Count of rejected draws by rule, updated in place; diverged draws count under `DIVERGED`.
 
     Raises:
         NotConvergedError: If all draws for a rollout are rejected, with the count by rule; or `MOST_DIVERGED` of them
-            diverged, with where the last one began.
+            diverge, with the start of the last one.
     """
     found: dict[int, tuple[DrawT, RolloutLabels]] = {}
     broken: dict[int, Counter[str]] = {index: Counter() for index in indices}

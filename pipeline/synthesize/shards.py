@@ -1,4 +1,4 @@
-"""All shards of a dataset in one command: one after the other, in processes, or as the tasks of a Ray cluster."""
+"""All shards of a dataset in one command: sequentially, in processes, or as tasks of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from contextlib import chdir, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..datasets.dataset import refuse_existing_shards
-from ..datasets.progress import progress
-from ..datasets.shards import shard_range
-from ..schemas import (
+from ...datasets.io.progress import progress
+from ...datasets.rollouts.dataset import refuse_existing_shards
+from ...datasets.rollouts.shards import shard_range
+from ...schemas import (
     CgwmError,
     DamagedShardError,
     DatasetSummary,
@@ -25,24 +25,24 @@ from ..schemas import (
     SynthesizeConfig,
     UsageError,
 )
-from .synthesize import shard_indices, synthesize
-from .workers import in_workers
+from ..runtime.processes import in_workers
+from .stage import shard_indices, synthesize
 
 ROLLOUTS_PER_SHARD = 32
-"""Of a Ray task, where nothing else is said: some minutes of work, which is what a dead worker loses."""
+"""Default number of rollouts of a Ray task: some minutes of work, which are lost when a worker dies."""
 RETRIES = 3
-"""How often a shard is begun again whose worker died."""
+"""Maximum number of restarts of a shard whose worker died."""
 _OF_ONE_SHARD = (NotConvergedError, DamagedShardError)
-"""Errors that say nothing about the other shards: these are still made."""
+"""Errors of a single shard, after which the other shards are still made."""
 
 _NONE_RUNS = "Could not find any running Ray instance"
-"""What Ray says where no cluster runs on this machine, which is no fault."""
+"""Message of Ray if no cluster runs on this machine, which is not an error."""
 
 _Outcome = tuple[int, DatasetSummary | CgwmError]
 
 
 def default_shards(rollouts: int) -> int:
-    """Return the number of shards for a cluster: it depends on the dataset alone, so that any cluster can go on.
+    """Return the number of shards for a cluster, which depends on the dataset alone, so any cluster can resume.
 
     >>> default_shards(8), default_shards(10_000)
     (1, 313)
@@ -65,22 +65,22 @@ def synthesize_shards(
     Args:
         model: MODEL.
         out: DATASET.
-        config: The settings; its number of the shard counts for nothing.
+        config: The settings; the number of the shard in them is ignored.
         overwrite: Replace shards that exist; with `resume` only damaged ones.
-        resume: Keep the shards that are there and whole.
+        resume: Keep existing intact shards.
         ray: The address of a Ray cluster, ``local`` for one on this machine, ``auto`` for the one that runs (by
-            RAY_ADDRESS, or here) or else ``local``. All its machines have to see `model` and `out` at these paths.
-            None: without Ray, in this process.
-        preview: Write a contact sheet and a film of the first rollouts beside the first shard.
-        workers: Without Ray, make so many shards at a time, in processes that share the cores and the GPU. A script
+            RAY_ADDRESS, or here) or else ``local``. All its machines need access to `model` and `out` at these paths.
+            None runs without Ray, in this process.
+        preview: Write a contact sheet and a film of the first rollouts next to the first shard.
+        workers: Number of shards made at a time without Ray, in processes that share the cores and the GPU. A script
             that asks for more than one needs ``if __name__ == "__main__":``, as these processes import it.
 
     Returns:
-        What the dataset holds now, and the speed.
+        Summary of the present content of the dataset, and the speed.
 
     Raises:
-        CgwmError: As :func:`synthesize`. Where one shard diverges or is damaged, the others are made all the same.
-        KeyboardInterrupt: With a word on what is complete.
+        CgwmError: As :func:`synthesize`. If one shard diverges or is damaged, the others are still made.
+        KeyboardInterrupt: With the number of complete shards.
     """
     began = time.perf_counter()
     shard_indices(config)
@@ -93,10 +93,25 @@ def synthesize_shards(
         outcomes = _here(model, out, parts, overwrite, resume, preview)
     else:
         outcomes = _on_ray(model, out, parts, overwrite, resume, preview, ray)
+    done, failed = _collect(outcomes, out, config)
+    if failed:
+        raise _failure(failed, len(done), config.shards)
+    return _summary(out, config, done, time.perf_counter() - began)
+
+
+def _collect(
+    outcomes: Generator[_Outcome, None, None], out: Path, config: SynthesizeConfig
+) -> tuple[dict[int, DatasetSummary], dict[int, CgwmError]]:
+    """Return the summaries and the errors by shard, as the shards complete.
+
+    Raises:
+        CgwmError: If an error concerns all shards.
+        KeyboardInterrupt: With a message that says how many shards are complete.
+    """
     done: dict[int, DatasetSummary] = {}
     failed: dict[int, CgwmError] = {}
     try:
-        # closed at once when it is left at an error, and its tasks with it
+        # An error closes the generator at once, and with it the tasks that it runs.
         with progress(None, "shards", config.rollouts, "rollout") as bar, closing(outcomes):
             for shard, outcome in outcomes:
                 if isinstance(outcome, DatasetSummary):
@@ -110,9 +125,7 @@ def synthesize_shards(
         raise KeyboardInterrupt(
             f"{len(done)} of {config.shards} shards of {out} are complete; the same command with --resume goes on."
         ) from None
-    if failed:
-        raise _failure(failed, len(done), config.shards)
-    return _summary(out, config, done, time.perf_counter() - began)
+    return done, failed
 
 
 def _here(
@@ -141,7 +154,7 @@ def _on_ray(
     with _connected(address) as ray:
         gpus = _gpus(ray, parts[0].device)
         task = ray.remote(_task).options(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)
-        # A task that is begun again may find the shard that it has made before its worker died: it keeps it.
+        # A restarted task may find the shard that it made before its worker died, and keeps it.
         keep = resume or not overwrite
         places = str(model.resolve()), str(out.resolve())
         pending = {task.remote(*places, part, overwrite, keep, preview): part.shard for part in parts}
@@ -154,14 +167,14 @@ def _on_ray(
         finally:
             for reference in pending:
                 ray.cancel(reference)
-            if pending:  # so that they remove what is unfinished
+            if pending:  # lets the tasks remove unfinished files
                 ray.wait(list(pending), num_returns=len(pending), timeout=10.0)
 
 
 def _task(
     model: str, out: str, config: SynthesizeConfig, overwrite: bool, resume: bool, preview: bool
 ) -> DatasetSummary | CgwmError:
-    """Make one shard; an error that was meant is returned, for Ray would wrap it and show a traceback."""
+    """Make one shard; return expected errors, because Ray would wrap them and show a traceback."""
     try:
         return synthesize(Path(model), Path(out), config, overwrite, resume, preview)
     except CgwmError as error:
@@ -193,7 +206,7 @@ def _connected(address: str) -> Iterator[Any]:
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     try:
         _connect(ray, address, quiet)
-        signal.signal(signal.SIGTERM, before)  # Ray's own would end the process with another exit code
+        signal.signal(signal.SIGTERM, before)  # Ray's handler would exit with another code
         yield ray
     finally:
         ray.shutdown()
@@ -201,7 +214,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 def _connect(ray: Any, address: str, options: dict[str, Any]) -> None:
     address = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
-    # Ray puts the working directory on its workers' path, where a clone's folder cgwm/ would hide the package.
+    # Ray adds the working directory to its workers' path, where the folder cgwm/ of a clone would hide the package.
     with chdir(os.path.sep):
         if address not in ("auto", "local"):
             _require_answer(address)
@@ -216,7 +229,7 @@ def _connect(ray: Any, address: str, options: dict[str, Any]) -> None:
 
 
 def _require_answer(address: str) -> None:
-    """Ray itself tries for many minutes to reach a machine that is not there."""
+    """Check that a cluster answers, because Ray tries for many minutes to reach a missing machine."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not (colon and port.isdecimal()):
         raise _no_cluster(address, "no host:port")
@@ -235,7 +248,7 @@ def _no_cluster(address: str, reason: str) -> UsageError:
 
 
 def _gpus(ray: Any, device: str) -> int:
-    """Return the GPUs of a task: one, unless the CPU is asked for or the cluster has none."""
+    """Return the number of GPUs of a task: one, unless the CPU is requested or the cluster has no GPU."""
     there = ray.cluster_resources().get("GPU", 0) >= 1
     if device == "cuda" and not there:
         raise UsageError("--device cuda: the Ray cluster has no GPU.", "auto, cpu.", "see 'ray status'.")

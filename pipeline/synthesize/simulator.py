@@ -1,9 +1,9 @@
-"""Many rollouts at once, each with its own parameters; what a rollout holds does not depend on the others.
+"""Simulation of batches of rollouts with individual parameters, each independent of the rest of the batch.
 
-On a CUDA device the fused kernel takes them together. Each environment is worked out by itself there, but how, to the
-last bit, depends on the number of environments (threads an environment, library routines for small matrices), so that
-a call always has the same number: what lacks is filled with copies. The torch engine adds the contacts of an
-environment in an order that depends on the others, so that it takes one rollout after the other.
+On a CUDA device the fused kernel simulates them together. Its environments are independent, but the last bits of the
+result depend on the number of environments (threads per environment, library routines for small matrices), so each call
+has the same number, filled up with copies. The torch engine adds the contacts of an environment in an order that
+depends on the others, so it simulates one rollout after the other.
 """
 
 from __future__ import annotations
@@ -16,59 +16,64 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.models import Model
-from ..datasets.rollouts import ContactTable
-from ..schemas import ModelFile, NotConvergedError
-from .compiler import compiler_version
-from .draws import Draw
-from .physics.checks import require_apart, require_finite
-from .physics.devices import on_device
-from .physics.dispatch import rollout as roll_out
-from .physics.driven import Drive
-from .physics.effects.effect import changed_by_effects
-from .physics.fused import unsupported
-from .physics.fused.host import lacking
-from .physics.records import ContactRecord
-from .physics.rollout import Rollout
-from .physics.world import State, World
-from .sampling import Start
+from ...datasets.models.model import Model
+from ...datasets.rollouts.rollouts import ContactTable
+from ...schemas import ModelFile, NotConvergedError
+from ..physics.checks import require_apart
+from ..physics.contact_record import ContactRecord
+from ..physics.devices import on_device
+from ..physics.effects.effect import changed_by_effects
+from ..physics.engine import rollout as roll_out
+from ..physics.fused import unsupported
+from ..physics.fused.host import lacking
+from ..physics.kinematic import Drive
+from ..physics.rollout import Rollout, require_finite
+from ..physics.world import State, World
+from ..runtime.kernel_build import compiler_version
+from .draw import Draw
+from .start_states import Start
 
 ENVIRONMENTS = 64
-"""Of every call of the fused kernel."""
+"""Number of environments in each call of the fused kernel."""
 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Motion:
-    """What came of a draw: float64, T frames, B bodies, in the world frame but for omega.
-
-    file: the drawn model with the gravity, masses and inertias that its effects give it; position_m (T, B, 3),
-    quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) of the body frames' origins, omega_body_rad_s (T, B, 3).
-    """
+    """Simulated motion of a draw, float64; T frames, B bodies."""
 
     draw: Draw
+    """The draw."""
     file: ModelFile
+    """The drawn model with the gravity, masses and inertias after its effects."""
     position_m: np.ndarray
+    """Positions of the origins of the body frames [m], world frame, shape (T, B, 3)."""
     quat_wxyz: np.ndarray
+    """Orientations (body to world), shape (T, B, 4)."""
     velocity_m_s: np.ndarray
+    """Velocities of the origins of the body frames [m/s], world frame, shape (T, B, 3)."""
     omega_body_rad_s: np.ndarray
+    """Angular velocities [rad/s], body frame, shape (T, B, 3)."""
     contacts: ContactTable
+    """Contacts of all frames."""
 
 
 @dataclass(frozen=True)
 class Diverged:
-    """A draw that did not stay finite, and the error that says where its start is."""
+    """A diverged draw."""
 
     draw: Draw
+    """The draw."""
     error: NotConvergedError
+    """Error that names the file of its start."""
 
 
 class Simulator:
-    """Simulates draws of one model.
+    """Simulator of draws of one model.
 
     Args:
-        model: The model, with its estimates.
+        model: The model with its estimates.
         times_s: Times of the frames, shape (T,).
         device: cpu or cuda.
     """
@@ -81,21 +86,21 @@ class Simulator:
 
     @property
     def engine(self) -> str:
-        """What simulates: engines agree to rounding, not to the byte."""
+        """Name of the engine; results of different engines agree to rounding, not to the byte."""
         if self._device == "cuda":
             return "fused on cuda" if self._together else "torch"
         return "torch" if lacking(self._world) is not None else f"fused on cpu, {compiler_version()}"
 
     @torch.no_grad()
     def run(self, draws: Sequence[Draw], seed: int) -> list[Motion | Diverged]:
-        """Simulate some rollouts; equal to simulating each alone, bit for bit.
+        """Simulate rollouts; the result of each equals that of its separate simulation, bit for bit.
 
         Args:
-            draws: The rollouts; up to `ENVIRONMENTS` go into one call.
+            draws: The rollouts; one call takes at most `ENVIRONMENTS`.
             seed: The root seed, for messages.
 
         Raises:
-            InputDataError: If a start, a mass or a contact number cannot be simulated.
+            InputDataError: If a start, a mass or a contact parameter cannot be simulated.
         """
         size = ENVIRONMENTS if self._together else 1
         found: list[Motion | Diverged] = []
@@ -115,14 +120,13 @@ class Simulator:
         there_world, there_state = on_device((world, state), self._device)
         rollout = roll_out(there_world, there_state, self._times, driven, record_contacts=True)
         rollout = on_device(rollout, "cpu")
-        assert rollout.contacts is not None  # asked for
         return [
             self._result(draw, _as_simulated(draw.model.file, worlds[row]), rollout, row, (world, state), names[row])
             for row, draw in enumerate(draws)
         ]
 
     def _driven(self, draws: Sequence[Draw]) -> dict[str, Drive]:
-        """Return the commands of the driven bodies, of all rollouts together."""
+        """Return the motions of the driven bodies, batched over all rollouts."""
         names = list(draws[0].start.driven)
         like = torch.zeros(1, dtype=torch.float64, device=self._device)
         return {name: Drive.of([draw.start.driven[name] for draw in draws], like) for name in names}
@@ -132,11 +136,11 @@ class Simulator:
     ) -> Motion | Diverged:
         rows = slice(row, row + 1)
         one = Rollout(
-            rollout.times_s,
-            rollout.position_m[rows],
-            rollout.quat_wxyz[rows],
-            rollout.velocity_m_s[rows],
-            rollout.omega_body_rad_s[rows],
+            times_s=rollout.times_s,
+            position_m=rollout.position_m[rows],
+            quat_wxyz=rollout.quat_wxyz[rows],
+            velocity_m_s=rollout.velocity_m_s[rows],
+            omega_body_rad_s=rollout.omega_body_rad_s[rows],
         )
         position, quat, velocity, omega = (
             values[0].numpy() for values in (one.position_m, one.quat_wxyz, one.velocity_m_s, one.omega_body_rad_s)
@@ -146,15 +150,23 @@ class Simulator:
                 require_finite(one, began[0], began[1].at(rows), [name])
             except NotConvergedError as error:
                 return Diverged(draw, error)
-        assert rollout.contacts is not None
-        return Motion(draw, file, position, quat, velocity, omega, _contact_table(rollout.contacts, row))
+        assert rollout.contacts is not None  # requested by `record_contacts`
+        return Motion(
+            draw=draw,
+            file=file,
+            position_m=position,
+            quat_wxyz=quat,
+            velocity_m_s=velocity,
+            omega_body_rad_s=omega,
+            contacts=_contact_table(rollout.contacts, row),
+        )
 
 
 def joined_worlds(worlds: Sequence[World]) -> World:
-    """Return worlds of one environment each as one of many; tensors that all share stay single.
+    """Return worlds of one environment each as one batched world; tensors that all share stay single.
 
     Raises:
-        ValueError: If they differ in more than the numbers of a batch.
+        ValueError: If they differ in more than batched values.
     """
     return _joined(list(worlds))
 
@@ -187,7 +199,7 @@ def _state(starts: Sequence[Start]) -> State:
 
 
 def _as_simulated(file: ModelFile, world: World) -> ModelFile:
-    """Return the model with the gravity, masses and inertias that its effects give it."""
+    """Return the model with the gravity, masses and inertias after its effects."""
     if not any(active.effect.has("world") for active in world.effects):
         return file
     world = changed_by_effects(world)
@@ -201,7 +213,7 @@ def _as_simulated(file: ModelFile, world: World) -> ModelFile:
 
 
 def _contact_table(record: ContactRecord, row: int) -> ContactTable:
-    """Keep the contacts that touch at the frame, or that passed on an impulse since the frame before."""
+    """Return the contacts that touch at a frame or transmitted an impulse since the previous frame."""
     impulse = record.impulse_n_s[row].numpy()
     distance = record.distance_m[row].numpy()
     active = (np.abs(impulse).max(-1, initial=0.0) > 0) | (distance <= 0)

@@ -1,8 +1,8 @@
-"""The stage synthesize: labelled rollouts of a fitted model into HDF5.
+"""The stage synthesize: write labelled rollouts of a fitted model to HDF5.
 
-Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e, and after a draw that
-the plan's rules reject from `spawn_key=(e, attempt)`; its content depends neither on the sharding nor on the rollouts
-that are simulated with it.
+Rollout e is drawn from `numpy.random.SeedSequence(seed, spawn_key=(e,))` with the global index e, and after a rejection
+by the plan's rules from `spawn_key=(e, attempt)`; its content depends neither on the sharding nor on the other rollouts
+of its batch.
 """
 
 from __future__ import annotations
@@ -20,37 +20,33 @@ from pathlib import Path
 
 import torch
 
-from ..datasets.dataset import finished_shard, new_dataset, shard_entry
-from ..datasets.progress import progress
-from ..datasets.rollout_writer import RolloutWriter
-from ..datasets.rollouts import FrameBlock, RolloutLabels
-from ..datasets.shards import contact_count, shard_name, shard_range
-from ..schemas import (
-    DatasetSummary,
-    ShardEntry,
-    SynthesizeConfig,
-    UsageError,
-)
-from .draws import Draw, draw_rollout
-from .memory import enough_memory
+from ...datasets.io.progress import progress
+from ...datasets.rollouts.dataset import finished_shard, new_dataset, shard_entry
+from ...datasets.rollouts.rollout_writer import RolloutWriter
+from ...datasets.rollouts.rollouts import FrameBlock, RolloutLabels
+from ...datasets.rollouts.shards import contact_count, shard_name, shard_range
+from ...schemas import DatasetSummary, ShardEntry, SynthesizeConfig, UsageError
+from ..runtime.resources import enough_memory, one_torch_thread
+from ..runtime.timing import Stopwatch
+from .draw import Draw, draw_rollout
+from .job import Job, manifest_of, notes_of, prepared
+from .labels import labels_of
 from .preview import with_preview
 from .rejection import accepted_rollouts
-from .rollout_batches import ENVIRONMENTS, Diverged
-from .rollout_labels import labels_of
-from .stopwatch import Stopwatch
-from .synthesis_job import Job, manifest_of, notes_of, prepared
-from .threads import one_torch_thread
+from .simulator import ENVIRONMENTS, Diverged
 
 ROLLOUTS_AT_ONCE = {"cuda": ENVIRONMENTS, "cpu": 1}
-"""Drawn and simulated together where the settings do not say, one batch ahead of the pictures."""
+"""Default number of rollouts per batch by device; simulation is one batch ahead of rendering."""
 
 
 @dataclass(frozen=True)
 class _Outcome:
-    """What became of draws that are not in the dataset: rejected, by rule; and what is said of those that diverged."""
+    """Draws that are not in the dataset."""
 
     rejected: Counter[str]
+    """Number of rejected draws by rule."""
     diverged: list[str]
+    """Messages on the diverged draws."""
 
 
 def synthesize(
@@ -64,28 +60,28 @@ def synthesize(
 ) -> DatasetSummary:
     """Write one shard of a dataset of labelled rollouts.
 
-    With one shard, `out` appears complete. With more, every call adds its shard to `out` (the first that is ready
-    makes it), in any order.
+    With one shard, `out` appears when it is complete. With more, every call adds its shard to `out` in any order, and
+    the first call that is ready creates `out`.
 
     Args:
         model: MODEL, a directory that `cgwm fit` wrote, with fitted physics.
         out: DATASET.
         config: The settings; times, sizes and the sampling plan are in it.
-        overwrite: Replace what is there: the dataset where it has one shard, else the shard.
-        resume: Keep the shard if it is there and its hash is right. With `overwrite`, a damaged one is made again.
-        preview: Write a contact sheet and a film of the first rollouts beside the first shard.
-        stopwatch: To measure where the time goes.
+        overwrite: Replace existing output: the dataset if it has one shard, else the shard.
+        resume: Keep the shard if it exists with the right hash. With `overwrite`, a damaged one is made again.
+        preview: Write a contact sheet and a film of the first rollouts next to the first shard.
+        stopwatch: Timer of the parts of the work.
 
     Returns:
-        What was written, with its hash and the speed, and how many draws were rejected by which rule.
+        Summary of the shard with its hash, the speed, and the number of rejected draws by rule.
 
     Raises:
         InputDataError: If `model` is no model, or has no fitted physics.
         UsageError: If the output exists, or belongs to another dataset.
-        DamagedShardError: If a shard that is to be kept is not what was written.
+        DamagedShardError: If a kept shard differs from what was written.
         NotConvergedError: If the rules reject all draws for a rollout, or too many of them diverge.
-        NotEnoughSpaceError: If there is no room for the shard.
-        NotEnoughMemoryError: If the pictures cannot be rendered in the memory that there is.
+        NotEnoughSpaceError: If the disk has no room for the shard.
+        NotEnoughMemoryError: If the available memory is not sufficient for rendering.
     """
     began = time.perf_counter()
     with one_torch_thread(kernels_too=True):
@@ -154,7 +150,7 @@ def _summary(
 
 
 def shard_indices(config: SynthesizeConfig) -> range:
-    """Return the global indices of the rollouts of a shard: successive ones, in shares that differ by at most one.
+    """Return the consecutive global indices of the rollouts of a shard; shares differ by at most one.
 
     Raises:
         UsageError: If there are more shards than rollouts.
@@ -170,7 +166,7 @@ def shard_indices(config: SynthesizeConfig) -> range:
 def _rollouts(
     job: Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch
 ) -> Generator[tuple[Draw, RolloutLabels], None, None]:
-    """Yield the accepted rollouts in the order of their numbers; the next batch is simulated meanwhile."""
+    """Yield the accepted rollouts in the order of their numbers, while the next batch is simulated."""
     size = job.config.batch or ROLLOUTS_AT_ONCE[job.device]
     batches = [indices[first : first + size] for first in range(0, len(indices), size)]
     with ThreadPoolExecutor(1, "cgwm-simulate") as ahead:
@@ -206,10 +202,10 @@ def _batch(job: Job, indices: range, outcome: _Outcome, stopwatch: Stopwatch) ->
 
 @contextmanager
 def _quick_turns() -> Iterator[None]:
-    """Let threads take turns with the interpreter after 0.2 ms instead of 5.
+    """Let threads switch after 0.2 ms instead of 5 ms.
 
-    The thread that launches the work of a GPU lets go of the interpreter at each launch, and waits for its turn to go
-    on while others compress and write.
+    The thread that launches GPU work releases the interpreter at each launch, and would wait for threads that compress
+    and write.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(2e-4)

@@ -1,9 +1,10 @@
-"""Errors of a measurement that last for several frames: how much of them, for how long, and residuals without them.
+"""Correlated measurement noise: its strength and correlation time, and the whitening of residuals.
 
-A tracker that filters, a marker that wanders over a ball or a calibration that is off in places make errors that
-neighbouring frames share. Forces are found by what is slow, and errors that last are slow: of a share s of the variance
-that is forgotten within tau, the covariance of two frames is s exp(-|dt| / tau), plus 1 - s of each alone. Of residuals
-the innovations are taken, so that what follows may take them for independent.
+A tracker that filters, a marker that moves over a ball or a calibration with local errors makes errors that
+neighbouring frames share. Forces are identified by slow changes, and correlated errors are slow. The noise is an
+Ornstein-Uhlenbeck process plus white noise: with a share s of the variance that decays with time constant tau, the
+covariance of two frames is s exp(-|dt| / tau), plus 1 - s on the diagonal. Residuals are replaced by their innovations,
+so that later steps may assume independence.
 """
 
 from __future__ import annotations
@@ -19,181 +20,205 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..estimation.noise import FLOOR_M, FLOOR_RAD
-from ..estimation.observations import Observations
-from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
-from .cuts import Segment
+from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ..optimization.levenberg_marquardt import Solution
+from .observations import Observations
+from .segmentation import Segment
+from .track_noise import FLOOR_M, FLOOR_RAD
 
 Array = NDArray[np.float64]
 
 LONGEST_S = 0.4
-"""Of a window: a longer one shows more of what lasts, and a force that changes within it may be taken for errors."""
+"""Maximum length [s] of a window. A longer one shows more of the correlation, but a force that changes within it may be
+taken for noise."""
 LEAST_DEGREE, MOST_DEGREE = 4, 12
+"""Minimum and maximum degree of the polynomials."""
 CIRCLE_LEFT = 1e-3
-"""Share of the circle of a point about the centre of mass that polynomials of the degree chosen leave."""
+"""Largest residual of the circle of a point about the centre of mass, as a share of its radius, that sets the
+degree."""
 LARGEST_TURN = 2.5
-"""Of a window of rotations [rad]: rotation vectors of a tumbling body are polynomials near none only."""
+"""Maximum rotation [rad] within a window of rotations: rotation vectors of a tumbling body are polynomials only near
+zero."""
 LEAST = 4
-"""Frames of a window beyond the numbers of its polynomial."""
+"""Minimum number of frames of a window in excess of the coefficients of its polynomial."""
 REMEMBERED = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""What is left of an error after one frame, of those that last, which are tried; and shares of the variance."""
+"""Correlations from one frame to the next that are tried."""
 SHARES = (1.0, 0.75, 0.5, 0.25)
+"""Shares of the variance that is correlated, that are tried."""
 SURE, SURE_ALONE = 20.0, 6.0
-"""Errors last where twice the log-likelihood grows by more than this of positions and rotations together, and by more
-than that of the kind itself. Noise that does not last, four times larger along one axis, reached 10."""
+"""Minimum of twice the gain in log-likelihood for noise to count as correlated: of positions and rotations together,
+and of each kind. White noise that is four times larger along one axis reached 10."""
 LIKELY = 2.0
-"""Of memories whose evidence is within this of the largest (two thirds of the true ones are), the slowest is taken."""
+"""Noise models within this distance of the largest evidence are candidates (two thirds of the true ones are); the
+slowest is chosen."""
 FLOORS = (FLOOR_M, FLOOR_RAD)
+"""Smallest standard deviations of position [m] and rotation [rad] at which correlation is looked for."""
 WRONG = 9.0
-"""Windows whose mean square is so many times the median's hold more than errors: a contact, or an outlier."""
+"""Ratio of a window's mean square to the median over windows above which it holds more than noise: a contact or an
+outlier."""
 ENOUGH = 60
-"""So few numbers beside the polynomials tell nothing."""
+"""Minimum number of residual degrees of freedom of all windows for an estimate."""
+ROBUST_SCALE = 3.0
+"""Scale of the robust loss with which windows are fitted, in sigmas."""
+MOST_CORRELATED = 0.98
+"""Maximum correlation from frame to frame."""
 
 
-class Lasting(NamedTuple):
-    """Share of the variance that lasts, and the time [s] in which it is forgotten to 1/e.
-
-    size: standard deviation that goes with these, in units of the likeliest one, which is that of the tracks: windows
-    tell what is new in each frame much better than how much lasts.
-    """
+class CorrelatedNoise(NamedTuple):
+    """Noise of one kind: an Ornstein-Uhlenbeck process plus white noise."""
 
     share: float = 0.0
+    """Share of the variance that is correlated."""
     time_s: float = 1.0
+    """Correlation time [s], in which the correlation falls to 1/e."""
     size: float = 1.0
+    """Standard deviation of this model in units of the likeliest model's, which is that of the tracks: windows
+    determine the innovation of each frame much better than the correlated share."""
 
 
-class Memory(NamedTuple):
-    """Of the errors of positions and of rotations."""
+class NoiseModel(NamedTuple):
+    """Noise models of positions and of rotations."""
 
-    position: Lasting = Lasting()
-    rotation: Lasting = Lasting()
-
-
-FORGETFUL = Memory()
-"""Errors that do not last."""
+    position: CorrelatedNoise = CorrelatedNoise()
+    """Noise of the positions."""
+    rotation: CorrelatedNoise = CorrelatedNoise()
+    """Noise of the rotations."""
 
 
-def without_memory(rows: Tensor, times_s: Tensor, mask: Tensor, lasting: Lasting) -> Tensor:
+WHITE = NoiseModel()
+"""Uncorrelated noise."""
+
+
+def innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
     """Return residuals as innovations over their standard deviations: what each frame adds to those before it.
 
-    Those of errors that last as given are independent and of variance 1 (Kalman 1960).
+    For noise of the given model they are independent and of variance 1 (Kalman 1960).
 
     Args:
         rows: Residuals in sigmas, or their derivatives, (B, T, ...); 0 where a frame does not count.
-        times_s: Of the frames (B, T).
-        mask: Which of them count (B, T).
-        lasting: The errors.
+        times_s: Frame times (B, T).
+        mask: Frames that count (B, T).
+        noise: The noise model.
     """
-    share = lasting.share
-    kept = torch.exp(-times_s.diff(dim=1) / lasting.time_s)
-    rows = rows / lasting.size
+    share = noise.share
+    kept = torch.exp(-times_s.diff(dim=1) / noise.time_s)
+    rows = rows / noise.size
     variance, expected = torch.full_like(times_s[:, 0], share), torch.zeros_like(rows[:, 0])
     found = []
     for frame in range(rows.shape[1]):
         counted = mask[:, frame] > 0
         spread = variance + 1 - share
         gain = torch.where(counted, variance / spread, torch.zeros_like(spread))
-        away = rows[:, frame] - expected * _beside(counted.to(rows), rows)
-        found.append(away * _beside(torch.where(counted, spread.rsqrt(), torch.ones_like(spread)), rows))
+        away = rows[:, frame] - expected * _expanded(counted.to(rows), rows)
+        found.append(away * _expanded(torch.where(counted, spread.rsqrt(), torch.ones_like(spread)), rows))
         if frame < rows.shape[1] - 1:
             factor = kept[:, frame]
-            expected = _beside(factor, rows) * (expected + _beside(gain, rows) * away)
+            expected = _expanded(factor, rows) * (expected + _expanded(gain, rows) * away)
             variance = factor.square() * variance * (1 - gain) + share * (1 - factor.square())
     return torch.stack(found, 1)
 
 
-def _beside(values: Tensor, rows: Tensor) -> Tensor:
+def _expanded(values: Tensor, rows: Tensor) -> Tensor:
     """Return values (B,) in the shape of a frame of rows (B, T, ...)."""
     return values.view(-1, *[1] * (rows.ndim - 2))
 
 
-def memory_of(whole: Observations, flight: Sequence[Segment]) -> tuple[Memory, tuple[float | None, float | None]]:
-    """Return how long the errors of tracks last, from flight and without any model, and their standard deviations.
+def estimate_noise_model(
+    whole: Observations, flight: Sequence[Segment]
+) -> tuple[NoiseModel, tuple[float | None, float | None]]:
+    """Estimate how the tracks' errors in flight are correlated, without any motion model, and how large they are.
 
-    Positions and rotations tell of it together: what makes one of them last, a filter, does so to the other.
+    The evidence of positions and rotations is added, because a filter correlates both.
 
     Returns:
-        The memory; standard deviations of position [m] and rotation [rad], None of those that do not last.
+        The noise model; standard deviations of position [m] and rotation [rad], None for uncorrelated ones.
     """
-    found = [_lasting(whole, flight, kind) for kind in (0, 1)]
+    found = [_likeliest(whole, flight, kind) for kind in (0, 1)]
     if sum(one.evidence for one in found) < SURE:
-        return FORGETFUL, (None, None)
-    # what is exact but for rounding errs alike from frame to frame, too
+        return WHITE, (None, None)
+    # rounding errors of exact values are correlated from frame to frame, too
     sure = [one.evidence > SURE_ALONE and one.std > floor for one, floor in zip(found, FLOORS, strict=True)]
     if not any(sure):
-        return FORGETFUL, (None, None)
-    lasting = Memory(*(one.lasting if yes else Lasting() for one, yes in zip(found, sure, strict=True)))
+        return WHITE, (None, None)
+    noise = NoiseModel(*(one.noise if yes else CorrelatedNoise() for one, yes in zip(found, sure, strict=True)))
     position, rotation = (one.std if yes else None for one, yes in zip(found, sure, strict=True))
-    return lasting, (position, rotation)
+    return noise, (position, rotation)
 
 
-def told_memory(memory: Memory) -> str:
-    """Say how long errors last, and what follows."""
+def noise_model_warnings(memory: NoiseModel) -> str:
+    """Return a warning that says how long errors are correlated, and what follows."""
     times = [
-        f"those of {name} for {1e3 * lasting.time_s:.0f} ms"
-        for name, lasting in zip(("position", "rotation"), memory, strict=True)
-        if lasting.share
+        f"{name}: {1e3 * noise.time_s:.0f} ms"
+        for name, noise in zip(("position", "rotation"), memory, strict=True)
+        if noise.share
     ]
     return (
-        f"errors of the tracks last from frame to frame, {' and '.join(times)}, as of smoothed tracks: they are "
-        "counted as such, and so much less is seen of slow forces. Give tracks as they were measured, if there are any."
+        f"the tracking errors are correlated in time ({', '.join(times)}), as after smoothing. This is modelled, which "
+        "makes slow forces harder to detect. Use unsmoothed tracks if you have them."
     )
 
 
-def _lasting(whole: Observations, flight: Sequence[Segment], kind: int) -> _Found:
-    """Return the likeliest memory of positions (kind 0) or rotations (1).
+def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Found:
+    """Return the likeliest noise model of positions (kind 0) or rotations (1).
 
-    Restricted maximum likelihood (Patterson & Thompson 1971): of what a polynomial leaves of every window.
+    Restricted maximum likelihood (Patterson & Thompson 1971): of the residuals of a polynomial in every window.
     """
     windows = _windows(whole, flight, kind)
     if sum(w.left.size for w in windows) < ENOUGH:
-        return _Found(Lasting(), 0.0, 0.0)
+        return _Found(CorrelatedNoise(), 0.0, 0.0)
     sizes = np.concatenate([(w.left**2).mean((1, 2)) for w in windows])
     kept = [w.without(WRONG * float(np.median(sizes))) for w in windows]
     windows = [w for w in kept if len(w.left)]
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
-    alone = _likelihood(windows, Lasting())[0]
+    alone = _likelihood(windows, CorrelatedNoise())[0]
     tried = []
     for remembered, share in itertools.product(REMEMBERED, SHARES):
-        lasting = Lasting(share, -step / math.log(remembered))
-        likelihood, std = _likelihood(windows, lasting)
+        noise = CorrelatedNoise(share, -step / math.log(remembered))
+        likelihood, std = _likelihood(windows, noise)
         slow = std**2 * (1 - share + share * (1 + remembered) / (1 - remembered))
-        tried.append((2 * (likelihood - alone), slow, lasting, std))
+        tried.append((2 * (likelihood - alone), slow, noise, std))
     most, _, _, likeliest = max(tried)
-    # what forces are found by is the slow part of the errors, which windows show least: rather too much of it
-    likely = [(slow, lasting, std) for evidence, slow, lasting, std in tried if evidence > most - LIKELY]
-    _, lasting, std = max(likely)
-    return _Found(lasting._replace(size=std / likeliest), likeliest, most)
+    # forces are found from slow changes, where windows show the errors least: the larger slow part is the safe choice
+    likely = [(slow, noise, std) for evidence, slow, noise, std in tried if evidence > most - LIKELY]
+    _, noise, std = max(likely)
+    return _Found(noise._replace(size=std / likeliest), likeliest, most)
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Errors of one kind: lasting; std of one frame [m or rad]; evidence: twice the log-likelihood gained."""
+    """The noise of one kind."""
 
-    lasting: Lasting
+    noise: CorrelatedNoise
+    """The likeliest noise model."""
     std: float
+    """Standard deviation of one frame [m or rad]."""
     evidence: float
+    """Twice the gain in log-likelihood over white noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows of n frames each (W): times (W, n) [s]; basis (W, n, m) of what no polynomial holds; left (W, m, c)."""
+    """Windows (W) of n frames each, projected on what no polynomial of the degree contains (m dimensions)."""
 
     times_s: Array
+    """Frame times, shape (W, n) [s]."""
     basis: Array
+    """Orthonormal complement of the polynomials, shape (W, n, m)."""
     left: Array
+    """Projected measurements, shape (W, m, c) [m or rad]."""
 
     def without(self, above: float) -> _Windows:
+        """Return the windows whose mean square is at most a limit."""
         kept = (self.left**2).mean((1, 2)) <= above
         return _Windows(self.times_s[kept], self.basis[kept], self.left[kept])
 
 
-def _likelihood(windows: Sequence[_Windows], lasting: Lasting) -> tuple[float, float]:
-    """Return the largest restricted log-likelihood of errors that last as given, and their standard deviation."""
+def _likelihood(windows: Sequence[_Windows], noise: CorrelatedNoise) -> tuple[float, float]:
+    """Return the largest restricted log-likelihood of a noise model, and its standard deviation."""
     square, logs, count = 0.0, 0.0, 0
     for w in windows:
         gap = np.abs(w.times_s[:, :, None] - w.times_s[:, None])
-        together = lasting.share * np.exp(-gap / lasting.time_s) + (1 - lasting.share) * np.eye(gap.shape[1])
+        together = noise.share * np.exp(-gap / noise.time_s) + (1 - noise.share) * np.eye(gap.shape[1])
         factor = np.linalg.cholesky(np.swapaxes(w.basis, 1, 2) @ together @ w.basis)
         white = np.linalg.solve(factor, w.left)
         square += float((white**2).sum())
@@ -204,6 +229,7 @@ def _likelihood(windows: Sequence[_Windows], lasting: Lasting) -> tuple[float, f
 
 
 def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[_Windows]:
+    """Return the windows of all flights, grouped by length and degree."""
     mask = (whole.seen, whole.turned)[kind]
     found: dict[tuple[int, int, int], list[tuple[Array, Array, Array]]] = {}
     for segment in flight:
@@ -229,7 +255,7 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[
 
 
 def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[int, int]:
-    """Return how many frames a window of a flight has, and the degree of its polynomials."""
+    """Return the number of frames of the windows of a flight, and the degree of its polynomials."""
     if len(frames) < LEAST_DEGREE + 1 + LEAST:
         return 0, LEAST_DEGREE
     times, known = whole.times_s[episode, frames], frames[whole.turned[episode, frames, column] > 0]
@@ -248,4 +274,66 @@ def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind
 
 
 def _circle_left(turn: float, degree: int) -> float:
+    """Return the residual of a unit circle over a turn [rad] after its Chebyshev series of a degree."""
     return 2 * (turn / 4) ** (degree + 1) / math.factorial(degree + 1)
+
+
+@dataclass(frozen=True)
+class WindowErrors:
+    """Variance and lag-one autocorrelation of the residuals of fitted windows (B).
+
+    A model that misses something bends a whole episode, and smoothed tracks have similar errors for several frames. As
+    for a first-order autoregression of correlation rho from frame to frame, (1 - rho) / (1 + rho) of the frames count.
+    """
+
+    chi2: Array
+    """Weighted sum of squares, shape (B,)."""
+    count: Array
+    """Weighted number of residuals less those of the state, shape (B,)."""
+    kind: NDArray[np.int64]
+    """1 for ends of episodes, 0 for other windows, shape (B,)."""
+    inflation: Array
+    """Variance inflation (1 + rho) / (1 - rho) by kind, shape (2,)."""
+
+    @property
+    def independent(self) -> Array:
+        """Effective sample size (B,) of each window."""
+        return self.count / self.inflation[self.kind]
+
+    def factor(self, numbers: int) -> tuple[float, float]:
+        """Return the factor, at least 1, by which the error variance exceeds the assumed one, and its dof.
+
+        Args:
+            numbers: Count of fitted parameters, without the states.
+        """
+        dof = max(float(self.independent.sum()) - numbers, 1.0)
+        return max(float(self.chi2.sum()) / dof, 1.0), dof
+
+    @staticmethod
+    def of(rows: Tensor, solution: Solution, batch: Observations, ends: NDArray[np.bool_]) -> WindowErrors:
+        """Measure the residuals of fitted windows.
+
+        Args:
+            rows: Residuals (B, F, 6) at the solution, in assumed standard deviations.
+            solution: Of the fit, which weighted them robustly.
+            batch: The windows.
+            ends: Windows (B,) that are ends of episodes: their errors are estimated separately.
+        """
+        weight = (1 / (1 + solution.chi2 / ROBUST_SCALE**2)).unflatten(1, (-1, len(batch.free)))
+        r = rows.unflatten(1, (-1, len(batch.free)))
+        known = torch.cat(
+            (batch.seen[..., None] * batch.measured_axes[:, None], batch.turned[..., None].expand(-1, -1, -1, 3)), -1
+        )
+        count = (weight[..., None] * known).sum(1)
+        count = (count - 2 * (known.sum(1) > 0)).clamp_min(0.0).sum((1, 2))
+        chi2 = (weight[..., None] * r.square() * known).sum((1, 2, 3))
+        pairs = torch.minimum(weight[:, 1:], weight[:, :-1])[..., None] * known[:, 1:] * known[:, :-1]
+        product = (pairs * r[:, 1:] * r[:, :-1]).sum((1, 2, 3))
+        square = 0.5 * (pairs * (r[:, 1:].square() + r[:, :-1].square())).sum((1, 2, 3))
+        kind = ends.astype(np.int64)
+        inflation = np.ones(2)
+        for k in np.unique(kind):
+            rho = float(product[kind == k].sum() / square[kind == k].sum().clamp_min(1e-300))
+            rho = min(max(rho, 0.0), MOST_CORRELATED)
+            inflation[k] = (1 + rho) / (1 - rho)
+        return WindowErrors(chi2.numpy(), count.numpy(), kind, inflation)

@@ -1,4 +1,4 @@
-"""Initial states: estimated by the model from the first frames of an episode, never past its first contact."""
+"""Initial states, estimated by the model from the first frames of an episode and never past its first contact."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..physics.distance import union_distance
-from ..physics.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ..optimization.levenberg_marquardt import Solution, minimise
+from ..physics.smooth_distance import union_distance
 from ..physics.world import World
-from .least_squares import Solution, minimise
 from .observations import START_FRAMES, Observations, straight_line
-from .trajectory import STATE_SIZE, TrajectoryResiduals, retract, state_prior
+from .residuals import STATE_SIZE, TrajectoryResiduals, retract, state_prior
 
 MIN_FRAMES = 4
-"""The warm-up has at least this many frames."""
+"""Minimum number of frames of the warm-up."""
 FLIGHT_MARGIN_M = 0.003
-"""A body this far from contact, plus three quarters of its last move, has not touched since the frame before."""
+"""Gap [m] that, plus three quarters of its last change, excludes a contact since the frame before."""
 
 LINE_MISFIT = 2.0
-"""Frames lie on a straight line where their mean square misfit is below this, in units of the noise."""
+"""Maximum mean square residual, in units of the noise variance, of frames that lie on a straight line."""
 LINE_SPREAD = 2.0
-"""Where they do, the velocity in contact may differ from the line's by this many of its standard deviations."""
+"""Prior standard deviation of a velocity in contact about that of such a line, in standard errors of the line."""
 
 
 def clearance(world: World, observations: Observations) -> Tensor:
-    """Return the smallest gap of any free body to the ground or to a driven or fixed body (B, T) [m], as measured."""
+    """Return the smallest measured gap (B, T) [m] of any free body to the ground or to a kinematic or fixed body."""
     gaps = []
     for column, index in enumerate(observations.free):
         body = world.bodies[index]
@@ -49,7 +49,7 @@ def clearance(world: World, observations: Observations) -> Tensor:
 
 
 def flight_frames(world: World, observations: Observations) -> Tensor:
-    """Return which frames (B, T) come before an item's first contact."""
+    """Return the frames (B, T) before each item's first contact."""
     gap = clearance(world, observations)
     move = torch.zeros_like(gap)
     move[:, 1:] = gap.diff(dim=1).abs()
@@ -58,14 +58,14 @@ def flight_frames(world: World, observations: Observations) -> Tensor:
 
 
 def warmup_frames(world: World, observations: Observations, warmup_s: float) -> Tensor:
-    """Return which frames (B, T) are the warm-up: its length or four frames, cut at the first contact from flight."""
+    """Return the frames (B, T) of the warm-up: its length or four frames, cut at the first contact after flight."""
     time = observations.times_s - observations.times_s[:, :1]
     measured = observations.seen.amax(-1) > 0
     early = time <= warmup_s + 1e-9
     first = measured.to(torch.int64).cumsum(1) <= MIN_FRAMES
     wanted = (early | first) & measured
     flight = flight_frames(world, observations)
-    two = measured.to(torch.int64).cumsum(1) <= 2  # a velocity needs two frames, whatever they hold
+    two = measured.to(torch.int64).cumsum(1) <= 2  # a velocity needs two frames, in flight or not
     return torch.where(flight[:, :1], wanted & (flight | two), wanted)
 
 
@@ -103,10 +103,10 @@ def estimate_states(
 
 
 def _information(world: World, warm: Observations, noise: tuple[float, float]) -> Tensor:
-    """Return the information (B, S) of the prior on state changes, tighter for what moves evenly while it touches.
+    """Return the information (B, S) of the prior on state changes, tighter for a body in contact that moves evenly.
 
-    Contact takes a velocity away at once, so that later frames do not tell it: the fit would spend it on the noise of
-    the first frame, and a body at rest would start with a hop.
+    Contact removes a velocity at once, so that later frames do not determine it: the fit would use it to follow the
+    noise of the first frame, and a body at rest would start with a hop.
     """
     bodies = len(warm.free)
     information = state_prior(bodies).to(world.gravity).repeat(len(warm.names), 1)

@@ -1,4 +1,4 @@
-"""The noise of the tracks, measured on flight without any model, and the frames that are no measurement at all."""
+"""Noise of the tracks, measured in flight without any motion model, and detection of wrong measurements."""
 
 from __future__ import annotations
 
@@ -9,33 +9,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..estimation.noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, moves
-from ..estimation.observations import Observations
-from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
-from .cuts import Segment
+from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from .observations import Observations
+from .segmentation import Segment
+from .track_noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, moves
 
 WINDOW = 9
 """Frames of a window that a cubic follows in free flight: 0.09 s at 100 Hz, within 0.1 mm for 6 mm at 20 rad/s."""
 DEGREE = 3
+"""Degree of the polynomial that is removed from a window."""
 SLOW_DEGREE = 7
-"""Orders from the fourth to this one of a window hold slow errors and next to nothing of a flight."""
+"""Orders from the fourth to this one contain slow errors of a window and almost nothing of the flight."""
 OUTLIER_SIGMAS = 6.0
-"""A frame so far from the cubic through the others of its window is no measurement: 2e-9 of normal ones lie there."""
+"""Distance, in sigmas, from the cubic through the other frames of a window above which a frame is a wrong measurement;
+2e-9 of normal errors lie there."""
 KEEP_SIGMAS = 4.0
+"""Residuals above this many sigmas of a first, robust estimate are left out of the final one."""
 SURE_SIGMAS = 2.5
-"""So many standard errors beyond chance are neighbouring frames' errors taken for correlated."""
+"""Minimum excess of the correlation of neighbouring frames, in standard errors, to count as correlated."""
 MOST_CORRELATED = 0.95
+"""Maximum correlation from frame to frame that is considered."""
 ENOUGH = 60
-"""So few residuals give a standard deviation within 10 %."""
+"""Minimum number of residuals for an estimate, which then has a standard error of 10 %."""
 
 
 def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float | None, float | None]:
-    """Return the standard deviations of position [m] and rotation [rad], per axis; None where too little is flight.
+    """Return the standard deviations of position [m] and rotation [rad] by axis; None with too little flight.
 
-    Each window of consecutive frames is fitted by a cubic; residuals are scaled to the same variance, those beyond
-    `KEEP_SIGMAS` of a first, robust estimate are left out. Windows of a body whose orientation was measured are short:
-    turning about a point beside its centre of mass, it does not follow a long cubic. A cubic follows a part of errors
-    that last for several frames, as those of smoothed tracks do: the standard deviation is that of all of them.
+    Each window of consecutive frames is fitted by a cubic; residuals are scaled to the same variance, and those beyond
+    `KEEP_SIGMAS` of a first, robust estimate are left out. Windows of a body with measured orientation are short,
+    because a point away from its centre of mass does not follow a long cubic. A cubic follows a part of errors that are
+    correlated over several frames, such as those of smoothed tracks; the result is the standard deviation of the full
+    errors.
     """
     position, rotation = _residuals(whole, flight)
     found = [_spread(position, FLOOR_M), _spread(rotation, FLOOR_RAD)]
@@ -47,10 +52,10 @@ def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float 
 
 
 def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
-    """Return by what factor the variance of slow errors of a centroid exceeds that of all; 1 where it is unknown.
+    """Return the factor by which the variance of slow errors of a centroid exceeds that of all; 1 where it is unknown.
 
-    Independent errors have the same variance in every orthogonal polynomial over a window; those that last for many
-    frames have more in the low orders, which are what forces are found by.
+    Independent errors have the same variance in every orthogonal polynomial over a window; errors correlated over many
+    frames have more in the low orders, which identify forces.
     """
     slow, all_orders = [], []
     for segment in flight:
@@ -67,21 +72,21 @@ def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
                 left = values - q[:, : DEGREE + 1] @ (q.T @ values)[: DEGREE + 1]
                 slow.append((parts**2).mean())
                 all_orders.append((left**2).sum() / (len(t) - DEGREE - 1) / values.shape[1])
-    # medians: a window with a bounce or an outlier in it shall not count for more than others
+    # medians, so that a window with a bounce or an outlier does not dominate
     return max(1.0, float(np.median(slow) / max(np.median(all_orders), FLOOR_M**2))) if len(slow) >= 10 else 1.0
 
 
 def without_outliers(
     whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]
 ) -> tuple[Observations, int, Tensor]:
-    """Return the episodes without wrong measurements in flight, how many there were, and where flight is none.
+    """Remove wrong measurements in flight, and find flight frames in which something touched the body.
 
-    A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen. Where the
-    others of a window do not lie on a cubic either, something touched: a bounce on a ground that is not where it was
-    said to be, or a hand.
+    A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen. Where the other
+    frames of a window do not lie on a cubic either, something touched the body: a bounce on a ground at another height
+    than stated, or a hand.
 
     Returns:
-        The episodes; the number of wrong measurements; frames (E, T) of flight in which something touched.
+        The episodes; the number of wrong measurements; frames (E, T) of flight in which something touched the body.
     """
     seen, turned = whole.seen.clone(), whole.turned.clone()
     kinked = torch.zeros_like(seen[..., 0], dtype=torch.bool)
@@ -107,9 +112,9 @@ def without_outliers(
 
 
 def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: float) -> float:
-    """Return by what factor errors exceed those that do not depend on each other, of the same residuals; 1 for these.
+    """Return the ratio of the standard deviation of correlated errors to that of independent ones with equal residuals.
 
-    With r = Q e, Q the projector on what a cubic leaves of a window, and errors e of correlation rho^|i-j|, C: the
+    With r = Q e, Q the projector on the residuals of a cubic in a window, and errors e of correlation rho^|i-j|, C: the
     expectation of r'r is tr(QC), that of r'Lr, neighbours multiplied, is tr(QLQC); their ratio gives rho.
     """
     t = np.linspace(-1, 1, WINDOW)
@@ -146,6 +151,7 @@ def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: fl
 
 
 def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the scaled residuals of positions [m] and of rotations [rad] of all windows."""
     found = []
     for kind in (0, 1):
         parts = [
@@ -186,12 +192,13 @@ def _frames(whole: Observations, segment: Segment, column: int, kind: int) -> li
 
 
 def _positions(whole: Observations, episode: int, column: int, frames: Tensor) -> np.ndarray:
-    """Return the measured coordinates (n, 1 to 3) [m]: those that ever change in the episode."""
+    """Return the measured coordinates (n, 1 to 3) [m]: those that change anywhere in the episode."""
     measured = whole.position_m[episode, whole.seen[episode, :, column] > 0, column].numpy()
     return whole.position_m[episode, frames, column].numpy()[:, moves(measured)]
 
 
 def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> np.ndarray:
+    """Return the residuals of a cubic (n, 1 to 3) [m or rad], scaled to equal variance."""
     t = whole.times_s[episode, frames].numpy()
     if kind == 0:
         values = _positions(whole, episode, column, frames)
@@ -205,6 +212,7 @@ def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind:
 
 
 def _spread(residuals: np.ndarray, floor: float) -> float | None:
+    """Return the standard deviation without outliers, at least a floor; None for too few residuals."""
     if len(residuals) < ENOUGH:
         return None
     first = MAD_TO_STD * float(np.median(np.abs(residuals)))

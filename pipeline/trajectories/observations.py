@@ -1,4 +1,4 @@
-"""Measured motions as a batch: windows of episodes on their own time grids, padded to one length."""
+"""Measured motion as a batch: windows of episodes on their own time grids, padded to one length."""
 
 from __future__ import annotations
 
@@ -10,49 +10,57 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..physics.driven import Drive
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.tracks import Track
+from ...schemas import InputDataError
+from ..geometry.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
+from ..physics.kinematic import Drive
 from ..physics.parameters import with_own
-from ..physics.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
 from ..physics.world import State, World
-from .noise import moves
+from .track_noise import moves
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
 
 START_FRAMES = 4
-"""The first guess of an item's state is a straight line through this many frames."""
+"""Number of frames of the straight line that is the first guess of an item's state."""
+LONGEST_STEP_S = 0.2
+"""Maximum median time between frames [s]: slower tracks show no flight, and times in milliseconds look slower."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Observations:
-    """A batch of measured windows.
-
-    names (B): episode of each item; times_s (B, T): frame times, padded beyond an item's end; position_m
-    (B, T, nf, 3) and quat_wxyz (B, T, nf, 4) of the free bodies' frames; seen, turned (B, T, nf): 1 where the position,
-    the orientation was measured, 0 elsewhere; drives: commands by driven body; state (B, nb): first guess of the
-    states at times_s[:, 0]; free (nf): indices of the free bodies; measured_axes
-    (B, nf, 3): 1 for coordinates that were measured, which are those that ever change in the track; own: values (B,) of
-    effects' parameters that each item has for its own, by `effect.parameter`.
-    """
+    """A batch of measured windows (B items, T frames, nf free bodies)."""
 
     names: tuple[str, ...]
+    """Episode of each item (B)."""
     times_s: Tensor
+    """Frame times, padded beyond an item's end, shape (B, T) [s]."""
     position_m: Tensor
+    """Positions of the free bodies' frames, world, shape (B, T, nf, 3)."""
     quat_wxyz: Tensor
+    """Orientations of the free bodies' frames, body to world, shape (B, T, nf, 4)."""
     seen: Tensor
+    """1 where the position was measured, 0 elsewhere, shape (B, T, nf)."""
     turned: Tensor
+    """1 where the orientation was measured, 0 elsewhere, shape (B, T, nf)."""
     drives: dict[str, Drive]
+    """Commands by kinematic body."""
     state: State
+    """First guess of the states of all bodies (B, nb) at the first frames."""
     free: tuple[int, ...]
+    """Indices of the free bodies (nf)."""
     measured_axes: Tensor
+    """1 for measured coordinates, which are those that change anywhere in the track, shape (B, nf, 3)."""
     own: dict[str, Tensor] = field(default_factory=dict)
+    """Group-specific values (B,) of effects' parameters, by `effect.parameter`."""
 
     def with_own(self, world: World) -> Observations:
-        """Return the items with the own numbers that a world has of their episodes."""
+        """Return the items with the group-specific parameters that a world has for their episodes."""
         return replace(self, own=_own(world, self.names))
 
     def world(self, world: World, repeats: int = 1) -> World:
-        """Return a world with the items' own numbers, for the batch repeated so many times."""
+        """Return a world with the items' group-specific parameters, for the batch repeated `repeats` times."""
         return with_own(world, self.own, repeats)
 
     @property
@@ -80,17 +88,17 @@ class Observations:
         }
         free = tuple(world.free)
         partial = Observations(
-            tuple(row.name for row in rows),
-            times,
-            position,
-            quat,
-            seen,
-            turned,
-            drives,
-            _resting(world, len(rows)),
-            free,
-            torch.as_tensor(np.stack([row.axes for row in rows])).to(like),
-            _own(world, [row.name for row in rows]),
+            names=tuple(row.name for row in rows),
+            times_s=times,
+            position_m=position,
+            quat_wxyz=quat,
+            seen=seen,
+            turned=turned,
+            drives=drives,
+            state=_resting(world, len(rows)),
+            free=free,
+            measured_axes=torch.as_tensor(np.stack([row.axes for row in rows])).to(like),
+            own=_own(world, [row.name for row in rows]),
         )
         return replace(partial, state=first_state(world, partial))
 
@@ -106,7 +114,7 @@ class Observations:
 
 
 def _own(world: World, names: Sequence[str]) -> dict[str, Tensor]:
-    """Return the own values (B,) of episodes by parameter; those that have none have the world's."""
+    """Return group-specific values (B,) of episodes by parameter; the world's common value where there is none."""
     numbers = sorted({number for values in world.own.values() for number in values})
     common = {f"{a.effect.name}.{key}": float(value[0]) for a in world.effects for key, value in a.values.items()}
     return {
@@ -116,18 +124,28 @@ def _own(world: World, names: Sequence[str]) -> dict[str, Tensor]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Row:
+    """One window of one episode as arrays (T frames, nf free bodies)."""
+
     name: str
+    """Name of the episode."""
     times: np.ndarray
+    """Frame times, shape (T,) [s]."""
     position: np.ndarray
+    """Positions, world, shape (T, nf, 3) [m]."""
     quat: np.ndarray
+    """Orientations, body to world, w first, shape (T, nf, 4)."""
     seen: np.ndarray
+    """1 where the position was measured, shape (T, nf)."""
     turned: np.ndarray
+    """1 where the orientation was measured, shape (T, nf)."""
     axes: np.ndarray
+    """1 for measured coordinates, shape (nf, 3)."""
 
     @staticmethod
     def of(world: World, name: str, tracks: dict[str, Track], window: tuple[float, float]) -> _Row:
+        """Cut a window [s] from the tracks of an episode, on the union of their frame times."""
         bodies = [world.bodies[index].name for index in world.free]
         cut = {body: tracks[body].window(*window) for body in bodies if body in tracks}
         times = np.unique(np.concatenate([track.time_s for track in cut.values()]))
@@ -142,9 +160,10 @@ class _Row:
                 measured = cut[body].quat_wxyz
                 if measured is not None:
                     quat[at, column], turned[at, column] = measured, 1.0
-        return _Row(name, times, position, quat, seen, turned, axes)
+        return _Row(name=name, times=times, position=position, quat=quat, seen=seen, turned=turned, axes=axes)
 
     def padded(self, length: int) -> _Row:
+        """Return the window extended to a length: the last values repeated, marked as not measured."""
         extra = length - len(self.times)
         step = np.diff(self.times).mean() if len(self.times) > 1 else 1.0
         times = np.concatenate((self.times, self.times[-1] + step * np.arange(1, extra + 1)))
@@ -154,13 +173,13 @@ class _Row:
 
         zero = np.zeros((extra, self.seen.shape[1]))
         return _Row(
-            self.name,
-            times,
-            pad(self.position),
-            pad(self.quat),
-            np.concatenate((self.seen, zero)),
-            np.concatenate((self.turned, zero)),
-            self.axes,
+            name=self.name,
+            times=times,
+            position=pad(self.position),
+            quat=pad(self.quat),
+            seen=np.concatenate((self.seen, zero)),
+            turned=np.concatenate((self.turned, zero)),
+            axes=self.axes,
         )
 
 
@@ -186,7 +205,7 @@ def first_state(world: World, observations: Observations) -> State:
 def straight_line(t: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return value at 0 and slope (3,) of the straight line through values (n, 3) at t (n,), by least squares.
 
-    By its formula: LAPACK's solution now and then differs in the last bit from one call to the next.
+    In closed form: LAPACK's solution sometimes differs in the last bit from one call to the next.
     """
     middle, mean = t.mean(), values.mean(0)
     away = (t - middle)[:, None]
@@ -195,7 +214,7 @@ def straight_line(t: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _resting(world: World, batch: int) -> State:
-    """Return all bodies unturned and at rest: fixed ones where they stand, the others at the origin of the world."""
+    """Return all bodies unrotated and at rest: fixed ones at their place, the others at the origin of the world."""
     like = world.gravity
     zero = torch.zeros(batch, len(world.bodies), 3).to(like)
     position, quat = zero.clone(), matrix_to_quat(torch.eye(3).to(like)).expand(batch, len(world.bodies), 4).clone()
@@ -203,3 +222,38 @@ def _resting(world: World, batch: int) -> State:
         if body.motion == "fixed" and body.place is not None:
             position[:, index], quat[:, index] = body.place[:, :3], body.place[:, 3:]
     return State(position, quat, zero, zero)
+
+
+def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
+    """Return the episodes of a split that have tracks of a free body.
+
+    Raises:
+        InputDataError: If none has.
+    """
+    free = {body.name for body in capture.manifest.bodies if body.motion == "free"}
+    episodes = [(name, capture.tracks(name)) for name in capture.episodes(split)]
+    usable = [(name, tracks) for name, tracks in episodes if free & set(tracks)]
+    if not usable:
+        raise InputDataError(
+            f"{capture.root}: none of the {len(episodes)} episodes of split '{split}' has a track of a free body.",
+            "tracks/<episode>.csv with rows for a body whose motion is 'free'.",
+            "add tracks, or fit from the videos: --supervise images.",
+        )
+    refuse_slow_times([t[b] for _, t in usable for b in free if b in t], str(capture.root))
+    return usable
+
+
+def refuse_slow_times(tracks: Sequence[Track], where: str) -> None:
+    """Refuse tracks whose frames are too far apart to show a flight.
+
+    Raises:
+        InputDataError: If they are: times are probably in milliseconds.
+    """
+    step = float(np.median(np.concatenate([np.diff(track.time_s) for track in tracks]))) if tracks else 0.0
+    if step > LONGEST_STEP_S:
+        raise InputDataError(
+            f"{where}: the tracks have a frame every {step:.3g} s; if these are milliseconds, they do "
+            "not match the column time_s.",
+            f"at most {LONGEST_STEP_S:g} s.",
+            "write time_s in seconds.",
+        )

@@ -1,4 +1,4 @@
-"""Residuals of rollouts against measured motions, in units of the measurement noise."""
+"""Residuals of rollouts against measured motion, in units of the measurement noise."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..physics.measured import measure
+from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..optimization.forward_mode import batched_jacobian
+from ..physics.observation_model import measure
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
-from ..physics.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..physics.world import State, World
-from .forward import batched_jacobian
 from .observations import Observations
 
 STATE_SIZE = 12
 """Coordinates of a free body's state: position [m], rotation [rad] (body), velocity [m/s], omega_body [rad/s]."""
 STATE_STEPS = (2e-4, 2e-3, 5e-3, 5e-2)
-"""Differences in position [m], rotation [rad], velocity [m/s] and omega [rad/s], where they stand for derivatives."""
+"""Difference steps in position [m], rotation [rad], velocity [m/s] and omega [rad/s], where differences replace
+derivatives."""
 STATE_PRIOR_STD = (0.1, 1.0, 5.0, 30.0)
-"""Spread of the weak prior on these coordinates about the first guess; it holds what was not measured."""
+"""Standard deviations of the weak prior on these coordinates about the first guess; it fixes what was not measured."""
 
 
 def state_prior(bodies: int) -> Tensor:
@@ -43,22 +44,27 @@ def retract(state: State, change: Tensor, free: Sequence[int]) -> State:
 
 @dataclass(frozen=True)
 class TrajectoryResiduals:
-    """The residuals of an open-loop rollout from every item's state: what `least_squares.minimise` wants.
+    """Residuals of an open-loop rollout from every item's state, as `levenberg_marquardt.minimise` takes them.
 
-    Rows are (frame, free body); their six columns are position and rotation, in sigmas. The standard deviations are
-    numbers, or one for every row, shape (B, F, 1). With `differences` the Jacobian is that of differences over
-    `STATE_STEPS`: exact derivatives of a body that rests on many spheres grow by a third in every step of 1 ms, and
-    lead nowhere. Each parameter then needs its `parameter_steps`, how far down and how far up, in fitted coordinates;
-    a step of 0 leaves that side out.
+    Rows are (frame, free body); their six columns are position and rotation, in sigmas.
     """
 
     world: World
+    """The world in which the items move."""
     parameters: Sequence[Parameter]
+    """Parameters of the world that are varied (P)."""
     observations: Observations
+    """The measured motion (B)."""
     position_std_m: float | Tensor
+    """Standard deviation of positions [m], or one for every row, shape (B, F, 1)."""
     rotation_std_rad: float | Tensor
+    """Standard deviation of rotations [rad], or one for every row, shape (B, F, 1)."""
     differences: bool = False
+    """Whether the Jacobian is that of differences over `STATE_STEPS`: exact derivatives of a body that rests on many
+    spheres grow by a third in every step of 1 ms, and are useless."""
     parameter_steps: Sequence[tuple[float, float]] = ()
+    """With `differences`, how far down and how far up each parameter is moved, in fitted coordinates; 0 leaves that
+    side out."""
 
     def __call__(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
         """Return residuals (B, F, 6) and, if wanted, their Jacobian (B, F, 6, P + S)."""
@@ -70,6 +76,7 @@ class TrajectoryResiduals:
         return value.unflatten(1, (-1, 6)), jacobian.unflatten(1, (-1, 6))
 
     def _exact(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return residuals (B, m) and their exact derivatives (B, m, P + S)."""
         return batched_jacobian(self._residuals, inputs)
 
     def _differenced(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,6 +101,7 @@ class TrajectoryResiduals:
             return self._roll(torch.cat((shared.expand(states.shape[0], -1), states), -1), 1)
 
     def _roll(self, inputs: Tensor, repeats: int) -> Rollout:
+        """Return the rollout, as measured, of inputs (repeats * B, P + S): parameters, then state changes."""
         count = len(self.parameters)
         values = [p.decode(inputs[:, k]) for k, p in enumerate(self.parameters)]
         seen = self.observations
@@ -105,6 +113,7 @@ class TrajectoryResiduals:
         return measure(world, state, seen.times_s.repeat(repeats, 1), drives)
 
     def _residuals(self, inputs: Tensor, repeats: int) -> Tensor:
+        """Return the flat residuals (repeats * B, F * 6) of inputs (repeats * B, P + S)."""
         rollout, seen, free = self._roll(inputs, repeats), self.observations, list(self.observations.free)
         position = rollout.position_m[:, :, free] - seen.position_m.repeat(repeats, 1, 1, 1)
         measured = quat_conjugate(seen.quat_wxyz.repeat(repeats, 1, 1, 1))

@@ -1,33 +1,283 @@
-"""Frames that look like flight and are none: the body is above the ground, and yet it does not fall."""
+"""Segmentation of episodes: long flight segments, short contact segments, and supported frames.
+
+The information about a force grows with the fourth power of the time for which it acts, so flights are cut as little as
+possible; a rollout through contact is a rough function of its start, so contacts are cut short (Bock & Plitt 1984).
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..estimation.observations import Observations
-from ..physics.world import World
-from .cuts import Segment
+from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ..physics.world import Body, World
+from .initial_state import FLIGHT_MARGIN_M, clearance
+from .observations import Observations
 
+if TYPE_CHECKING:
+    from ...datasets.capture.tracks import Track
+
+FLIGHT_S = 0.60
+"""Maximum length [s] of a flight segment; longer flights are cut into equal parts."""
+MIN_FLIGHT_S = 0.06
+"""Minimum length [s] of a flight between two contacts: a shorter one determines no acceleration and belongs to the
+contact."""
+CONTACT_S = 0.10
+"""Maximum length [s] of a contact segment."""
+MIN_FRAMES = 6
+"""Minimum number of frames of a segment: its state uses up the information of two."""
+LEAD_S = 0.03
+"""Length [s] of flight before and after a contact that is included, to determine the velocities before and after."""
+GAP = 2.5
+"""Maximum gap within a segment, in median frame intervals."""
+STILL_SIGMAS = 4.0
+"""Nothing moves in a segment where the means of its halves differ by less than this many standard errors."""
+KEPT_RESTS = 2
+"""Number of segments at rest in a row that are kept."""
+MOVE_SHARE = 0.75
+"""Share of its last or next move by which a point must be away from contact: whatever the bounce, one of its sides lies
+within half a move (study of diagnosis, pitfall P1)."""
+NOISE_SIGMAS = 3.0
+"""Standard errors of the measured heights by which the margin of flight grows."""
 MOST_LIFT = 0.5
-"""Share of gravity: where so much of it does not act, something carries the body. No effect in the air is so strong."""
+"""Maximum difference of an acceleration from gravity, as a share of gravity, for free fall: no effect in the air is
+stronger."""
 SURE_SIGMAS = 5.0
+"""Minimum of that difference in standard errors."""
 
 
-def carried_frames(world: World, whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]) -> Tensor:
-    """Return frames (E, T) of flight segments in which a body's acceleration is far from gravity.
+@dataclass(frozen=True)
+class Segment:
+    """Consecutive frames of an episode."""
 
-    A ground that is not where it was said to be, a marker beside the body's middle or a hand make a body slide or rest
+    episode: int
+    """Index of the episode."""
+    first: int
+    """First frame."""
+    last: int
+    """Last frame, included."""
+
+
+def whole_episodes(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> Observations:
+    """Return all frames of all episodes as one batch."""
+    return Observations.of(world, episodes, [(-torch.inf, torch.inf)] * len(episodes))
+
+
+def cut_episodes(
+    world: World, whole: Observations, noise: tuple[float, float], touched: Tensor | None = None
+) -> tuple[list[Segment], list[Segment], Tensor]:
+    """Cut whole episodes into flight and contact segments.
+
+    Args:
+        world: The world, for shape and ground.
+        whole: The episodes (E).
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
+        touched: Frames (E, T) that are known not to be flight.
+
+    Returns:
+        The flight segments, the contact segments, and the airborne frames (E, T).
+    """
+    clear = clear_frames(world, whole, noise)
+    if touched is not None:
+        clear &= ~touched
+    flight: list[Segment] = []
+    contact: list[Segment] = []
+    for episode, times in enumerate(whole.times_s):
+        seen = torch.nonzero(whole.seen[episode].amax(-1) > 0)[:, 0]
+        begin, end = (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, 0)
+        for start, stop in _stretches(times[begin:end]):
+            first, last = begin + start, begin + stop
+            flies, touches = _cut_stretch(episode, times, clear[episode], first, last)
+            flight += flies
+            contact += touches
+    return flight, without_rest(whole, contact, noise), clear
+
+
+def _cut_stretch(
+    episode: int, times: Tensor, clear: Tensor, first: int, last: int
+) -> tuple[list[Segment], list[Segment]]:
+    """Return the flight and the contact segments of frames `first` to `last` of an episode, which have no gap.
+
+    Args:
+        episode: Its index.
+        times: All its frame times (T,) [s].
+        clear: Airborne frames (T,).
+        first: First frame.
+        last: Last frame, included.
+    """
+    flight: list[Segment] = []
+    contact: list[Segment] = []
+    step = float(times[first : last + 1].diff().median()) if last > first else 1.0
+    runs = _runs(clear[first : last + 1].tolist())
+    flies = [
+        is_clear and b - a + 1 >= MIN_FRAMES and float(times[first + b] - times[first + a]) >= MIN_FLIGHT_S
+        for is_clear, a, b in runs
+    ]
+    for fly, group in itertools.groupby(zip(flies, runs, strict=True), key=lambda pair: pair[0]):
+        spans = [run for _, run in group]
+        a, b = first + spans[0][1], first + spans[-1][2]
+        if fly:
+            flight += [Segment(episode, *part) for part in _parts(a, b, step, FLIGHT_S, share=False)]
+        elif not all(is_clear for is_clear, _, _ in spans):
+            lead = max(1, round(LEAD_S / step))
+            a, b = max(first, a - lead), min(last, b + lead)
+            contact += [Segment(episode, *part) for part in _parts(a, b, step, CONTACT_S, share=True)]
+    return flight, contact
+
+
+def without_rest(whole: Observations, items: Sequence[Segment], noise: tuple[float, float]) -> list[Segment]:
+    """Return the segments without those in which nothing moves, except the first in a row: more add no information."""
+    kept, resting = [], {}
+    for item in items:
+        frames = slice(item.first, item.last + 1)
+        still = True
+        for values, mask, sigma in (
+            (whole.position_m[item.episode, frames], whole.seen[item.episode, frames], noise[0]),
+            (_turns(whole, item), whole.turned[item.episode, frames], noise[1]),
+        ):
+            half = len(values) // 2
+            parts = [
+                (values[p] * mask[p, :, None]).sum(0) / mask[p, :, None].sum(0).clamp_min(1.0)
+                for p in (slice(0, half), slice(half, None))
+            ]
+            limit = STILL_SIGMAS * sigma * (2 / half) ** 0.5
+            still &= bool(((parts[1] - parts[0]).abs() < limit).all())
+        resting[item.episode] = resting.get(item.episode, 0) + 1 if still else 0
+        if resting[item.episode] <= KEPT_RESTS:
+            kept.append(item)
+    return kept
+
+
+def _turns(whole: Observations, item: Segment) -> Tensor:
+    """Return the rotation vectors (T, nf, 3) from the first frame of a segment to each."""
+    quat = whole.quat_wxyz[item.episode, item.first : item.last + 1]
+    return quat_log(quat_multiply(quat_conjugate(quat[:1]), quat))
+
+
+def _stretches(times: Tensor) -> list[tuple[int, int]]:
+    """Return first and last frames of the parts of an episode without a gap."""
+    if len(times) < 2:
+        return []
+    steps = times.diff()
+    cuts = (steps > GAP * steps.median()).nonzero()[:, 0].tolist()
+    edges = [-1, *cuts, len(times) - 1]
+    return [(a + 1, b) for a, b in itertools.pairwise(edges)]
+
+
+def _runs(flags: Sequence[bool]) -> list[tuple[bool, int, int]]:
+    """Return (flag, first, last) of each run of equal flags."""
+    found, start = [], 0
+    for flag, group in itertools.groupby(flags):
+        count = len(list(group))
+        found.append((flag, start, start + count - 1))
+        start += count
+    return found
+
+
+def _parts(first: int, last: int, step_s: float, longest_s: float, share: bool) -> list[tuple[int, int]]:
+    """Cut frames into equal parts of at most a length [s]; with `share`, one ends in the frame that begins the next.
+
+    A contact may happen between two frames: shared ends lose none.
+    """
+    count = last - first + 1
+    if count < MIN_FRAMES:
+        return []
+    most = max(MIN_FRAMES, round(longest_s / step_s) + 1)
+    number = max(1, min(-(-count // most), count // MIN_FRAMES))
+    edges = [first + round(k * (count - (1 if share else 0)) / number) for k in range(number + 1)]
+    if share:
+        return list(itertools.pairwise(edges))
+    return [(a, b - 1) for a, b in itertools.pairwise(edges)]
+
+
+def size_of(body: Body) -> float:
+    """Return the radius [m] of the ball about the body frame's origin that holds the body's spheres."""
+    return float((body.centers[0].square().sum(-1).sqrt() + body.radii[0]).max())
+
+
+def clear_frames(world: World, observations: Observations, noise: tuple[float, float]) -> Tensor:
+    """Return the airborne frames (B, T): surely without contact, also between two frames.
+
+    Args:
+        world: The world; without a ground, kinematic or further free bodies all frames are flight.
+        observations: Whole episodes, or windows of them.
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
+    """
+    clear = observations.seen.amax(-1) > 0
+    if world.ground_normal is not None and world.ground_offset is not None:
+        for column, index in enumerate(observations.free):
+            heights = heights_of(world, world.bodies[index], observations, column)
+            margin = FLIGHT_MARGIN_M + NOISE_SIGMAS * float(np.hypot(noise[0], noise[1] * size_of(world.bodies[index])))
+            clear &= _apart(heights, margin)
+    others = clearance(replace(world, ground_normal=None), observations)
+    if bool(torch.isfinite(others).any()):
+        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise[0])
+    for a in range(len(observations.free)):
+        for b in range(a):
+            reach = size_of(world.bodies[observations.free[a]]) + size_of(world.bodies[observations.free[b]])
+            gap = (observations.position_m[:, :, a] - observations.position_m[:, :, b]).norm(dim=-1) - reach
+            clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise[0])
+    return clear
+
+
+class GroundPlane(NamedTuple):
+    """The ground plane of a world."""
+
+    normal: Tensor
+    """Unit normal (3,), world frame."""
+    offset: Tensor
+    """Height along the normal (B,) [m]."""
+
+    @staticmethod
+    def of(world: World) -> GroundPlane:
+        """Return the ground plane of a world.
+
+        Raises:
+            ValueError: If the world has no ground.
+        """
+        if world.ground_normal is None or world.ground_offset is None:
+            raise ValueError("this world has no ground plane")
+        return GroundPlane(world.ground_normal, world.ground_offset)
+
+
+def heights_of(world: World, body: Body, observations: Observations, column: int) -> Tensor:
+    """Return the heights (B, T, N) [m] of a body's spheres; of its bounding ball where no orientation was measured."""
+    normal, offset = GroundPlane.of(world)
+    origin = observations.position_m[:, :, column] @ normal - offset[0]
+    chosen = slice(None) if body.on_plane is None else body.on_plane
+    along = quat_to_matrix(observations.quat_wxyz[:, :, column]).transpose(-1, -2) @ normal
+    own = origin[..., None] + along @ body.centers[0, chosen].T - body.radii[0, chosen]
+    ball = (origin - size_of(body))[..., None]
+    return torch.where(observations.turned[:, :, column, None] > 0, own, torch.minimum(own, ball))
+
+
+def _apart(gaps: Tensor, margin: float) -> Tensor:
+    """Return the frames (B, T) whose gaps (B, T, N) all exceed the margin and a share of their last and next move."""
+    moves = gaps.diff(dim=1).abs()
+    edge = torch.zeros_like(gaps[:, :1])
+    move = torch.maximum(torch.cat((edge, moves), 1), torch.cat((moves, edge), 1))
+    return (gaps > margin + MOVE_SHARE * move).all(-1)
+
+
+def supported_frames(
+    world: World, whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]
+) -> Tensor:
+    """Return the supported frames (E, T) of flight segments: a body's acceleration is far from gravity.
+
+    A ground at another height than stated, a marker away from the body's middle or a hand make a body slide or rest
     above the ground. The acceleration is that of a parabola through the measured heights, with its standard error.
 
     Args:
         world: For gravity.
         whole: The episodes (E).
         flight: Segments that are clear of the ground.
-        noise: Of the tracks (position [m], rotation [rad]).
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
     """
     found = torch.zeros_like(whole.seen[..., 0], dtype=torch.bool)
     gravity = world.gravity[0]

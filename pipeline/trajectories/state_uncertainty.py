@@ -1,6 +1,6 @@
-"""What the uncertainty of an initial state means for a whole rollout, and the state that fits a whole rollout best.
+"""Effect of the initial state's uncertainty on a whole rollout, and the state that fits a whole rollout best.
 
-Both look at states within the uncertainty of the warm-up's estimate. Rollouts with impacts are rough functions of
+Both evaluate states within the uncertainty of the warm-up's estimate. Rollouts with impacts are rough functions of
 their start, so derivatives are differences over one standard deviation of it, not exact ones at a point.
 """
 
@@ -13,42 +13,40 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..optimization.levenberg_marquardt import robust_loss
 from ..physics.world import World
-from .least_squares import robust_loss
 from .observations import Observations
-from .trajectory import STATE_SIZE, TrajectoryResiduals
+from .residuals import STATE_SIZE, TrajectoryResiduals
 
 MAX_STEP = (0.005, 0.05, 0.1, 0.5)
 """Largest differences in position [m], rotation [rad], velocity [m/s], omega [rad/s], where nothing was measured."""
 DAMPINGS = (0.01, 0.1, 1.0, 10.0, 100.0)
-"""Levenberg-Marquardt dampings, tried side by side, in units of the warm-up's information."""
+"""Levenberg-Marquardt dampings, tried in parallel, in units of the warm-up's information."""
 ROBUST_SCALE = 3.0
+"""Scale of the Cauchy loss, in sigmas."""
 MAX_ITEMS = 128
-"""Rollouts in one batch: more run out of the processor's cache."""
+"""Maximum number of rollouts in one batch: more exceed the processor's cache."""
 
 
 @dataclass(frozen=True)
 class StartUncertainty:
-    """Rollouts from states within the uncertainty of the start, for a batch of episodes.
-
-    Attributes:
-        world: The world.
-        observations: The episodes, their states at the warm-up's estimate.
-        covariance: Of the state changes, shape (B, S, S), S = 12 for each free body.
-        weight: Which frames count, shape (B, T, nf), 1 or 0.
-    """
+    """Rollouts from states within the uncertainty of the start, for a batch of episodes (B)."""
 
     world: World
+    """The world in which the episodes are rolled out."""
     observations: Observations
+    """The episodes, with their states at the warm-up's estimate."""
     covariance: Tensor
+    """Covariance of the state changes, shape (B, S, S), S = 12 for each free body."""
     weight: Tensor
+    """Frames that count, shape (B, T, nf), 1 or 0."""
 
     def noise_floor(self, samples: int, seeds: Sequence[int]) -> Tensor:
         """Return the mean distance (B,) [m] between rollouts from sampled states and the rollout from their mean.
 
         Args:
             samples: Number of samples for each episode.
-            seeds: A number for each episode, so that its samples do not depend on the others.
+            seeds: Seed of each episode, so that its samples do not depend on the others.
         """
         size = self.covariance.shape[-1]
         normal = np.stack(
@@ -62,10 +60,10 @@ class StartUncertainty:
         return self._distance(rows[:, 1:] - rows[:, :1]).mean(1)
 
     def fit(self, noise: tuple[float, float], iterations: int) -> Tensor:
-        """Return the mean distance (B,) [m] to the measured track after fitting the state to the whole of it.
+        """Return the mean distance (B,) [m] to the measured track after fitting the state to all of it.
 
         Gauss-Newton steps with Cauchy weights in the coordinates in which the start's covariance is the identity, with
-        several dampings side by side; a state is kept only where it lowers the distance, so the figure is never above
+        several dampings in parallel; a state is kept only where it lowers the distance, so the result never exceeds
         that of the start.
 
         Args:
@@ -111,7 +109,9 @@ class StartUncertainty:
         parts = []
         for first in range(0, len(items), MAX_ITEMS):
             chosen = self.observations.select(items[first : first + MAX_ITEMS])
-            residuals = TrajectoryResiduals(self.world, [], chosen, 1.0, 1.0)
+            residuals = TrajectoryResiduals(
+                world=self.world, parameters=[], observations=chosen, position_std_m=1.0, rotation_std_rad=1.0
+            )
             parts.append(residuals(flat.new_zeros(0), flat[first : first + MAX_ITEMS], False)[0])
         return torch.cat(parts).unflatten(0, (batch, count))
 
@@ -126,7 +126,7 @@ class StartUncertainty:
 def covariance_root(covariance: Tensor) -> Tensor:
     """Return R with covariance = R R^T, shape (B, S, S).
 
-    Cholesky's, of the correlations: it is unique, where eigenvectors of equal variances turn with the last bit.
+    By the Cholesky factor of the correlations, which is unique; eigenvectors of equal variances depend on the last bit.
     """
     std = covariance.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
     correlation = covariance / (std[:, :, None] * std[:, None])
@@ -141,7 +141,7 @@ def _limited(root: Tensor) -> Tensor:
 
 
 def _spread(rows: Tensor, noise: float) -> Tensor:
-    """Return for each item (B, 3) the noise together with the median residual: what one frame may be trusted for."""
+    """Return the scale of one frame for each item (B, 3): noise and median residual, added in quadrature."""
     size = rows.square().sum(-1).sqrt()
     median = torch.nan_to_num(size.masked_fill(size == 0, torch.nan).nanmedian(1).values)
     return (median.square() + noise**2).sqrt()[:, None].expand(-1, 3)

@@ -1,4 +1,4 @@
-"""The noise of measured tracks, estimated from the tracks themselves."""
+"""Noise of measured tracks, estimated from the tracks alone."""
 
 from __future__ import annotations
 
@@ -9,30 +9,31 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ...datasets.capture.tracks import Track
 
 WINDOW = 5
 """Frames of a window; short enough for free flight to be a parabola in position and rotation."""
 LONG_FRAMES, LONG_S = 9, 0.3
-"""Length of a window of a centroid's flight. A marker that wanders over a ball, or a filter, makes errors that last
-for many frames, which a short parabola follows. A cubic follows a drag of 0.03 / m at 6 m/s within 0.02 mm."""
+"""Minimum frames and length [s] of a window of a centroid's flight. A marker that moves over a ball, or a filter, makes
+errors that are correlated over many frames, which a short parabola would follow. A cubic follows a drag of 0.03 / m at
+6 m/s within 0.02 mm."""
 MAD_TO_STD = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 FLOOR_M, FLOOR_RAD = 1e-5, 1e-4
-"""Smallest noise admitted: noiseless tracks would give infinite weights."""
+"""Minimum noise of position [m] and rotation [rad]: noiseless tracks would get infinite weights."""
 
 
 def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> tuple[float, float]:
-    """Return the standard deviations of position [m] and rotation [rad], for each axis.
+    """Return the standard deviations of position [m] and rotation [rad] for each axis.
 
     Each window of consecutive frames is fitted by a parabola in position and in rotation vector (a tumbling body turns
-    at a changing rate); the
-    residuals' median absolute deviation, scaled for the degrees of freedom used up, ignores the few windows that hold
-    an impact. A coordinate that never changes was not measured, and has no part in it.
+    at a changing rate); the residuals' median absolute deviation, scaled for the degrees of freedom used, ignores the
+    few windows that contain an impact. A coordinate that never changes was not measured, and is left out.
 
     Args:
         tracks: Of free bodies.
-        flying: Whether they are in free flight all the time: windows of centroids are then as long as errors that last
-            for many frames, which a short parabola follows.
+        flying: Whether they are in free flight all the time: windows of centroids are then as long as errors that are
+            correlated over many frames, which a short parabola would follow.
     """
     positions, rotations = [], []
     for track in tracks:
@@ -51,16 +52,18 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> tuple[float
 
 
 def moves(position_m: np.ndarray) -> np.ndarray:
-    """Return which coordinates (3) of a track (T, 3) ever change; all, where none does."""
+    """Return the coordinates (3) of a track (T, 3) that change at all; all three where none does."""
     changes = np.ptp(position_m, axis=0) > 0
     return changes if changes.any() else np.ones(3, bool)
 
 
 def _residual(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
+    """Return the residuals of a polynomial, scaled for the degrees of freedom that it uses."""
     basis = np.vander(t, degree + 1)
     residual = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
     return residual * np.sqrt(len(t) / (len(t) - degree - 1))
 
 
 def _spread(residuals: list[np.ndarray]) -> float:
+    """Return the robust standard deviation of residuals; 0 without any."""
     return float(MAD_TO_STD * np.median(np.abs(np.concatenate(residuals)))) if residuals else 0.0

@@ -1,4 +1,4 @@
-"""The checks of a dataset: schema, numbers, hashes, reprojection of the poses, and Newton's law for the labels."""
+"""Checks of a dataset: schema, numbers, hashes, reprojection of the poses, and Newton's laws for the labels."""
 
 from __future__ import annotations
 
@@ -11,34 +11,44 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..datasets.dataset import check_hashes, read_manifest
-from ..datasets.models import Model, read_model
-from ..datasets.progress import progress
-from ..datasets.rollouts import Node, demo_names, open_shard
-from ..schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
-from .validate_faults import Fault
-from .validate_motion import MotionFindings, check_motion, motion_facts
-from .validate_pictures import PictureFindings, check_pictures, picture_facts
+from ...datasets.io.progress import progress
+from ...datasets.models.model import Model, read_model
+from ...datasets.rollouts.dataset import check_hashes, read_manifest
+from ...datasets.rollouts.rollouts import Node, demo_names, open_shard
+from ...schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
+from .faults import Fault
+from .newton import MotionFindings, check_motion, motion_facts
+from .reprojection import PictureFindings, check_pictures, picture_facts
 
 QUATERNION_TOLERANCE = 1e-6
+"""Largest difference of the norm of a quaternion or normal from 1."""
 SHOWN_FAULTS = 20
+"""Maximum number of faults listed in the report."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Findings:
-    """What the checks gathered over all rollouts."""
+    """Results of the checks, collected over all rollouts."""
 
     faults: list[str] = field(default_factory=list)
+    """All faults, as sentences."""
     failures: list[Failure] = field(default_factory=list)
+    """The faults of rollouts, with their places and values."""
     rollouts: int = 0
+    """Number of rollouts that were checked."""
     contacts: int = 0
+    """Number of contacts in these rollouts."""
     quaternion_error: float = 0.0
+    """Largest difference of a quaternion's norm from 1."""
     motion: MotionFindings = field(default_factory=MotionFindings)
+    """Results of the checks of momentum and angular momentum."""
     pictures: PictureFindings = field(default_factory=PictureFindings)
+    """Results of the comparison of poses with pictures."""
     units: dict[str, str] = field(default_factory=dict)
+    """Units of the arrays, by name."""
 
     def add(self, shard: str, demo: str, fault: Fault) -> None:
-        """Take a fault of a rollout."""
+        """Record a fault of a rollout."""
         failure = fault.at(shard, demo)
         self.failures.append(failure)
         self.faults.append(failure.text)
@@ -49,9 +59,9 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
 
     Args:
         path: DATASET.
-        sample: Look at so many rollouts, drawn at random from all shards that are there, and at the hashes of their
-            shards alone; all where left out.
-        seed: Of that draw.
+        sample: Number of rollouts to check, drawn at random from all shards that exist; only the hashes of their shards
+            are checked. None checks all.
+        seed: Seed of that draw.
 
     Raises:
         InputDataError: If the manifest or a shard cannot be read at all.
@@ -66,7 +76,7 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
     for shard in progress(shards, "shards"):
         file = root / shard.file
         if not file.is_file():
-            continue  # told by check_hashes
+            continue  # reported by check_hashes
         try:
             with open_shard(file) as handle:
                 _check_shard(handle, shard, model, findings, None if chosen is None else chosen[shard.file])
@@ -85,9 +95,9 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
 
 
 def _sample(shards: Sequence[ShardEntry], count: int, seed: int) -> dict[str, list[int]]:
-    """Return places of rollouts within their shards, by file: `count` of all, or all where there are fewer."""
+    """Draw `count` rollouts, or all if there are fewer; return their indices within their shards, by file."""
     if count < 1:
-        raise UsageError(f"--sample {count}: no number of rollouts.", "1 or more.")
+        raise UsageError(f"--sample {count}: not a valid number of rollouts.", "1 or more.")
     places = [(shard.file, place) for shard in shards for place in range(shard.rollouts)]
     order = np.random.default_rng(seed).permutation(len(places))[:count]
     chosen: dict[str, list[int]] = {}
@@ -153,10 +163,10 @@ def _check_shard(
                 findings.add(shard.file, name, fault)
         except KeyError as error:
             text = f"an array or attribute is missing: {error.args[0]}."
-            findings.add(shard.file, name, Fault("schema", text))
+            findings.add(shard.file, name, Fault(check="schema", text=text))
         except OSError as error:
             text = f"a block cannot be read: {str(error).splitlines()[0]}."
-            findings.add(shard.file, name, Fault("readable", text))
+            findings.add(shard.file, name, Fault(check="readable", text=text))
 
 
 def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterator[Fault]:
@@ -166,7 +176,7 @@ def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterato
     time = demo["time"][()]
     if not (np.diff(time) > 0).all():
         frame = int(np.argmin(np.diff(time) > 0)) + 1
-        yield Fault("time", f"time: not increasing at frame {frame}.", frame, value=float(time[frame]))
+        yield Fault(check="time", text=f"time: not increasing at frame {frame}.", frame=frame, value=float(time[frame]))
         return
     yield from _check_states(demo, findings)
     yield from _check_parameters(demo, model)
@@ -176,24 +186,25 @@ def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterato
 
 
 def _check_states(demo: Node, findings: _Findings) -> Iterator[Fault]:
-    """Quaternions have length 1, and robomimic's low-dimensional state is that of the bodies."""
+    """Check that quaternions have length 1 and that robomimic's low-dimensional state equals that of the bodies."""
     norms = np.linalg.norm(demo["bodies/quat_wxyz"][()], axis=-1)
     errors = np.abs(norms - 1).max(axis=1)
     error = float(errors.max())
     findings.quaternion_error = max(findings.quaternion_error, error)
     if not error <= QUATERNION_TOLERANCE:
         frame = int(errors.argmax())
-        text = f"bodies/quat_wxyz: frame {frame}: a norm is off 1 by {error:.2g}; {QUATERNION_TOLERANCE:g} is allowed."
-        yield Fault("quaternions", text, frame, value=error, limit=QUATERNION_TOLERANCE)
+        text = f"bodies/quat_wxyz: frame {frame}: a norm differs from 1 by {error:.2g}; "
+        text += f"{QUATERNION_TOLERANCE:g} is allowed."
+        yield Fault(check="quaternions", text=text, frame=frame, value=error, limit=QUATERNION_TOLERANCE)
     parts = [demo[f"bodies/{key}"][()] for key in ("pos", "quat_wxyz", "vel", "omega_body")]
     expected = np.concatenate(parts, axis=-1).reshape(len(norms), -1)
     found = demo["obs/object"][()]
     if found.shape != expected.shape or not np.array_equal(found, expected, equal_nan=True):
-        yield Fault("schema", "obs/object: differs from the bodies' poses and velocities.")
+        yield Fault(check="schema", text="obs/object: differs from the bodies' poses and velocities.")
 
 
 def _check_arrays(demo: Node, count: int, findings: _Findings) -> Iterator[Fault]:
-    """Every array has its unit, the right number of frames, and finite numbers."""
+    """Check that every array has its unit, the right number of frames, and finite numbers."""
     arrays: dict[str, h5py.Dataset] = {}
 
     def visit(name: str, item: object) -> None:
@@ -204,17 +215,17 @@ def _check_arrays(demo: Node, count: int, findings: _Findings) -> Iterator[Fault
     for name, item in arrays.items():
         lacking = [key for key in ("unit", "frame", "order", "shape_meaning", "description") if key not in item.attrs]
         if lacking:
-            yield Fault("schema", f"{name}: has no attribute {', '.join(lacking)}.")
+            yield Fault(check="schema", text=f"{name}: has no attribute {', '.join(lacking)}.")
             continue
         if not name.startswith(("parameters/", "cameras/", "obs/")):
             findings.units[name] = str(item.attrs["unit"])
         if str(item.attrs["shape_meaning"]).startswith("(T,") and item.shape[0] != count:
-            yield Fault("schema", f"{name}: {item.shape[0]} frames; num_samples says {count}.")
+            yield Fault(check="schema", text=f"{name}: {item.shape[0]} frames; num_samples says {count}.")
         if item.dtype.kind == "f" and item.size and not _finite(item):
-            yield Fault("finite", f"{name}: holds numbers that are not finite.")
+            yield Fault(check="finite", text=f"{name}: contains numbers that are not finite.")
     for name in json.loads(str(demo.attrs["params_json"])):
         if f"parameters/{name}" not in arrays:
-            yield Fault("schema", f"params_json names '{name}', which is not in parameters/.")
+            yield Fault(check="schema", text=f"params_json names '{name}', which is not in parameters/.")
 
 
 def _finite(item: h5py.Dataset) -> bool:
@@ -224,14 +235,14 @@ def _finite(item: h5py.Dataset) -> bool:
 
 
 def _check_parameters(demo: Node, model: Model | None) -> Iterator[Fault]:
-    """Physical parameters lie within the bounds that the model gives them."""
+    """Check that physical parameters lie within the bounds of the model."""
     for listed in model.file.parameters if model is not None else ():
         if listed.bounds is None or listed.name not in demo["parameters"]:
             continue
         value, (low, high) = float(demo["parameters"][listed.name][()]), listed.bounds
         if not low <= value <= high:
-            text = f"parameters/{listed.name}: {value:g} {listed.unit}; {low:g} to {high:g} is admissible."
-            yield Fault("parameters", text, value=value, limit=low if value < low else high)
+            text = f"parameters/{listed.name}: {value:g} {listed.unit}; {low:g} to {high:g} is allowed."
+            yield Fault(check="parameters", text=text, value=value, limit=low if value < low else high)
 
 
 def _check_contacts(demo: Node, count: int, model: Model | None, findings: _Findings) -> Iterator[Fault]:
@@ -240,25 +251,27 @@ def _check_contacts(demo: Node, count: int, model: Model | None, findings: _Find
     rows = len(contacts["body_a"])
     findings.contacts += rows
     if len(offsets) != count + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
-        yield Fault("contacts", f"contacts/offsets: they do not divide {rows} contacts among {count} frames.")
+        yield Fault(
+            check="contacts", text=f"contacts/offsets: they do not divide {rows} contacts among {count} frames."
+        )
         return
     bodies = len(demo["bodies/names"])
     indices = np.concatenate([contacts["body_a"], contacts["body_b"]])
     if rows and (indices.min() < -1 or indices.max() >= bodies or contacts["body_a"].min() < 0):
         text = f"contacts: body indices outside 0 to {bodies - 1} (-1 = ground, only as body_b)."
-        yield Fault("contacts", text)
+        yield Fault(check="contacts", text=text)
         return
     errors = np.abs(np.linalg.norm(contacts["normal_world"], axis=-1) - 1)
     if rows and not errors.max() <= QUATERNION_TOLERANCE:
         row = int(errors.argmax())
         frame = int(np.searchsorted(offsets, row, side="right")) - 1
-        text = f"contacts/normal_world: frame {frame}, row {row}: not all of unit length, off by {errors[row]:.2g}."
-        yield Fault("contacts", text, frame, value=float(errors[row]), limit=QUATERNION_TOLERANCE)
+        text = f"contacts/normal_world: frame {frame}, row {row}: the length differs from 1 by {errors[row]:.2g}."
+        yield Fault(check="contacts", text=text, frame=frame, value=float(errors[row]), limit=QUATERNION_TOLERANCE)
     pulls = (contacts["impulse_world"] * contacts["normal_world"]).sum(-1)
     scale = float(np.abs(contacts["impulse_world"]).max()) if rows else 0.0
     if rows and pulls.min() < -1e-6 * scale and not json.loads(str(demo.attrs["effects_json"])):
         row = int(pulls.argmin())
         frame = int(np.searchsorted(offsets, row, side="right")) - 1
         text = f"contacts/impulse_world: frame {frame}: a contact pulls by {-pulls.min():.2g} N s; contacts only push."
-        yield Fault("contacts", text, frame, value=float(pulls.min()), limit=0.0)
+        yield Fault(check="contacts", text=text, frame=frame, value=float(pulls.min()), limit=0.0)
     yield from check_motion(demo, contacts, model, findings.motion)

@@ -1,26 +1,33 @@
-"""A fault that a check of a dataset finds in a rollout."""
+"""Faults that the checks of a dataset find in a rollout."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..schemas import Failure
+from ...schemas import Failure
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Fault:
-    """What is wrong, which check found it, where, the number and its limit. The check adds no file and no rollout."""
+    """A fault within one rollout; `at` adds the shard and the rollout."""
 
     check: str
+    """Name of the check that found it."""
     text: str
+    """What is wrong, as a sentence."""
     frame: int | None = None
+    """Frame in which it was found."""
     camera: str | None = None
+    """Camera whose picture is concerned."""
     body: str | None = None
+    """Body that is concerned."""
     value: float | None = None
+    """The value that was found, in the unit given in the text."""
     limit: float | None = None
+    """The limit that the value violates, same unit."""
 
     def at(self, shard: str, demo: str) -> Failure:
-        """Return the fault with its place, for the report."""
+        """Return the fault for the report, with its shard and rollout."""
         text = f"{shard}, {demo}: {self.text}"
         finite = {
             name: float(value)

@@ -1,7 +1,7 @@
-"""Newton's law for the labels: momentum and angular momentum change by what the contacts and all else give.
+"""Newton's laws for the labels: changes of momentum and angular momentum against contacts, gravity and effects.
 
-Impulses of contacts and gravity are labels. What effects add (drag, ...) is computed here from their formulas, at the
-labelled states, and integrated from frame to frame by the trapezoidal rule.
+Impulses of contacts and gravity are labels. The loads of effects (drag, ...) are computed here from their formulas at
+the labelled states, and integrated from frame to frame by the trapezoidal rule.
 """
 
 from __future__ import annotations
@@ -14,49 +14,58 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..datasets.models import Model
-from ..datasets.rollouts import Node
-from ..schemas import EffectModel
-from .net_forces import contact_torque_n_m
-from .physics.effects import load_effect
-from .physics.rollout import Engine
-from .physics.world import State, World
-from .sampling import rotation_matrix
-from .validate_faults import Fault
+from ...datasets.models.model import Model
+from ...datasets.rollouts.rollouts import Node
+from ...schemas import EffectModel
+from ..geometry.viewpoint import rotation_matrix
+from ..physics.effects import load_effect
+from ..physics.net_contact_wrench import contact_torque_n_m
+from ..physics.rollout import Engine
+from ..physics.world import State, World
+from .faults import Fault
 
 IMPULSE_TOLERANCE = 1e-6
-"""Largest excess of momentum change over impulse, as a fraction of the largest momentum change: float64 sums."""
+"""Largest difference between a change of momentum and the impulses, as a fraction of the largest change; it allows for
+rounding of float64 sums."""
 LEVER_SHARE = 0.25
-"""Largest median, over the frames with contact, of the excess of angular momentum over what the contacts turn, as a
-fraction of the sum of impulses times their levers: places in a wrong frame give about 1, those of the demo 0.0005."""
+"""Largest median, over the frames with contact, of the difference between the change of angular momentum and the
+moments of the contacts, as a fraction of the sum of impulses times their levers. Contact positions in a wrong frame
+give about 1, those of the demo 0.0005."""
 ENOUGH_FRAMES = 5
-"""Of fewer frames with contact a median says nothing."""
+"""Minimum number of frames with contact for a median."""
 
 
 @dataclass
 class MotionFindings:
-    """Measured over all rollouts: the largest excess of momentum [N s], and the lever shares of frames in contact."""
+    """Results of the checks of motion over all rollouts."""
 
     impulse_excess_n_s: float = 0.0
+    """Largest difference between a change of momentum and the impulses [N s]."""
     angular_excess_share: list[float] = field(default_factory=list)
+    """For each body and frame in contact, the difference between the change of angular momentum and the moments of
+    the contacts, as a fraction of the sum of impulses times their levers."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Body:
-    """A free body over a rollout: T frames.
-
-    mass [kg]; com (T, 3) [m], velocity (T, 3) [m/s] of it, spin (T, 3) [N m s] angular momentum about it, omega (T,)
-    [rad/s], all world; pull (T, 3) [m/s2] and torque (T, 3) [N m] of effects.
-    """
+    """A free body over a rollout of T frames; vectors in the world frame."""
 
     name: str
+    """Name of the body."""
     mass: float
+    """Mass [kg]."""
     com: np.ndarray
+    """Centre of mass [m], shape (T, 3)."""
     velocity: np.ndarray
+    """Velocity of the centre of mass [m/s], shape (T, 3)."""
     spin: np.ndarray
+    """Angular momentum about the centre of mass [N m s], shape (T, 3)."""
     omega: np.ndarray
+    """Angular speed [rad/s], shape (T,)."""
     pull: np.ndarray
+    """Acceleration by effects [m/s2], shape (T, 3)."""
     torque: np.ndarray
+    """Torque by effects [N m], shape (T, 3)."""
 
 
 def check_motion(
@@ -66,9 +75,9 @@ def check_motion(
 
     Args:
         demo: The rollout.
-        contacts: The arrays of its contacts; their offsets and bodies were checked.
-        model: The dataset's model, for the formulas of its effects; without it, rollouts with effects are passed over.
-        findings: Takes what was measured.
+        contacts: The arrays of its contacts, with checked offsets and bodies.
+        model: The dataset's model, for the formulas of its effects; without it, rollouts with effects are skipped.
+        findings: The results so far, which are extended.
     """
     effects: dict[str, dict[str, float]] = json.loads(str(demo.attrs["effects_json"]))
     if effects and model is None:
@@ -97,23 +106,23 @@ def _body(read: dict[str, np.ndarray], index: int, model: Model | None, effects:
     if effects and model is not None:
         pull, torque = _loads(read, index, model, effects)
     return _Body(
-        read["names"][index].decode(),
-        float(read["mass"][index]),
-        read["pos"][:, index] + rotation @ com,
-        read["vel"][:, index] + np.einsum("tij,tj->ti", rotation, np.cross(omega, com)),
-        np.einsum("tij,jk,tk->ti", rotation, inertia, omega),
-        np.linalg.norm(omega, axis=1),
-        pull,
-        torque,
+        name=read["names"][index].decode(),
+        mass=float(read["mass"][index]),
+        com=read["pos"][:, index] + rotation @ com,
+        velocity=read["vel"][:, index] + np.einsum("tij,tj->ti", rotation, np.cross(omega, com)),
+        spin=np.einsum("tij,jk,tk->ti", rotation, inertia, omega),
+        omega=np.linalg.norm(omega, axis=1),
+        pull=pull,
+        torque=torque,
     )
 
 
 def _loads(
     read: dict[str, np.ndarray], index: int, model: Model, effects: dict[str, dict[str, float]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the effects give a body at each frame: acceleration [m/s2] and torque [N m], world, shape (T, 3)."""
+    """Return acceleration [m/s2] and torque [N m] of a body by effects at each frame, world frame, each (T, 3)."""
     bodies = [
-        # what commands a driven body does not matter here
+        # the command of a driven body does not matter here
         body.model_copy(update={"motion": "fixed" if body.motion == "driven" else body.motion})
         for body in model.file.bodies
     ]
@@ -129,29 +138,29 @@ def _loads(
 
 
 def _impulses(contacts: dict[str, np.ndarray], frame: np.ndarray, index: int, count: int) -> np.ndarray:
-    """Return the sum of the impulses on a body since the frame before [N s], world, shape (T, 3)."""
+    """Return the sum of the impulses on a body since the previous frame [N s], world frame, shape (T, 3)."""
     total = np.zeros((count, 3))
     for sign, side in ((1.0, "body_a"), (-1.0, "body_b")):
-        mine = contacts[side] == index
-        np.add.at(total, frame[mine], sign * contacts["impulse_world"][mine])
+        rows = contacts[side] == index
+        np.add.at(total, frame[rows], sign * contacts["impulse_world"][rows])
     return total
 
 
 def _levers(
     contacts: dict[str, np.ndarray], frame: np.ndarray, index: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return frames (n,), places (n, 3) [m] and impulses (n, 3) [N s] of the contacts of a body, on that body."""
+    """Return frames (n,), positions (n, 3) [m] and impulses (n, 3) [N s] on a body of its contacts."""
     sides = [(1.0, contacts["body_a"] == index), (-1.0, contacts["body_b"] == index)]
-    frames = np.concatenate([frame[mine] for _, mine in sides])
-    places = np.concatenate([contacts["pos_world"][mine] for _, mine in sides])
-    impulses = np.concatenate([sign * contacts["impulse_world"][mine] for sign, mine in sides])
+    frames = np.concatenate([frame[rows] for _, rows in sides])
+    places = np.concatenate([contacts["pos_world"][rows] for _, rows in sides])
+    impulses = np.concatenate([sign * contacts["impulse_world"][rows] for sign, rows in sides])
     return frames, places, impulses
 
 
 def _check_forces(
     contacts: dict[str, np.ndarray], read: dict[str, np.ndarray], time: np.ndarray, frame: np.ndarray
 ) -> Iterator[Fault]:
-    """Labelled forces are the impulses, and torques the changes of angular momentum, by time between the frames."""
+    """Check labelled forces and torques against impulses and changes of angular momentum over the time step."""
     length = np.concatenate([[np.inf], np.diff(time)])
     total = [_impulses(contacts, frame, index, len(time)) for index in range(len(read["motions"]))]
     force = np.stack(total, axis=1) / length[:, None, None]
@@ -171,8 +180,8 @@ def _check_forces(
         limit = IMPULSE_TOLERANCE * max(float(np.abs(expected).max()), 1e-12)
         if not errors.max() <= limit:
             worst = int(frames[errors.argmax()])
-            text = f"{name}: frame {worst}: off {what} by {errors.max():.3g} {unit}."
-            yield Fault("forces", text, worst, value=float(errors.max()), limit=limit)
+            text = f"{name}: frame {worst}: differs from {what} by {errors.max():.3g} {unit}."
+            yield Fault(check="forces", text=text, frame=worst, value=float(errors.max()), limit=limit)
 
 
 def _check_momentum(
@@ -209,14 +218,24 @@ def _worst(
     allowed: np.ndarray,
     wrong: np.ndarray,
 ) -> Iterator[Fault]:
-    """Yield the worst of the intervals (T - 1,) that are wrong, if any: by `than` much more did `what` change there."""
+    """Yield a fault for the worst of the wrong intervals (T - 1,), if any.
+
+    Args:
+        what: The quantity that changes, which names the check.
+        array: The array that the fault concerns.
+        body: The body.
+        than: Unit of the excess and what it exceeds, in words.
+        excess: Difference between the change and its causes.
+        allowed: Its limit.
+        wrong: Which intervals exceed the limit.
+    """
     if not wrong.any():
         return
     worst = int(np.where(wrong, excess / allowed, 0).argmax())
     yield Fault(
-        what,
-        f"{array}: body '{body.name}', frame {worst + 1}: {what} changed by {excess[worst]:.3g} {than}; "
-        f"{allowed[worst]:.2g} is allowed. So in {int(wrong.sum())} frames.",
+        check=what,
+        text=f"{array}: body '{body.name}', frame {worst + 1}: {what} changed by {excess[worst]:.3g} {than}; "
+        f"{allowed[worst]:.2g} is allowed. Frames with this fault: {int(wrong.sum())}.",
         frame=worst + 1,
         body=body.name,
         value=float(excess[worst]),
@@ -225,9 +244,10 @@ def _worst(
 
 
 def _bent(values: np.ndarray, touching: np.ndarray) -> np.ndarray:
-    """Return what the trapezoidal rule may miss of values (T, 3), by interval and second, shape (T - 1,).
+    """Return a bound on the error of the trapezoidal rule for values (T, 3), per second of each interval (T - 1,).
 
-    Less than they change by; where an impact may hide that, they may be anything up to twice their size.
+    The bound is the change of the values; in intervals with contact, where an impact may hide their change, twice
+    their magnitude is added.
     """
     size = np.linalg.norm(values, axis=1)
     return np.linalg.norm(np.diff(values, axis=0), axis=1) + 2 * np.maximum(size[1:], size[:-1]) * touching
@@ -243,8 +263,8 @@ def _check_spin(
 ) -> Iterator[Fault]:
     """Compare the change of angular momentum about the centre of mass with the moments of the contacts.
 
-    Where in an interval an impulse acted is not labelled, only its mean place; so each lever may be off by the way that
-    body and contact move within the interval.
+    The labels give only the mean position of an impulse within an interval; so each lever may be wrong by the distance
+    that body and contact move within the interval.
     """
     frames, places, impulses = levers
     step = np.diff(time)
@@ -277,10 +297,10 @@ def _check_spin(
     findings.angular_excess_share += shares.tolist()
     if len(shares) >= ENOUGH_FRAMES and not np.median(shares) <= LEVER_SHARE:
         yield Fault(
-            "angular momentum",
-            f"contacts/pos_world: body '{body.name}': in half of the {len(shares)} frames with contact the angular "
-            f"momentum differs by {100 * np.median(shares):.0f} % or more of what the contacts can turn; "
-            f"{100 * LEVER_SHARE:.0f} % is allowed.",
+            check="angular momentum",
+            text=f"contacts/pos_world: body '{body.name}': in half of the {len(shares)} frames with contact, the "
+            f"change of angular momentum differs from the moments of the contacts by {100 * np.median(shares):.0f} % "
+            f"or more of the impulses times their levers; {100 * LEVER_SHARE:.0f} % is allowed.",
             body=body.name,
             value=float(np.median(shares)),
             limit=LEVER_SHARE,
@@ -288,7 +308,7 @@ def _check_spin(
 
 
 def motion_facts(findings: MotionFindings) -> dict[str, Any]:
-    """Return what was measured, for the report."""
+    """Return the results of the checks of motion for the report."""
     facts: dict[str, Any] = {"impulse_excess_n_s": findings.impulse_excess_n_s}
     if findings.angular_excess_share:
         facts["angular_excess_share_median"] = float(np.median(findings.angular_excess_share))

@@ -1,4 +1,4 @@
-"""Poses against pictures: the labelled poses, projected without the renderer, have to lie on masks and depth."""
+"""Check of poses against pictures: labelled poses, projected without the renderer, must match masks and depth."""
 
 from __future__ import annotations
 
@@ -9,52 +9,61 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..datasets.cameras import Camera
-from ..datasets.loader import camera_of
-from ..datasets.models import Model
-from ..datasets.rollouts import Node
-from .sampling import rotation_matrix
-from .validate_faults import Fault
+from ...datasets.capture.cameras import Camera
+from ...datasets.models.model import Model
+from ...datasets.rollouts.loader import camera_of
+from ...datasets.rollouts.rollouts import Node
+from ..geometry.viewpoint import rotation_matrix
+from .faults import Fault
 
 SPHERE_RADIUS = 1.177
-"""A lone opaque sphere lets half of the light through at this many s: sqrt(2 ln 2)."""
+"""Radius at which a single opaque sphere transmits half of the light, in units of its scale s: sqrt(2 ln 2)."""
 SOLID = 0.1
-"""Spheres of a lower opacity are not painted."""
+"""Minimum opacity of the spheres that are projected."""
 MARGIN_PX = 2
-"""A mask may reach this far beyond the projected spheres, which overlap more than one by one."""
+"""Largest distance of a mask from the projected spheres [px]; overlapping spheres reach farther than single ones."""
 MIN_INSIDE = 0.95
-"""Fraction of a body's mask that has to lie within its projected spheres."""
+"""Minimum fraction of a body's mask within its projected spheres."""
 MIN_IOU = 0.7
-"""Least intersection over union of a body's mask and its projected spheres, but for pixels that something hides."""
+"""Minimum intersection over union of a body's mask and its projected spheres, without occluded pixels."""
 MIN_IOU_PX = 80
-"""Of smaller bodies the rim is most of the picture, and the intersection over union says little."""
+"""Minimum size of a body for a check of the intersection over union [px]; smaller bodies are mostly rim."""
 MIN_PIXELS = 20
-"""Smaller masks are not judged."""
+"""Minimum size of a mask that is checked [px]."""
 DEPTH_RADII = 4.0
-"""Median difference of a body's depth from that of its nearest projected sphere, in the radius of its spheres."""
+"""Largest median difference of a body's depth from that of its nearest projected sphere [scale of its spheres]."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PictureFindings:
-    """Measured over all pictures, a number a body and picture."""
+    """Results of the comparison over all pictures; lists have one entry per body and picture."""
 
     frames: int = 0
+    """Number of pictures."""
     iou: list[float] = field(default_factory=list)
+    """Intersection over union of the mask and the visible projected spheres."""
     inside: list[float] = field(default_factory=list)
+    """Fraction of the mask within the projected spheres."""
     centre_px: list[float] = field(default_factory=list)
+    """Distance between the centroids of the mask and of the visible projected spheres [px]."""
     depth_m: list[float] = field(default_factory=list)
+    """Median difference between the labelled depth and that of the projected spheres [m]."""
     amodal_iou: list[float] = field(default_factory=list)
+    """Intersection over union of the amodal mask and the projected spheres."""
 
 
 @dataclass(frozen=True)
 class _Painted:
-    """The projected spheres of a body: depth (H, W) of the nearest one [m], 0 where there is none; their radius [m]."""
+    """The projected spheres of a body."""
 
     depth: np.ndarray
+    """Depth of the nearest sphere [m], shape (H, W); 0 where no sphere is projected."""
     radius_m: float
+    """Median scale of the spheres [m]."""
 
     @property
     def covered(self) -> np.ndarray:
+        """Pixels with a projected sphere, shape (H, W)."""
         return self.depth > 0
 
 
@@ -68,7 +77,9 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
         sets = [demo[f"obs/{camera_name}_{key}"] for key in ("mask", "depth")]
         size = (camera.height, camera.width)
         if any(item.shape[1:] != size for item in sets):
-            yield Fault("shape", f"obs/{camera_name}_mask: shape {sets[0].shape[1:]}; the camera has {size}.")
+            yield Fault(
+                check="shape", text=f"obs/{camera_name}_mask: shape {sets[0].shape[1:]}; the camera has {size}."
+            )
             continue
         amodal_set = demo[f"obs/{camera_name}_amodal"]
         counts = {key: demo[f"bodies/{key}"][:, number] for key in ("visible_px", "amodal_px", "visible_fraction")}
@@ -81,7 +92,14 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
                 place = f"obs/{camera_name}_mask, frame {frame}"
                 if mask.max(initial=0) > len(names):
                     text = f"{place}: label {mask.max()}; there are {len(names)} bodies."
-                    yield Fault("labels", text, frame, camera_name, value=float(mask.max()), limit=len(names))
+                    yield Fault(
+                        check="labels",
+                        text=text,
+                        frame=frame,
+                        camera=camera_name,
+                        value=float(mask.max()),
+                        limit=len(names),
+                    )
                     continue
                 bits = [amodals[frame - first] >> np.uint8(body) & 1 > 0 for body in range(len(names))]
                 listed = {key: values[frame] for key, values in counts.items()}
@@ -99,13 +117,21 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
                     if fault is not None:
                         check, text, value, limit = fault
                         place = f"obs/{camera_name}, frame {frame}, body '{names[body]}'"
-                        yield Fault(check, f"{place}: {text}", frame, camera_name, names[body], value, limit)
+                        yield Fault(
+                            check=check,
+                            text=f"{place}: {text}",
+                            frame=frame,
+                            camera=camera_name,
+                            body=names[body],
+                            value=value,
+                            limit=limit,
+                        )
 
 
 def _check_counts(
     mask: np.ndarray, amodal: list[np.ndarray], listed: dict[str, np.ndarray], names: list[str], frame: int, camera: str
 ) -> Iterator[Fault]:
-    """`bodies/visible_px` counts the pixels of the mask, `amodal_px` the bits; `visible_fraction` is their quotient."""
+    """Check `visible_px` and `amodal_px` of `bodies/` against the masks, and `visible_fraction` against their ratio."""
     visible = np.bincount(mask.ravel(), minlength=len(names) + 1)[1 : len(names) + 1]
     whole = np.array([part.sum() for part in amodal])
     fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
@@ -115,13 +141,21 @@ def _check_counts(
             if not abs(value - expected) <= 1e-6:
                 text = f"bodies/{key}: frame {frame}, camera {camera}, body '{name}': {value:g}; "
                 text += f"the masks have {expected:g}."
-                yield Fault("labels", text, frame, camera, name, float(value), float(expected))
+                yield Fault(
+                    check="labels",
+                    text=text,
+                    frame=frame,
+                    camera=camera,
+                    body=name,
+                    value=float(value),
+                    limit=float(expected),
+                )
 
 
 def _paint(model: Model, name: str, position: np.ndarray, quat: np.ndarray, camera: Camera) -> _Painted:
-    """Project a body's spheres by the labels alone: no renderer, so that its conventions are tested too.
+    """Project a body's spheres from the labels, without the renderer, so that its conventions are tested, too.
 
-    A disc for each sphere in front of the camera, the nearest last. OpenCV's pixel centres are whole numbers.
+    Each sphere in front of the camera is drawn as a disc, the nearest last. OpenCV's pixel centres are integers.
     """
     splats = model.body_splats[name]
     solid = np.asarray(splats.opacities) > SOLID
@@ -152,7 +186,7 @@ def _compare(
     """Compare a body's mask and depth with its projected spheres.
 
     Returns:
-        Of the first fault the check, what is wrong, the number and its limit; None where there is none.
+        Check, text, value and limit of the first fault; None if there is none.
     """
     area, covered = int(mask.sum()), body.covered
     reach = DEPTH_RADII * body.radius_m
@@ -174,17 +208,18 @@ def _compare(
             findings.centre_px.append(float(np.linalg.norm(centres[0] - centres[1])))
         if inside < MIN_INSIDE:
             outside = 100 * (1 - inside)
-            text = f"{outside:.0f} % of its mask lies outside the projected body; pose or camera is wrong."
+            text = f"{outside:.0f} % of its mask lies outside the projected body; the pose or the camera is wrong."
             return "reprojection", text, inside, MIN_INSIDE
     if max(area, int(visible.sum())) >= MIN_IOU_PX and iou < MIN_IOU:
-        text = f"mask and projected body overlap by {iou:.2f} (IoU); {MIN_IOU} is allowed. Pose or mask is wrong."
+        text = f"mask and projected body overlap by {iou:.2f} (IoU); at least {MIN_IOU} is required. "
+        text += "The pose or the mask is wrong."
         return "reprojection", text, iou, MIN_IOU
     both = mask & covered
     if both.sum() >= MIN_PIXELS:
         error = float(np.median(np.abs(depth[both] - body.depth[both])))
         findings.depth_m.append(error)
         if not error <= reach:
-            text = f"its depth is off that of its pose by {error:.3g} m (median); {reach:.2g} m is allowed."
+            text = f"its depth differs from that of its pose by {error:.3g} m (median); {reach:.2g} m is allowed."
             return "depth", text, error, reach
     return None
 
@@ -192,7 +227,7 @@ def _compare(
 def _compare_amodal(
     body: _Painted, amodal: np.ndarray, findings: PictureFindings
 ) -> tuple[str, str, float, float] | None:
-    """Compare a body's amodal mask with its projected spheres, hidden or not; returns what `_compare` does."""
+    """Compare a body's amodal mask with all its projected spheres; the result is as in `_compare`."""
     covered = body.covered
     if max(int(covered.sum()), int(amodal.sum())) < MIN_IOU_PX:
         return None
@@ -200,11 +235,12 @@ def _compare_amodal(
     findings.amodal_iou.append(iou)
     if iou >= MIN_IOU:
         return None
-    return "amodal mask", f"amodal mask and pose overlap by {iou:.2f}; {MIN_IOU} is allowed.", iou, MIN_IOU
+    text = f"amodal mask and pose overlap by {iou:.2f} (IoU); at least {MIN_IOU} is required."
+    return "amodal mask", text, iou, MIN_IOU
 
 
 def picture_facts(findings: PictureFindings) -> dict[str, Any]:
-    """Return what was measured, for the report."""
+    """Return the results of the comparison for the report."""
     facts: dict[str, Any] = {}
     if findings.iou:
         facts["mask_iou_median"] = float(np.median(findings.iou))

@@ -1,4 +1,4 @@
-"""`cgwm validate`: is this capture, model or dataset what it should be?"""
+"""The stage validate (`cgwm validate`): check that a capture, model or dataset is correct."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datasets.capture import Capture
-from ..datasets.check import find_faults
-from ..datasets.kinds import kind_of
-from ..datasets.models import Model, read_model
-from ..schemas import InputDataError, UsageError
-from ..schemas.validation import ValidationReport
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.check import find_faults
+from ...datasets.io.kinds import kind_of
+from ...datasets.models.model import Model, read_model
+from ...schemas import InputDataError, UsageError
+from ...schemas.validation import ValidationReport
 
 
 def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> ValidationReport:
@@ -20,28 +20,28 @@ def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> Val
 
     Args:
         thing: CAPTURE, MODEL or DATASET.
-        sample: Of a dataset, look at so many rollouts, drawn at random; all where left out.
-        seed: Of that draw.
+        sample: Number of rollouts of a dataset to check, drawn at random; None checks all.
+        seed: Seed of that draw.
 
     Returns:
-        The facts that were found and measured; its `faults` are those of what cgwm itself wrote (hashes,
-        reprojection, ...).
+        The facts that were found and measured; its `faults` are those of files that cgwm wrote (hashes, reprojection,
+        ...).
 
     Raises:
-        InputDataError: If the directory is none of the three or a file in it cannot be read, and for everything
-            that is wrong with a capture, which is the user's to correct: all faults in one message.
-        UsageError: If a sample is asked for of what is no dataset.
+        InputDataError: If the directory is none of the three, a file in it cannot be read, or a capture is wrong; the
+            message lists all faults of the capture, because the user has to correct them.
+        UsageError: If a sample is requested of a capture or model.
     """
     path = Path(thing)
     kind = kind_of(path)
     if sample is not None and kind in ("capture", "model"):
-        raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "leave --sample out.")
+        raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
     if kind == "capture":
         return validate_capture(path)
     if kind == "model":
         return validate_model(path)
     if kind == "dataset":
-        from .validate_dataset import validate_dataset
+        from .dataset import validate_dataset
 
         return validate_dataset(path, sample, seed)
     found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset"
@@ -49,7 +49,7 @@ def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> Val
 
 
 def validate_capture(path: Path | str) -> ValidationReport:
-    """Check everything in a capture, and count what there is."""
+    """Check a capture completely, and count its contents."""
     capture = Capture.open(path, check=False)
     facts, faults = find_faults(capture)
     if len(faults) == 1:
@@ -61,7 +61,7 @@ def validate_capture(path: Path | str) -> ValidationReport:
 
 
 def validate_model(path: Path | str) -> ValidationReport:
-    """Check the files of a model and its numbers."""
+    """Check the files of a model, its inertia and its parameters."""
     model = read_model(path)
     facts = {
         "bodies": [body.name for body in model.file.bodies],
@@ -82,9 +82,9 @@ def _model_faults(model: Model) -> list[str]:
         moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if moments[0] <= 0 or moments[2] > 1.02 * (moments[0] + moments[1]):
             shown = ", ".join(f"{moment:.3g}" for moment in moments)
-            faults.append(f"model.json: body '{body.name}': no body has the principal moments {shown} kg m2.")
+            faults.append(f"model.json: body '{body.name}': principal moments {shown} kg m2 are impossible.")
         if model.file.contact is not None and body.name not in model.collision:
-            faults.append(f"model.json: body '{body.name}' has no colliding spheres, but the model has contacts.")
+            faults.append(f"model.json: body '{body.name}' has no collision spheres, but the model has contacts.")
     for entry in model.file.parameters:
         low, high = entry.bounds or (-np.inf, np.inf)
         if not low <= entry.estimate <= high:

@@ -1,1 +1,5 @@
-"""Looking at motion: where everything is at a moment, how contacts are drawn, and a viewer in the browser."""
+"""Viewer of models and datasets in the browser."""
+
+from .stage import open_view
+
+__all__ = ["open_view"]

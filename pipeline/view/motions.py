@@ -1,4 +1,4 @@
-"""The motions that can be looked at: rollouts of a dataset, and what a model does by itself."""
+"""Motions for the viewer: rollouts of a dataset, and simulations of a model."""
 
 from __future__ import annotations
 
@@ -9,49 +9,46 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.cameras import Camera
-from ...datasets.loader import RolloutReader
-from ...datasets.models import Model
-from ...datasets.rollouts import ContactTable
+from ...datasets.capture.cameras import Camera
+from ...datasets.models.model import Model
+from ...datasets.rollouts.loader import RolloutReader
+from ...datasets.rollouts.rollouts import ContactTable
 from ...schemas import SamplingPlan, SynthesizeConfig
-from ..draws import draw_rollout
-from ..rollout_batches import Diverged, Simulator
-from ..sampling import resolve_plan
+from ..synthesize.draw import draw_rollout
+from ..synthesize.plan import resolve_plan
+from ..synthesize.simulator import Diverged, Simulator
 
 Array = NDArray[np.float64]
 Contacts = Mapping[str, NDArray[np.generic]]
-"""Of one frame: pos_world [m] (N, 3), impulse_world [N s] (N, 3), mode (N,), as `RolloutReader.contacts` has them."""
+"""Contacts of a frame: pos_world [m] (N, 3), impulse_world [N s] (N, 3), mode (N,), as in `RolloutReader.contacts`."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
-    """A motion of all bodies of a model. T frames, B bodies.
-
-    Attributes:
-        times_s: Shape (T,).
-        position_m: Body frame origins [m], world, shape (T, B, 3).
-        quat_wxyz: T_world_body, shape (T, B, 4).
-        contacts: Of each frame.
-        cameras: That filmed it, by name.
-        image: Returns the picture, uint8 RGB (H, W, 3), of a camera at a frame; None where there are no cameras.
-    """
+    """A motion of the B bodies of a model over T frames."""
 
     times_s: Array
+    """Times of the frames [s], shape (T,)."""
     position_m: Array
+    """Body frame origins [m], world frame, shape (T, B, 3)."""
     quat_wxyz: Array
+    """Orientations T_world_body, shape (T, B, 4)."""
     contacts: tuple[Contacts, ...]
+    """Contacts of each frame."""
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    """Cameras of its pictures, by name."""
     image: Callable[[str, int], NDArray[np.uint8]] | None = None
+    """Function that returns the picture of a camera at a frame, uint8 RGB (H, W, 3); None without cameras."""
 
     @property
     def largest_impulse_n_s(self) -> float:
-        """The largest impulse of a single contact [N s]; 0 without contacts."""
+        """Largest impulse of a single contact [N s]; 0 without contacts."""
         sizes = [np.linalg.norm(rows["impulse_world"], axis=-1) for rows in self.contacts if len(rows["mode"])]
         return max((float(values.max()) for values in sizes), default=0.0)
 
 
 def recorded_motion(reader: RolloutReader, number: int) -> Motion:
-    """Return the rollout at place `number` of a reader; its pictures are read when they are asked for."""
+    """Return the rollout at index `number` of a reader; its pictures are read on demand."""
     frames = reader.rollouts[number].frames
     return Motion(
         times_s=reader.read(number, "time"),
@@ -64,7 +61,7 @@ def recorded_motion(reader: RolloutReader, number: int) -> Motion:
 
 
 def still(model: Model) -> Motion:
-    """Return the model as it stood in the photos: one frame, no contacts."""
+    """Return the model with its bodies as in the photos: one frame, no contacts."""
     poses = [body.photo_pose for body in model.file.bodies]
     return Motion(
         times_s=np.zeros(1),
@@ -75,14 +72,14 @@ def still(model: Model) -> Motion:
 
 
 def can_move(model: Model) -> bool:
-    """Tell whether a model has what a simulation needs: fitted contacts, colliding spheres, and a free body."""
+    """Return whether a model can be simulated: it has fitted contacts, collision spheres and a free body."""
     bodies = model.file.bodies
     spheres = all(body.name in model.collision for body in bodies)
     return model.file.contact is not None and spheres and any(body.motion == "free" for body in bodies)
 
 
 def own_motion(model: Model, number: int) -> Motion:
-    """Simulate what `cgwm synthesize` draws first by default, with every parameter at its estimate.
+    """Simulate a rollout that `cgwm synthesize` draws by default, with every parameter at its estimate.
 
     Args:
         model: A model that can move.
@@ -97,7 +94,9 @@ def own_motion(model: Model, number: int) -> Motion:
     (found,) = Simulator(model, times_s, "cpu").run([drawn], config.seed)
     if isinstance(found, Diverged):
         raise found.error
-    return Motion(times_s, found.position_m, found.quat_wxyz, _by_frame(found.contacts))
+    return Motion(
+        times_s=times_s, position_m=found.position_m, quat_wxyz=found.quat_wxyz, contacts=_by_frame(found.contacts)
+    )
 
 
 def _by_frame(table: ContactTable) -> tuple[Contacts, ...]:

@@ -1,4 +1,4 @@
-"""Where everything is at a moment of a motion: bodies, what they are made of, and the marks of the contacts."""
+"""The scene at one moment of a motion: shapes and poses of the bodies, and contact marks."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datasets.models import Model
-from ...datasets.ply import Splats
-from ..sampling import up_direction
-from ..splats.relighting import Relighting
-from ..splats.spheres import Spheres
-from .contact_marks import ContactMarks, arrow_scale, contact_marks
+from ...datasets.models.model import Model
+from ...datasets.shapes.ply import Splats
+from ..geometry.spheres import Spheres
+from ..rendering.contact_glyphs import ContactMarks, arrow_scale, contact_marks
+from ..rendering.relighting import Relighting
+from ..synthesize.plan import up_direction
 from .motions import Motion
 
 Array = NDArray[np.float64]
@@ -21,27 +21,26 @@ Array = NDArray[np.float64]
 LONGEST_ARROW = 2.5
 """Length of the arrow of a motion's largest impulse [radii of the largest free body]."""
 _UNKNOWN_RADIUS_M = 0.1
+"""Size of the marks if no free body has a shape [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class BodyShape:
-    """What a body is made of, in its own frame.
-
-    Attributes:
-        name: Of the body.
-        splats: What is seen, or None.
-        centers_m: Of the spheres that collide [m], shape (N, 3); N = 0 where there are none.
-        radii_m: Their radii [m], shape (N,).
-    """
+    """Visual and collision spheres of a body, in its body frame."""
 
     name: str
+    """Name of the body."""
     splats: Splats | None
+    """Visual spheres; None without them."""
     centers_m: Array
+    """Centres of the collision spheres [m], shape (N, 3); N = 0 without them."""
     radii_m: Array
+    """Radii of the collision spheres [m], shape (N,)."""
     _relighting: Relighting | None = None
+    """Change of the light on the splats as the body turns; None if their colours do not change."""
 
     def colors_at(self, quat_wxyz: Array) -> Array:
-        """Return the colours of the splats (M, 3) at an orientation (4,), in the model's light."""
+        """Return the colours of the splats (M, 3) for an orientation (4,), in the light of the model."""
         if self.splats is None:
             return np.zeros((0, 3))
         colors = np.asarray(self.splats.colors, np.float64)
@@ -56,22 +55,24 @@ class BodyShape:
         return self._relighting is not None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SceneAt:
-    """A moment: poses of B bodies, T_world_body, and the contacts' marks."""
+    """Poses of B bodies and contact marks at one moment of a motion."""
 
     time_s: float
+    """Time of the frame [s]."""
     position_m: Array
-    """Shape (B, 3)."""
+    """Body frame origins [m], world frame, shape (B, 3)."""
     quat_wxyz: Array
-    """Shape (B, 4)."""
+    """Orientations T_world_body, shape (B, 4)."""
     marks: ContactMarks
+    """Points and arrows of the contacts."""
     largest_impulse_n_s: float
-    """Of the contacts at this moment [N s]; 0 without any."""
+    """Largest impulse of a contact at this moment [N s]; 0 without contacts."""
 
 
 def shapes_of(model: Model) -> list[BodyShape]:
-    """Return what each body of a model is made of, in the order of the model."""
+    """Return the shapes of the bodies of a model, in its order."""
     shapes = []
     for body in model.file.bodies:
         splats, colliding = model.body_splats.get(body.name), model.collision.get(body.name)
@@ -81,19 +82,21 @@ def shapes_of(model: Model) -> list[BodyShape]:
             relighting = Relighting.of(model.file.light, body, normals)
         centers = np.zeros((0, 3)) if colliding is None else np.asarray(colliding.means, np.float64)
         radii = np.zeros(0) if colliding is None else np.asarray(colliding.scales, np.float64) * body.radius_factor
-        shapes.append(BodyShape(body.name, splats, centers, radii, relighting))
+        shapes.append(
+            BodyShape(name=body.name, splats=splats, centers_m=centers, radii_m=radii, _relighting=relighting)
+        )
     return shapes
 
 
 def background_from(model: Model, eye_m: Array) -> Splats | None:
-    """Return the background with the colours that it shows to a camera at `eye_m` (3,), world frame."""
+    """Return the background with the colours seen from `eye_m` (3,), world frame; None without a background."""
     if model.scene is None:
         return None
     return Spheres.from_numpy(model.scene).seen_from(torch.as_tensor(eye_m, dtype=torch.float32)).to_numpy()
 
 
 def radius_m(model: Model, shapes: list[BodyShape]) -> float:
-    """Return the size that marks are drawn by: the radius of the largest free body about its origin [m]."""
+    """Return the radius of the largest free body [m], which sets the size of the marks."""
     free = {body.name for body in model.file.bodies if body.motion == "free"}
     reaches = []
     for shape in (shape for shape in shapes if shape.name in free):
@@ -104,7 +107,7 @@ def radius_m(model: Model, shapes: list[BodyShape]) -> float:
 
 
 def scene_at(motion: Motion, frame: int, size_m: float) -> SceneAt:
-    """Return a moment of a motion; arrows are as long as `LONGEST_ARROW` times `size_m` [m] at its largest impulse."""
+    """Return the scene at a frame; the motion's largest impulse has an arrow of `LONGEST_ARROW` times `size_m` [m]."""
     scale = arrow_scale(motion.largest_impulse_n_s, LONGEST_ARROW * size_m)
     contacts = motion.contacts[frame]
     sizes = np.linalg.norm(contacts["impulse_world"], axis=-1)
@@ -118,9 +121,9 @@ def scene_at(motion: Motion, frame: int, size_m: float) -> SceneAt:
 
 
 def viewpoint(model: Model, motion: Motion, size_m: float) -> tuple[Array, Array, Array]:
-    """Return where to look from first, what at, and which way is up: three (3,), world frame, the first two in metres.
+    """Return the initial eye point [m], target [m] and up direction, each (3,), world frame.
 
-    From between the cameras, a little farther off than they are; without cameras from a little above.
+    The eye point is between the cameras and slightly farther away than they are, or, without cameras, above the motion.
     """
     up = up_direction(model.file)
     moving = [k for k, body in enumerate(model.file.bodies) if body.motion == "free"] or slice(None)

@@ -1,7 +1,7 @@
-"""What a viser scene is filled with: splats, balls, cameras and the marks of contacts.
+"""Nodes of a viser scene: splats, balls, cameras and contact marks.
 
-viser's splats are marked experimental. They move with their body's frame without being sent again, are sorted together
-with the background, and look like the renderer's, so bodies are no point clouds here.
+viser's splats are marked experimental. They are used instead of point clouds because they move with their body's frame
+without being sent again, are sorted together with the background, and look like those of the renderer.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ...datasets.cameras import Camera
-from ...datasets.ply import Splats
-from .contact_marks import ContactMarks
+from ...datasets.capture.cameras import Camera
+from ...datasets.shapes.ply import Splats
+from ..rendering.contact_glyphs import ContactMarks
 from .scene_at import BodyShape
 
 _LARGEST_HALF_SIGMA = 200.0
-"""viser sends covariances as half-precision floats, which end at 65504: the largest sphere of a group, in its unit."""
+"""Scale of the largest sphere of a group in the unit in which the group is sent: viser sends covariances as
+half-precision floats, whose maximum is 65504."""
 _POINT_RADIUS = 0.1
-"""Of a contact [radii of the largest free body]."""
+"""Radius of a contact point [radii of the largest free body]."""
 _SPHERE_RGB = (120, 190, 120)
 
 
 def add_splats(scene: Any, name: str, splats: Splats) -> Any:
-    """Add spherical Gaussians, and return their handle; centres in the frame of the parent node."""
+    """Add spherical Gaussians with centres in the frame of the parent node, and return their handle."""
     sigma = np.asarray(splats.scales, np.float64)
     unit = _LARGEST_HALF_SIGMA / float(sigma.max(initial=1e-9))
     return scene.add_gaussian_splats(
@@ -40,7 +41,7 @@ def add_splats(scene: Any, name: str, splats: Splats) -> Any:
 
 
 def add_spheres(scene: Any, name: str, shape: BodyShape) -> Any:
-    """Add the spheres of a body that collide, and return their handle; None where there are none."""
+    """Add the collision spheres of a body, and return their handle; None if it has none."""
     if not len(shape.radii_m):
         return None
     return _add_balls(scene, name, shape.centers_m, shape.radii_m, np.array(_SPHERE_RGB, np.uint8))
@@ -63,7 +64,7 @@ def _add_balls(scene: Any, name: str, centers_m: NDArray[Any], radii_m: NDArray[
 
 
 def add_camera(scene: Any, name: str, camera: Camera, scale_m: float) -> Any:
-    """Add a camera without a picture, `/cameras/<name>`, so far in front of its centre as `scale_m` [m] tells."""
+    """Add a camera `/cameras/<name>` without a picture, drawn as a frustum of length `scale_m` [m]."""
     pose = camera.T_world_cam
     return scene.add_camera_frustum(
         f"/cameras/{name}",
@@ -85,7 +86,7 @@ def vertical_angle_rad(camera: Camera) -> float:
 
 
 def add_marks(scene: Any, count: int, size_m: float) -> list[Any]:
-    """Add as many points and arrows as a motion has contacts at once: of equal number, they move without flicker."""
+    """Add points and arrows for the maximum number of simultaneous contacts; a constant number avoids flicker."""
     nowhere, colors = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8)
     points = _add_balls(scene, "/contacts/points", nowhere, np.full(count, _POINT_RADIUS * size_m), colors)
     arrows = scene.add_arrows(
@@ -100,13 +101,13 @@ def add_marks(scene: Any, count: int, size_m: float) -> list[Any]:
 
 
 def place_marks(handles: list[Any], marks: ContactMarks, wanted: bool) -> None:
-    """Put the marks of `add_marks` where the contacts of a frame are; hide them where there are none."""
+    """Move the marks of `add_marks` to the contacts of a frame, or hide them if there are none."""
     for handle in handles:
         handle.visible = wanted and len(marks) > 0
     if not handles or not len(marks):
         return
     points, arrows = handles
-    # The last contact stands in for those that are not there.
+    # unused marks lie on the last contact
     chosen = np.minimum(np.arange(len(arrows.points)), len(marks) - 1)
     colors = linear(marks.colors[chosen])
     points.batched_positions, points.batched_colors = marks.points_m[chosen].astype(np.float32), colors
@@ -119,7 +120,7 @@ def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return what viser's page has to be sent for instances and arrows to show these sRGB values (IEC 61966-2-1)."""
+    """Convert sRGB values (IEC 61966-2-1) to the linear ones that viser expects for instances and arrows."""
     values = colors / 255.0
     return as_bytes(np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4))
 
@@ -130,7 +131,7 @@ def quat_of(rotation: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def turn_from_z(normal: Any) -> NDArray[np.float64]:
-    """Return the quaternion w x y z (4,) of the shortest turn that takes z to a unit normal (3,)."""
+    """Return the quaternion w x y z (4,) of the shortest rotation that takes z to a unit normal (3,)."""
     x, y, z = normal
     if z < -1 + 1e-9:
         return np.array([0.0, 1.0, 0.0, 0.0])

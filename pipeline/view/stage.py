@@ -1,4 +1,4 @@
-"""`cgwm view`: a dataset's rollouts, or a model and its own motion, in the browser."""
+"""The stage view (`cgwm view`): rollouts of a dataset, or a model and its simulated motion, in the browser."""
 
 from __future__ import annotations
 
@@ -6,27 +6,28 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from ..datasets.dataset import read_manifest
-from ..datasets.kinds import kind_of
-from ..datasets.loader import RolloutReader
-from ..datasets.models import read_model
-from ..schemas import InputDataError
-from .viewing.motions import Motion, can_move, own_motion, recorded_motion, still
-from .viewing.viewer import Viewer, require_viser
+from ...datasets.io.kinds import kind_of
+from ...datasets.models.model import read_model
+from ...datasets.rollouts.dataset import read_manifest
+from ...datasets.rollouts.loader import RolloutReader
+from ...schemas import InputDataError
+from .motions import Motion, can_move, own_motion, recorded_motion, still
+from .viewer import Viewer, require_viser
 
 OWN_MOTIONS = 6
+"""Number of simulated motions offered for a model."""
 
 
 def open_view(thing: Path | str, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
-    """Start a server that shows a dataset or a model; it ends with the process, or with the returned context.
+    """Start a server that shows a dataset or a model; it stops with the process or with the returned context.
 
     Args:
         thing: DATASET or MODEL.
-        host: Address to listen at.
-        port: Port to listen at; 0 takes a free one.
+        host: Address to listen on.
+        port: Port to listen on; 0 takes a free one.
 
     Raises:
-        UsageError: If viser is not installed, or the address cannot be had.
+        UsageError: If viser is not installed, or the address is not available.
         InputDataError: If the directory is neither, or a file in it is missing or wrong.
     """
     path = Path(thing)

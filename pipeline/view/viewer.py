@@ -1,4 +1,4 @@
-"""A motion in the browser: the page, what it shows and what can be pressed. Only this room speaks to viser."""
+"""The page of the viewer: scene, controls and playback. Only the folder `view` uses viser."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from ...datasets.models import Model
+from ...datasets.models.model import Model
 from ...schemas import CgwmError, UsageError
-from .contact_marks import SLIDING_RGB, STICKING_RGB
+from ..rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB
 from .motions import Motion
-from .nodes import (
+from .scene_at import SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
+from .scene_nodes import (
     add_camera,
     add_marks,
     add_spheres,
@@ -28,16 +29,16 @@ from .nodes import (
     turn_from_z,
     vertical_angle_rad,
 )
-from .scene_at import SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
 
 SPEEDS = {"as it was": 1.0, "3 times slower": 1 / 3, "10 times slower": 0.1}
 _MOST_UPDATES_HZ = 30.0
 _SEE_THROUGH = 0.12
-"""Of the opacities: several spheres lie behind each other everywhere."""
+"""Factor on the opacities of see-through bodies; it is small because several spheres lie behind each other."""
 _OVERVIEW = "overview"
 FIELD_OF_VIEW_RAD = 0.9
+"""Vertical angle of view of the overview [rad]."""
 _AMBIENT, _SUN = 2.2, 1.0
-"""Light in which what is no splat has about its own colour; viser's own makes it paler."""
+"""Light intensities that approximately preserve the colours of meshes; viser's defaults make them paler."""
 
 
 def require_viser() -> Any:
@@ -57,14 +58,14 @@ class Viewer:
     """A page with a time slider that shows one of several motions of a model.
 
     Args:
-        title: What is shown.
-        model: Its bodies, background, ground and light.
-        motions: What can be chosen, by name; each is made when it is chosen first, and the first at once.
-        host: Address to listen at.
-        port: Port to listen at; 0 takes a free one.
+        title: Title of the page.
+        model: Model with bodies, background, ground and light.
+        motions: Functions that make the motions, by name; the first is called at once, the others when first chosen.
+        host: Address to listen on.
+        port: Port to listen on; 0 takes a free one.
 
     Raises:
-        UsageError: If viser is not installed, or the address cannot be had.
+        UsageError: If viser is not installed, or the address is not available.
         CgwmError: If the first motion cannot be made.
     """
 
@@ -97,7 +98,7 @@ class Viewer:
             self.server.stop()
 
     def run(self) -> None:
-        """Play whenever that is asked for; returns only by an exception, such as KeyboardInterrupt."""
+        """Play while playback is on; ends only by an exception, such as KeyboardInterrupt."""
         while True:
             times_s = self._motion.times_s
             pace = SPEEDS[self._speed.value]
@@ -112,7 +113,7 @@ class Viewer:
             self._kept[name] = self._made[name]()
         return self._kept[name]
 
-    # What stands in the scene
+    # Scene
 
     def _add_scene(self, model: Model) -> None:
         scene, size = self.server.scene, self._size_m
@@ -146,7 +147,7 @@ class Viewer:
         self._marks: list[Any] = []
 
     def _begin(self, motion: Motion) -> None:
-        """Put what belongs to a motion, and not to a moment of it, into the scene."""
+        """Add what belongs to a motion as a whole (cameras, number of marks, controls) to the scene."""
         with self._lock, self.server.atomic():
             self._motion = motion
             for handle in [*self._cameras.values(), *self._marks]:
@@ -182,7 +183,7 @@ class Viewer:
                     handle.image = self._motion.image(name, frame)
             self._status.content = _words(now, frame, len(self._motion.times_s))
 
-    # What can be pressed
+    # Controls
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -212,7 +213,10 @@ class Viewer:
         self._through.on_update(lambda _: self._guarded(self._make_see_through))
 
     def _look_from(self, client: Any, place: str) -> None:
-        """Move the view of one page to where it began, or to a camera, whose picture would then hide everything."""
+        """Move the view of one page to the overview or to a camera.
+
+        Frusta are hidden at a camera, because its picture would hide the scene.
+        """
         camera = self._motion.cameras.get(place)
         if client is None:
             return
@@ -257,7 +261,7 @@ class Viewer:
                     handle.opacities = as_bytes(share * np.asarray(shape.splats.opacities)[:, None])
 
     def _guarded(self, work: Callable[[], None]) -> None:
-        """Do what a click asks for; what it raises stands on the page, and the server goes on."""
+        """Do what a click asks for; show its errors on the page and keep the server running."""
         try:
             work()
         except CgwmError as error:
@@ -267,7 +271,11 @@ class Viewer:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return a port that is free at an address; viser would silently take another one than was asked for."""
+    """Return the port if it is free, or a free one for 0; viser itself would silently take another port.
+
+    Raises:
+        UsageError: If the port is not available.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -12,7 +12,7 @@ from .registry import EFFECTS, Size, draw_effect
 from .things import Kind, Thing, draw_thing
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True)  # name, thing and effects are given by position in lists of cases
 class Case:
     """Everything about a capture; two captures of equal cases are equal to the last bit.
 

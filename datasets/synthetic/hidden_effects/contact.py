@@ -27,7 +27,7 @@ def rolling_resistance(thing: Thing, size: float, rng: np.random.Generator) -> H
         return np.zeros(3), -_held(now, size, spin) * spin
 
     form = "torque -c_r N tanh(|omega_t| / 1 rad/s) omega_t / |omega_t|, N MuJoCo's normal force"
-    return Hidden("rolling_resistance", {"c_r": size}, form, wrench=wrench)
+    return Hidden(name="rolling_resistance", values={"c_r": size}, form=form, wrench=wrench)
 
 
 @hidden_effect("torsional_friction", "contact", {"cube": 0.004, "ball": 3e-4}, {"cube": 0.015, "ball": 1.2e-3})
@@ -39,7 +39,7 @@ def torsional_friction(thing: Thing, size: float, rng: np.random.Generator) -> H
         return np.zeros(3), -_held(now, size, spin) * spin
 
     form = "torque -c_t N tanh(|omega_n| / 1 rad/s) sign(omega_n) n, N MuJoCo's normal force"
-    return Hidden("torsional_friction", {"c_t": size}, form, wrench=wrench)
+    return Hidden(name="torsional_friction", values={"c_t": size}, form=form, wrench=wrench)
 
 
 @hidden_effect("viscous_friction", "contact", 0.35, 1.4)
@@ -51,7 +51,12 @@ def viscous_friction(thing: Thing, size: float, rng: np.random.Generator) -> Hid
         share = (now.heights_m < _TOUCHING_M).astype(float)
         return _at_points(now, -c_v * now.velocities_m_s * (1.0, 1.0, 0.0), share / max(share.sum(), 1.0))
 
-    return Hidden("viscous_friction", {"c_v": c_v}, "force -c_v v_t, shared by the points that touch", wrench=wrench)
+    return Hidden(
+        name="viscous_friction",
+        values={"c_v": c_v},
+        form="force -c_v v_t, shared by the points that touch",
+        wrench=wrench,
+    )
 
 
 @hidden_effect("stribeck_friction", "contact", 0.1, 0.25)
@@ -63,7 +68,7 @@ def stribeck_friction(thing: Thing, size: float, rng: np.random.Generator) -> Hi
         friction[:] = (thing.friction + size * np.exp(-((slip / _STRIBECK_SPEED_M_S) ** 2)))[:, None]
 
     form = "mu + d exp(-(v_t / v_s)^2) in every contact and step"
-    return Hidden("stribeck_friction", {"d": size, "v_s": _STRIBECK_SPEED_M_S}, form, touch=touch)
+    return Hidden(name="stribeck_friction", values={"d": size, "v_s": _STRIBECK_SPEED_M_S}, form=form, touch=touch)
 
 
 @hidden_effect("anisotropic_friction", "contact", 0.05, 0.15)
@@ -76,7 +81,10 @@ def anisotropic_friction(thing: Thing, size: float, rng: np.random.Generator) ->
         return replace(world, friction=(max(thing.friction - a, _LEAST_FRICTION), thing.friction + a))
 
     return Hidden(
-        "anisotropic_friction", {"a": a, "b": 0.0}, "MuJoCo's cone with mu + a in x, mu - a in y", build=build
+        name="anisotropic_friction",
+        values={"a": a, "b": 0.0},
+        form="MuJoCo's cone with mu + a in x, mu - a in y",
+        build=build,
     )
 
 
@@ -96,7 +104,7 @@ def friction_patch(thing: Thing, size: float, rng: np.random.Generator) -> Hidde
         friction[:] = np.where((place**2).sum(1) < radius**2, inside, thing.friction)[:, None]
 
     values = {"change": inside - thing.friction, "x_m": middle[0], "y_m": middle[1], "radius_m": radius}
-    return Hidden("friction_patch", values, "mu + change inside a disc with a sharp edge", touch=touch)
+    return Hidden(name="friction_patch", values=values, form="mu + change inside a disc with a sharp edge", touch=touch)
 
 
 @hidden_effect("velocity_restitution", "contact", 0.1, 0.4)
@@ -115,7 +123,7 @@ def velocity_restitution(thing: Thing, size: float, rng: np.random.Generator) ->
         ratio[:] = held
 
     form = "MuJoCo's damping ratio of a contact set when it begins, for a restitution e / (1 + r v)"
-    return Hidden("velocity_restitution", {"r": size}, form, touch=touch)
+    return Hidden(name="velocity_restitution", values={"r": size}, form=form, touch=touch)
 
 
 @hidden_effect("adhesion", "contact", 3.0, 10.0)
@@ -129,7 +137,12 @@ def adhesion(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return _at_points(now, np.array([[0.0, 0.0, -pull]]), share)
 
     values = {"F": pull, "g": _ADHESION_GAP_M}
-    return Hidden("adhesion", values, "force -F (1 - h / g) e_z at the points within the gap, shared", wrench=wrench)
+    return Hidden(
+        name="adhesion",
+        values=values,
+        form="force -F (1 - h / g) e_z at the points within the gap, shared",
+        wrench=wrench,
+    )
 
 
 def _held(now: Moment, length: float, spin: Array) -> float:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from ....schemas import CamerasFile, PosedVideo, Scale, Video
-from ...cameras import Camera, to_intrinsics
-from ...capture import Capture
-from ...images import write_image
-from ...manifest import write_manifest
-from ...tracks import Track
+from ...capture.cameras import Camera, to_intrinsics
+from ...capture.capture import Capture
+from ...capture.images import write_image
+from ...capture.manifest import write_manifest
+from ...capture.tracks import Track
 from ..rig import look_at
 from .case import Case
 from .record import make_capture
@@ -31,7 +31,7 @@ FOCAL_PX = 420.0
 AWAY_M, HEIGHT_M = 2.4, 1.0
 """Of the cameras from the world's origin, about which all paths lie."""
 SUPERSAMPLED = 4
-"""So many points along and across a pixel tell how much of it is covered."""
+"""Number of sample points along and across a pixel, from which its coverage is counted."""
 _BODY, _GROUND, _NOISE = (60, 130, 190), 150, 4.0
 
 
@@ -67,7 +67,13 @@ def video_cameras(case: Case) -> dict[str, Camera]:
     cameras = {}
     for name, azimuth in (("left", facing), ("right", facing + rng.uniform(1.2, 1.7))):
         eye = np.array([AWAY_M * np.cos(azimuth), AWAY_M * np.sin(azimuth), HEIGHT_M])
-        cameras[name] = Camera(width, height, K, np.zeros(0), look_at(eye, np.array([0.0, 0.0, 0.25])))
+        cameras[name] = Camera(
+            width=width,
+            height=height,
+            K=K,
+            distortion=np.zeros(0),
+            T_world_cam=look_at(eye, np.array([0.0, 0.0, 0.25])),
+        )
     return cameras
 
 

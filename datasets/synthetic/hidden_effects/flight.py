@@ -22,7 +22,7 @@ def linear_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def wrench(now: Moment) -> Wrench:
         return -now.mass_kg * size * now.velocity_m_s, NONE
 
-    return Hidden("linear_drag", {"c": size}, "force -m c u at the centre of mass", wrench=wrench)
+    return Hidden(name="linear_drag", values={"c": size}, form="force -m c u at the centre of mass", wrench=wrench)
 
 
 @hidden_effect("quadratic_drag", "flight", 0.1, 0.4)
@@ -33,7 +33,7 @@ def quadratic_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidde
     def wrench(now: Moment) -> Wrench:
         return _air(thing, size, areas, now, now.velocity_m_s), NONE
 
-    return Hidden("quadratic_drag", {"k": size}, _AIR, wrench=wrench)
+    return Hidden(name="quadratic_drag", values={"k": size}, form=_AIR, wrench=wrench)
 
 
 _AIR = (
@@ -59,7 +59,9 @@ def wind(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return _air(thing, k, areas, now, now.velocity_m_s - air), NONE
 
     values = {"w_x": air[0], "w_y": air[1], "k": k}
-    return Hidden("wind", values, f"{_AIR}; u - w for u", ("quadratic_drag",), wrench=wrench)
+    return Hidden(
+        name="wind", values=values, form=f"{_AIR}; u - w for u", comes_with=("quadratic_drag",), wrench=wrench
+    )
 
 
 @hidden_effect("magnus_lift", "flight", {"ball": 0.01}, {"ball": 0.04})
@@ -70,7 +72,7 @@ def magnus_lift(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def wrench(now: Moment) -> Wrench:
         return now.mass_kg * s * cross(now.omega_rad_s, now.velocity_m_s), NONE
 
-    return Hidden("magnus_lift", {"s": s}, "force m s omega x u at the centre of mass", wrench=wrench)
+    return Hidden(name="magnus_lift", values={"s": s}, form="force m s omega x u at the centre of mass", wrench=wrench)
 
 
 @hidden_effect("spin_damping", "flight", 0.2, 1.0)
@@ -81,7 +83,7 @@ def spin_damping(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def wrench(now: Moment) -> Wrench:
         return NONE, -size * inertia * now.omega_rad_s
 
-    return Hidden("spin_damping", {"d": size}, "torque -d (tr I / 3) omega", wrench=wrench)
+    return Hidden(name="spin_damping", values={"d": size}, form="torque -d (tr I / 3) omega", wrench=wrench)
 
 
 @hidden_effect("constant_force", "flight", 0.15, 0.4)
@@ -93,7 +95,7 @@ def constant_force(thing: Thing, size: float, rng: np.random.Generator) -> Hidde
     def wrench(now: Moment) -> Wrench:
         return now.mass_kg * f, NONE
 
-    return Hidden("constant_force", _named("f", f), "force m f at the centre of mass", wrench=wrench)
+    return Hidden(name="constant_force", values=_named("f", f), form="force m f at the centre of mass", wrench=wrench)
 
 
 @hidden_effect("gravity_tilt", "flight", 0.7, 2.0)
@@ -105,7 +107,9 @@ def gravity_tilt(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return replace(world, gravity_m_s2=turn(vector) @ world.gravity_m_s2)
 
     values = {"tilt_x": vector[0], "tilt_y": vector[1]}
-    return Hidden("gravity_tilt", values, "MuJoCo's gravity turned by exp(tilt_x e_x + tilt_y e_y)", build=build)
+    return Hidden(
+        name="gravity_tilt", values=values, form="MuJoCo's gravity turned by exp(tilt_x e_x + tilt_y e_y)", build=build
+    )
 
 
 @hidden_effect("gravity_scale", "flight", 0.01, 0.03)
@@ -116,7 +120,7 @@ def gravity_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden
     def build(world: Mechanics) -> Mechanics:
         return replace(world, gravity_m_s2=(1 + s) * world.gravity_m_s2)
 
-    return Hidden("gravity_scale", {"s": s}, "MuJoCo's gravity times 1 + s", build=build)
+    return Hidden(name="gravity_scale", values={"s": s}, form="MuJoCo's gravity times 1 + s", build=build)
 
 
 @hidden_effect("buoyancy", "flight", 0.1, 0.3)
@@ -126,7 +130,7 @@ def buoyancy(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def wrench(now: Moment) -> Wrench:
         return np.array([0.0, 0.0, now.mass_kg * size]), NONE
 
-    return Hidden("buoyancy", {"b": size}, "force m b upwards at the centre of mass", wrench=wrench)
+    return Hidden(name="buoyancy", values={"b": size}, form="force m b upwards at the centre of mass", wrench=wrench)
 
 
 @hidden_effect("ground_magnet", "flight", 3.0, 10.0)
@@ -138,7 +142,7 @@ def ground_magnet(thing: Thing, size: float, rng: np.random.Generator) -> Hidden
         return np.array([0.0, 0.0, -now.mass_kg * size * (1 + height / _MAGNET_RANGE_M) ** -4]), NONE
 
     form = "force -m A (1 + h / l)^-4 e_z at the centre of mass, h the height of the lowest point"
-    return Hidden("ground_magnet", {"A": size, "l": _MAGNET_RANGE_M}, form, wrench=wrench)
+    return Hidden(name="ground_magnet", values={"A": size, "l": _MAGNET_RANGE_M}, form=form, wrench=wrench)
 
 
 @hidden_effect("com_offset", "flight", {"cube": 0.002, "ball": 0.001}, {"cube": 0.006, "ball": 0.004})
@@ -149,7 +153,7 @@ def com_offset(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def build(world: Mechanics) -> Mechanics:
         return replace(world, com_m=world.com_m + d)
 
-    return Hidden("com_offset", _named("d", d), "MuJoCo's inertial position moved by d", build=build)
+    return Hidden(name="com_offset", values=_named("d", d), form="MuJoCo's inertial position moved by d", build=build)
 
 
 @hidden_effect("inertia_shape", "flight", {"cube": 0.1}, {"cube": 0.3})
@@ -165,9 +169,9 @@ def inertia_shape(thing: Thing, size: float, rng: np.random.Generator) -> Hidden
     inertia = build(Mechanics.of(thing, 1)).inertia_kg_m2
     six = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return Hidden(
-        "inertia_shape",
-        {"inertia_kg_m2": six.tolist(), "factors": factors.tolist()},
-        "MuJoCo's inertia is Q I Q, Q symmetric with the roots of the factors as eigenvalues",
+        name="inertia_shape",
+        values={"inertia_kg_m2": six.tolist(), "factors": factors.tolist()},
+        form="MuJoCo's inertia is Q I Q, Q symmetric with the roots of the factors as eigenvalues",
         build=build,
     )
 

@@ -18,7 +18,7 @@ def length_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def observe(position: Array, rotation: Array) -> tuple[Array, Array]:
         return (1 + s) * position, rotation
 
-    return Hidden("length_scale", {"s": s}, "p_measured = (1 + s) p", observe=observe)
+    return Hidden(name="length_scale", values={"s": s}, form="p_measured = (1 + s) p", observe=observe)
 
 
 @hidden_effect("frame_tilt", "measurement", 0.7, 2.0)
@@ -31,14 +31,16 @@ def frame_tilt(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return position @ matrix.T, matrix @ rotation
 
     values = {"tilt_x": vector[0], "tilt_y": vector[1]}
-    return Hidden("frame_tilt", values, "p_measured = R p, R = exp(tilt_x e_x + tilt_y e_y)", observe=observe)
+    return Hidden(
+        name="frame_tilt", values=values, form="p_measured = R p, R = exp(tilt_x e_x + tilt_y e_y)", observe=observe
+    )
 
 
 @hidden_effect("clock_scale", "measurement", 0.01, 0.03)
 def clock_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     """Times times 1 + s, s [1] of either sign."""
     s = size * sign(rng)
-    return Hidden("clock_scale", {"s": s}, "t_measured = (1 + s) t", clock=1 + s)
+    return Hidden(name="clock_scale", values={"s": s}, form="t_measured = (1 + s) t", clock=1 + s)
 
 
 @hidden_effect("marker_offset", "measurement", {"cube": 0.002, "ball": 0.001}, {"cube": 0.006, "ball": 0.004})
@@ -50,4 +52,4 @@ def marker_offset(thing: Thing, size: float, rng: np.random.Generator) -> Hidden
         return position + rotation @ d, rotation
 
     values = {f"d_{axis}": float(value) for axis, value in zip("xyz", d, strict=True)}
-    return Hidden("marker_offset", values, "p_measured = p + R d", observe=observe)
+    return Hidden(name="marker_offset", values=values, form="p_measured = p + R d", observe=observe)

@@ -16,7 +16,7 @@ GRAVITY_M_S2 = 9.81
 STEP_S = 2e-4
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Mechanics:
     """What the engine is told of the world before it starts; effects change it.
 
@@ -40,10 +40,17 @@ class Mechanics:
     def of(cls, thing: Thing, law: int) -> Mechanics:
         """Return the world without any effect."""
         inertia, gravity = np.diag(thing.inertia_kg_m2), np.array([0.0, 0.0, -GRAVITY_M_S2])
-        return cls(thing, law, np.zeros(3), inertia, gravity, (thing.friction, thing.friction))
+        return cls(
+            thing=thing,
+            law=law,
+            com_m=np.zeros(3),
+            inertia_kg_m2=inertia,
+            gravity_m_s2=gravity,
+            friction=(thing.friction, thing.friction),
+        )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Moment:
     """The state at one time, in world axes.
 
@@ -69,7 +76,7 @@ Wrench = tuple[Array, Array]
 """Force [N] at the centre of mass and torque [N m] about it, world axes."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Hidden:
     """One effect with its true numbers: any of the hooks, each of which does nothing where it is None.
 
@@ -145,4 +152,16 @@ class Reader:
         arms[:, 2] -= self._radius
         inertia = rotation @ self._inertia @ rotation.T
         heights, points = com[2] + arms[:, 2], moving + cross_rows(omega, arms)
-        return Moment(time_s, self._mass, com, moving, omega, rotation, inertia, arms, heights, points, pressed_n)
+        return Moment(
+            time_s=time_s,
+            mass_kg=self._mass,
+            com_m=com,
+            velocity_m_s=moving,
+            omega_rad_s=omega,
+            rotation=rotation,
+            inertia_kg_m2=inertia,
+            arms_m=arms,
+            heights_m=heights,
+            velocities_m_s=points,
+            pressed_n=pressed_n,
+        )

@@ -46,7 +46,14 @@ def draw_mystery(seed: int) -> Case:
     rng = np.random.default_rng([seed, *b"mystery"])
     nothing = rng.random() < NOTHING
     thing, effect = CHOICES[int(rng.integers(len(CHOICES)))]
-    return Case("mystery", thing, () if nothing else (effect,), "large", seed, noise_given=True)
+    return Case(
+        name="mystery",
+        thing=thing,
+        effects=() if nothing else (effect,),
+        magnitude="large",
+        seed=seed,
+        noise_given=True,
+    )
 
 
 def make_mystery(capture: Path, sealed: Path, case: Case) -> None:

@@ -175,7 +175,7 @@ def planned_case(
     # the last bit tells development from the rest, whatever the names
     seed = 2 * (code // 2) + (stage != "development")
     law = 1 + (k if not effects else code // 2) % 2
-    case = Case(name, thing, effects, size, seed, law)
+    case = Case(name=name, thing=thing, effects=effects, magnitude=size, seed=seed, law=law)
     if noise == "study":
         return case
     rng = case.rng("measurement")

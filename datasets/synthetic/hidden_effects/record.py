@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ....schemas import Body, BoxShape, CaptureManifest, Ground, Shape, World
 from ....schemas.capture import Measurement, SphereShape
-from ...atomic import new_directory, new_file
-from ...manifest import write_manifest
-from ...tracks import Track, tracks_csv
+from ...capture.manifest import write_manifest
+from ...capture.tracks import Track, tracks_csv
+from ...io.atomic import new_directory, new_file
 from . import mechanics, mujoco_engine
 from .case import Case
 from .mechanics import Hidden, Mechanics, Motion

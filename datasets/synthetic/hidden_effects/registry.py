@@ -17,7 +17,7 @@ Draw = Callable[[Thing, float, np.random.Generator], Hidden]
 BOTH: tuple[Kind, ...] = ("cube", "ball")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Entry:
     """An effect that can be hidden.
 
@@ -54,7 +54,7 @@ def hidden_effect(
         return dict(value) if isinstance(value, dict) else dict.fromkeys(BOTH, float(value))
 
     def enter(draw: Draw) -> Draw:
-        EFFECTS[name] = Entry(name, acts, by_thing(small), by_thing(large), draw)
+        EFFECTS[name] = Entry(name=name, acts=acts, small=by_thing(small), large=by_thing(large), draw=draw)
         return draw
 
     return enter

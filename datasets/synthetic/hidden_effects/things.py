@@ -16,7 +16,7 @@ _CORNER_M = 1e-4
 """Radius of the spheres in a box's corners, by which MuJoCo has it touch the ground: each has its own friction."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Thing:
     """A homogeneous body and its contact with the ground.
 
@@ -65,7 +65,14 @@ def draw_thing(kind: Kind, law: int, rng: np.random.Generator) -> Thing:
     mass = rng.uniform(0.25, 0.6) if kind == "cube" else rng.uniform(0.06, 0.2)
     friction, damping = rng.uniform(0.2, 0.4), rng.uniform(0.16, 0.45)
     time = rng.uniform(0.7e-3, 1.0e-3) * (1.0 if law == 1 else 2.0)
-    return Thing(kind, half, round(mass, 4), round(friction, 4), round(time, 7), round(damping, 4))
+    return Thing(
+        kind=kind,
+        half_extents_m=half,
+        mass_kg=round(mass, 4),
+        friction=round(friction, 4),
+        natural_time_s=round(time, 7),
+        damping_ratio=round(damping, 4),
+    )
 
 
 def restitution_of(damping_ratio: float | Array) -> Array:

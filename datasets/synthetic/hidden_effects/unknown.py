@@ -22,7 +22,7 @@ def gust(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return (now.mass_kg * np.sin(np.pi * phase) * push if 0 < phase < 1 else NONE), NONE
 
     values = {"f_x": push[0], "f_y": push[1], "begin_s": begin, "width_s": width}
-    return Hidden("gust", values, "force m f sin(pi (t - begin) / width) for 0.15 s", wrench=wrench)
+    return Hidden(name="gust", values=values, form="force m f sin(pi (t - begin) / width) for 0.15 s", wrench=wrench)
 
 
 @hidden_effect("shaking", "unknown", 1.0, 3.0)
@@ -34,7 +34,7 @@ def shaking(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return now.mass_kg * np.sin(2 * np.pi * frequency * now.time_s + phase) * push, NONE
 
     values = {"f_x": push[0], "f_y": push[1], "frequency_hz": frequency, "phase_rad": phase}
-    return Hidden("shaking", values, "force m f sin(2 pi frequency t + phase)", wrench=wrench)
+    return Hidden(name="shaking", values=values, form="force m f sin(2 pi frequency t + phase)", wrench=wrench)
 
 
 @hidden_effect("attractor", "unknown", 1.0, 4.0)
@@ -46,7 +46,7 @@ def attractor(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
         return now.mass_kg * size * (line - now.com_m) * (1.0, 1.0, 0.0), NONE
 
     values = {"stiffness": size, "x_m": line[0], "y_m": line[1]}
-    return Hidden("attractor", values, "force m stiffness (line - x), horizontal", wrench=wrench)
+    return Hidden(name="attractor", values=values, form="force m stiffness (line - x), horizontal", wrench=wrench)
 
 
 @hidden_effect("quadratic_spin_drag", "unknown", 0.02, 0.06)
@@ -58,7 +58,9 @@ def quadratic_spin_drag(thing: Thing, size: float, rng: np.random.Generator) -> 
         omega = now.omega_rad_s
         return NONE, -size * inertia * np.sqrt(omega @ omega) * omega
 
-    return Hidden("quadratic_spin_drag", {"q": size}, "torque -q (tr I / 3) |omega| omega", wrench=wrench)
+    return Hidden(
+        name="quadratic_spin_drag", values={"q": size}, form="torque -q (tr I / 3) |omega| omega", wrench=wrench
+    )
 
 
 @hidden_effect("heading_force", "unknown", 0.6, 2.0)
@@ -74,7 +76,12 @@ def heading_force(thing: Thing, size: float, rng: np.random.Generator) -> Hidden
         pull = now.mass_kg * size * np.sin(2 * (heading - angle)) * min(speed / 0.2, 1.0)
         return pull * np.array([-np.sin(heading), np.cos(heading), 0.0]), NONE
 
-    return Hidden("heading_force", {"f": size, "angle_rad": angle}, "force m f sin(2 (heading - angle))", wrench=wrench)
+    return Hidden(
+        name="heading_force",
+        values={"f": size, "angle_rad": angle},
+        form="force m f sin(2 (heading - angle))",
+        wrench=wrench,
+    )
 
 
 @hidden_effect("gravity_step", "unknown", 0.6, 2.0)
@@ -85,4 +92,6 @@ def gravity_step(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
     def wrench(now: Moment) -> Wrench:
         return (now.mass_kg * f * _UP if now.time_s > begin else NONE), NONE
 
-    return Hidden("gravity_step", {"f": f, "begin_s": begin}, "force m f upwards after a time", wrench=wrench)
+    return Hidden(
+        name="gravity_step", values={"f": f, "begin_s": begin}, form="force m f upwards after a time", wrench=wrench
+    )

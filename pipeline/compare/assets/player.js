@@ -1,53 +1,9 @@
-"""Style sheet and script of a comparison's player: motion, error curves, frames and residual wrenches, one clock."""
-
-REPLAY_STYLE = """
-:root { --m0: #1f5fa8; --m1: #c46a1b; --m2: #1d7a46; --m3: #8e3b8e; --m4: #b3261e; --m5: #5b6472; }
-.chart.ladder { max-width: 1060px; min-width: 640px; } .wrench .scroll svg { min-width: 640px; }
-.ladder .episode { opacity: .45; } .ladder .episode:hover { opacity: 1; }
-.ladder .episode .line { stroke: var(--frozen); stroke-width: 1; } .ladder .episode circle { fill: var(--frozen); }
-.ladder .episode:hover .line { stroke: var(--ink); } .ladder .zero { stroke: var(--ballistic); stroke-dasharray: 5 4; }
-.ladder .median { stroke: var(--model); stroke-width: 3; } circle.median { fill: var(--model); }
-.ladder .floor { stroke: var(--good); stroke-width: 2; } .ladder .fitted { stroke: var(--m3); stroke-width: 2; }
-.chart.ladder .value, .chart.ladder .name { font-size: 13px; fill: var(--ink); } .ladder .value { font-weight: 600; }
-.legend .median { border-color: var(--model); } .legend .floor { border-color: var(--good); }
-.legend .fitted { border-color: var(--m3); } .legend .zero { border-top: 2px dashed var(--ballistic); }
-.legend .episode { border-color: var(--frozen); border-width: 1px; }
-.replay { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 8px 22px; align-items: start; }
-.replay canvas { display: block; width: 100%; background: #fbfbfc; border: 1px solid var(--line); border-radius: 4px; }
-.replay h3 { margin: 6px 0 4px; font-weight: 500; color: var(--soft); font-size: 13.5px; }
-.replay svg.chart { cursor: crosshair; touch-action: none; }
-.replay svg .now { stroke: var(--ink); stroke-width: 1; } .replay svg .bar { stroke: none; }
-.replay svg .one { stroke: var(--good); stroke-dasharray: 4 3; }
-.toggles { display: flex; gap: 8px; flex-wrap: wrap; }
-.toggles button { padding: 2px 10px; border-width: 1px 1px 1px 6px; border-radius: 4px; }
-.toggles button[aria-pressed=true] { background: #fff; color: var(--ink); border-color: var(--line); }
-.toggles button[aria-pressed=false] { color: var(--frozen); text-decoration: line-through; }
-.controls select { font: inherit; font-size: 14px; padding: 3px 6px; border: 1px solid var(--line); border-radius: 6px;
-  background: #fff; color: inherit; }
-.phases { display: flex; flex-wrap: wrap; gap: 4px 14px; font-size: 13px; color: var(--soft); }
-.phases i { display: inline-block; width: 12px; height: 12px; margin-right: 5px; vertical-align: -1px; }
-.film { display: grid; gap: 8px; margin-top: 10px; }
-.film .row { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 8px; }
-.film figure { margin: 0; } .film figcaption { margin-top: 2px; font-size: 13px; }
-.film canvas { width: 100%; display: block; border-radius: 2px; background: #000; }
-table.sortable th { cursor: pointer; user-select: none; } table.sortable th:hover { color: var(--ink); }
-table.sortable th[aria-sort=ascending]::after { content: " ▲"; }
-table.sortable th[aria-sort=descending]::after { content: " ▼"; }
-td button.go { padding: 0 8px; font-size: 13px; }
-.heat { background: rgb(179 38 30 / var(--heat)); padding: 1px 5px; border-radius: 3px; }
-.wrench svg.chart circle { cursor: pointer; } .wrench svg .zero { stroke: var(--frozen); }
-.wrench svg .error { stroke-width: 1; opacity: .35; } .wrench svg circle { opacity: .8; }
-.wrench svg .bin { stroke: var(--ink); stroke-width: 2; fill: none; }
-@media (max-width: 760px) { .replay { grid-template-columns: minmax(0, 1fr); } }
-"""
-
-REPLAY_SCRIPT = """
 (() => {
 const root = document.getElementById("replay"), block = document.getElementById("replay-data");
 for (const table of document.querySelectorAll("table.sortable")) {
   const heads = [...table.tHead.rows[0].cells];
   const key = cell => {
-    const words = cell.textContent.trim().replace(/\\u2212/g, "-"), number = parseFloat(words);
+    const words = cell.textContent.trim().replace(/\u2212/g, "-"), number = parseFloat(words);
     return Number.isNaN(number) ? words : number;
   };
   heads.forEach((head, column) => {
@@ -167,7 +123,7 @@ function view(canvas, vertical) {
   const place = p => [x0 + s * (dot(U, p) - mid), y0 - s * (dot(V, p) - middle)];
   g.font = "11px system-ui, sans-serif"; g.fillStyle = soft; g.strokeStyle = "#e6e8ec"; g.lineWidth = 1;
   const grid = step(Math.max(high[0] - low[0], high[vertical] - low[vertical]));
-  const words = v => (Math.abs(v) < 1e-9 ? 0 : v).toFixed(grid < 0.1 ? 2 : 1).replace("-", "\u2212");
+  const words = v => (Math.abs(v) < 1e-9 ? 0 : v).toFixed(grid < 0.1 ? 2 : 1).replace("-", "−");
   const from = mid - (x0 - left) / s, to = mid + (width - 8 - x0) / s;
   for (let v = Math.ceil(from / grid) * grid; v <= to + 1e-9; v += grid) {
     const x = x0 + s * (v - mid);
@@ -388,7 +344,7 @@ const show = k => { frame = k; draw(); };
 function choose(k, time) {
   at = k; frame = time === undefined ? 0 : nearest(episode().t, time);
   picker.value = k; slider.max = episode().t.length - 1;
-  find("bearing").textContent = String(episode().bearing).replace("-", "\u2212");
+  find("bearing").textContent = String(episode().bearing).replace("-", "−");
   prepare(); draw();
 }
 const stop = () => { clearInterval(timer); timer = null; play.textContent = "Play"; };
@@ -477,4 +433,3 @@ for (const select of chart.querySelectorAll("select")) select.addEventListener("
 const first = data.wrench.first;
 part("model").value = 0; part("kind").value = first[0]; part("coordinate").value = first[1]; scatter();
 })();
-"""

@@ -1,9 +1,10 @@
-"""Glides against impacts: is the friction of what glides that of what strikes?
+"""Friction consistency test: does the friction of sliding segments agree with that of impacts?
 
-A ground that pulls presses a gliding body harder than its weight, so that glides show a larger friction, by the factor
-1 + F / m g; in an impact the pull is nothing beside the impulse. Every candidate is fitted to the glides beside a
-friction; what brings that to the one of impacts, which is known to the share by which the two differ where nothing is
-missing, is named. Not for a ball: its impacts end sticking as a rule, and tell no friction.
+A ground that attracts the body presses a sliding body harder than its weight, so sliding shows a friction larger by the
+factor 1 + F / m g; in an impact the attraction is negligible against the impulse. Every candidate is fitted to the
+sliding segments together with a friction. A candidate is selected if it brings this friction to that of the impacts,
+within the share by which the two differ where nothing is missing. The test does not apply to a ball: its impacts
+usually end sticking and do not show the friction.
 """
 
 from __future__ import annotations
@@ -16,176 +17,193 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..physics.parameters import CONTACT_PARAMETERS, Parameter
-from ..physics.world import World
-from ..tails import chi2_tail
-from .candidates import Candidate, Variant, admissible, variants_of
-from .cuts import Segment
-from .glide_fits import GlideFit
-from .glide_stage import (
-    FIRST_ITERATIONS,
-    SURPLUS_SIGMAS,
-    GlideEvidence,
-    StartedGlides,
-    batches,
-    fitted_glides,
-)
-from .phases import is_round
-from .prepared import Prepared
-from .refit import refit
-from .score import ScoreTest
-from .segments import Segments
-from .slots import Evidence
+from ...optimization.uncertainty import chi2_tail
+from ...physics.parameters import CONTACT_PARAMETERS, Parameter
+from ...physics.world import World
+from ...segments.candidates import Candidate, Variant, admissible, variants_of
+from ...segments.contact_phases import is_round
+from ...segments.prepare import Prepared
+from ...segments.segment_fit import refit
+from ...segments.segments import Segments
+from ...segments.sliding_fit import SlidingFit, StartedSliding, fit_sliding
+from ...trajectories.segmentation import Segment
+from ..effect_selection import Evidence
+from ..score_test import ScoreTest
+from .sliding import FIRST_ITERATIONS, SURPLUS_SIGMAS, SlidingEvidence, batches
 
 SPREAD = 0.13
-"""Frictions of glides and of impacts differ by this share (root mean square of the logarithm; at most 0.33 of 14) on
-development seeds where nothing is missing: no law of contact is exact in an impact."""
+"""Standard deviation of the logarithm of the ratio between the frictions of sliding and of impacts where nothing is
+missing, because no contact law is exact in an impact. Root mean square of 14 development cases, of which the largest
+was 0.33."""
 SCORE, RESOLVED = 8.0, 0.75
-"""An effect is named above this score, and where it takes away this share of what lies between the frictions. Nothing
-is fitted where those alone differ by less [chi2]: on development seeds 6 without one at most, 13 to 29 with one."""
+"""Thresholds of the test: minimum score, and minimum share of the discrepancy between the frictions that the effect
+removes. The score is also the minimum discrepancy [chi2] for which effects are fitted: on the development cases it was
+at most 6 without an effect and 13 to 29 with one."""
 LEAD = 6.0
-"""Another one within this score of it leaves the two unseparated."""
+"""Another effect counts as equal if its score is lower by less than this."""
 FEWEST = 6
-"""So many segments with impacts are the fewest that tell a friction."""
+"""Minimum number of segments with impacts for an estimate of their friction."""
 
 
 @dataclass(frozen=True)
-class _Struck:
-    """The friction that impacts tell: value [1], the width of its logarithm, and by what chi2 of glides is divided."""
+class _ImpactFriction:
+    """Friction estimated from impacts."""
 
     friction: float
+    """Friction coefficient [1]."""
     width: float
+    """Standard error of its logarithm, including the model error."""
     spread: float
+    """Factor by which chi2 of the sliding segments is divided."""
 
-    def joint(self, fit: GlideFit) -> float:
-        """Return chi2 of glides, and of their friction as far as they tell it apart from the fitted effect."""
+    def joint(self, fit: SlidingFit) -> float:
+        """Return chi2 of the sliding segments plus that of the discrepancy between the frictions."""
         return fit.cost / self.spread + self.between(fit)
 
-    def between(self, fit: GlideFit) -> float:
-        """Return chi2 of the two frictions alone."""
+    def between(self, fit: SlidingFit) -> float:
+        """Return chi2 of the discrepancy, with the error of the sliding friction given the fitted effect."""
         variance = float(self.covariance(fit)[0, 0])
         return self.apart(fit.values[0, 0]) ** 2 / (self.width**2 + variance)
 
     def apart(self, value: Tensor) -> float:
-        """Return by how much the logarithm of a friction exceeds that of impacts."""
+        """Return the difference between the logarithm of a friction and that of the impacts."""
         return float(value) - math.log(self.friction)
 
-    def covariance(self, fit: GlideFit) -> Tensor:
-        """Return the covariance (P, P) of what was fitted to glides."""
+    def covariance(self, fit: SlidingFit) -> Tensor:
+        """Return the covariance (P, P) of the parameters fitted to the sliding segments."""
         return torch.linalg.pinv(fit.information[0], hermitian=True) * self.spread
 
 
-def grip_evidence(
+def friction_consistency_evidence(
     prepared: Prepared,
     world: World,
     contact: Segments,
     candidates: Sequence[Candidate],
-    started: StartedGlides | None,
-) -> list[GlideEvidence]:
-    """Return the evidence of candidates that glides and impacts together tell, the best first; mostly none.
+    started: StartedSliding | None,
+) -> list[SlidingEvidence]:
+    """Return the evidence of candidates that resolve a discrepancy between the frictions, the best first.
+
+    It is empty without such a discrepancy, without sliding segments or enough impacts, and for a round body.
 
     Args:
         prepared: The episodes.
         world: The model's world.
-        contact: Its contact segments with fitted states.
-        candidates: All of them.
-        started: Its glides.
+        contact: Contact segments with fitted states.
+        candidates: All candidates.
+        started: The sliding segments and their fit without candidates.
     """
     if started is None or is_round(world.bodies[world.free[0]]):
         return []
-    glides, own, known = started.segments, started.friction, started.told
-    hits = [k for k, item in enumerate(contact.items) if not _within(item, glides.items)]
-    if len(hits) < FEWEST:
+    sliding, own, known = started.segments, started.friction, started.told
+    struck = [k for k, item in enumerate(contact.items) if not _within(item, sliding.items)]
+    if len(struck) < FEWEST:
         return []
-    soft = glides.world
-    told, error = refit([contact.select(hits)], world, CONTACT_PARAMETERS).number("friction")
-    struck = _Struck(told, math.hypot(SPREAD, error / told), 1.0)
-    if (struck.apart(own) / struck.width) ** 2 < SCORE:
+    soft_world = sliding.world
+    friction, error = refit([contact.select(struck)], world, CONTACT_PARAMETERS).number("friction")
+    impacts = _ImpactFriction(friction, math.hypot(SPREAD, error / friction), 1.0)
+    if (impacts.apart(own) / impacts.width) ** 2 < SCORE:
         return []
-    alone = fitted_glides(soft, [], [(glides, own[None])], known)[0]
-    degrees = float(glides.dof.sum())
-    struck = replace(struck, spread=max(1.0, alone.cost / degrees))
+    alone = fit_sliding(soft_world, [], [(sliding, own[None])], known)[0]
+    degrees = float(sliding.dof.sum())
+    impacts = replace(impacts, spread=max(1.0, alone.cost / degrees))
     kept, _ = admissible(world, candidates, prepared.turned)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
-    # no fit of glides falls further below its mean by chance
+    # chi2 of the sliding segments falls no further below its mean by chance
     surplus = alone.cost - degrees + SURPLUS_SIGMAS * math.sqrt(2 * degrees)
-    most = (struck.apart(own) / struck.width) ** 2 + surplus / struck.spread
+    most = (impacts.apart(own) / impacts.width) ** 2 + surplus / impacts.spread
     variants = [v for v in variants if len(v.parameters) * math.log(degrees) + SCORE < most]
-    found = _fits(soft, variants, alone, struck, known)
+    found = _fits(soft_world, variants, alone, impacts, known)
     if not found:
         return []
-    # what the friction alone gains from where the best one ended is no sign of an effect
-    _, ended = min(found, key=lambda one: struck.joint(one[1]))
-    again = fitted_glides(soft, [], [(ended.segments, own[None])], known)[0]
-    least = min((alone, again), key=struck.joint)
-    return _ranked(found, kept, least, degrees, struck)
+    # the friction alone, fitted again from the states of the best candidate: what both gain is no sign of an effect
+    _, ended = min(found, key=lambda one: impacts.joint(one[1]))
+    again = fit_sliding(soft_world, [], [(ended.segments, own[None])], known)[0]
+    least = min((alone, again), key=impacts.joint)
+    return _ranked(found, kept, least, degrees, impacts)
 
 
 def _fits(
-    soft: World, variants: Sequence[Variant], alone: GlideFit, struck: _Struck, known: Sequence[Parameter]
-) -> list[tuple[Variant, GlideFit]]:
-    """Return the fits of the variants, those that are far behind after some steps only to there."""
+    soft_world: World,
+    variants: Sequence[Variant],
+    alone: SlidingFit,
+    impacts: _ImpactFriction,
+    known: Sequence[Parameter],
+) -> list[tuple[Variant, SlidingFit]]:
+    """Fit the variants; those that are far behind after the first iterations are not continued."""
     own = alone.values[0]
     pulls = [v for v in variants if len(v.parameters) == 1 and v.active.effect.has("wrench")]
-    found: list[tuple[Variant, GlideFit]] = []
+    found: list[tuple[Variant, SlidingFit]] = []
     for part in batches([v for v in variants if v not in pulls]):
-        tried = fitted_glides(soft, part, [(alone.segments, own)] * len(part), known, FIRST_ITERATIONS)
-        costs = [struck.joint(fit) for fit in tried]
+        tried = fit_sliding(soft_world, part, [(alone.segments, own)] * len(part), known, FIRST_ITERATIONS)
+        costs = [impacts.joint(fit) for fit in tried]
         for variant, fit, cost in zip(part, tried, costs, strict=True):
             close = cost == min(costs)
-            again = fitted_glides(soft, [variant], [(fit.segments, fit.values[0])], known)[0] if close else fit
+            again = fit_sliding(soft_world, [variant], [(fit.segments, fit.values[0])], known)[0] if close else fit
             found.append((variant, again))
-    # what pulls does to a glide just what more friction does: the fit of that, with the friction of impacts
-    body = soft.bodies[soft.free[0]]
-    press = float(body.mass[0] * soft.gravity[0].norm()) * math.expm1(struck.apart(own[0]))
+    # an attracting ground acts on sliding as more friction does: start at the force that explains the discrepancy
+    body = soft_world.bodies[soft_world.free[0]]
+    press = float(body.mass[0] * soft_world.gravity[0].norm()) * math.expm1(impacts.apart(own[0]))
     for variant in pulls if press > 0 else []:
         start = torch.cat([own, torch.tensor([press]).to(own)])
-        start[0] = math.log(struck.friction)
-        found.append((variant, fitted_glides(soft, [variant], [(alone.segments, start)], known, FIRST_ITERATIONS)[0]))
+        start[0] = math.log(impacts.friction)
+        found.append(
+            (variant, fit_sliding(soft_world, [variant], [(alone.segments, start)], known, FIRST_ITERATIONS)[0])
+        )
     return found
 
 
 def _ranked(
-    found: Sequence[tuple[Variant, GlideFit]],
+    found: Sequence[tuple[Variant, SlidingFit]],
     kept: Sequence[Candidate],
-    alone: GlideFit,
+    alone: SlidingFit,
     degrees: float,
-    struck: _Struck,
-) -> list[GlideEvidence]:
-    """Return the evidence of what was fitted; its share is that of what lies between the two frictions."""
-    best: dict[int, GlideEvidence] = {}
+    impacts: _ImpactFriction,
+) -> list[SlidingEvidence]:
+    """Return the evidence of the fits, the best first; its share is that of the discrepancy between the frictions."""
+    best: dict[int, SlidingEvidence] = {}
     for variant, fit in found:
         candidate, number = kept[variant.place], len(variant.parameters)
-        gain = max(0.0, struck.joint(alone) - struck.joint(fit))
-        spread = struck.covariance(fit)
-        # what is left between the two frictions is shared among all that was fitted
-        share = spread[:, 0] / (struck.width**2 + spread[0, 0])
-        moved = fit.values[0] - share * struck.apart(fit.values[0, 0])
+        gain = max(0.0, impacts.joint(alone) - impacts.joint(fit))
+        spread = impacts.covariance(fit)
+        # the residual discrepancy is distributed over all fitted parameters
+        share = spread[:, 0] / (impacts.width**2 + spread[0, 0])
+        moved = fit.values[0] - share * impacts.apart(fit.values[0, 0])
         spread = spread - share[:, None] * spread[0]
         values = moved[-number:].numpy().astype(np.float64)
         covariance = spread[-number:, -number:].numpy().astype(np.float64)
         p_value = chi2_tail(gain, number)
-        test = ScoreTest(gain, number, p_value, values, covariance, bool((values != 0).any()))
+        test = ScoreTest(
+            statistic=gain,
+            dof=number,
+            p_value=p_value,
+            estimate=values,
+            covariance=covariance,
+            admissible=bool((values != 0).any()),
+        )
         deviations = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         names = [p.name for p in candidate.effect.parameters]
-        numbers = {name: (float(v), float(s)) for name, v, s in zip(names, values, deviations, strict=True)}
-        evidence = Evidence(candidate, variant.constants, test, p_value, numbers=numbers)
+        estimates = {name: (float(v), float(s)) for name, v, s in zip(names, values, deviations, strict=True)}
+        evidence = Evidence(
+            candidate=candidate, constants=variant.constants, test=test, p_value=p_value, numbers=estimates
+        )
         score = gain - number * math.log(degrees)
-        resolved = 1 - struck.between(fit) / struck.between(alone)
-        one = GlideEvidence(evidence, score, float(moved[0].exp()), fit.cost / degrees, resolved)
+        resolved = 1 - impacts.between(fit) / impacts.between(alone)
+        one = SlidingEvidence(
+            evidence=evidence, score=score, friction=float(moved[0].exp()), left=fit.cost / degrees, share=resolved
+        )
         if variant.place not in best or score > best[variant.place].score:
             best[variant.place] = one
     return sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))
 
 
-def named_by_grip(evidence: Sequence[GlideEvidence]) -> list[GlideEvidence]:
-    """Return the effect that brings glides and impacts together, and its equals; none where there is none."""
+def selected_by_friction_consistency(evidence: Sequence[SlidingEvidence]) -> list[SlidingEvidence]:
+    """Return the effect that reconciles sliding and impacts, and its equals; empty if none passes the thresholds."""
     fit = [one for one in evidence if one.evidence.test.admissible]
     if not fit or fit[0].score < SCORE or fit[0].share < RESOLVED:
         return []
     return [one for one in fit if one.score > fit[0].score - LEAD and one.share >= RESOLVED]
 
 
-def _within(item: Segment, glides: Sequence[Segment]) -> bool:
-    """Whether a contact segment lies in a glide, to a frame."""
-    return any(item.episode == g.episode and item.first >= g.first - 1 and item.last <= g.last + 1 for g in glides)
+def _within(item: Segment, sliding: Sequence[Segment]) -> bool:
+    """Return whether a contact segment lies within a sliding segment, up to one frame."""
+    return any(item.episode == g.episode and item.first >= g.first - 1 and item.last <= g.last + 1 for g in sliding)

@@ -1,9 +1,9 @@
-"""What impacts say: is an effect of contact missing where a ball meets the ground and leaves it again?
+"""Impact test: is a contact effect missing where a ball meets the ground and leaves it again?
 
-Every candidate is fitted to the same impacts beside one restitution and one friction of all of them (`impact_law.py`).
-Their velocities before and after are those of the flights (`impacts.py`), so that no law of contact enters. A friction
-is told only by impacts through which the point that touches slides; one that sticks has the same end whatever the
-friction, and effects that no impact tells are left out.
+Every candidate is fitted to the same impacts, together with one restitution and one friction for all of them
+(`impact_law.py`). The velocities before and after an impact are those of the flights (`impact_velocities.py`), so no
+contact law enters. Only impacts whose contact point slides show the friction; one that sticks ends the same whatever
+the friction is. Effects that no impact shows are left out.
 """
 
 from __future__ import annotations
@@ -16,62 +16,58 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..physics.contact import ContactLaw
-from ..physics.effects.effect import ActiveEffect
-from ..physics.parameters import Parameter
-from ..physics.world import World
-from ..tails import f_tail
-from .candidates import Candidate, Variant, admissible, base_values, variants_of, with_variants
-from .glide_stage import own_numbers
-from .impact_fits import BASE, ImpactFit, ImpactProblem, fit_impacts
-from .impacts import Impacts, measured_impacts
-from .prepared import Prepared
-from .score import ScoreTest
-from .slots import Evidence
+from ...optimization.uncertainty import f_tail
+from ...physics.contact_law import ContactLaw
+from ...physics.effects.effect import ActiveEffect
+from ...physics.world import World
+from ...segments.candidates import Candidate, Variant, admissible, variants_of
+from ...segments.impact_fit import BASE, LEAST, ImpactBase, ImpactFit, ImpactProblem, fit_impacts
+from ...segments.impact_velocities import measured_impacts
+from ...segments.prepare import Prepared
+from ..effect_selection import Evidence
+from ..score_test import ScoreTest
 
 Array = NDArray[np.float64]
 
-LEAST = 4
-"""So many impacts are the fewest that tell more than a restitution."""
 TOLD = 1.0
-"""Impacts tell an effect where one of a size that matters moves them by more than this [chi2]."""
-WEIGH_AGAIN = 2
-"""So many times the base is fitted, each with weights from the one before."""
+"""Minimum change of the impacts [chi2] by an effect of the usual size for the effect to be tested."""
 SCORE, SIZE, EXPLAINED, HELD_OUT_T = 6.0, 0.35, 0.5, 1.0
-"""An effect in impacts is named above this score, this size in scales that matter, this share of the excess of chi2
-that it explains, and where held-out episodes gain, by more than so many standard errors of their mean. On development
-seeds the largest scores of 30 balls without an effect were 4.1 and 2.7, of effects of sizes 0.26 and 0.33."""
+"""Thresholds of the impact test: minimum score, minimum size in usual sizes of the parameters, minimum share of the
+excess of chi2 that the effect explains, and minimum mean gain of held-out episodes in its standard errors. On the
+development cases the largest scores of 30 balls without an effect were 4.1 and 2.7, of effects of sizes 0.26 and
+0.33."""
 LEAD, LEAD_SHARE = 6.0, 0.1
-"""Another one within this score of it, or this share of it, leaves the two unseparated if it has a size, too."""
+"""Another effect counts as equal if its score is lower by less than the first value, or by less than this share of the
+best score, and its size is above `SIZE`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImpactEvidence:
-    """A candidate in impacts.
-
-    score: by how much chi2 falls, in units of what the best candidate leaves, less the penalty of BIC; evidence, with
-    its numbers and held-out gains; fit: of the base and the effect; size: of the largest of its numbers, in scales that
-    matter; gain, t: of the held-out episodes together, and their mean in its standard errors, of the best alone and
-    where it stands out; share: of the excess of chi2 that it explains, in the part (rebounds, or the rest) that it acts
-    on.
-    """
+    """Evidence for a candidate in impacts."""
 
     evidence: Evidence
+    """Evidence with estimates and held-out gains."""
     score: float
+    """Fall of chi2 in units of the residual of the best candidate, less the penalty of BIC."""
     fit: ImpactFit
+    """Fit of restitution, friction and the effect."""
     size: float
+    """Size of the largest parameter, in usual sizes."""
     gain: float
+    """Gain of all held-out episodes together; 0 except for the best candidate above the other thresholds."""
     t: float
+    """Mean gain of the held-out episodes in its standard errors; 0 where `gain` is not computed."""
     share: float
+    """Share of the excess of chi2 that it explains, in the part (rebounds, or the rest) that it acts on."""
 
 
 def impact_evidence(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> list[ImpactEvidence]:
-    """Return the evidence of the candidates that impacts tell, the best first; none where no ball meets the ground.
+    """Return the evidence of the candidates that impacts show, the best first; empty without enough impacts of a ball.
 
     Args:
         prepared: The episodes.
         world: The model's world.
-        candidates: All of them.
+        candidates: All candidates.
     """
     if not isinstance(world.contact, ContactLaw):
         return []
@@ -84,93 +80,41 @@ def impact_evidence(prepared: Prepared, world: World, candidates: Sequence[Candi
     found = []
     for variant in variants:
         problem, start = base.beside(variant)
-        if _told(problem, start, len(base.parameters)):
+        if _is_shown(problem, start, len(base.parameters)):
             found.append((variant, fit_impacts(problem, start, centre=base.centre_of(start))))
     return _ranked(base, found, kept)
 
 
 def with_impact_effect(world: World, found: ImpactEvidence) -> World:
-    """Return the world with an effect and the restitution beside it as impacts tell them.
+    """Return the world with an effect and the restitution, both as estimated from the impacts.
 
-    The friction stays: that of impacts is seldom told, and what glides and other contacts tell was fitted.
+    The friction keeps its value: impacts seldom show it, and it was fitted to sliding and other contacts.
     """
     evidence, law = found.evidence, world.contact
-    assert isinstance(law, ContactLaw) and evidence.numbers is not None
-    values = evidence.constants | {name: value for name, (value, _) in evidence.numbers.items()}
+    assert isinstance(law, ContactLaw)  # impacts are tested under no other law
+    values = evidence.constants | {name: value for name, (value, _) in evidence.estimates.items()}
     active = ActiveEffect.of(evidence.candidate.effect, values, world.gravity[0, :1])
     place = [p.name for p in BASE].index("damping_ratio")
     ratio = torch.full_like(law.damping_ratio, float(np.exp(found.fit.values[place])))
     return replace(world, contact=replace(law, damping_ratio=ratio), effects=(*world.effects, active))
 
 
-def named_by_impacts(evidence: Sequence[ImpactEvidence]) -> list[ImpactEvidence]:
-    """Return the effect that impacts name and its equals; none where they name none."""
-    if not evidence or not _stands_out(evidence[0]) or evidence[0].gain <= 0 or evidence[0].t < HELD_OUT_T:
+def selected_in_impacts(evidence: Sequence[ImpactEvidence]) -> list[ImpactEvidence]:
+    """Return the effect that the impact test selects and its equals; empty where it selects none."""
+    if not evidence or not _is_candidate(evidence[0]) or evidence[0].gain <= 0 or evidence[0].t < HELD_OUT_T:
         return []
     lead = max(LEAD, LEAD_SHARE * evidence[0].score)
     fit = [one for one in evidence if one.evidence.test.admissible and one.size > SIZE and one.score > 0]
     return [one for one in fit if one.score > evidence[0].score - lead]
 
 
-def _stands_out(one: ImpactEvidence) -> bool:
-    """Whether the best effect is worth a look at held-out episodes, which takes most of the time."""
+def _is_candidate(one: ImpactEvidence) -> bool:
+    """Return whether an effect passes all thresholds but those of held-out episodes, which take most of the time."""
     return one.evidence.test.admissible and one.size > SIZE and one.score >= SCORE and one.share >= EXPLAINED
 
 
-@dataclass(frozen=True, eq=False)
-class ImpactBase:
-    """The world without a candidate, fitted to the impacts: what every candidate starts from and is compared with."""
-
-    problem: ImpactProblem
-    centre: torch.Tensor
-    fit: ImpactFit
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Numbers of the contact and of the effects that the world has."""
-        return self.problem.parameters
-
-    @staticmethod
-    def of(world: World, impacts: Impacts) -> ImpactBase:
-        """Fit what a world has to impacts."""
-        known = own_numbers(world)
-        # not where the model's fit put them: an effect that it lacks has pulled them
-        usual = torch.tensor([p.encode(p.prior[0]) for p in BASE]).to(world.gravity)
-        parameters, centre = (*BASE, *known), torch.cat([usual, base_values(world, known)])
-        problem, value = ImpactProblem(world, parameters, impacts), centre
-        for _ in range(WEIGH_AGAIN):
-            problem = problem.whitened(value)
-            fit = fit_impacts(problem, value, centre=centre)
-            value = torch.as_tensor(fit.values)
-        return ImpactBase(problem, centre, fit)
-
-    def beside(self, variant: Variant) -> tuple[ImpactProblem, torch.Tensor]:
-        """Return the problem with a candidate, and values to start from."""
-        world, own = with_variants(self.problem.world, [variant], "contact")
-        zero = torch.zeros(len(own)).to(self.centre)
-        problem = replace(self.problem, world=world, parameters=(*self.parameters, *own))
-        return problem, torch.cat([torch.as_tensor(self.fit.values), zero])
-
-    def centre_of(self, start: torch.Tensor) -> torch.Tensor:
-        """Return the centre of the priors of a problem with a candidate."""
-        return torch.cat([self.centre, torch.zeros_like(start[len(self.centre) :])])
-
-    def gains(self, problem: ImpactProblem, value: Array) -> Array:
-        """Return by how much chi2 of each episode falls when the others tell an effect's numbers."""
-        episode = self.problem.impacts.episode
-        start = torch.as_tensor(value)
-        gains = []
-        for own in np.unique(episode):
-            others = (episode != own).astype(np.float64)
-            without = fit_impacts(self.problem, torch.as_tensor(self.fit.values), others, self.centre)
-            fitted = fit_impacts(problem, start, others, self.centre_of(start))
-            parts = [(fit.rows[episode == own] ** 2).sum() for fit in (without, fitted)]
-            gains.append(float(parts[0] - parts[1]))
-        return np.array(gains)
-
-
-def _told(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
-    """Whether an effect of a size that matters, either way where that may be, moves the impacts."""
+def _is_shown(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
+    """Return whether an effect of the usual size, of either sign where both are allowed, changes the impacts."""
     moves = []
     for place, parameter in enumerate(problem.parameters[base:], base):
         scale = parameter.prior[1] / 5
@@ -185,6 +129,7 @@ def _told(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
 def _ranked(
     base: ImpactBase, found: Sequence[tuple[Variant, ImpactFit]], kept: Sequence[Candidate]
 ) -> list[ImpactEvidence]:
+    """Return the evidence of the fits, the best first and with its held-out gains."""
     if not found:
         return []
     tries: dict[int, int] = {}
@@ -192,7 +137,7 @@ def _ranked(
         tries[variant.place] = tries.get(variant.place, 0) + 1
     count = len(base.problem.impacts)
     degrees = np.array([count - 1, 5 * count - 1], dtype=float)
-    # what is left by the best of all, in rebounds and in the rest; impacts that scatter more count less
+    # smallest residuals of all fits, in rebounds and in the rest: impacts with more scatter have less weight
     left = np.min([fit.chi2 for _, fit in found], axis=0)
     spread = np.maximum(1.0, left / degrees)
     best: dict[int, ImpactEvidence] = {}
@@ -206,20 +151,29 @@ def _ranked(
         freedom = max(float(degrees.sum()) - number, 1.0)
         p_value = f_tail(fall / number, number, freedom)
         covariance = np.linalg.inv(fit.information)[-number:, -number:] * spread[part]
-        test = ScoreTest(fall, number, p_value, values, covariance, bool((values != 0).any()))
-        numbers = {
+        test = ScoreTest(
+            statistic=fall,
+            dof=number,
+            p_value=p_value,
+            estimate=values,
+            covariance=covariance,
+            admissible=bool((values != 0).any()),
+        )
+        estimates = {
             p.name: (float(v), float(s))
             for p, v, s in zip(candidate.effect.parameters, values, np.sqrt(np.diag(covariance)), strict=True)
         }
         size = float(np.max([abs(v) / p.scale for p, v in zip(candidate.effect.parameters, values, strict=True)]))
         score = fall - number * math.log(count) - 2 * math.log(tries[variant.place])
         corrected = min(1.0, p_value * tries[variant.place])
-        evidence = Evidence(candidate, variant.constants, test, corrected, numbers=numbers)
-        one = ImpactEvidence(evidence, score, fit, size, 0.0, 0.0, share)
+        evidence = Evidence(
+            candidate=candidate, constants=variant.constants, test=test, p_value=corrected, numbers=estimates
+        )
+        one = ImpactEvidence(evidence=evidence, score=score, fit=fit, size=size, gain=0.0, t=0.0, share=share)
         if variant.place not in best or score > best[variant.place].score:
             best[variant.place] = one
     order = sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))
-    return [_held_out(base, order[0], found, kept, spread), *order[1:]] if _stands_out(order[0]) else order
+    return [_held_out(base, order[0], found, kept, spread), *order[1:]] if _is_candidate(order[0]) else order
 
 
 def _held_out(
@@ -229,7 +183,7 @@ def _held_out(
     kept: Sequence[Candidate],
     spread: Array,
 ) -> ImpactEvidence:
-    """Return the evidence with what it gains in episodes that it was not fitted to."""
+    """Return the evidence with its gains in held-out episodes."""
     own = one.evidence
     variant = next(v for v, _ in found if kept[v.place] is own.candidate and v.constants == own.constants)
     gains = base.gains(base.beside(variant)[0], one.fit.values) / float(spread.max())

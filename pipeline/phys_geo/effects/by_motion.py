@@ -1,7 +1,8 @@
-"""Effects of contact fitted to glides: while a body slides, rolls or spins on the ground its weight is the force.
+"""Fit effects to the kind of motion that identifies them: flights, sliding segments, impacts of a ball.
 
-About an impact a law of contact misses more than most effects change, and a fit there bends them until it fits. In a
-glide the normal force is the weight by every law, so that what is left between motion and model is friction.
+An effect that acts in flight is fitted to flights alone, where motion and model differ only by noise. Around an impact
+the error of a contact law exceeds the influence of most effects, and a fit there would absorb that error. In sliding
+and rolling the normal force is the weight under every law, so that the residual is friction.
 """
 
 from __future__ import annotations
@@ -9,65 +10,126 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
-from .diagnosis.glide_fits import told_by_each
-from .diagnosis.glide_stage import StartedGlides, fitted_along, fitted_glides
-from .diagnosis.prepared import Prepared
-from .first_contacts import FirstContacts
-from .physics.effects import Effect
-from .physics.parameters import FRICTION
-from .physics.world import World
-from .shown_effects import at_nothing, shown_effects
+from ....datasets.capture.tracks import Track
+from ...optimization.uncertainty import correlation_of, few_covariance
+from ...physics.contact_law import ContactLaw
+from ...physics.effects import Effect
+from ...physics.parameters import DAMPING_RATIO, FRICTION, Parameter
+from ...physics.world import World
+from ...segments.candidates import base_values
+from ...segments.first_contact_fit import UNOBSERVABLE_SHARE, EffectEstimate, described, placed
+from ...segments.impact_fit import BASE, LEAST, ImpactBase, fit_impacts
+from ...segments.impact_velocities import measured_impacts
+from ...segments.prepare import Prepared, prepare
+from ...segments.segment_fit import linearised, refit
+from ...segments.sliding_fit import (
+    StartedSliding,
+    contact_effect_parameters,
+    fit_sliding,
+    information_by_segment,
+    nuisance_parameters,
+)
+from .identified_effects import at_neutral, identified_effects
+
+ITERATIONS = 25
+"""Maximum number of steps in a fit to flights."""
+
+
+def fit_effect_flights(
+    world: World,
+    episodes: Sequence[tuple[str, dict[str, Track]]],
+    wanted: Sequence[tuple[Parameter, float]],
+    noise: tuple[float, float],
+) -> EffectEstimate | None:
+    """Fit effects to the flights of episodes, each with its own initial state, as `cgwm diagnose` does.
+
+    Impacts are left out, because the errors of the contact law would bias the effects' parameters.
+
+    Args:
+        world: World with effects, none of which acts in contact alone.
+        episodes: Name and tracks by body of each episode.
+        wanted: Parameters of the effects, and their start.
+        noise: Noise of the tracks (position [m], rotation [rad]).
+
+    Returns:
+        The estimate; None if there are no flights, or they do not identify all parameters.
+    """
+    prepared = prepare(world, episodes, noise)
+    if prepared.flight is None:
+        return None
+    names = [parameter for parameter, _ in wanted]
+    start = torch.tensor([parameter.encode(value) for parameter, value in wanted]).to(world.gravity)
+    found = refit([prepared.flight], world, names, start, ITERATIONS)
+    linear = linearised(found.segments[0], names, found.values)
+    prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start).numpy()
+    information = linear.information.sum(0).numpy()
+    # the error of an effect's formula is common to all frames of an episode
+    episode = torch.tensor([item.episode for item in prepared.flight.items])
+    scores = torch.stack([linear.score[episode == one].sum(0) for one in episode.unique().tolist()])
+    excess = max(prepared.slow, float(linear.chi2.sum() / linear.dof.sum().clamp_min(1.0)), 1.0)
+    covariance = few_covariance(information / excess + prior, scores.numpy() / excess, prior)
+    std = np.sqrt(np.diag(covariance))
+    if any(s > UNOBSERVABLE_SHARE * p.prior[1] for s, p in zip(std, names, strict=True)):
+        return None
+    parameters = tuple(described(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True))
+    record = {"flights": len(prepared.flight.items), "costs": [found.cost], "chi2": excess}
+    correlation = correlation_of([p.name for p in names], covariance)
+    return EffectEstimate(
+        world=placed(world, names, found.values), parameters=parameters, record=record, correlations=(correlation,)
+    )
 
 
 @dataclass(frozen=True)
-class EffectGlides:
-    """Glides of episodes, started without the effects that are wanted."""
+class SlidingStart:
+    """Sliding segments of episodes, fitted without the effects that are to be fitted."""
 
-    started: StartedGlides
+    started: StartedSliding
+    """Sliding segments with their fit."""
 
     @staticmethod
-    def may_tell(effect: Effect) -> bool:
-        """Whether glides may tell an effect: what presses the body on the ground acts there as more friction does."""
+    def may_identify(effect: Effect) -> bool:
+        """Return whether sliding can identify an effect; a force onto the ground is inseparable from friction."""
         return effect.phase == "contact" and not effect.has("wrench")
 
     @staticmethod
-    def of(prepared: Prepared, bare: World) -> EffectGlides | None:
-        """Find the glides and fit them; None where there are none.
+    def of(prepared: Prepared, bare: World) -> SlidingStart | None:
+        """Find the sliding segments and fit them; None if there are none.
 
         Args:
             prepared: The episodes.
-            bare: The world without the effects that are wanted.
+            bare: World without the effects that are to be fitted.
         """
-        started = StartedGlides.of(prepared, bare, prepared.flight)
-        return None if started is None else EffectGlides(started)
+        started = StartedSliding.of(prepared, bare, prepared.flight)
+        return None if started is None else SlidingStart(started)
 
-    def fit(self, world: World, names: Sequence[str]) -> FirstContacts:
-        """Fit the effects at their constants, with the friction beside them and a start of each glide.
+    def fit(self, world: World, names: Sequence[str]) -> EffectEstimate:
+        """Fit the effects at their constants, together with the friction and the start of each sliding segment.
 
         Args:
-            world: With the effects, and others.
-            names: Of the effects.
+            world: World with the effects, and possibly others.
+            names: Names of the effects.
         """
-        told, base = self.started.told, self.started.base
-        beside = replace(base.segments.world, effects=at_nothing(world, names).effects)
-        parameters = fitted_along(beside, told)
-        begun = base.values[0, :2]  # friction and height; the effects at nothing
-        found = fitted_glides(beside, [], [(base.segments, begun)], told)[0]
-        glides = found.segments.in_world(beside)
-        information, score = told_by_each(glides, parameters, found.values[0])
-        # none of the friction: it begins at what glides tell, and a prior there would tell what acts like it
+        known, base = self.started.told, self.started.base
+        neutral = replace(base.segments.world, effects=at_neutral(world, names).effects)
+        parameters = nuisance_parameters(neutral, known)
+        start = base.values[0, :2]  # friction and height; the effects are neutral
+        found = fit_sliding(neutral, [], [(base.segments, start)], known)[0]
+        sliding = found.segments.in_world(neutral)
+        information, score = information_by_segment(sliding, parameters, found.values[0])
+        # no prior on the friction: its start comes from the same segments, and would decide about similar effects
         prior = torch.tensor([0.0 if p is FRICTION else 1 / p.prior[1] ** 2 for p in parameters]).to(information)
-        excess = max(found.cost / float(glides.dof.sum()), 1.0)
+        excess = max(found.cost / float(sliding.dof.sum()), 1.0)
         friction = float(found.values[0, 0].exp())
         record = {
-            "glides": len(glides.items),
+            "glides": len(sliding.items),
             "costs": [base.cost, found.cost],
             "chi2": excess,
             "friction": friction,
         }
-        shown = shown_effects(
+        estimate = identified_effects(
             world,
             names,
             parameters,
@@ -78,4 +140,64 @@ class EffectGlides:
             excess,
             record,
         )
-        return replace(shown, along={FRICTION.name: friction})
+        return replace(estimate, along={FRICTION.name: friction})
+
+
+@dataclass(frozen=True)
+class ImpactStart:
+    """Impacts of a ball, fitted without the effects that are to be fitted."""
+
+    base: ImpactBase
+    """Impacts with their fit."""
+
+    @staticmethod
+    def may_identify(effect: Effect) -> bool:
+        """Return whether impacts can identify an effect."""
+        return effect.phase == "contact"
+
+    @staticmethod
+    def of(prepared: Prepared, bare: World) -> ImpactStart | None:
+        """Find the impacts and fit them; None if there are too few, or the body is not a ball.
+
+        Args:
+            prepared: The episodes.
+            bare: World without the effects that are to be fitted.
+        """
+        impacts = measured_impacts(prepared, bare) if isinstance(bare.contact, ContactLaw) else None
+        return None if impacts is None or len(impacts) < LEAST else ImpactStart(ImpactBase.of(bare, impacts))
+
+    def fit(self, world: World, names: Sequence[str]) -> EffectEstimate:
+        """Fit the effects at their constants, together with the contact parameters.
+
+        Args:
+            world: World with the effects, and possibly others.
+            names: Names of the effects.
+        """
+        neutral = at_neutral(world, names)
+        parameters = contact_effect_parameters(neutral)
+        centre = torch.cat([self.base.centre[: len(BASE)], base_values(neutral, parameters)])
+        start = torch.cat([torch.as_tensor(self.base.fit.values[: len(BASE)]), centre[len(BASE) :]])
+        problem = replace(self.base.problem, world=neutral, parameters=(*BASE, *parameters))
+        found = fit_impacts(problem, start, centre=centre)
+        prior = torch.tensor([1 / p.prior[1] ** 2 for p in problem.parameters]).to(centre)
+        rows, slopes = problem.linear(torch.as_tensor(found.values))
+        impacts = self.base.problem.impacts
+        excess = max(float(found.chi2.sum()) / (6 * len(impacts) - len(problem.parameters)), 1.0)
+        record = {
+            "impacts": len(impacts),
+            "costs": [float(fit.chi2.sum()) for fit in (self.base.fit, found)],
+            "chi2": excess,
+        }
+        estimate = identified_effects(
+            world,
+            names,
+            problem.parameters,
+            torch.as_tensor(found.values),
+            torch.as_tensor(found.information) - torch.diag(prior),
+            prior,
+            -(slopes.mT @ rows[..., None])[..., 0],
+            excess,
+            record,
+        )
+        damping = DAMPING_RATIO.decode(torch.as_tensor(found.values)[BASE.index(DAMPING_RATIO)])
+        return replace(estimate, along={DAMPING_RATIO.name: float(damping)})

@@ -1,94 +1,136 @@
-"""Effects in a fit: found in flights, glides, impacts or about first contacts, where they show; constants on grids."""
+"""Fit of a world's effects to flights, sliding segments, impacts or first contacts, with constants from grids."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
-from ..datasets.tracks import Track
-from .diagnosis.prepared import prepare
-from .effect_flights import fit_effect_flights
-from .effect_glides import EffectGlides
-from .effect_impacts import EffectImpacts
-from .first_contacts import AFTER_S, CONTACT_S, FirstContacts, fit_first_contacts
-from .own_numbers import fit_own_numbers
-from .physics.effects import ActiveEffect
-from .physics.parameters import GROUND_SHIFT, Parameter, effect_parameters
-from .physics.world import World
+from ....datasets.capture.tracks import Track
+from ...physics.effects import ActiveEffect
+from ...physics.parameters import GROUND_SHIFT, Parameter, effect_parameters
+from ...physics.world import World
+from ...segments.first_contact_fit import AFTER_S, CONTACT_S, EffectEstimate, fit_first_contacts
+from ...segments.prepare import Prepared, prepare
+from ...segments.random_effects import fit_random_effects
+from .by_motion import ImpactStart, SlidingStart, fit_effect_flights
 
 Start = list[tuple[Parameter, float]]
+"""Parameters of effects, and their start."""
+Episodes = Sequence[tuple[str, dict[str, Track]]]
+"""Name and tracks by body of each episode."""
 
 
-def fit_effect_motions(
+def fit_effects(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Episodes,
     along: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
     groups: Mapping[str, str] | None = None,
-) -> FirstContacts:
-    """Fit the world's effects: to flights, glides and impacts those that they show, the others about first contacts.
+) -> EffectEstimate:
+    """Fit the world's effects to flights, sliding segments and impacts, and the remaining ones around first contacts.
 
-    The open-loop search is for few numbers: with every effect its valley gets narrower; these show effects well. A
-    constant (a range, a speed) means nothing while its effect is neutral, so that it cannot be searched from there: it
-    is tried at each value of its grid, and the one with the lowest cost is kept.
+    The open-loop search suits few parameters, as each effect narrows its basin; single kinds of motion identify effects
+    well. A constant (a range, a speed) has no influence while its effect is neutral, so that it cannot be searched from
+    there: each value of its grid is tried, and the one with the lowest cost is kept.
 
     Args:
-        world: With effects.
+        world: World with effects.
         episodes: Name and tracks by body of each episode.
-        along: The contact's numbers that are fitted along in contact, and where they start.
-        noise: Of the tracks (position [m], rotation [rad]).
-        groups: Group of each episode that belongs to one, for effects with numbers of each group's own.
+        along: Contact parameters that are fitted with the effects in contact, and their start.
+        noise: Noise of the tracks (position [m], rotation [rad]).
+        groups: Group of each episode that belongs to one, for effects with group-specific parameters.
 
     Raises:
-        InputDataError: If an effect has numbers of each group's own, and an episode belongs to none.
+        InputDataError: If an effect has group-specific parameters, and an episode belongs to no group.
         NotConvergedError: If the rollouts diverge at the start.
     """
     contact = [active.effect.name for active in world.effects if active.effect.phase == "contact"]
     others = [active.effect.name for active in world.effects if active.effect.name not in contact]
     after_s = CONTACT_S if contact else AFTER_S
     if any(parameter.shared != "all" for parameter in effect_parameters(world)):
-        return _with_own_numbers(world, episodes, along, noise, groups or {}, bool(contact))
+        return _with_segment_parameters(world, episodes, along, noise, groups or {}, bool(contact))
 
-    parts: dict[str, FirstContacts] = {}
-    left, at = [*others, *contact], world
-    flown = _best(at, others, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise)) if others else None
-    if flown is not None:
-        # what flights show stands: in contact it would be bent by what the contact law misses
-        parts["in_flight"], left, at = flown, contact, flown.world
-    prepared = prepare(_without(at, contact), episodes, noise) if contact else None
-    for where, kind in (("in_glides", EffectGlides), ("in_impacts", EffectImpacts)):
-        # not those of flight that flights do not show
-        names = [a.effect.name for a in at.effects if a.effect.name in left and kind.may_tell(a.effect)]
-        motion = kind.of(prepared, _without(at, names)) if prepared is not None and names else None
+    progress = _Progress(world, [*others, *contact], list(along), {})
+    if others:
+        progress = progress.with_flights(episodes, others, noise)
+    if contact:
+        progress = progress.with_contacts(episodes, contact, noise)
+    if progress.missing:
+        progress = progress.with_first_contacts(episodes, noise, after_s)
+    return _joined(progress.parts)
+
+
+@dataclass(frozen=True)
+class _Progress:
+    """Effects found so far, each kind of motion fitted in the world that the one before has left."""
+
+    world: World
+    """The world with the effects found so far."""
+    missing: list[str]
+    """Names of the effects that are not identified yet."""
+    along: list[tuple[Parameter, float]]
+    """Contact parameters that are fitted with the effects, and their start."""
+    parts: dict[str, EffectEstimate]
+    """Estimates by the key of the kind of motion in `fit.json`."""
+
+    def with_flights(self, episodes: Episodes, names: Sequence[str], noise: tuple[float, float]) -> _Progress:
+        """Add the effects that act in flight, if flights identify all of them."""
+        flown = _best(self.world, names, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise))
+        if flown is None:
+            return self
+        # these estimates are final: in contact the errors of the contact law would bias them
+        missing = [name for name in self.missing if name not in names]
+        return replace(self, world=flown.world, missing=missing, parts=self.parts | {"in_flight": flown})
+
+    def with_contacts(self, episodes: Episodes, contact: Sequence[str], noise: tuple[float, float]) -> _Progress:
+        """Add the effects that sliding segments identify, then those that impacts identify."""
+        prepared = prepare(_without(self.world, contact), episodes, noise)
+        progress = self
+        for where, kind in (("in_glides", SlidingStart), ("in_impacts", ImpactStart)):
+            progress = progress._with_contact_motion(where, kind, prepared)
+        return progress
+
+    def _with_contact_motion(self, where: str, kind: type[SlidingStart | ImpactStart], prepared: Prepared) -> _Progress:
+        """Add the effects that one kind of contact motion identifies."""
+        # an effect of flight that flights do not identify is not fitted here
+        names = [
+            a.effect.name for a in self.world.effects if a.effect.name in self.missing and kind.may_identify(a.effect)
+        ]
+        motion = kind.of(prepared, _without(self.world, names)) if names else None
         if motion is None:
-            continue
-        told = _best(at, names, lambda at, _, motion=motion, names=names: motion.fit(at, names))
-        assert told is not None  # these always give something
-        shown = {parameter.name.partition(".")[0] for parameter in told.parameters}
-        if shown:
-            kept = {name: value for name, value in told.constants.items() if name.partition(".")[0] in shown}
-            parts[where], at = replace(told, constants=kept), told.world
-            left = [name for name in left if name not in shown]
-            along = [(p, told.along.get(p.name, value)) for p, value in along]
-    if left:
-        about_contacts = _best(
-            at, left, lambda at, wanted: fit_first_contacts(at, episodes, wanted, along, noise, True, after_s)
+            return self
+        found = _best_of(self.world, names, lambda at, _: motion.fit(at, names))
+        identified = {parameter.name.partition(".")[0] for parameter in found.parameters}
+        if not identified:
+            return self
+        kept = {name: value for name, value in found.constants.items() if name.partition(".")[0] in identified}
+        return _Progress(
+            found.world,
+            [name for name in self.missing if name not in identified],
+            [(p, found.along.get(p.name, value)) for p, value in self.along],
+            self.parts | {where: replace(found, constants=kept)},
         )
-        assert about_contacts is not None  # windows always give something
-        parts["about_contacts"] = about_contacts
-    return _joined(parts)
+
+    def with_first_contacts(self, episodes: Episodes, noise: tuple[float, float], after_s: float) -> _Progress:
+        """Add the effects that are still missing, from windows around first contacts."""
+        found = _best_of(
+            self.world,
+            self.missing,
+            lambda at, wanted: fit_first_contacts(at, episodes, wanted, self.along, noise, True, after_s),
+        )
+        return replace(self, missing=[], parts=self.parts | {"about_contacts": found})
 
 
 def _without(world: World, names: Sequence[str]) -> World:
-    """Return the world without some of its effects."""
+    """Return the world without the named effects."""
     return replace(world, effects=tuple(a for a in world.effects if a.effect.name not in names))
 
 
-def _joined(parts: Mapping[str, FirstContacts]) -> FirstContacts:
-    """Return what fits found one after the other, each in the world of the one before; by where they looked."""
+def _joined(parts: Mapping[str, EffectEstimate]) -> EffectEstimate:
+    """Return successive estimates, each in the world of the one before, as one; the last record holds the others."""
     *before, (_, last) = parts.items()
     return replace(
         last,
@@ -100,57 +142,81 @@ def _joined(parts: Mapping[str, FirstContacts]) -> FirstContacts:
     )
 
 
-def _with_own_numbers(
+def _with_segment_parameters(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Episodes,
     along: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
     groups: Mapping[str, str],
     touching: bool,
-) -> FirstContacts:
-    # steps through a first contact are rough, and would hold up those of all the others
+) -> EffectEstimate:
+    """Return the effects with group- or episode-specific parameters, as random effects."""
+    # the cost is rough in parameters that move a first contact, which would slow down the steps of all others
     others = [(p, value) for p, value in along if touching and p != GROUND_SHIFT]
     if along and world.ground_normal is not None:
         others.append((GROUND_SHIFT, 0.0))
 
-    def own(at: World, _: Start) -> FirstContacts:
-        # from where the effects stand: there the prior of units has its middle
+    def with_groups(at: World, _: Start) -> EffectEstimate:
+        # start at the present values, where the prior of the groups has its mean
         values = {f"{a.effect.name}.{name}": float(value) for a in at.effects for name, value in a.values.items()}
         wanted = [(parameter, values[parameter.name]) for parameter in effect_parameters(at)]
-        return fit_own_numbers(at, episodes, groups, wanted, others, noise, not along, CONTACT_S if touching else 0.0)
+        return fit_random_effects(
+            at, episodes, groups, wanted, others, noise, not along, CONTACT_S if touching else 0.0
+        )
 
-    found = _best(world, [active.effect.name for active in world.effects], own)
-    assert found is not None  # windows always give something
-    return found
+    return _best_of(world, [active.effect.name for active in world.effects], with_groups)
 
 
 def _best(
-    world: World, names: Sequence[str], fit: Callable[[World, Start], FirstContacts | None]
-) -> FirstContacts | None:
-    """Return the fit of some effects at those of their constants that fit best; None where a fit gives nothing."""
+    world: World, names: Sequence[str], fit: Callable[[World, Start], EffectEstimate | None]
+) -> EffectEstimate | None:
+    """Return the fit of effects with the best values of their constants; None if a fit returns None."""
+    grids = _grids(world, names)
+    found: list[EffectEstimate] = []
+    for chosen in grids:
+        at = _at(world, chosen)
+        one = fit(at, _starts(at, names))
+        if one is None:
+            return None
+        found.append(replace(one, constants=chosen))
+    return _lowest(found)
+
+
+def _best_of(world: World, names: Sequence[str], fit: Callable[[World, Start], EffectEstimate]) -> EffectEstimate:
+    """Return the fit of effects with the best values of their constants, for a fit that never returns None."""
+    found: list[EffectEstimate] = []
+    for chosen in _grids(world, names):
+        at = _at(world, chosen)
+        found.append(replace(fit(at, _starts(at, names)), constants=chosen))
+    return _lowest(found)
+
+
+def _grids(world: World, names: Sequence[str]) -> list[dict[str, float]]:
+    """Return each combination of values of the effects' constants, by `effect.constant`; without any, an empty one."""
     grids = [
         (a.effect.name, constant) for a in world.effects if a.effect.name in names for constant in a.effect.constants
     ]
-    best: FirstContacts | None = None
-    tried = []
-    for values in itertools.product(*(constant.grid for _, constant in grids)):
-        chosen = {f"{effect}.{constant.name}": value for (effect, constant), value in zip(grids, values, strict=True)}
-        at = _at(world, chosen)
-        found = fit(at, _starts(at, names))
-        if found is None:
-            return None
-        tried.append(chosen | {"cost": found.record["costs"][-1]})
-        if best is None or tried[-1]["cost"] < best.record["costs"][-1]:
-            best = replace(found, constants=chosen)
-    assert best is not None  # the product of no grids has one member
-    return replace(best, record=best.record | {"constants_tried": tried}) if grids else best
+    return [
+        {f"{effect}.{constant.name}": value for (effect, constant), value in zip(grids, values, strict=True)}
+        for values in itertools.product(*(constant.grid for _, constant in grids))
+    ]
+
+
+def _lowest(found: Sequence[EffectEstimate]) -> EffectEstimate:
+    """Return the fit with the lowest cost, the first of equal ones; its record lists all constants that were tried."""
+    costs = [one.record["costs"][-1] for one in found]
+    best = found[min(range(len(costs)), key=lambda k: costs[k])]
+    if not best.constants:
+        return best
+    tried = [one.constants | {"cost": cost} for one, cost in zip(found, costs, strict=True)]
+    return replace(best, record=best.record | {"constants_tried": tried})
 
 
 def _starts(world: World, names: Sequence[str]) -> Start:
-    """Return the parameters of some effects and where they start: an effect that is neutral at the size that matters.
+    """Return the parameters of effects and their start; a neutral effect starts at the scale of its parameters.
 
-    Only numbers that cannot be negative: others have no sign yet. From nothing, what acts through another effect, as
-    wind does through drag, would have no slope.
+    That applies to nonnegative parameters, as the sign of others is unknown. From a neutral start an effect that acts
+    through another one, as wind does through drag, would have no gradient.
     """
     found = {parameter.name: parameter for parameter in effect_parameters(world)}
     starts = []
@@ -158,18 +224,19 @@ def _starts(world: World, names: Sequence[str]) -> Start:
         if active.effect.name not in names:
             continue
         neutral = all(float(active.values[p.name]) == 0.0 for p in active.effect.parameters)
-        for number in active.effect.parameters:
-            value = float(active.values[number.name])
-            begun = number.scale if neutral and number.nonnegative else value
-            starts.append((found[f"{active.effect.name}.{number.name}"], begun))
+        for parameter in active.effect.parameters:
+            value = float(active.values[parameter.name])
+            start = parameter.scale if neutral and parameter.nonnegative else value
+            starts.append((found[f"{active.effect.name}.{parameter.name}"], start))
     return starts
 
 
 def _at(world: World, constants: Mapping[str, float]) -> World:
+    """Return the world with constants of its effects, `effect.constant` by name."""
     effects = []
     for active in world.effects:
-        own = {c.name: constants.get(f"{active.effect.name}.{c.name}") for c in active.effect.constants}
-        chosen = {name: value for name, value in own.items() if value is not None}
+        given = {c.name: constants.get(f"{active.effect.name}.{c.name}") for c in active.effect.constants}
+        chosen = {name: value for name, value in given.items() if value is not None}
         like = next(iter(active.values.values()), torch.zeros(1))
         effects.append(ActiveEffect.of(active.effect, active.values | chosen, like))
     return replace(world, effects=tuple(effects))

@@ -1,4 +1,4 @@
-"""What a kind of motion shows of effects: the numbers that it tells, with intervals, and no others."""
+"""Estimates of the effects that a kind of motion identifies, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from .first_contacts import UNOBSERVABLE_SHARE, FirstContacts, correlation_of, described, few_covariance, placed
-from .physics.effects import ActiveEffect
-from .physics.parameters import Parameter
-from .physics.world import World
+from ...optimization.uncertainty import correlation_of, few_covariance
+from ...physics.effects import ActiveEffect
+from ...physics.parameters import Parameter
+from ...physics.world import World
+from ...segments.first_contact_fit import UNOBSERVABLE_SHARE, EffectEstimate, described, placed
 
 
-def at_nothing(world: World, names: Sequence[str]) -> World:
-    """Return the world with some of its effects at nothing, at their own constants."""
+def at_neutral(world: World, names: Sequence[str]) -> World:
+    """Return the world with the named effects neutral; their constants stay."""
     return replace(world, effects=tuple(_neutral(a) if a.effect.name in names else a for a in world.effects))
 
 
-def shown_effects(
+def identified_effects(
     world: World,
     names: Sequence[str],
     parameters: Sequence[Parameter],
@@ -30,40 +31,44 @@ def shown_effects(
     score: Tensor,
     excess: float,
     record: dict[str, Any],
-) -> FirstContacts:
-    """Return what was found of the effects of which the data show at least a number.
+) -> EffectEstimate:
+    """Keep the effects of which the data identify at least one parameter.
 
-    Another number of such an effect stands near nothing, and its interval is wide.
+    Another parameter of such an effect stays near its neutral value, with a wide interval.
 
     Args:
-        world: With the effects.
-        names: Of the effects.
-        parameters: What was fitted (P), theirs and others.
-        values: In fitted coordinates (P,).
-        information: On the values (P, P), without priors.
-        prior: Information of these (P,).
-        score: Of each piece of motion (B, P), with a start of its own: what a formula misses is missed all through it.
-        excess: By what factor the variance of residuals exceeds that of the noise.
-        record: For `fit.json`.
+        world: World with the effects.
+        names: Names of the effects.
+        parameters: Fitted parameters (P), those of the effects and others.
+        values: Estimates in fitted coordinates, shape (P,).
+        information: Information on the values without priors, shape (P, P).
+        prior: Information of the priors, shape (P,).
+        score: Gradient of the log-likelihood of each segment, shape (B, P). The error of an effect's formula is common
+            to all frames of a segment.
+        excess: Ratio of the variance of the residuals to that of the noise.
+        record: Course of the fit, for `fit.json`.
     """
-    whose = [p.name.partition(".")[0] for p in parameters]
-    held = np.diag(prior.numpy())
-    covariance = few_covariance(information.numpy() / excess + held, score.numpy() / excess, held)
+    effect_of = [p.name.partition(".")[0] for p in parameters]
+    prior_information = np.diag(prior.numpy())
+    covariance = few_covariance(
+        information.numpy() / excess + prior_information, score.numpy() / excess, prior_information
+    )
     std = np.sqrt(np.diag(covariance))
     known = std < UNOBSERVABLE_SHARE * np.array([p.prior[1] for p in parameters])
-    shown = {name for name, yes in zip(whose, known, strict=True) if yes and name in names}
-    own = [k for k, name in enumerate(whose) if name in shown]
-    if not own:
-        return FirstContacts(world, (), record)
-    mine = [parameters[k] for k in own]
-    return FirstContacts(
-        placed(world, mine, values[own]),
-        tuple(described(p, float(values[k]), float(std[k])) for p, k in zip(mine, own, strict=True)),
-        record,
-        (correlation_of([p.name for p in mine], covariance[np.ix_(own, own)]),),
+    identified = {name for name, yes in zip(effect_of, known, strict=True) if yes and name in names}
+    kept = [k for k, name in enumerate(effect_of) if name in identified]
+    if not kept:
+        return EffectEstimate(world=world, parameters=(), record=record)
+    theirs = [parameters[k] for k in kept]
+    return EffectEstimate(
+        world=placed(world, theirs, values[kept]),
+        parameters=tuple(described(p, float(values[k]), float(std[k])) for p, k in zip(theirs, kept, strict=True)),
+        record=record,
+        correlations=(correlation_of([p.name for p in theirs], covariance[np.ix_(kept, kept)]),),
     )
 
 
 def _neutral(active: ActiveEffect) -> ActiveEffect:
+    """Return an effect with neutral parameters and its constants."""
     constants = {c.name: active.values[c.name] for c in active.effect.constants}
     return ActiveEffect.of(active.effect, constants, next(iter(active.values.values())))

@@ -1,4 +1,4 @@
-"""Effects in a fit: added to the model, and their values written back."""
+"""Effects that a user asks for: added to a model, fitted, and written back with their values."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..datasets.tracks import Track
-from ..schemas import EffectModel, InputDataError, PhysConfig, UsageError
-from ..schemas import Parameter as FittedParameter
-from .diagnosis.releases import after_release, find_releases
-from .phys_geo import PhysicsFit, fit_physics
-from .physics.effects import load_effect
-from .physics.effects.registry import split_units
-from .physics.world import World
+from ....datasets.capture.tracks import Track
+from ....schemas import EffectModel, FittedParameter, InputDataError, PhysConfig, UsageError
+from ...physics.effects import load_effect
+from ...physics.effects.registry import split_units
+from ...physics.world import World
+from ...segments.release_detection import after_release, find_releases
+from ..tracks.contact_fit import fit_physics
+from ..tracks.contact_result import PhysicsFit
 
 
 def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple[EffectModel, ...]:
-    """Return the effects of a model and the wanted ones that it does not have yet, at their neutral values.
+    """Return the effects of a model, with the wanted ones that it lacks at their neutral values.
 
     Raises:
         UsageError: If an effect cannot be loaded, or two have one name.
@@ -25,20 +25,20 @@ def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple
     effects = [*present, *(EffectModel(name=_absolute(name)) for name in wanted)]
     unique: dict[str, EffectModel] = {}
     for effect in effects:
-        own = load_effect(effect.name).name
-        if own in unique and split_units(unique[own].name)[0] == split_units(effect.name)[0]:
-            # the same effect, shared otherwise: it goes on from where it is
-            unique[own] = unique[own].model_copy(update={"name": effect.name})
-        if own in unique and unique[own].name != effect.name:
+        short = load_effect(effect.name).name
+        if short in unique and split_units(unique[short].name)[0] == split_units(effect.name)[0]:
+            # the same effect with another grouping keeps its values
+            unique[short] = unique[short].model_copy(update={"name": effect.name})
+        if short in unique and unique[short].name != effect.name:
             raise UsageError(
-                f"two effects are called '{own}': {unique[own].name} and {effect.name}.", todo="rename one of them."
+                f"two effects are called '{short}': {unique[short].name} and {effect.name}.", todo="rename one of them."
             )
-        unique.setdefault(own, effect)
+        unique.setdefault(short, effect)
     return tuple(unique.values())
 
 
 def _absolute(name: str) -> str:
-    """Return the name of an effect, a user's file by its whole path, so that the model finds it from anywhere."""
+    """Return the name of an effect, with the absolute path of a user's file, so that a model works in any directory."""
     file, _, rest = name.partition(":")
     return f"{Path(file).resolve()}:{rest}" if file.endswith(".py") else name
 
@@ -51,34 +51,33 @@ def fitted_effects(
     own: Mapping[str, Mapping[str, float]] | None = None,
     spread: Mapping[str, float] | None = None,
 ) -> tuple[EffectModel, ...]:
-    """Return the effects with the values that a fit found.
+    """Return the effects with fitted values.
 
     Args:
         present: The model's effects.
-        names: The name that an effect gives itself, by the name that the model has for it.
-        parameters: What was fitted, `effect.parameter` by name.
-        constants: The chosen constants, `effect.constant` by name.
-        own: By session or episode, the values of `effect.parameter` that are its own.
-        spread: Of these from unit to unit, `effect.parameter` by name.
+        names: Short name of each effect, by its name in the model.
+        parameters: Fitted parameters, named `effect.parameter`.
+        constants: Chosen constants, `effect.constant` by name.
+        own: Group- or episode-specific values of `effect.parameter`, by group or episode.
+        spread: Standard deviation between groups, by `effect.parameter`.
     """
     found = {p.name: p.estimate for p in parameters if "[" not in p.name} | dict(constants)
     effects = []
     for effect in present:
         prefix = f"{names[effect.name]}."
-        values = {key.removeprefix(prefix): value for key, value in found.items() if key.startswith(prefix)}
-        mine = {
-            unit: {key.removeprefix(prefix): value for key, value in numbers.items() if key.startswith(prefix)}
-            for unit, numbers in (own or {}).items()
-        }
+        specific = {group: _without_prefix(prefix, values) for group, values in (own or {}).items()}
         update = {
-            "parameters": effect.parameters | values,
-            "own": {unit: numbers for unit, numbers in mine.items() if numbers},
-            "spread": {
-                key.removeprefix(prefix): value for key, value in (spread or {}).items() if key.startswith(prefix)
-            },
+            "parameters": effect.parameters | _without_prefix(prefix, found),
+            "own": {group: values for group, values in specific.items() if values},
+            "spread": _without_prefix(prefix, spread or {}),
         }
         effects.append(effect.model_copy(update=update))
     return tuple(effects)
+
+
+def _without_prefix(prefix: str, values: Mapping[str, float]) -> dict[str, float]:
+    """Return the values whose names begin with a prefix, by the rest of their names."""
+    return {key.removeprefix(prefix): value for key, value in values.items() if key.startswith(prefix)}
 
 
 def fit_with_effects(
@@ -86,10 +85,10 @@ def fit_with_effects(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     config: PhysConfig,
     noise: tuple[float | None, float | None],
-    begun: bool = False,
+    warm_started: bool = False,
     groups: Mapping[str, str] | None = None,
 ) -> PhysicsFit:
-    """Fit the world, see `fit_physics`, where its effects have what they need; throws count from their release on.
+    """Fit the world as `fit_physics` does, after checking its effects' needs and cutting throws at their release.
 
     Raises:
         InputDataError: If an effect needs what the world or the episodes do not have.
@@ -97,11 +96,12 @@ def fit_with_effects(
     """
     _require_needs(world, episodes)
     released_s, warnings = find_releases(world, episodes, noise)
-    found = fit_physics(world, after_release(episodes, released_s), config, noise, begun, groups)
+    found = fit_physics(world, after_release(episodes, released_s), config, noise, warm_started, groups)
     return replace(found, warnings=(*found.warnings, *warnings))
 
 
 def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> None:
+    """Refuse effects that need what the world or the episodes do not have."""
     free = {body.name for body in world.bodies if body.free}
     turned = any(
         name in free and track.quat_wxyz is not None for _, tracks in episodes for name, track in tracks.items()
@@ -128,8 +128,8 @@ def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]
                 )
         if has["driven"] and effect.phase == "measurement" and "driven" not in effect.needs:
             raise InputDataError(
-                f"the effect '{effect.name}' with a driven body: its track is its command and was measured alike, "
-                "which a fit cannot undo yet.",
+                f"the effect '{effect.name}' with a driven body: the body's track is its command, and is distorted by "
+                "the same measurement, which a fit cannot correct yet.",
                 "effects of the measurement for captures without driven bodies.",
                 "leave it out of --effects.",
             )

@@ -1,1 +1,1 @@
-"""Videos of moving bodies compared with renders of the model: image loss and pose tracking."""
+"""Fit the contact model to videos: pose tracking, image losses and end-to-end refinement."""

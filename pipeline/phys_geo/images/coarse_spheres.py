@@ -1,4 +1,4 @@
-"""Fewer spheres for small pictures: what lies in one cell of a grid becomes one sphere."""
+"""Coarse visual spheres for small images: the spheres in each cell of a grid are merged."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...datasets.models import Model
-from ...datasets.ply import Splats
+from ....datasets.models.model import Model
+from ....datasets.shapes.ply import Splats
 
 CELLS_PER_RADIUS = 4.0
-"""A cell is the body's mean radius over this: finer than a pixel of the small pictures."""
+"""Mean radius of the body over the side of a cell, which is then finer than a pixel of the small images."""
 
 
 def coarse_model(model: Model) -> Model:
-    """Return the model with fewer visual spheres in its bodies, for searching on small pictures."""
+    """Return the model with fewer visual spheres in its bodies, for the search on small images."""
     bodies = {}
     for name, splats in model.body_splats.items():
         radius = float(np.linalg.norm(splats.means - splats.means.mean(0), axis=1).mean())
@@ -23,10 +23,11 @@ def coarse_model(model: Model) -> Model:
 
 
 def merged(splats: Splats, cell_m: float) -> Splats:
-    """Merge the spheres of each cell of a grid into one with their mean place and colour and their common spread.
+    """Merge the spheres of each cell of a grid into one with their mean position and colour and their total variance.
 
-    The variance of a sphere is the mean of its parts' plus a third of the scatter of their centres' squared distance
-    (the isotropic Gaussian with the mixture's second moment; derived); weights are opacity times cross-section.
+    The variance of a sphere is the mean variance of its parts plus a third of the mean squared distance of their
+    centres from the mean (the isotropic Gaussian with the mixture's second moment; derived); weights are opacity times
+    cross-section.
 
     Args:
         splats: The spheres.

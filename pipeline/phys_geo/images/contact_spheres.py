@@ -1,7 +1,7 @@
-"""The spheres with which bodies touch, as numbers to be fitted: what collision tells about geometry.
+"""Contact spheres as fitted parameters: geometry estimated from collisions.
 
-Only spheres that come into contact change a motion, so only these are moved; all others keep their places. The image
-gives them nothing directly: they are reached through the motion alone, as published (contact model notes, section 7).
+Only spheres that come into contact influence a motion, so only these are moved. Images have no direct gradient by them:
+they are fitted through the motion alone, as published (contact model notes, section 7).
 """
 
 from __future__ import annotations
@@ -12,23 +12,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..physics.rollout import Rollout
-from ..physics.rotation import quat_to_matrix
-from ..physics.world import World
+from ...geometry.rotation import quat_to_matrix
+from ...physics.rollout import Rollout
+from ...physics.world import World
 
 TOUCH_M = 5e-4
-"""A sphere that comes as near as this to the ground or to a sphere of another body may touch."""
+"""Maximum gap of a contact sphere to the ground or to a sphere of another body [m]."""
 MOST = 20
-"""Most spheres of a body that are fitted, those that come nearest."""
+"""Maximum number of spheres of a body that are fitted; those that come nearest are chosen."""
 MOVED_STD_M = 4e-4
-"""Spread of the prior of where a sphere is, and of how large: what photos leave open."""
+"""Standard deviation of the prior of a sphere's centre and radius [m]: the uncertainty that photos leave."""
 
 
 @dataclass(frozen=True)
-class TouchingSpheres:
-    """Spheres by body: which (body, indices (m,)). Coordinates of each: centre (3) and radius, in `MOVED_STD_M`."""
+class ContactSpheres:
+    """Contact spheres by body; coordinates of each are centre (3) and radius, in units of `MOVED_STD_M`."""
 
     chosen: tuple[tuple[int, Tensor], ...]
+    """Index of each body, and indices of its contact spheres, shape (m,)."""
 
     @property
     def count(self) -> int:
@@ -36,8 +37,8 @@ class TouchingSpheres:
         return sum(4 * len(indices) for _, indices in self.chosen)
 
     @staticmethod
-    def of(world: World, rollouts: Rollout) -> TouchingSpheres:
-        """Choose the spheres of free bodies that come nearest to something in any of the rollouts (B)."""
+    def of(world: World, rollouts: Rollout) -> ContactSpheres:
+        """Choose the spheres of free bodies that come nearest to an obstacle in any of the rollouts (B)."""
         chosen = []
         for index in world.free:
             gap = _least_gaps(world, rollouts, index)
@@ -45,7 +46,7 @@ class TouchingSpheres:
             order = order[gap[order] < TOUCH_M]
             if len(order):
                 chosen.append((index, order))
-        return TouchingSpheres(tuple(chosen))
+        return ContactSpheres(tuple(chosen))
 
     def apply(self, world: World, coordinates: Tensor) -> World:
         """Return the world with the spheres moved by coordinates (K, count)."""
@@ -56,13 +57,13 @@ class TouchingSpheres:
             body = world.bodies[index]
             centers = body.centers.expand(len(part), -1, -1).index_add(1, indices, part[..., :3])
             radii = body.radii.expand(len(part), -1).index_add(1, indices, part[..., 3])
-            # a corner is a sphere of a fraction of a millimetre: it cannot shrink to nothing
+            # a corner is a sphere of a fraction of a millimetre, which must not vanish
             radii = radii.maximum(0.5 * body.radii)
             world = world.with_body(index, centers=centers, radii=radii)
         return world
 
     def record(self, world: World, coordinates: Tensor) -> dict[str, dict[str, float]]:
-        """Return by body how many spheres were moved, and how far on average and at most [m]."""
+        """Return by body the number of moved spheres, and their mean and maximum displacement [m]."""
         found, first = {}, 0
         for index, indices in self.chosen:
             part = MOVED_STD_M * coordinates[first : first + 4 * len(indices)].unflatten(0, (-1, 4))
@@ -77,7 +78,7 @@ class TouchingSpheres:
 
 
 def _least_gaps(world: World, rollouts: Rollout, index: int) -> Tensor:
-    """Return the least gap (n,) [m] of each sphere of a body to the ground and to the spheres of others."""
+    """Return the minimum gap (n,) [m] of each sphere of a body to the ground and to the spheres of others."""
     body = world.bodies[index]
     centers = _placed(body.centers[0], rollouts, index)
     gap = torch.full((centers.shape[-2],), torch.inf).to(centers)
@@ -100,7 +101,7 @@ def _placed(centers: Tensor, rollouts: Rollout, index: int) -> Tensor:
 
 
 def dense_times(times_s: Tensor, factor: int) -> Tensor:
-    """Return times (B, T) with `factor` - 1 more between each two."""
+    """Return times (B, T) with `factor` - 1 additional ones between neighbours."""
     between: Sequence[Tensor] = [
         times_s[:, :-1] + (k / factor) * (times_s[:, 1:] - times_s[:, :-1]) for k in range(factor)
     ]

@@ -1,4 +1,4 @@
-"""Windows: equal rectangles of video frames around the moving bodies."""
+"""Crops of video frames around the moving bodies, all of the same size."""
 
 from __future__ import annotations
 
@@ -8,48 +8,51 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .footage import Video
+from .video_frames import Video
 
 _TILE = 8
-"""Windows begin on multiples of the renderer's tile [px]: tiles, and squares of pixels, stay in place."""
+"""Crops begin on multiples of the renderer's tile [px], so that tiles and blocks of pixels stay in place."""
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Equal rectangles in some frames of a video: frames (S,), corners (S, 2) [px], size (width, height)."""
+    """Rectangles of one size in frames of a video."""
 
     frames: Tensor
+    """Index of the frame of each rectangle, shape (S,)."""
     corners: Tensor
+    """Upper left corners [px], shape (S, 2)."""
     size: tuple[int, int]
+    """Width and height [px]."""
 
     def cut(self, pictures: Tensor, which: Tensor | None = None) -> Tensor:
-        """Return the rectangles of pictures (T, H, W, F), those of `which` or the window's frames: (S, h, w, F)."""
+        """Return the rectangles (S, h, w, F) of images (T, H, W, F); `which`: images instead of the window's frames."""
         columns = self.corners[:, :1] + torch.arange(self.size[0], device=self.corners.device)
         rows = self.corners[:, 1:] + torch.arange(self.size[1], device=self.corners.device)
         frames = self.frames if which is None else which
         return pictures[frames[:, None, None], rows[:, :, None], columns[:, None, :]]
 
     def repeat(self, times: int) -> Window:
-        """Return the windows one after the other, as often as told."""
+        """Return the windows repeated the given number of times."""
         return Window(self.frames.repeat(times), self.corners.repeat(times, 1), self.size)
 
 
 def window_of(video: Video, frames: Tensor, means: Tensor, reach: Tensor, margin: int = 0) -> Window:
-    """Return windows that hold spheres as far as they are in the picture.
+    """Return windows that contain the visible parts of spheres.
 
     Args:
         video: The video.
         frames: A frame of it for each window, shape (S,).
         means: Centres of the spheres at that frame [m], world, shape (S, N, 3).
-        reach: Distance from its centre [m] at which a sphere is too faint to be drawn, shape (N,).
-        margin: Further pixels on each side.
+        reach: Distance from a sphere's centre at which it is too faint to be drawn [m], shape (N,).
+        margin: Additional pixels on each side.
     """
     with torch.no_grad():
         viewmats = video.viewmats[frames]
         local = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
         depth = local[..., 2]
         seen = (depth > reach)[..., None]
-        # a sphere seen off the axis is an ellipse that is longer than the disc of one on it: hence the factor
+        # off the optical axis a sphere appears as an ellipse, longer than the disc on the axis by this factor
         away = depth.clamp_min(1e-3)[..., None]
         middle = local[..., :2] / away
         radius = reach[:, None] / away * (1 + middle.square().sum(-1, keepdim=True))

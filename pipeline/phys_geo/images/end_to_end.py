@@ -1,8 +1,8 @@
-"""End-to-end refinement: contact parameters, touching spheres and start states against the image loss of rollouts.
+"""End-to-end refinement of contact parameters, contact spheres and start states on the image loss of rollouts.
 
-The renderer gives the exact gradient of the loss by the poses of every frame in reverse mode; the rollout gives how the
-poses answer to parameters, spheres and states, by differences; the two are multiplied. Derivatives of the rollout
-would be exact too and of no use: those of a body that rests on many spheres grow by a third in every step.
+The renderer gives the exact gradient of the loss by the poses of every frame in reverse mode; rollouts give the
+response of the poses to parameters, spheres and states by differences; the two are multiplied. Exact derivatives of the
+rollout are unsuitable: for a body that rests on many spheres they grow by a third in every step.
 """
 
 from __future__ import annotations
@@ -13,71 +13,73 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ...datasets.progress import progress
-from ..estimation.least_squares import bound_stops, robust_loss
-from ..estimation.observations import Observations
-from ..estimation.trajectory import STATE_SIZE, STATE_STEPS, retract
-from ..physics.dispatch import rollouts_at_once
-from ..physics.measured import measure
-from ..physics.parameters import Parameter, apply_parameters
-from ..physics.rollout import Rollout
-from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
-from ..physics.world import World
+from ....datasets.io.progress import progress
+from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ...optimization.levenberg_marquardt import bound_stops, robust_loss
+from ...physics.engine import rollouts_at_once
+from ...physics.observation_model import measure
+from ...physics.parameters import Parameter, apply_parameters
+from ...physics.rollout import Rollout
+from ...physics.world import World
+from ...trajectories.observations import Observations
+from ...trajectories.residuals import STATE_SIZE, STATE_STEPS, retract
+from .contact_spheres import ContactSpheres
 from .image_loss import ImageLoss
-from .touching import TouchingSpheres
 
 TRACK_WEIGHT = 0.01
-"""With tracks too: a mean misfit of one sigma costs this share of the image loss at the start (choice of cgwm)."""
+"""Cost of a mean track misfit of one standard deviation, as a share of the image loss at the start (choice of cgwm)."""
 TRACK_ROBUST_SCALE = 4.0
+"""Scale of the robust loss of tracks, in standard deviations."""
 CURVATURE_BLUR = 8
-"""Pixels over which the curvature (not the gradient) averages residuals: without it the L1 norm's steps are tiny."""
+"""Side of the squares over which the curvature (not the gradient) averages residuals [px]; without it the steps of the
+L1 norm are tiny."""
 ATTEMPTS = 7
+"""Maximum number of dampings that are tried in a step."""
 SMALLEST_FALL = 3e-4
-"""The refinement ends when the objective falls by less than this fraction."""
+"""Relative decrease of the objective in a step below which the refinement ends."""
 PATIENCE = 2
-"""It also ends after so many steps without a lower loss of the frames that are held out."""
+"""Number of steps without a lower loss of the held-out frames after which the refinement ends."""
 GEOMETRY_WEIGHT = 1e-5
-"""Share of the image loss at the start that a sphere costs which is moved by its prior's width: it holds those that
-the motion does not tell about, and lets those move that it does (choice of cgwm)."""
+"""Cost of moving a sphere by one standard deviation of its prior, as a share of the image loss at the start. It fixes
+spheres that the motion does not identify, and hardly restrains the others (choice of cgwm)."""
 PARAMETER_STEP, SPHERE_STEP = 0.03, 0.25
-"""Differences of a parameter (fitted coordinate) and of a sphere (in widths of its prior)."""
+"""Steps of the differences: of a parameter (fitted coordinate), and of a sphere (standard deviations of its prior)."""
 
 
 @dataclass(frozen=True)
 class TrackTerm:
-    """Measured tracks beside the images: their observations on the same time grid, and their noise [m, rad]."""
+    """Measured tracks in addition to the images."""
 
     observations: Observations
+    """Observations on the time grid of the images."""
     noise: tuple[float, float]
+    """Standard deviation of the tracks' errors: position [m], rotation [rad]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageObjective:
-    """The image loss of rollouts from a batch of episodes (B), and the track term where there is one.
-
-    Attributes:
-        world: The world.
-        parameters: What is fitted (P).
-        observations: The start states and time grids.
-        losses: The image loss of each episode.
-        columns: For each episode, the instants of its footage (row 0) and their frames in the grid (row 1), (2, k).
-        held: The same of the instants that are held out.
-        tracks: Measured tracks to be matched as well.
-        scale: Unit of the objective: the image loss at the start, with tracks; else 1.
-        unit: The objective at the start.
-        geometry: Spheres that are fitted too (G coordinates, which follow the parameters), or None.
-    """
+    """Image loss of rollouts from a batch of episodes (B), with a track term where there is one."""
 
     world: World
+    """The world."""
     parameters: Sequence[Parameter]
+    """Fitted parameters (P)."""
     observations: Observations
+    """Start states and time grids."""
     losses: Sequence[ImageLoss]
+    """Image loss of each episode."""
     columns: Sequence[Tensor]
+    """For each episode, the instants of its footage (row 0) and their frames in the grid (row 1), shape (2, k)."""
     held: Sequence[Tensor] = ()
+    """As `columns`, for the held-out instants."""
     tracks: TrackTerm | None = None
+    """Measured tracks that are matched in addition."""
     scale: float = 1.0
+    """Unit of the objective: with tracks the image loss at the start, otherwise 1."""
     unit: float = 1.0
-    geometry: TouchingSpheres | None = None
+    """Objective at the start."""
+    geometry: ContactSpheres | None = None
+    """Contact spheres that are fitted too (G coordinates, which follow the parameters), or None."""
 
     @property
     def moved(self) -> int:
@@ -101,7 +103,9 @@ class ImageObjective:
     def parts(self, rollout: Rollout, held: bool = False) -> Tensor:
         """Return the loss by parts (3,): photometric, mask, tracks; infinite if the rollout blew up.
 
-        held: Of the frames that are held out, instead of the others; without tracks.
+        Args:
+            rollout: The rollouts.
+            held: Use the held-out frames instead of the others, and no tracks.
         """
         images = torch.zeros(2, dtype=torch.float64)
         columns = self.held if held else self.columns
@@ -118,7 +122,7 @@ class ImageObjective:
         return torch.cat([images, tracks[None]])
 
     def value(self, parts: Tensor, shared: Tensor) -> float:
-        """Return the objective of parts, with what the spheres (in `shared`) cost that were moved."""
+        """Return the objective from its parts, with the cost of the moved spheres in `shared`."""
         held_back = GEOMETRY_WEIGHT * self.unit * float(shared[len(self.parameters) :].square().sum())
         return float(parts[:2].sum()) / self.scale + TRACK_WEIGHT * float(parts[2]) + held_back
 
@@ -133,7 +137,7 @@ class ImageObjective:
         return slope
 
     def curvature(self, rollout: Rollout) -> Tensor:
-        """Return the curvature (B, T, 6 nf, 6 nf) of the image loss by poses, as re-weighted least squares has it."""
+        """Return the curvature (B, T, 6 nf, 6 nf) of the image loss by poses, from re-weighted least squares."""
         batch, length = self.observations.times_s.shape
         size = 6 * len(self.observations.free)
         curvature = torch.zeros(batch, length, size, size, dtype=torch.float64)
@@ -146,7 +150,7 @@ class ImageObjective:
         return curvature
 
     def jacobian(self, shared: Tensor, states: Tensor, rollout: Rollout) -> Tensor:
-        """Return how the poses change (B, T, 6 nf, P + G + S), by differences; coordinates of `PoseModel`."""
+        """Return the Jacobian of the poses (B, T, 6 nf, P + G + S) by differences; coordinates of `PoseModel`."""
         batch, size = states.shape
         steps = torch.cat(
             [
@@ -173,7 +177,7 @@ class ImageObjective:
     def normal_equations(
         self, shared: Tensor, states: Tensor, rollout: Rollout, curvature: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return matrix and gradient of the objective in (P + G + B S) unknowns: parameters, spheres, each state."""
+        """Return matrix and gradient of the objective in P + G + B S unknowns: parameters, spheres, states."""
         jacobian = self.jacobian(shared, states, rollout)
         _, track_slope, track_weight = self._tracks(rollout)
         slope = self.gradient(rollout) / self.scale + TRACK_WEIGHT * track_slope
@@ -194,7 +198,7 @@ class ImageObjective:
         return matrix, vector
 
     def _tracks(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the tracks' mean robust misfit, its slope and weights (B, T, 6 nf) by the poses."""
+        """Return the mean robust misfit of the tracks, with its gradient and weights by the poses (B, T, 6 nf)."""
         shape = (*self.observations.times_s.shape, 6 * len(self.observations.free))
         if self.tracks is None:
             nothing = torch.zeros(shape, dtype=torch.float64)
@@ -212,41 +216,44 @@ class ImageObjective:
 
 
 def _difference(poses: Observations, measured: Observations) -> Tensor:
-    """Return what leads from measured poses to others (B, T, nf, 6): shift [m], turn [rad]."""
+    """Return the difference of poses from measured ones (B, T, nf, 6): shift [m], rotation vector [rad]."""
     turn = quat_log(quat_multiply(quat_conjugate(measured.quat_wxyz), poses.quat_wxyz))
     return torch.cat([poses.position_m - measured.position_m, turn], -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Refined:
-    """Where the refinement ended.
-
-    shared (P + G,), states (B, S); before, after (3,): parts of the loss; history: of the objective; held: the image
-    loss of the frames held out, after every step, empty without such frames; kept: the step that is returned, which
-    has the lowest of them; stopped: why it ended.
-    """
+    """Result of the refinement."""
 
     shared: Tensor
+    """Parameters and spheres in fitted coordinates, shape (P + G,)."""
     states: Tensor
+    """Changes of the start states, shape (B, S)."""
     before: Tensor
+    """Parts of the loss at the start: photometric, mask, tracks, shape (3,)."""
     after: Tensor
+    """Parts of the loss at the returned step, shape (3,)."""
     history: list[float]
+    """Objective at the start and after each step."""
     held: list[float]
+    """Image loss of the held-out frames at the start and after each step; empty without such frames."""
     kept: int
+    """Step that is returned: the one with the lowest loss of the held-out frames."""
     stopped: str
+    """Reason for the end."""
 
 
 def refine_end_to_end(
     objective: ImageObjective, shared: Tensor, states: Tensor, bounds: Tensor, iterations: int
 ) -> Refined:
-    """Lower the objective by damped Gauss-Newton steps; a step is kept only if the true loss falls.
+    """Minimise the objective by damped Gauss-Newton steps, each accepted only if the true loss decreases.
 
     Args:
-        objective: What is to fall.
+        objective: The objective.
         shared: Start of the parameters and spheres in fitted coordinates, shape (P + G,).
         states: Start of the state changes, shape (B, S).
         bounds: Bounds of the parameters and spheres, shape (P + G, 2).
-        iterations: Most steps.
+        iterations: Maximum number of steps.
     """
     rollout = objective.rollout(shared, states)
     before = parts = objective.parts(rollout)
@@ -281,13 +288,22 @@ def refine_end_to_end(
         if step + 1 - kept >= PATIENCE:
             stopped = "the frames held out are no longer explained better"
             break
-    return Refined(best[0], best[1], before, best[2], history, held, kept, stopped)
+    return Refined(
+        shared=best[0],
+        states=best[1],
+        before=before,
+        after=best[2],
+        history=history,
+        held=held,
+        kept=kept,
+        stopped=stopped,
+    )
 
 
 def _step(
     matrix: Tensor, slope: Tensor, damping: float, shared: Tensor, states: Tensor, bounds: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return shared numbers and states after one damped step; a number that a bound stops takes no part."""
+    """Return shared parameters and states after one damped step; parameters that a bound stops are left out."""
     count = len(shared)
     free = torch.ones_like(slope)
     free[:count] = (~bound_stops(shared, -slope[:count], bounds)).double()

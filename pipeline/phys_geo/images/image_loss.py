@@ -1,12 +1,12 @@
-"""The image loss: real frames against renders of the background and the bodies at given poses.
+"""Image loss: real frames against renders of the background and the bodies at given poses.
 
     L = mean over frames of  L1(gain * render, frame)  +  MASK_WEIGHT * L1(visible body, mask)
 
-Both over the whole picture. What does not move is rendered once a camera, colours and depths: the plate. For each frame
-only the moving bodies are rendered, in a window around them, over the plate; the rest of the sum is a constant of the
-window. A pixel in which the plate is nearer than the bodies by more than its spheres are rough shows the plate.
-Appearance and geometry are constants here: poses get a gradient from the renderer, {c, s} none (contact model notes,
-section 7).
+Both terms cover the whole image. The static scene is rendered once for each camera pose, with colours and depths: the
+plate. For each frame only the moving bodies are rendered, in a window around them, over the plate; the rest of the sum
+is a constant of the window. A pixel shows the plate where it is nearer than the bodies by more than the roughness of
+its spheres. Appearance and geometry are constants here: poses get a gradient from the renderer, {c, s} none (contact
+model notes, section 7).
 """
 
 from __future__ import annotations
@@ -17,82 +17,73 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.models import Model
-from ...schemas import InputDataError
-from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
-from ..splats.render import MIN_ALPHA, RenderOutput, render
-from ..splats.spheres import Spheres
-from ..splats.views import camera_center
-from .footage import Footage, Video
-from .windows import Window, window_of
+from ....datasets.models.model import Model
+from ....datasets.shapes.ply import Splats
+from ....schemas import InputDataError
+from ...geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
+from ...geometry.spheres import Spheres
+from ...rendering.render import MIN_ALPHA, render
+from .backdrop import backdrop_of
+from .crops import Window, window_of
+from .video_frames import Footage, Video
 
 MASK_WEIGHT = 1.0
-"""Weight of the silhouettes: a wrong pixel of mask costs as much as a wrong black-and-white one (choice of cgwm)."""
+"""Weight of the silhouettes: a wrong pixel of a mask costs as much as black in place of white (choice of cgwm)."""
 DIFFERENCE_M = 5e-4
-"""Step of the differences for the curvature: a small part of a pixel."""
+"""Step of the differences for the curvature [m], a small part of a pixel."""
 HUBER = 0.1
-"""Tracking takes residuals below this as squares: least squares finds its way where the L1 norm creeps."""
+"""Residual below which the tracking loss is quadratic; least squares converges where the L1 norm creeps."""
 MIN_IOU = 0.5
-"""A pose whose silhouettes overlap the masks by less is no pose of the body."""
+"""Minimum intersection over union of silhouettes and masks for a pose to count as found."""
 MAX_ERROR_RATIO = 0.7
-"""Without masks: a body in the right place explains its pixels at least this much better than the background does."""
+"""Maximum ratio of the colour error on the body to that of the background alone for a pose without masks to count as
+found."""
 MIN_AREA_PX = 12.0
+"""Minimum drawn area of the bodies for a pose to count as found [px]."""
 OCCLUDER_RADII = 0.5
-"""What does not move hides a body where it is nearer by this much of the body's radius: a ground of spheres is rough,
-and must not swallow the rim of what stands on it."""
+"""Depth difference above which the static scene hides a body, as a share of the body's radius: a ground of spheres is
+rough, and must not hide the rim of a body on it."""
 _MAX_RENDERS = 128
+"""Maximum number of renders in one batch."""
 
 
 @dataclass(frozen=True)
 class PoseModel:
-    """Huber loss and its second-order model at poses: value (K,), slope (K, D), curvature (K, D, D); D = 6 free bodies.
+    """Second-order model of the Huber loss at poses (K), in D = 6 nf coordinates of the nf free bodies.
 
-    Coordinates: translation [m], world; rotation vector [rad], body; for each free body.
+    Coordinates of each free body: translation [m] in the world frame, and rotation vector [rad] in the body frame.
     """
 
     value: Tensor
+    """Loss, shape (K,)."""
     slope: Tensor
+    """Gradient, shape (K, D)."""
     curvature: Tensor
+    """Curvature, shape (K, D, D)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseQuality:
-    """How poses (K) agree with the frames where the bodies are drawn.
-
-    iou (K,): of the free bodies' silhouettes with the masks, NaN without masks; error (K,): mean absolute colour error
-    on the bodies; blank (K,): the same of the background alone; area (K,): drawn pixels, 0 where no camera sees it.
-    """
+    """Agreement of renders at poses (K) with the frames where the bodies are drawn."""
 
     iou: Tensor
+    """Intersection over union of the free bodies' silhouettes and the masks, NaN without masks, shape (K,)."""
     error: Tensor
+    """Mean absolute colour error on the bodies, shape (K,)."""
     blank: Tensor
+    """Mean absolute colour error of the background alone in the same pixels, shape (K,)."""
     area: Tensor
+    """Drawn area [px], 0 where no camera sees the bodies, shape (K,)."""
 
     @property
     def found(self) -> Tensor:
-        """Which poses (K,) explain the frames: half of the mask, or the colours far better than no body does."""
+        """Whether poses explain the frames: by the overlap with masks, or by colours without masks, shape (K,)."""
         agrees = torch.where(self.iou.isnan(), self.error < MAX_ERROR_RATIO * self.blank, self.iou >= MIN_IOU)
         return agrees & (self.area > MIN_AREA_PX)
 
 
-@dataclass(frozen=True, eq=False)
-class Backdrop:
-    """What a video shows where nothing moves.
-
-    plates (P, H, W, 3): renders of the static scene; depths (P, H, W): its median depth [m], infinite where it is not
-    seen; plate_of (T,): the frame's plate; gain (3,): exposure of the camera against the model; unexplained (T,): sum
-    of |gain plate - frame| / 3.
-    """
-
-    plates: Tensor
-    depths: Tensor
-    plate_of: Tensor
-    gain: Tensor
-    unexplained: Tensor
-
-
 class ImageLoss:
-    """The loss of an episode's frames as a function of the bodies' poses.
+    """Loss of an episode's frames as a function of the bodies' poses.
 
     Args:
         model: A model with visual spheres and a background.
@@ -102,7 +93,7 @@ class ImageLoss:
     """
 
     def __init__(self, model: Model, footage: Footage, free: Sequence[int], min_alpha: float = MIN_ALPHA) -> None:
-        _check(model, free)
+        scene = _required_scene(model, free)
         self.footage, self.free, self._min_alpha, self._step_m = footage, tuple(free), min_alpha, DIFFERENCE_M
         like = footage.videos[0].frames
         self._count = len(model.file.bodies)
@@ -119,8 +110,7 @@ class ImageLoss:
                 static.append(Spheres(means, spheres.scales, spheres.opacities, spheres.colors))
             else:
                 self._moving.append((index, spheres))
-        assert model.scene is not None
-        static.append(Spheres.from_numpy(model.scene, like.dtype, like.device))
+        static.append(Spheres.from_numpy(scene, like.dtype, like.device))
         self._static = Spheres.joined(static)
         moving = Spheres.joined([spheres for _, spheres in self._moving])
         label = torch.cat([torch.full((len(spheres),), index) for index, spheres in self._moving])
@@ -131,7 +121,7 @@ class ImageLoss:
         self.radii = {index: _radius(spheres) for index, spheres in self._moving}
         self._roughness = OCCLUDER_RADII * max(self.radii.values())
         self.centers = {index: spheres.means.mean(0) for index, spheres in self._moving}
-        self._backdrops = [self._backdrop(video) for video in footage.videos]
+        self._backdrops = [backdrop_of(self._static, video, min_alpha) for video in footage.videos]
 
     @property
     def photometric(self) -> bool:
@@ -144,21 +134,21 @@ class ImageLoss:
         return {v.camera: b.gain.tolist() for v, b in zip(self.footage.videos, self._backdrops, strict=True)}
 
     def values(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
-        """Return the loss at poses, the mean over the cameras that saw the instant.
+        """Return the loss at poses, averaged over the cameras with a frame at the instant.
 
         Args:
-            instants: Which instant of the footage each pose belongs to, shape (K,).
+            instants: Instant of the footage of each pose, shape (K,).
             position_m: Body frame origins [m], world, shape (K, nb, 3).
             quat_wxyz: Shape (K, nb, 4).
 
         Returns:
-            Shape (K,); 0 where no camera saw the instant.
+            The loss, 0 where no camera has a frame at the instant, shape (K,).
         """
         with torch.no_grad():
             return self.parts(instants, position_m, quat_wxyz).sum(-1)
 
     def parts(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
-        """Return the loss by its parts, photometric and (weighted) mask, shape (K, 2); differentiable in the poses."""
+        """Return the parts of the loss, photometric and weighted mask, shape (K, 2), differentiable in the poses."""
         total = torch.zeros(len(instants), 2).to(self._static.means)
         shots = torch.zeros(len(instants)).to(total)
         for number, video in enumerate(self.footage.videos):
@@ -188,10 +178,10 @@ class ImageLoss:
 
     @torch.no_grad()
     def expand(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor, blur: int = 1) -> PoseModel:
-        """Return the Huber loss at poses, less that of the background alone, with slope and curvature by differences.
+        """Return the Huber loss at poses, minus that of the background, with gradient and curvature by differences.
 
-        The curvature is that of re-weighted least squares, J^T diag(1 / max(|r|, HUBER)) J. Residuals averaged over
-        squares of `blur` pixels, half overlapping, widen the valley to about as many pixels.
+        The curvature is that of re-weighted least squares, J^T diag(1 / max(|r|, HUBER)) J. Averaging residuals over
+        half-overlapping squares of `blur` pixels widens the basin to about as many pixels.
         """
         count, size = len(instants), 6 * len(self.free)
         like = self._static.means
@@ -212,7 +202,7 @@ class ImageLoss:
 
     @torch.no_grad()
     def quality(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> PoseQuality:
-        """Say how well renders at poses agree with the frames where the bodies are."""
+        """Return the agreement of renders at poses with the frames where the bodies are drawn."""
         count, free = len(instants), list(self.free)
         inside, union, error, blank, area = (torch.zeros(count).to(self._static.means) for _ in range(5))
         for number, video in enumerate(self.footage.videos):
@@ -234,10 +224,10 @@ class ImageLoss:
         return PoseQuality(inside / union, error / area, blank / area, area)
 
     def difference(self, number: int, frame: int) -> Tensor:
-        """Return how much a frame differs from what is behind the bodies, mean of the channels (H, W).
+        """Return the difference of a frame from the scene behind the bodies, averaged over channels (H, W).
 
-        Behind them is the model's background and, where the camera stands still, the median of all frames: a pixel
-        must differ from both, for renders of textured ground err at every edge.
+        The scene is the model's background and, if the camera does not move, the median of all frames. A pixel must
+        differ from both, because renders of textured ground are wrong at every edge.
         """
         drop, video = self._backdrops[number], self.footage.videos[number]
         difference = (drop.gain * drop.plates[drop.plate_of[frame]] - video.frames[frame]).abs().mean(-1)
@@ -247,7 +237,7 @@ class ImageLoss:
         return difference.minimum(usual)
 
     def _frames(self, number: int, instants: Tensor) -> Tensor:
-        """Return the frames of a video at instants (K,), -1 for none, on the CPU."""
+        """Return the frames of a video at instants (K,), -1 where there is none, on the CPU."""
         return torch.as_tensor(self.footage.frame_at[number])[instants.cpu()]
 
     def moved(self, position_m: Tensor, quat_wxyz: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
@@ -262,6 +252,7 @@ class ImageLoss:
     def _shot_model(
         self, number: int, frames: Tensor, position_m: Tensor, quat_wxyz: Tensor, steps: Tensor, blur: int
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return loss (K,), gradient (K, D) and curvature (K, D, D) of one camera's frames at poses."""
         video, size = self.footage.videos[number], len(steps)
         count = len(frames)
         window = window_of(video, frames, self._place(position_m, quat_wxyz), self._reach, margin=2)
@@ -326,34 +317,9 @@ class ImageLoss:
         behind = window.cut(drop.plates, plate_of) * (1 - seen * shown.alpha[..., None])
         return seen * shown.features + torch.nn.functional.pad(behind, (0, self._count))
 
-    @torch.no_grad()
-    def _backdrop(self, video: Video) -> Backdrop:
-        poses, plate_of = torch.unique(video.viewmats.flatten(1), dim=0, return_inverse=True)
-        views = []
-        for pose in poses.view(-1, 1, 4, 4):
-            seen = self._static.seen_from(camera_center(pose[0]))
-            spheres = (seen.means, seen.scales, seen.opacities, seen.colors)
-            views.append(render(*spheres, pose, video.K[None], *video.size, min_alpha=self._min_alpha, median=True))
-        plates = torch.cat([view.features for view in views])
-        depths = torch.cat([_median(view) for view in views])
-        gain = _gain(video, plates, plate_of)
-        unexplained = torch.stack(
-            [
-                ((gain * plates[plate]).clamp(0, 1) - frame).abs().sum() / 3
-                for plate, frame in zip(plate_of, video.frames, strict=True)
-            ]
-        )
-        return Backdrop(plates, depths, plate_of, gain, unexplained)
-
-
-def _median(view: RenderOutput) -> Tensor:
-    """Return the median depth (1, H, W) [m], infinite where more than half of the light gets through."""
-    assert view.median_depth is not None
-    return torch.where(view.median_depth > 0, view.median_depth, torch.inf)
-
 
 def _filmed(frames: Tensor, most: int) -> Iterator[Tensor]:
-    """Yield the indices of poses (K,) whose instant the camera saw, at most so many at once."""
+    """Yield the indices of poses (K,) with a frame of the camera, in batches of at most `most`."""
     rows = (frames >= 0).nonzero()[:, 0]
     if len(rows):
         yield from rows.split(most)
@@ -369,6 +335,7 @@ def _rows(color: Tensor, mask: Tensor, blur: int) -> Tensor:
 
 
 def _huber(residual: Tensor) -> Tensor:
+    """Return the Huber loss of each residual, with slope 1 above `HUBER`."""
     size = residual.abs()
     return torch.where(size < HUBER, 0.5 * size.square() / HUBER, size - 0.5 * HUBER)
 
@@ -381,31 +348,18 @@ def _mask_outside(video: Video, window: Window) -> Tensor:
     return video.covers[window.frames].sum((1, 2, 3)) - inside
 
 
-def _gain(video: Video, plates: Tensor, plate_of: Tensor) -> Tensor:
-    """Return the exposure (3,): the median ratio of the frames to the background's render, where no body covers it."""
-    behind = plates[plate_of]
-    bright = behind > 0.1
-    if video.covers is not None:
-        bright = bright & (video.covers.sum(1) < 0.01)[..., None]
-    gains = []
-    for channel in range(3):
-        rows = bright[..., channel]
-        ratio = video.frames[..., channel][rows] / behind[..., channel][rows]
-        gains.append(ratio.median() if ratio.numel() else ratio.new_tensor(1.0))
-    return torch.stack(gains)
-
-
 def _reach(spheres: Spheres, min_alpha: float) -> Tensor:
-    """Return how far from its centre a sphere's alpha reaches `min_alpha` [m], shape (N,)."""
+    """Return the distance from its centre at which a sphere's alpha falls to `min_alpha` [m], shape (N,)."""
     return spheres.scales * (2 * (spheres.opacities / min_alpha).clamp_min(1.0).log()).sqrt()
 
 
 def _radius(spheres: Spheres) -> float:
-    """Return the mean distance of a body's spheres from their middle [m]."""
+    """Return the mean distance of a body's spheres from their centroid [m]."""
     return float((spheres.means - spheres.means.mean(0)).norm(dim=1).mean().clamp_min(1e-4))
 
 
-def _check(model: Model, free: Sequence[int]) -> None:
+def _required_scene(model: Model, free: Sequence[int]) -> Splats:
+    """Return the model's background; refuse a model without it, or without visual spheres of a free body."""
     todo = "run 'cgwm fit CAPTURE --stage sg-gs' on photos with masks, then pass the model with --from."
     if model.scene is None:
         raise InputDataError(
@@ -419,3 +373,4 @@ def _check(model: Model, free: Sequence[int]) -> None:
             raise InputDataError(
                 f"the model has no visual spheres of the free body '{name}'.", "spheres from photos with masks.", todo
             )
+    return model.scene

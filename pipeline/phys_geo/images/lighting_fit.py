@@ -1,8 +1,8 @@
-"""What a measured motion adds to a body's looks: the light that falls on it, and the sides that no photo shows.
+"""Light and colours of bodies from frames of a measured motion: the light on a body, and sides that no photo shows.
 
-The spheres carry the colours of the photos, where the body rests and hides its underside. Frames of a motion with known
-poses show its sides in other light: their ratio tells the light (`splats.relighting` applies it), and with it they tell
-the colours of what the photos did not show.
+The spheres have the colours of the photos, in which the body is at rest and hides its underside. Frames of a motion
+with known poses show its sides in other light. The ratios of brightness identify the light (`rendering.relighting`
+applies it), and with the light the frames give the colours of the sides that the photos do not show.
 """
 
 from __future__ import annotations
@@ -17,56 +17,69 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..datasets.capture import Capture
-from ..datasets.models import Model
-from ..datasets.ply import Splats
-from ..datasets.tracks import Track
-from ..schemas import Exposure, Light
-from .image_errors import usable_cameras, video_view
-from .physics.driven import Drive
-from .physics.rotation import quat_to_matrix
-from .splats.colors import sphere_weights
-from .splats.relighting import Relighting, light_terms
-from .splats.render import render
-from .splats.spheres import Spheres
-from .splats.views import load_views
+from ....datasets.capture.cameras import Camera
+from ....datasets.capture.capture import Capture
+from ....datasets.capture.tracks import Track
+from ....datasets.models.model import Model
+from ....datasets.shapes.ply import Splats
+from ....schemas import Exposure, Light
+from ...geometry.rotation import quat_to_matrix
+from ...geometry.spheres import Spheres
+from ...physics.kinematic import Drive
+from ...rendering.relighting import Relighting, light_terms
+from ...rendering.render import RenderOutput, render
+from ...rendering.video_view import usable_cameras, video_view
+from ...sg_gs.colors import sphere_weights
+from ...sg_gs.views import load_views
 
 Array = NDArray[np.float64]
 
 EPISODES, FRAMES = 4, 12
-"""Episodes to look at, and frames of each camera of an episode."""
+"""Maximum number of episodes, and of frames of each camera of an episode."""
 PHOTOS, PHOTO_SIZE = 16, 320
-"""Photos, evenly spread, that tell which spheres were seen, and their longer side [px]."""
+"""Maximum number of photos, evenly spread, from which seen spheres are determined, and their longer side [px]."""
 SEEN_PX = 2.0
-"""A sphere with less weight than this in all these photos together, or in all frames, was not seen."""
+"""Minimum total weight of a seen sphere in all these photos, or in all frames [px]."""
 BLOCK_PX = 4
-"""Means over blocks of this side are compared: texture that is a little off cancels in them."""
+"""Side of the blocks whose means are compared [px]; slightly displaced texture cancels in them."""
 MIN_BLOCKS = 200
+"""Minimum number of blocks for estimating the light."""
 MIN_ALPHA = 0.95
+"""Minimum opacity of the rendered body in compared pixels."""
 SATURATED = (0.03, 0.97)
+"""Range of colours that the sensor does not clip."""
 PRIOR_MEAN, PRIOR_STD = np.array([0.0, 0.0, 0.6, 0.2]), np.array([0.5, 0.5, 0.5, 0.1])
-"""Lamp and sky before any data: a lamp overhead about as bright as the room, and a floor that sends some light back."""
+"""Mean and standard deviation of the prior of lamp and sky: a lamp overhead about as bright as the room, and a floor
+that reflects some light."""
 SIDE_STD = 0.05
-"""Relative error of a side's brightness in a frame: its texture is not quite the photos'."""
+"""Relative error of a side's brightness in a frame, whose texture differs slightly from the photos'."""
 SIDES_PER_FRAME = 3.0
-"""Blocks on one side err alike; a frame counts as this many independent ones."""
+"""Number of independent blocks in a frame; errors of blocks on one side are correlated."""
 IRLS_STEPS = 20
+"""Number of iterations of re-weighted least squares."""
 FACING = 0.15
-"""A surface is seen where the cosine between its normal and the way to the camera is above this; what shines through
-the rim of a body, or of the ground before it, has been seen by nobody."""
+"""Minimum cosine between a visible surface's normal and the direction to the camera; it excludes surfaces that shine
+through the rim of a body or of the ground in front of it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Frame:
-    """A body in a frame: colours in the model's exposure (H, W, 3), where they count (H, W), camera, body's pose."""
+    """A body in a frame of a video."""
 
     body: int
+    """Index of the body in the model."""
+    normals: NDArray[np.floating]
+    """Normals of its spheres, body frame, shape (N, 3)."""
     image: Array
+    """Colours of the frame, converted to the model's exposure, shape (H, W, 3)."""
     usable: NDArray[np.bool_]
+    """Pixels that show the body and are not saturated, shape (H, W)."""
     camera: Camera
+    """Undistorted camera of the frame."""
     rotation: Tensor
+    """Rotation of the body, R_world_body, shape (3, 3)."""
     position: Tensor
+    """Origin of the body's frame [m], world, shape (3,)."""
 
 
 def learn_appearance(
@@ -76,17 +89,17 @@ def learn_appearance(
     split: str = "train",
     found: Mapping[str, dict[str, Track]] | None = None,
 ) -> Model:
-    """Add to a model the light, and the colours of spheres that only the motion shows.
+    """Add the light to a model, and the colours of spheres that only the motion shows.
 
     Args:
-        model: With spheres of the bodies, and normals on them.
-        capture: With calibrated cameras, photos, videos and measured tracks.
-        exposures: Of the video cameras; others are not looked at.
-        split: The episodes to look at.
-        found: Tracks found in the videos, by episode and body, in the place of measured ones; None: measured ones.
+        model: Model with spheres of the bodies, and their normals.
+        capture: Capture with calibrated cameras, photos, videos and measured tracks.
+        exposures: Exposure by video camera; other cameras are not used.
+        split: Name of the episodes.
+        found: Tracks found in the videos, by episode and body, instead of measured ones; None for measured ones.
 
     Returns:
-        The model, unchanged where too little of a moving body is seen.
+        The model, unchanged if too little of a moving body is seen.
     """
     frames = _frames(model, capture, exposures, split, found)
     seen = {name: _seen(model, capture, name) for name in {model.file.bodies[frame.body].name for frame in frames}}
@@ -113,8 +126,8 @@ def fit_light(ratio: Array, normals_now: Array, normals_photo: Array, independen
     Args:
         ratio: Brightness in a frame over that of the photos' colours, shape (n,).
         normals_now: Normals in the frame, world, shape (n, 3).
-        normals_photo: Of the same places in the photos, world, shape (n, 3).
-        independent: How many of the ratios are independent of each other.
+        normals_photo: Normals of the same places in the photos, world, shape (n, 3).
+        independent: Number of independent ratios.
     """
     share = min(1.0, independent / len(ratio))
     starts = [0.5 * np.array([x, y, 1.0]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
@@ -124,14 +137,14 @@ def fit_light(ratio: Array, normals_now: Array, normals_photo: Array, independen
 
 
 def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: float) -> tuple[float, Array]:
-    """Return the cost of a light and its numbers (4,), by least squares with Cauchy weights from a first lamp (3,).
+    """Return the cost of a light and its parameters (4,), by least squares with Cauchy weights from a first lamp (3,).
 
-    On each side of the terminator the residuals are linear, so each step is a linear problem.
+    On each side of the terminator the residuals are linear, so that each step is a linear problem.
     """
     seen, pictured = torch.as_tensor(now), torch.as_tensor(photo)
     prior = np.diag(1 / np.square(PRIOR_STD))
     fit: Array = np.array([*lamp, PRIOR_MEAN[3]])
-    best, numbers = math.inf, fit
+    best, light = math.inf, fit
     for _ in range(IRLS_STEPS):
         terms = [light_terms(normals, torch.as_tensor(fit[:3])).numpy() for normals in (seen, pictured)]
         design, wanted = terms[0] / ratio[:, None] - terms[1], 1 - 1 / ratio  # errors are relative to the brightness
@@ -141,10 +154,10 @@ def _light_from(lamp: Array, ratio: Array, now: Array, photo: Array, share: floa
         away = fit - PRIOR_MEAN
         cost = share * float(np.log1p(np.square(residual / SIDE_STD)).sum()) + float(away @ prior @ away)
         if cost < best:
-            best, numbers = cost, fit
+            best, light = cost, fit
         weighted = share / SIDE_STD**2 * design.T * weight
         fit = np.linalg.solve(weighted @ design + prior, weighted @ wanted + prior @ PRIOR_MEAN).astype(np.float64)
-    return best, numbers
+    return best, light
 
 
 def _frames(
@@ -154,6 +167,7 @@ def _frames(
     split: str,
     known: Mapping[str, dict[str, Track]] | None,
 ) -> list[_Frame]:
+    """Return the frames of moving bodies with known poses, in cameras with known exposure."""
     found = []
     for episode in capture.episodes(split)[:EPISODES]:
         tracks = capture.tracks(episode) if known is None else known.get(episode, {})
@@ -162,15 +176,23 @@ def _frames(
                 continue
             for index, body in enumerate(model.file.bodies):
                 track, splats = tracks.get(body.name), model.body_splats.get(body.name)
-                shown = body.motion == "free" and splats is not None and splats.normals is not None
-                if shown and track is not None and track.quat_wxyz is not None:
-                    found += _body_frames(capture, exposures[camera], camera, episode, index, track)
+                if body.motion != "free" or splats is None or splats.normals is None:
+                    continue
+                if track is not None and track.quat_wxyz is not None:
+                    found += _body_frames(capture, exposures[camera], camera, episode, index, splats.normals, track)
     return found
 
 
 def _body_frames(
-    capture: Capture, exposure: Exposure, camera: str, episode: str, index: int, track: Track
+    capture: Capture,
+    exposure: Exposure,
+    camera: str,
+    episode: str,
+    index: int,
+    normals: NDArray[np.floating],
+    track: Track,
 ) -> list[_Frame]:
+    """Return frames of one body in one video, evenly spread over its track."""
     times = capture.frame_times(camera, episode)
     inside = np.flatnonzero((times >= track.time_s[0] - 1e-6) & (times <= track.time_s[-1] + 1e-6))
     if not len(inside):
@@ -192,7 +214,17 @@ def _body_frames(
             label = (view.undistorted(masks[k], labels=True)[0] == index + 1).astype(np.uint8)
             usable &= cv2.erode(label, np.ones((3, 3))) > 0
         rotation = quat_to_matrix(pose.quat_wxyz[0])
-        found.append(_Frame(index, (image - offset) / gain, usable, plain, rotation, pose.com[0]))
+        found.append(
+            _Frame(
+                body=index,
+                normals=normals,
+                image=(image - offset) / gain,
+                usable=usable,
+                camera=plain,
+                rotation=rotation,
+                position=pose.com[0],
+            )
+        )
     return found
 
 
@@ -225,26 +257,25 @@ def _seen(model: Model, capture: Capture, name: str) -> NDArray[np.bool_]:
 
 
 def _resting_normals(model: Model, name: str) -> Tensor:
-    """Return the normals (N, 3) of a body's spheres as it stands in the photos, world frame."""
+    """Return the normals (N, 3) of a body's spheres at its pose in the photos, world frame."""
     body = next(body for body in model.file.bodies if body.name == name)
     rotation = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz, dtype=torch.float64))
     return torch.as_tensor(model.body_splats[name].normals, dtype=torch.float64) @ rotation.T
 
 
 def _facing(means: Tensor, normals: Tensor, eye: Tensor) -> Tensor:
-    """Return which surfaces (N,), as 0 or 1, face a camera at `eye` (3,); means and normals (N, 3), world frame."""
+    """Return which surfaces face a camera at `eye` (3,), as 0 or 1 (N,); means and normals (N, 3), world frame."""
     way = eye.to(means) - means
     return ((way * normals.to(means)).sum(-1) > FACING * way.norm(dim=-1)).to(means)
 
 
 @torch.no_grad()
 def _ratios(model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]]) -> tuple[Array, Array, Array] | None:
-    """Return brightness ratios (n,) and normals now and in the photos (n, 3) of blocks on a body that photos show."""
+    """Return brightness ratios (n,), and normals in frame and photos (n, 3), of blocks on a body that photos show."""
     body = model.file.bodies[frame.body]
     splats = model.body_splats[body.name]
-    assert splats.normals is not None  # `_frames` has no others
     known = seen[body.name].astype(np.float64)[:, None]
-    features, alpha = _pictured(splats, frame, np.concatenate([splats.colors, splats.normals, known], 1).astype(float))
+    features, alpha = _pictured(splats, frame, np.concatenate([splats.colors, frame.normals, known], 1).astype(float))
     brightness = [frame.image.sum(-1)[..., None], features[..., :3].sum(-1)[..., None]]
     blocks = _blocks(np.concatenate([*brightness, features[..., 3:]], -1), frame.usable & (alpha > MIN_ALPHA))
     length = np.linalg.norm(blocks[:, 2:5], axis=1)
@@ -264,21 +295,23 @@ def _pictured(splats: Splats, frame: _Frame, features: Array) -> tuple[Array, Ar
 
 
 def _in_frame(splats: Splats, frame: _Frame, features: Tensor) -> Spheres:
+    """Return a body's spheres at its pose in a frame, with features (N, F) as colours."""
     spheres = Spheres.from_numpy(splats)
     means = spheres.means @ frame.rotation.float().T + frame.position.float()
     return Spheres(means, spheres.scales, spheres.opacities, features)
 
 
-def _rendered(spheres: Spheres, camera: Camera):
+def _rendered(spheres: Spheres, camera: Camera) -> RenderOutput:
+    """Return the render of spheres in a camera."""
     viewmat, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (camera.T_cam_world, camera.K))
     size = (camera.width, camera.height)
     return render(spheres.means, spheres.scales, spheres.opacities, spheres.colors, viewmat, K, *size)
 
 
 def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, seen: NDArray[np.bool_]) -> Splats:
-    """Return a body's spheres with the colours of those that only the frames show, in the light of the photos.
+    """Return a body's spheres with colours from the frames for those that no photo shows, in the light of the photos.
 
-    What neither shows takes the mean of what is seen, as bright as its side would be.
+    Spheres that neither shows get the median colour of the seen ones, with the brightness of their side.
     """
     body = model.file.bodies[index]
     splats = model.body_splats[body.name]
@@ -307,7 +340,7 @@ def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, s
 
 
 def _blocks(table: Array, usable: NDArray[np.bool_]) -> Array:
-    """Return the means (n, C) of the blocks of a table (H, W, C) all of whose pixels are usable."""
+    """Return the means (n, C) of the blocks of a table (H, W, C) whose pixels are all usable."""
     height, width = (size // BLOCK_PX for size in usable.shape)
     whole = table[: height * BLOCK_PX, : width * BLOCK_PX].reshape(height, BLOCK_PX, width, BLOCK_PX, -1)
     full = usable[: height * BLOCK_PX, : width * BLOCK_PX].reshape(height, BLOCK_PX, width, BLOCK_PX).all((1, 3))

@@ -1,4 +1,4 @@
-"""Looking for the pose of bodies in one instant of a video: by silhouettes, over all orientations, by descent."""
+"""Search for the pose of bodies at one instant of a video, from silhouettes, over all orientations, and by descent."""
 
 from __future__ import annotations
 
@@ -10,40 +10,45 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..physics.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
-from .footage import Video
+from ...geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
 from .image_loss import ImageLoss
+from .video_frames import Video
 
 ROTATIONS = 72
-"""Orientations that a search scores: about 35 degrees apart, within what the descent bridges."""
+"""Number of orientations that a search scores: about 35 degrees apart, within the range of the descent."""
 NEARBY_DEG = (20.0, 40.0)
-"""Turns from an expected orientation that a search also scores, about fourteen axes each."""
+"""Angles from an expected orientation that a search also scores, each around fourteen axes [deg]."""
 KEPT = 6
-"""Best orientations of a search that are refined."""
+"""Number of the best orientations of a search that are refined."""
 SAME_POSE = (0.15, math.radians(8.0))
-"""Poses closer than this (radii of the body, radians) are one."""
+"""Maximum distance and angle of equal poses (radii of the body, radians)."""
 MIN_SILHOUETTE_PX = 6.0
+"""Minimum area of a silhouette that locates a body [px]."""
 DIFFERENCE_FLOOR = 0.08
-"""Without masks a pixel shows a body if it differs from the background by this, and by 4 times the median."""
+"""Minimum difference from the background of a pixel that shows a body, without masks; it must also exceed 4 times the
+median difference."""
 STEP_LIMIT = 0.5
-"""Longest step of the descent, in radii of the body and radians."""
+"""Maximum step of the descent, in radii of the body and radians."""
 SMALL_STEP = 1e-3
-"""The descent ends with a step below this, in the same units."""
+"""Step below which the descent ends, in radii of the body and radians."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of all bodies: position_m (K, nb, 3), quat_wxyz (K, nb, 4), and the image loss at them, value (K,)."""
+    """Poses (K) of all bodies (nb) at one instant, with their image loss."""
 
     position_m: Tensor
+    """Body frame origins [m], world, shape (K, nb, 3)."""
     quat_wxyz: Tensor
+    """Orientations, shape (K, nb, 4)."""
     value: Tensor
+    """Image loss, shape (K,)."""
 
     def __len__(self) -> int:
         return len(self.value)
 
     def at(self, rows: Tensor) -> Poses:
-        """Return some of them."""
+        """Return the poses of some rows."""
         return Poses(self.position_m[rows], self.quat_wxyz[rows], self.value[rows])
 
     @staticmethod
@@ -57,17 +62,17 @@ class Poses:
 
 
 def search(loss: ImageLoss, instant: int, position_m: Tensor, quat_wxyz: Tensor, blur: int) -> Poses:
-    """Try many orientations of each free body in turn, about its silhouettes, or about the given place.
+    """Try many orientations of each free body in turn, at its silhouettes or at the expected position.
 
     Args:
-        loss: The loss on small pictures.
-        instant: Which instant of its footage.
-        position_m: Expected places of all bodies [m], world, shape (nb, 3).
+        loss: Image loss on small images.
+        instant: Instant of its footage.
+        position_m: Expected positions of all bodies [m], world, shape (nb, 3).
         quat_wxyz: Expected orientations, shape (nb, 4).
         blur: As in `ImageLoss.expand`.
 
     Returns:
-        The best few, refined; of several free bodies all but the last stand as in the best.
+        The best few poses, refined; with several free bodies all but the last have the best pose.
     """
     position, quat = position_m.clone(), quat_wxyz.clone()
     found: Poses | None = None
@@ -89,12 +94,12 @@ def search(loss: ImageLoss, instant: int, position_m: Tensor, quat_wxyz: Tensor,
 
 
 def descend(loss: ImageLoss, instant: int, position: Tensor, quat: Tensor, iterations: int, blur: int) -> Poses:
-    """Levenberg-Marquardt on the image loss of one instant from several poses (K, nb, ...) at once."""
+    """Minimise the image loss of one instant from several poses (K, nb, ...) by Levenberg-Marquardt."""
     return descend_all(loss, torch.full((len(position),), instant), position, quat, iterations, blur)
 
 
 def descend_all(loss: ImageLoss, instants: Tensor, position: Tensor, quat: Tensor, iterations: int, blur: int) -> Poses:
-    """Levenberg-Marquardt on the image loss, each pose (K, nb, ...) at its instant (K,)."""
+    """Minimise the image loss from poses (K, nb, ...), each at its instant (K,), by Levenberg-Marquardt."""
     model = loss.expand(instants, position, quat, blur)
     damping = torch.full_like(model.value, 1e-2)
     for _ in range(iterations):
@@ -120,7 +125,7 @@ def descend_all(loss: ImageLoss, instants: Tensor, position: Tensor, quat: Tenso
 
 
 def distinct(loss: ImageLoss, poses: Poses, most: int) -> Poses:
-    """Return the best poses, at most so many, without those that are all but equal to a better one."""
+    """Return the best poses, at most `most`, without those that nearly equal a better one."""
     kept: list[int] = []
     for row in poses.value.argsort(stable=True).tolist():
         if len(kept) < most and not any(_same(loss, poses, row, other) for other in kept):
@@ -129,6 +134,7 @@ def distinct(loss: ImageLoss, poses: Poses, most: int) -> Poses:
 
 
 def _same(loss: ImageLoss, poses: Poses, a: int, b: int) -> bool:
+    """Return whether two poses of all free bodies are nearly equal."""
     for index in loss.free:
         shift = float((poses.position_m[a, index] - poses.position_m[b, index]).norm())
         cosine = float((poses.quat_wxyz[a, index] * poses.quat_wxyz[b, index]).sum().abs().clamp_max(1.0))
@@ -138,7 +144,7 @@ def _same(loss: ImageLoss, poses: Poses, a: int, b: int) -> bool:
 
 
 def located(loss: ImageLoss, instant: int, index: int) -> Tensor | None:
-    """Return the middle of a body (3,), world, from its silhouettes, or None where too little of it is seen."""
+    """Return the centroid of a body (3,), world, from its silhouettes; None if too little of it is visible."""
     rays, distances = [], []
     for number, video in enumerate(loss.footage.videos):
         frame = int(loss.footage.frame_at[number, instant])
@@ -161,7 +167,7 @@ def located(loss: ImageLoss, instant: int, index: int) -> Tensor | None:
 
 
 def small_silhouette_px(loss: ImageLoss) -> float | None:
-    """Return the area [px] that a tenth of the free bodies' silhouettes stay below; None where none is seen."""
+    """Return the 10 % quantile of the areas of the free bodies' silhouettes [px]; None if none is visible."""
     areas = []
     for number, frames in enumerate(loss.footage.frame_at.tolist()):
         for frame in set(frames) - {-1}:
@@ -171,7 +177,7 @@ def small_silhouette_px(loss: ImageLoss) -> float | None:
 
 
 def _silhouette(loss: ImageLoss, number: int, frame: int, index: int) -> Tensor:
-    """Return where a body is seen (H, W): its mask, or the largest region that differs from the background."""
+    """Return a body's silhouette (H, W): its mask, or the largest region that differs from the background."""
     video = loss.footage.videos[number]
     if video.covers is not None:
         return video.covers[frame, index]
@@ -185,7 +191,7 @@ def _silhouette(loss: ImageLoss, number: int, frame: int, index: int) -> Tensor:
 
 
 def rotation_grid(count: int) -> Tensor:
-    """Return evenly spread rotations, quaternions wxyz (count, 4).
+    """Return evenly spread rotations as quaternions wxyz, shape (count, 4).
 
     Source: super-Fibonacci spirals (M. Alexa, CVPR 2022).
     """
@@ -205,7 +211,7 @@ def _nearby(quat_wxyz: Tensor) -> Tensor:
 
 
 def _ray(video: Video, frame: int, cover: Tensor) -> tuple[Tensor, Tensor]:
-    """Return origin and unit direction (world) of the ray through the middle of a silhouette (H, W)."""
+    """Return origin and unit direction (world) of the ray through the centroid of a silhouette (H, W)."""
     rows = torch.arange(cover.shape[0]).to(cover) + 0.5
     columns = torch.arange(cover.shape[1]).to(cover) + 0.5
     area = cover.sum()

@@ -1,13 +1,13 @@
 """Pose tracks from videos: render, compare, correct, and choose among several histories.
 
-A single picture often has several poses that explain it about equally (a box turned about, a body seen from one side
-only), and a tracker that follows one of them from the first frame on may follow a wrong one. So several are followed:
+A single image often has several poses that explain it about equally (a box turned around, a body seen from one side
+only), and a tracker that follows one of them from the first frame may follow a wrong one. Several are followed instead:
 
-1. At a few instants spread over the episode all orientations are tried (`pose_search`).
-2. Forwards, then backwards in time, each pose that was found is carried to the next instant at constant velocity and
-   corrected; the best few different ones stay.
-3. Among all of them the history is chosen whose pictures fit best at turns that bodies make (Viterbi's algorithm).
-4. Its poses are corrected on the large pictures.
+1. At a few instants, spread over the episode, all orientations are tried (`pose_search`).
+2. Forwards, then backwards in time, each pose is extrapolated to the next instant at constant velocity and corrected;
+   the best few distinct ones are kept.
+3. Viterbi's algorithm chooses the history with the best agreement of images at plausible rotations between them.
+4. Its poses are corrected on the large images.
 """
 
 from __future__ import annotations
@@ -21,71 +21,76 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.progress import progress
-from ...schemas import NotConvergedError
-from ..physics.rotation import geodesic_angle, quat_conjugate, quat_exp, quat_log, quat_multiply
+from ....datasets.io.progress import progress
+from ....schemas import NotConvergedError
+from ...geometry.rotation import geodesic_angle, quat_conjugate, quat_exp, quat_log, quat_multiply
 from .image_loss import ImageLoss, PoseQuality
 from .pose_search import Poses, descend, descend_all, distinct, located, search
 
 KEYFRAMES = 5
-"""Instants at which all orientations are tried."""
+"""Number of instants at which all orientations are tried first."""
 BEAM = 4
-"""Poses that are followed."""
+"""Maximum number of poses that are followed."""
 ALARM = 1.25
-"""All orientations are tried at further instants: where the colour error on the best pose exceeds the median of the
-instants so far by this factor, as after an impact."""
+"""Ratio of the colour error at the best pose to the median of earlier instants above which all orientations are tried
+again, as after an impact."""
 ALARM_IOU = 0.8
+"""Overlap of the best pose with the masks below which all orientations are tried again."""
 MIN_FOUND = 0.5
-"""With less than this share of the frames found, the tracking has failed."""
+"""Minimum share of the instants in which the bodies must be found."""
 CORRELATED_PX = 5.0
-"""Errors of shape, shading and colour are shared by squares of about so many pixels. Chosen on one built-in scene,
-where it makes the standard deviations about as large as the errors against the true poses."""
+"""Side of the squares over which errors of shape, shading and colour are correlated [px]. Chosen on one built-in scene,
+where it makes the standard deviations about as large as the errors of the poses."""
 CORRELATED_COARSE_PX = 1.5
-"""The same in the small pictures."""
+"""Side of these squares in the small images [px]."""
 TURN_STD_RAD_S = 10.0
-"""Spread of the speeds at which bodies turn, for choosing among histories: half a turn between two frames is none."""
+"""Standard deviation of the angular speed in the choice among histories; it excludes half a turn between two frames."""
 CARRY_ITERATIONS, POLISH_ITERATIONS = 4, 4
+"""Maximum number of steps in correcting an extrapolated pose, and in the final correction."""
 COARSE_BLUR, FINE_BLUR = 4, 2
-"""Residuals are averaged over this many pixels: while searching, and in the last steps."""
+"""Side of the squares over which residuals are averaged, in the search and in the final correction [px]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PoseTrack:
-    """Poses of all bodies at the instants of an episode's footage (I), in the world's order of bodies (nb).
-
-    position_m (I, nb, 3), quat_wxyz (I, nb, 4); curvature (I, 6 nf, 6 nf) of the image loss by the free bodies' poses;
-    covariance (I, 6 nf, 6 nf) [m2, rad2], from the scatter of the pixels; loss (I,); quality; found (I,); searches:
-    how often all orientations were tried; rival_nats: by how much the best history that begins with another
-    orientation is less likely, infinite where there is none.
-    """
+    """Poses of all bodies at the instants of an episode's footage (I), in the world's order of bodies (nb)."""
 
     position_m: Tensor
+    """Body frame origins [m], world, shape (I, nb, 3)."""
     quat_wxyz: Tensor
+    """Orientations, shape (I, nb, 4)."""
     curvature: Tensor
+    """Curvature of the image loss by the free bodies' poses, shape (I, 6 nf, 6 nf)."""
     covariance: Tensor
+    """Covariance of the free bodies' poses from the scatter of the pixels [m2, rad2], shape (I, 6 nf, 6 nf)."""
     loss: Tensor
+    """Image loss, shape (I,)."""
     quality: PoseQuality
+    """Agreement of the poses with the frames."""
     found: Tensor
+    """Whether the bodies were found, shape (I,)."""
     searches: int
+    """Number of instants at which all orientations were tried."""
     rival_nats: float
+    """Log-likelihood ratio of the history to the best one with another first orientation; infinite without one."""
 
     @property
     def variance(self) -> Tensor:
-        """Variances of the free bodies' poses where they were found (F, nf, 2, 3): shift [m2] and turn [rad2]."""
+        """Variances of the free bodies' poses where they were found: shift [m2], rotation [rad2], (F, nf, 2, 3)."""
         return self.covariance[self.found].diagonal(dim1=1, dim2=2).unflatten(1, (-1, 2, 3))
 
 
 def pose_noise(tracks: Sequence[PoseTrack]) -> tuple[float, float]:
-    """Return the noise of found poses (position [m], rotation [rad]), by axis.
+    """Return the noise of found poses by axis (position [m], rotation [rad]).
 
-    It is the root of the variance's median over the instants of all tracks, averaged over axes and free bodies.
+    The variance is the median over the instants of all tracks, averaged over axes and free bodies.
     """
     std = torch.cat([track.variance for track in tracks]).median(0).values.mean((0, 2)).sqrt()
     return float(std[0]), float(std[1])
 
 
 def track_state(track: PoseTrack) -> dict[str, object]:
-    """Return a track as a checkpoint takes it."""
+    """Return a track in the form of a checkpoint."""
     quality = {name: getattr(track.quality, name) for name in track.quality.__dataclass_fields__}
     rest = {name: getattr(track, name) for name in track.__dataclass_fields__ if name != "quality"}
     # JSON has no infinity
@@ -100,22 +105,26 @@ def stored_track(state: Mapping[str, Any]) -> PoseTrack:
 
 @dataclass(frozen=True)
 class _Followed:
-    """Poses (K) at an instant and what they came from: the pose before, or themselves where that is not known."""
+    """Poses (K) at an instant, with the pose before each."""
 
     instant: int
+    """The instant."""
     poses: Poses
+    """Poses at the instant."""
     before: Poses | None
+    """Most likely pose before each of them; None at the first instant."""
     before_instant: int
+    """Instant of the poses before."""
 
 
 class PoseTracker:
-    """Tracks the free bodies of one episode.
+    """Tracker of the free bodies of one episode.
 
     Args:
-        coarse: The loss on small pictures, for searching.
-        fine: The loss on larger ones, for the last steps.
-        position_m: Poses of all bodies at the instants; those of driven bodies count, shape (I, nb, 3).
-        quat_wxyz: Shape (I, nb, 4).
+        coarse: Loss on small images, for the search.
+        fine: Loss on larger images, for the final correction.
+        position_m: Body frame origins at the instants [m], world; used for driven bodies, shape (I, nb, 3).
+        quat_wxyz: Orientations at the instants, shape (I, nb, 4).
     """
 
     def __init__(self, coarse: ImageLoss, fine: ImageLoss, position_m: Tensor, quat_wxyz: Tensor) -> None:
@@ -130,7 +139,7 @@ class PoseTracker:
         """Track all instants.
 
         Raises:
-            NotConvergedError: If the body is found in fewer than half of them.
+            NotConvergedError: If the bodies are found in fewer than half of them.
         """
         count, name = len(self._times), self._coarse.footage.episode
         visible = [k for k in range(count) if all(located(self._coarse, k, i) is not None for i in self._coarse.free)]
@@ -155,15 +164,15 @@ class PoseTracker:
         if float(found.float().mean()) < MIN_FOUND:
             raise NotConvergedError(self._failure(quality, found), todo=_TODO)
         return PoseTrack(
-            self._position.double().cpu(),
-            self._quat.double().cpu(),
-            model.curvature.double().cpu(),
-            self._covariance(model.curvature, quality).double().cpu(),
-            model.value.cpu(),
-            PoseQuality(*(getattr(quality, name).cpu() for name in quality.__dataclass_fields__)),
-            found.cpu(),
-            self._searches,
-            rival,
+            position_m=self._position.double().cpu(),
+            quat_wxyz=self._quat.double().cpu(),
+            curvature=model.curvature.double().cpu(),
+            covariance=self._covariance(model.curvature, quality).double().cpu(),
+            loss=model.value.cpu(),
+            quality=PoseQuality(*(getattr(quality, name).cpu() for name in quality.__dataclass_fields__)),
+            found=found.cpu(),
+            searches=self._searches,
+            rival_nats=rival,
         )
 
     def _searched(self, visible: list[int]) -> dict[int, Poses]:
@@ -174,24 +183,25 @@ class PoseTracker:
         }
 
     def _search(self, instant: int, position_m: Tensor, quat_wxyz: Tensor) -> Poses:
+        """Try all orientations at one instant."""
         self._searches += 1
         return search(self._coarse, instant, position_m, quat_wxyz, COARSE_BLUR)
 
     def _follow(self, order: Iterable[int], pools: dict[int, Poses]) -> None:
-        """Carry poses from instant to instant, in the given order, and add what they lead to."""
+        """Extrapolate and correct poses from instant to instant in the given order, and add them to the pools."""
         last: _Followed | None = None
         for instant in order:
             here = pools.get(instant)
-            carried: Poses | None = None
+            corrected: Poses | None = None
             if last is not None:
                 position, quat = self._expected(last, instant)
-                carried = descend(self._coarse, instant, position, quat, CARRY_ITERATIONS, COARSE_BLUR)
-                every = carried if here is None else Poses.joined([carried, here])
+                corrected = descend(self._coarse, instant, position, quat, CARRY_ITERATIONS, COARSE_BLUR)
+                every = corrected if here is None else Poses.joined([corrected, here])
                 best = every.at(every.value.argsort(stable=True)[:1])
                 if self._alarmed(instant, best):
                     fresh = self._search(instant, best.position_m[0], best.quat_wxyz[0])
                     here = fresh if here is None else Poses.joined([here, fresh])
-            every = Poses.joined([part for part in (carried, here) if part is not None])
+            every = Poses.joined([part for part in (corrected, here) if part is not None])
             pools[instant] = distinct(self._coarse, every, BEAM)
             last = self._linked(instant, pools[instant], last)
 
@@ -203,7 +213,7 @@ class PoseTracker:
         return _Followed(instant, poses, last.poses.at(turns.argmin(0)), last.instant)
 
     def _expected(self, last: _Followed, instant: int) -> tuple[Tensor, Tensor]:
-        """Return where poses will be at another instant, at constant velocity of the free bodies; (K, nb, ...)."""
+        """Return poses (K, nb, ...) extrapolated to another instant, at constant velocity of the free bodies."""
         position = self._position[instant].repeat(len(last.poses), 1, 1)
         quat = self._quat[instant].repeat(len(last.poses), 1, 1)
         for index in self._coarse.free:
@@ -218,7 +228,7 @@ class PoseTracker:
         return position, quat
 
     def _alarmed(self, instant: int, best: Poses) -> bool:
-        """Tell whether even the best pose explains the picture worse than those before were explained."""
+        """Return whether the best pose explains the image worse than earlier images were explained."""
         quality = self._coarse.quality(torch.tensor([instant]), best.position_m, best.quat_wxyz)
         error, iou, found = float(quality.error[0]), float(quality.iou[0]), bool(quality.found[0])
         usual = float(np.median(self._errors)) if self._errors else error
@@ -227,21 +237,23 @@ class PoseTracker:
         return not found or error > ALARM * usual or iou < ALARM_IOU
 
     def _turn_cost(self, before: Poses, after: Poses, first: int, second: int) -> Tensor:
-        """Return how unlikely the turns from poses (K) to poses (L) are, (K, L) [nats]."""
+        """Return the negative log-likelihood of the rotations from poses (K) to poses (L), shape (K, L) [nats]."""
         scale = TURN_STD_RAD_S * abs(float(self._times[second] - self._times[first]))
         free = list(self._coarse.free)
         angle = geodesic_angle(before.quat_wxyz[:, None, free], after.quat_wxyz[None, :, free])
         return 0.5 * (angle / scale).square().sum(-1)
 
     def _choose(self, visible: list[int], pools: dict[int, Poses]) -> float:
-        """Take the most likely history; return by how much the best one from another first pose is less likely."""
+        """Choose the most likely history; return its margin over the best one with another first pose [nats]."""
         usual = float(np.median(self._errors)) if self._errors else 0.05
         pixels = sum(v.size[0] * v.size[1] for v in self._coarse.footage.videos)
         unit = pixels / (max(usual, 1e-3) * CORRELATED_COARSE_PX**2)
         best = [unit * pools[k].value.double() for k in visible]
         back: list[Tensor] = []
         total = best[-1]
-        for place in range(len(visible) - 2, -1, -1):  # backwards, so that what remains at the end is the first pose
+        for place in range(
+            len(visible) - 2, -1, -1
+        ):  # backwards, so that the totals at the end belong to the first poses
             first, second = visible[place], visible[place + 1]
             turned = self._turn_cost(pools[first], pools[second], first, second).double()
             ahead = turned + total[None]
@@ -259,10 +271,10 @@ class PoseTracker:
         return rival
 
     def _covariance(self, curvature: Tensor, quality: PoseQuality) -> Tensor:
-        """Return covariances (I, 6 nf, 6 nf) of poses whose pixels err by a Laplace law, each on its own.
+        """Return covariances (I, 6 nf, 6 nf) of poses for independent Laplace errors of the pixels.
 
         Derived: -log p = pixels * loss / b with b the mean absolute error on the body, so the information is
-        pixels * curvature / b, if pixels erred independently; see `CORRELATED_PX`.
+        pixels * curvature / b for independent pixels; see `CORRELATED_PX` for correlated ones.
         """
         footage = self._fine.footage
         pixels = torch.zeros(len(footage.times_s)).to(curvature)
@@ -272,6 +284,7 @@ class PoseTracker:
         return scale[:, None, None] * torch.linalg.pinv(curvature.double(), hermitian=True).to(curvature)
 
     def _failure(self, quality: PoseQuality, found: Tensor) -> str:
+        """Return the message of a tracking that failed."""
         count = int(found.sum())
         text = f"{self._fine.footage.episode}: the body was found in {count} of {len(self._times)} instants"
         if bool(quality.iou.isfinite().any()):
@@ -286,3 +299,4 @@ _TODO = (
     "check that the videos show the body of the model, that their cameras are calibrated in the capture's frame, and "
     "add video_masks/; or fit from tracks: --supervise tracks."
 )
+"""Advice for a tracking that failed."""

@@ -1,8 +1,8 @@
-"""The image loss without photos: silhouettes of known shapes against the masks of the videos.
+"""Image loss without photos: silhouettes of known shapes against the masks of the videos.
 
     L = mean over frames of  MASK_WEIGHT * L1(silhouette, mask)
 
-the mask part of `image_loss`, with the same units and coordinates.
+This is the mask part of `image_loss`, with the same units and coordinates.
 """
 
 from __future__ import annotations
@@ -12,29 +12,30 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ...datasets.models import Model
-from ...schemas import InputDataError
-from ..splats.mesh import Mesh, sample_surface
-from ..splats.spheres import Spheres
-from .footage import Footage, Video
-from .image_loss import Backdrop, ImageLoss, PoseQuality
+from ....datasets.models.model import Model
+from ....schemas import InputDataError
+from ...geometry.mesh import Mesh, sample_surface
+from ...geometry.spheres import Spheres
+from .backdrop import Backdrop
+from .crops import Window, window_of
+from .image_loss import ImageLoss, PoseQuality
 from .silhouettes import Outline, covered
-from .windows import Window, window_of
+from .video_frames import Footage, Video
 
 EDGE = (0.02, 0.98)
-"""A pixel is on an edge where a silhouette or a mask covers a share of it between these."""
+"""Range of the covered share of a pixel on an edge of a silhouette or a mask."""
 
 STEP_PX = 0.4
-"""Step of differences by poses: the motion of about so many pixels; smaller ones feel the raster."""
+"""Step of the differences by poses, as a motion in the image [px]; with smaller ones the raster shows."""
 
 
 def image_loss(model: Model, footage: Footage, free: Sequence[int], outlines: Mapping[str, Mesh]) -> ImageLoss:
-    """Return the loss of an episode's frames: of silhouettes, where the bodies' surfaces are given."""
+    """Return the loss of an episode's frames, of silhouettes if the bodies' surfaces are given."""
     return SilhouetteLoss(model, footage, free, outlines) if outlines else ImageLoss(model, footage, free)
 
 
 class SilhouetteLoss(ImageLoss):
-    """The loss of an episode's masks as a function of the bodies' poses.
+    """Loss of an episode's masks as a function of the bodies' poses.
 
     Args:
         model: The bodies, in the order of the masks' labels.
@@ -50,17 +51,10 @@ class SilhouetteLoss(ImageLoss):
         self.footage, self.free = footage, tuple(free)
         like = footage.videos[0].frames
         self._count = len(model.file.bodies)
-        for video in footage.videos:
-            if video.covers is None:
-                raise InputDataError(
-                    f"episode '{footage.episode}': the video of camera '{video.camera}' has no masks, and the model "
-                    "has nothing else to be compared with.",
-                    f"video_masks/{video.camera}/{footage.episode}/%06d.png.",
-                    "add the masks, or a model with the stage sg-gs from photos.",
-                )
+        self._covers = [_required_covers(video, footage.episode) for video in footage.videos]
         self._outlines, self._moving, self.radii, self.centers = [], [], {}, {}
         for index, body in enumerate(model.file.bodies):
-            shown = any(bool(v.covers[:, index].any()) for v in footage.videos if v.covers is not None)
+            shown = any(bool(covers[:, index].any()) for covers in self._covers)
             if index not in self.free and (body.motion != "driven" or not shown):
                 continue
             mesh = outlines[body.name]
@@ -85,12 +79,12 @@ class SilhouetteLoss(ImageLoss):
 
     @property
     def gains(self) -> dict[str, list[float]]:
-        """No camera's exposure is known."""
+        """Return no exposures, as colours are not compared."""
         return {}
 
     @torch.no_grad()
     def quality(self, instants: Tensor, position_m: Tensor, quat_wxyz: Tensor) -> PoseQuality:
-        """Say how well silhouettes agree with the masks: `error` is that of pixels on edges, `blank` without bodies."""
+        """Return the agreement of silhouettes with masks; `error` and `blank` are relative to the pixels on edges."""
         count, free = len(instants), list(self.free)
         inside, union, error, blank, edges, area = (torch.zeros(count).to(self._static.means) for _ in range(6))
         for number, video in enumerate(self.footage.videos):
@@ -98,16 +92,16 @@ class SilhouetteLoss(ImageLoss):
             rows = (frames >= 0).nonzero()[:, 0]
             if not len(rows):
                 continue
-            assert video.covers is not None
+            covers = self._covers[number]
             window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach, 2)
             mine = self._picture(number, window, position_m[rows], quat_wxyz[rows])[..., 3:][..., free]
-            cover = window.cut(video.covers.movedim(1, -1))[..., free]
+            cover = window.cut(covers.movedim(1, -1))[..., free]
             on_edge = ((mine > EDGE[0]) & (mine < EDGE[1])) | ((cover > EDGE[0]) & (cover < EDGE[1]))
             error[rows] += (mine - cover).abs().sum((1, 2, 3))
             blank[rows] += cover.sum((1, 2, 3))
             edges[rows] += on_edge.sum((1, 2, 3))
             area[rows] += mine.sum((1, 2, 3))
-            whole = (video.covers[window.frames][:, free] > 0.5).sum((1, 2, 3))
+            whole = (covers[window.frames][:, free] > 0.5).sum((1, 2, 3))
             both = ((mine > 0.5) & (cover > 0.5)).sum((1, 2, 3))
             inside[rows] += both
             union[rows] += (mine > 0.5).sum((1, 2, 3)) + whole - both
@@ -122,23 +116,33 @@ class SilhouetteLoss(ImageLoss):
         return picture[..., :0]
 
     def _blank(self, number: int, window: Window) -> tuple[Tensor, Tensor]:
-        covers = self.footage.videos[number].covers
-        assert covers is not None
-        mask = -window.cut(covers.movedim(1, -1))
+        mask = -window.cut(self._covers[number].movedim(1, -1))
         return mask[..., :0], mask
 
 
+def _required_covers(video: Video, episode: str) -> Tensor:
+    """Return the share of each pixel that each body covers (T, bodies, H, W); refuse a video without masks."""
+    if video.covers is None:
+        raise InputDataError(
+            f"episode '{episode}': the video of camera '{video.camera}' has no masks, and the model "
+            "has nothing else to be compared with.",
+            f"video_masks/{video.camera}/{episode}/%06d.png.",
+            "add the masks, or a model with the stage sg-gs from photos.",
+        )
+    return video.covers
+
+
 def _nothing_behind(video: Video) -> Backdrop:
-    """Return a backdrop whose colours nobody looks at."""
+    """Return a backdrop without content, as colours are not compared."""
     count = len(video.frames)
     zero = torch.zeros(1, *video.frames.shape[1:]).to(video.frames)
     unexplained = torch.zeros(count).to(zero)
     plate_of = torch.zeros(count, dtype=torch.int64, device=zero.device)
-    return Backdrop(zero, zero[..., 0], plate_of, zero.new_ones(3), unexplained)
+    return Backdrop(plates=zero, depths=zero[..., 0], plate_of=plate_of, gain=zero.new_ones(3), unexplained=unexplained)
 
 
 def _pixel_m(footage: Footage, index: int, radius_m: float) -> float:
-    """Return about how much a pixel is at a body [m]: its radius over that of a disc with the area of its masks."""
+    """Return the approximate size of a pixel at a body [m]: its radius over that of a disc with its masks' area."""
     areas = torch.cat([v.covers[:, index].sum((1, 2)) for v in footage.videos if v.covers is not None])
     typical = float(areas[areas > 1.0].median()) if bool((areas > 1.0).any()) else 1.0
     return radius_m / (typical / torch.pi) ** 0.5

@@ -1,8 +1,8 @@
-"""Silhouettes of bodies of known shape: what each covers of every pixel, from triangles, and its slope by the poses.
+"""Silhouettes of bodies of known shape: covered share of each pixel, from triangles, with derivatives by the poses.
 
-A capture with a known shape and masks of the videos needs no photos: where the body is can be seen from its outline.
-Outlines of spheres would not do: how far a layer of them reaches beyond their centres depends on how many lie behind
-each other along a ray, which made the outline of a block up to 8 % too large or too small.
+A capture with a known shape and masks of the videos needs no photos: the silhouette identifies the pose. Silhouettes of
+spheres are not accurate enough: the reach of a layer of spheres beyond their centres depends on their number along a
+ray, which made the silhouette of a block up to 8 % too large or too small.
 """
 
 from __future__ import annotations
@@ -19,38 +19,44 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from ...datasets.capture import Capture
-from ...datasets.models import Model
-from ...schemas import BodyModel, InputDataError
-from ..physics.rotation import quat_exp, quat_multiply, quat_to_matrix
-from ..splats.directions import fibonacci_directions
-from ..splats.mesh import Mesh
-from ..splats.shapes import shape_mesh
-from .footage import Video
-from .windows import Window
+from ....datasets.capture.capture import Capture
+from ....datasets.models.model import Model
+from ....schemas import BodyModel, InputDataError
+from ...geometry.directions import fibonacci_directions
+from ...geometry.mesh import Mesh
+from ...geometry.primitives import shape_mesh
+from ...geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
+from .crops import Window
+from .video_frames import Video
 
 SUPERSAMPLED = 8
-"""Pixels are cut into so many squared: a silhouette's edge is then accurate to a hundredth of a pixel on average."""
+"""Number of cells along a side of a pixel; the edge of a silhouette is then accurate to 0.01 px on average."""
 _SHIFT = 6
+"""Fractional bits of coordinates in OpenCV's polygon filling."""
 _BALL_POINTS = 60
+"""Number of vertices of a sphere's surface."""
 _CONVEX = 1e-6
-"""A body whose volume differs by less than this share from its hull's is convex."""
+"""Maximum relative difference of the volumes of a convex body and of its hull."""
 NEAREST_M = 1e-3
-"""A triangle with a corner nearer to the eye than this is not drawn."""
+"""Minimum depth of the corners of a triangle that is drawn [m]."""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A body's surface in its frame: vertices (V, 3) [m], faces (F, 3); its index in the model and its radius [m]."""
+    """Surface of a body in its frame."""
 
     index: int
+    """Index of the body in the model."""
     vertices: Tensor
+    """Vertices [m], shape (V, 3)."""
     faces: NDArray[np.int64]
+    """Vertices of each triangle, shape (F, 3)."""
     radius_m: float
+    """Mean distance of the surface from its centroid [m]."""
 
     @cached_property
     def corners(self) -> NDArray[np.int64] | None:
-        """Vertices of a convex body's hull: their hull in a picture is its silhouette. None where it is not convex."""
+        """Vertices of a convex body's hull, whose projected hull is the silhouette; None if it is not convex."""
         points = self.vertices.detach().cpu().numpy().astype(np.float64)
         hull = ConvexHull(points)
         sides = points[self.faces]
@@ -59,15 +65,15 @@ class Outline:
 
 
 def body_outlines(model: Model, capture: Capture, episodes: Sequence[str]) -> tuple[dict[str, Mesh], list[str]]:
-    """Return the surfaces of the bodies where only masks can be compared, and a warning that says so.
+    """Return the surfaces of the bodies and a warning if only masks can be compared; otherwise nothing.
 
-    A model with a background, and visual spheres of every free body, can be compared with whole pictures: then there
-    are none. In any other, colours are not compared with half a scene.
+    A model with a background and visual spheres of every free body can be compared with whole images. With any other
+    model no colours are compared.
 
     Args:
         model: The model.
-        capture: The capture: shapes are files of it.
-        episodes: Those to be fitted.
+        capture: The capture, with the files of shapes.
+        episodes: Names of the episodes to fit.
 
     Raises:
         InputDataError: If a video has no masks.
@@ -86,12 +92,12 @@ def body_outlines(model: Model, capture: Capture, episodes: Sequence[str]) -> tu
                     f"run 'cgwm fit CAPTURE --stage all' on photos, or add video_masks/{camera}/{episode}/%06d.png.",
                 )
     meshes = {body.name: _surface(model, capture, body) for body in model.file.bodies}
-    text = f"photometric part left out: the model has {what}; the fit rests on the masks of the videos alone."
+    text = f"photometric part left out: the model has {what}; the fit uses the masks of the videos alone."
     return meshes, [text]
 
 
 def _surface(model: Model, capture: Capture, body: BodyModel) -> Mesh:
-    """Return a body's surface: its shape's, or that of the spheres that collide."""
+    """Return the surface of a body, from its shape or from its collision spheres."""
     if body.shape is not None and body.shape.splats is None:
         return shape_mesh(body.shape, capture.root)
     spheres = model.collision[body.name]
@@ -112,29 +118,30 @@ def covered(
     quat_wxyz: Tensor,
     step_m: float,
 ) -> Tensor:
-    """Return which share of each pixel of a window each of `count` bodies covers, shape (S, h, w, count).
+    """Return the share of each pixel of a window that each of `count` bodies covers, shape (S, h, w, count).
 
-    Where bodies overlap, the one whose middle is nearer to the camera hides the other. Differentiable in the poses
+    Where bodies overlap, the one whose centroid is nearer to the camera hides the other. Differentiable in the poses
     by differences.
 
     Args:
-        video: Its cameras.
+        video: The video, for its cameras.
         window: The rectangles.
         outlines: The bodies that are drawn.
         count: Number of all bodies.
-        position_m: Their poses, shape (S, nb, 3).
-        quat_wxyz: Shape (S, nb, 4).
-        step_m: Step of the differences, to both sides; below a third of a pixel the raster shows in them.
+        position_m: Body frame origins [m], world, shape (S, nb, 3).
+        quat_wxyz: Orientations, shape (S, nb, 4).
+        step_m: Step of the central differences [m]; below a third of a pixel the raster shows in them.
     """
     drawn = (video, window, tuple(outlines), count)
     return _Covered.apply(position_m, quat_wxyz, drawn, step_m)  # pyright: ignore[reportReturnType]
 
 
 _Drawn = tuple[Video, Window, tuple[Outline, ...], int]
+"""Video, window, drawn bodies and number of all bodies."""
 
 
 class _Covered(torch.autograd.Function):
-    """`covered`, with derivatives from differences to both sides of each pose."""
+    """Function of `covered`, with derivatives from central differences by each pose."""
 
     @staticmethod
     def forward(ctx: Any, position_m: Tensor, quat_wxyz: Tensor, drawn: _Drawn, step_m: float) -> Tensor:
@@ -163,7 +170,7 @@ class _Covered(torch.autograd.Function):
                     ends.append((value(moved, quat), value(position, turned)))
                 shift, spin = (a - b for a, b in zip(*ends, strict=True))
                 by_position[:, index] += (shift / (2 * ctx.step_m))[:, None] * axis
-                # a turn about a body axis moves q along q (0, axis) / 2 for each radian; these are orthogonal
+                # a rotation about a body axis moves q along q (0, axis) / 2 per radian; these are orthogonal
                 tangent = quat_multiply(quat[:, index], torch.cat([axis.new_zeros(1), axis])[None])
                 by_quat[:, index] += 2 * (spin / (2 * turn))[:, None] * tangent
         return by_position, by_quat, None, None
@@ -172,6 +179,7 @@ class _Covered(torch.autograd.Function):
 def _pictures(
     position_m: Tensor, quat_wxyz: Tensor, video: Video, window: Window, outlines: tuple[Outline, ...], count: int
 ) -> Tensor:
+    """Return the covered share of each pixel, without derivatives; see `covered`."""
     like = video.frames
     views = video.viewmats[window.frames]
     projected = []
@@ -194,9 +202,9 @@ def _pictures(
 
 
 def _fill(labels: NDArray[np.uint8], pixels: NDArray[Any], depth: NDArray[Any], outline: Outline, value: int) -> None:
-    """Draw what of a body lies in front of the camera, its vertices at pixels (V, 2)."""
+    """Draw the part of a body in front of the camera, with vertices at pixels (V, 2)."""
     limit = 1 << (30 - _SHIFT)
-    # centres of pixels are at whole numbers in OpenCV
+    # OpenCV has the centres of pixels at integers
     scaled = np.round(np.clip((SUPERSAMPLED * pixels - 0.5) * (1 << _SHIFT), -limit, limit)).astype(np.int32)
     corners = outline.corners
     if corners is not None and bool((depth[corners] > NEAREST_M).all()):
@@ -209,7 +217,8 @@ def _fill(labels: NDArray[np.uint8], pixels: NDArray[Any], depth: NDArray[Any], 
 def _shares(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the share of each pixel (h, w) that is inside, from a finer raster.
 
-    OpenCV fills half a pixel of that raster too much all around; a pixel less is half a pixel too little.
+    OpenCV fills half a cell of that raster too much all around; eroded by one cell, it is half a cell too little. The
+    mean of the two is used.
     """
     wide = inside.view(np.uint8)
     narrow = cv2.erode(wide, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), borderValue=1)

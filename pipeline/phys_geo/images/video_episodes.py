@@ -1,4 +1,4 @@
-"""The first step of phys-geo from videos: the episodes with their image losses, and the tracks found in them."""
+"""Video episodes for phys-geo: image losses, and tracks found in the videos."""
 
 from __future__ import annotations
 
@@ -12,45 +12,48 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.capture import Capture
-from ..datasets.models import Model
-from ..datasets.tracks import Track
-from ..schemas import InputDataError
-from .checkpoint import Slot
-from .imaging.coarse import coarse_model
-from .imaging.footage import Footage, load_footage
-from .imaging.image_loss import ImageLoss
-from .imaging.pose_search import small_silhouette_px
-from .imaging.pose_tracks import PoseTrack, PoseTracker, pose_noise, stored_track, track_state
-from .imaging.silhouette_loss import image_loss
-from .phys_geo import MAX_SPAN_S
-from .physics.driven import Drive
-from .physics.world import World
-from .splats.mesh import Mesh
+from ....datasets.capture.capture import Capture
+from ....datasets.capture.tracks import Track
+from ....datasets.models.model import Model
+from ....schemas import InputDataError
+from ...geometry.mesh import Mesh
+from ...physics.kinematic import Drive
+from ...physics.world import World
+from ...runtime.checkpoint import Slot
+from ..tracks.contact_fit import MAX_SPAN_S
+from .coarse_spheres import coarse_model
+from .image_loss import ImageLoss
+from .pose_search import small_silhouette_px
+from .pose_tracking import PoseTrack, PoseTracker, pose_noise, stored_track, track_state
+from .silhouette_loss import image_loss
+from .video_frames import Footage, load_footage
 
 COARSE_SIZE, COARSE_BODY_PX = 80, 20.0
-"""Longer side [px] of the pictures for searching poses, more where a body would cover less than so many pixels."""
+"""Longer side of the images for the pose search [px], and minimum area of a body in them [px], for which they are made
+larger."""
 MAX_INSTANTS = 90
-"""More instants of an episode are thinned evenly: the image loss of each costs a render a camera."""
+"""Maximum number of instants of an episode, evenly spread; each costs a render for each camera."""
 RIVAL_NATS = 10.0
-"""A history of poses that is less likely by less than this is said to be possible too."""
+"""Log-likelihood ratio below which another history of poses is reported as possible [nats]."""
 
 
-@dataclass(frozen=True)
-class Episode:
-    """An episode with its losses, and its track: from the images, or measured.
-
-    tracks: by body, of the free bodies as far as found and of the driven ones; found: from images, or None.
-    """
+@dataclass(frozen=True, kw_only=True)
+class VideoEpisode:
+    """An episode with its image loss and its tracks, which are measured or found in the images."""
 
     name: str
+    """Name of the episode."""
     footage: Footage | None
+    """Videos of the episode; None if there are none."""
     loss: ImageLoss | None
+    """Image loss of the videos; None if there are none."""
     tracks: dict[str, Track]
+    """Tracks by body: of the free bodies as far as known, and of the driven ones."""
     found: PoseTrack | None
+    """Poses found in the images; None for measured tracks."""
 
 
-def filmed_episode(
+def load_video_episode(
     world: World,
     model: Model,
     capture: Capture,
@@ -61,7 +64,7 @@ def filmed_episode(
     tracks_too: bool,
     image_size: int,
     device: torch.device,
-) -> Episode:
+) -> VideoEpisode:
     """Read an episode and find its tracks.
 
     Args:
@@ -70,45 +73,60 @@ def filmed_episode(
         capture: The capture.
         name: Name of the episode.
         outlines: Surfaces of the bodies, where only masks can be compared.
-        slot: Where found poses are kept, so that an interrupted fit does not look for them again.
-        tracks_too: Use measured tracks where there are any, instead of looking for them.
-        image_size: Longer side [px] of the pictures to be compared.
-        device: Where pictures are rendered.
+        slot: Part of the checkpoint for the found poses, so that an interrupted fit does not search for them again.
+        tracks_too: Use measured tracks where there are any, instead of finding them in the images.
+        image_size: Longer side of the compared images [px].
+        device: Device of the renderer.
 
     Raises:
-        InputDataError: If the episode lacks what is needed.
+        InputDataError: If the episode lacks videos, masks or tracks that are needed.
         NotConvergedError: If the body is not found.
     """
     measured = capture.tracks(name)
     drives = commands(world, capture, name, measured)
     own = {body.name: measured[body.name] for body in world.bodies if body.free and body.name in measured}
     if tracks_too and own and not capture.videos(name):
-        return Episode(name, None, None, own | drives, None)
+        return VideoEpisode(name=name, footage=None, loss=None, tracks=own | drives, found=None)
     footage = _within_span(load_footage(capture, name, image_size, device))
     loss = image_loss(model, footage, world.free, outlines)
     if tracks_too and own:
-        return Episode(name, footage, loss, own | drives, None)
+        return VideoEpisode(name=name, footage=footage, loss=loss, tracks=own | drives, found=None)
     if len(world.free) > 1 and any(video.covers is None for video in footage.videos):
         raise InputDataError(
             f"{capture.root}: {len(world.free)} free bodies, and videos of episode '{name}' without masks.",
             "video_masks/<camera>/<episode>, or a single free body.",
-            "add masks, so that the bodies can be told apart.",
+            "add masks, which are needed to distinguish the bodies.",
         )
+    found = _found_track(world, model, capture, loss, outlines, slot, drives, device)
+    return VideoEpisode(
+        name=name, footage=footage, loss=loss, tracks=_tracks_of(world, footage, found) | drives, found=found
+    )
+
+
+def _found_track(
+    world: World,
+    model: Model,
+    capture: Capture,
+    loss: ImageLoss,
+    outlines: Mapping[str, Mesh],
+    slot: Slot,
+    drives: Mapping[str, Track],
+    device: torch.device,
+) -> PoseTrack:
+    """Return the poses of an episode from its checkpoint; without one, find them and write it."""
     state = slot.read(torch.device("cpu"))
     if state is not None:
-        return Episode(
-            name, footage, loss, _tracks_of(world, footage, stored_track(state)) | drives, stored_track(state)
-        )
-    small = _within_span(load_footage(capture, name, _coarse_size(loss), device))
+        return stored_track(state)
+    small = _within_span(load_footage(capture, loss.footage.episode, _coarse_size(loss), device))
     coarse = image_loss(coarse_model(model), small, world.free, outlines)
-    position, quat = driven_poses(world, drives, footage.times_s)
+    position, quat = kinematic_poses(world, drives, loss.footage.times_s)
     found = PoseTracker(coarse, loss, position, quat).run()
     slot.write(track_state(found))
-    return Episode(name, footage, loss, _tracks_of(world, footage, found) | drives, found)
+    return found
 
 
 def _coarse_size(loss: ImageLoss) -> int:
-    """Return the longer side [px] of the pictures for searching: large enough for bodies that are small in them."""
+    """Return the longer side of the images for the pose search [px], larger for small bodies."""
     side = max(max(video.size) for video in loss.footage.videos)
     area = small_silhouette_px(loss)
     if area is None:
@@ -129,16 +147,16 @@ def _tracks_of(world: World, footage: Footage, found: PoseTrack) -> dict[str, Tr
 
 
 def commands(world: World, capture: Capture, episode: str, measured: Mapping[str, Track]) -> dict[str, Track]:
-    """Return the tracks of the driven bodies, which are their commands, with images as well.
+    """Return the tracks of the driven bodies, which are their commands.
 
     Args:
         world: The world.
         capture: The capture.
         episode: Name of the episode.
-        measured: All its measured tracks, by body.
+        measured: Measured tracks of the episode, by body.
 
     Raises:
-        InputDataError: If a driven body has none.
+        InputDataError: If a driven body has no track.
     """
     drives = {}
     for body in world.bodies:
@@ -153,11 +171,11 @@ def commands(world: World, capture: Capture, episode: str, measured: Mapping[str
     return drives
 
 
-def driven_poses(world: World, drives: Mapping[str, Track], times_s: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
-    """Return poses in the world frame with those of driven bodies; the others lie unturned at the origin.
+def kinematic_poses(world: World, drives: Mapping[str, Track], times_s: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    """Return poses in the world frame, from the tracks for driven bodies and the identity for others.
 
     Args:
-        world: The world, of nb bodies.
+        world: The world with nb bodies.
         drives: Commands by body.
         times_s: Times [s], shape (I,).
 
@@ -175,7 +193,7 @@ def driven_poses(world: World, drives: Mapping[str, Track], times_s: NDArray[np.
 
 
 def _within_span(footage: Footage) -> Footage:
-    """Return the footage up to the span of the fit, thinned evenly to the most instants."""
+    """Return the footage within the duration of the fit, evenly thinned to at most `MAX_INSTANTS`."""
     times = footage.times_s
     keep = np.flatnonzero(times <= times[0] + MAX_SPAN_S + 1e-9)
     if len(keep) > MAX_INSTANTS:
@@ -183,11 +201,11 @@ def _within_span(footage: Footage) -> Footage:
     return Footage(footage.episode, footage.videos, times[keep], footage.frame_at[:, keep])
 
 
-def tracks_noise(capture: Capture, episodes: Sequence[Episode]) -> tuple[float | None, float | None]:
-    """Return the noise of the tracks (position [m], rotation [rad]); None where it is to be estimated from them.
+def tracks_noise(capture: Capture, episodes: Sequence[VideoEpisode]) -> tuple[float | None, float | None]:
+    """Return the noise of the tracks (position [m], rotation [rad]); None for estimation from the tracks.
 
-    For tracks from images it comes from the pixels: their scatter about smooth motion is no measure, because a video
-    of some fifteen frames has an impact in every window.
+    For tracks from images it comes from the pixels. Their scatter around smooth motion is no measure, because a video
+    of about fifteen frames has an impact in every window.
     """
     found = [episode.found for episode in episodes if episode.found is not None]
     if not found:
@@ -195,8 +213,8 @@ def tracks_noise(capture: Capture, episodes: Sequence[Episode]) -> tuple[float |
     return pose_noise(found)
 
 
-def track_record(episode: Episode) -> dict[str, Any]:
-    """Return how the tracks of an episode were found, for `fit.json`."""
+def track_record(episode: VideoEpisode) -> dict[str, Any]:
+    """Return source and quality of the tracks of an episode, for `fit.json`."""
     if episode.found is None:
         return {"source": "measured"}
     found, quality = episode.found, episode.found.quality
@@ -219,8 +237,8 @@ def track_record(episode: Episode) -> dict[str, Any]:
     }
 
 
-def track_warnings(episodes: Sequence[Episode]) -> list[str]:
-    """Return what a user should know about the tracks that were found."""
+def track_warnings(episodes: Sequence[VideoEpisode]) -> list[str]:
+    """Return warnings about the tracks that were found in videos."""
     texts = []
     for episode in episodes:
         if episode.found is None:
@@ -231,12 +249,12 @@ def track_warnings(episodes: Sequence[Episode]) -> list[str]:
         if episode.found.rival_nats < RIVAL_NATS:
             texts.append(
                 f"{episode.name}: another history of poses, from another orientation, explains the frames about as "
-                f"well; masks, a second camera or a body with more pattern would tell them apart."
+                f"well; masks, a second camera or a body with more texture would distinguish them."
             )
         if episode.footage is not None and all(video.covers is None for video in episode.footage.videos):
             texts.append(
-                f"{episode.name}: videos without masks; orientations rest on colours alone, which changing light on a "
-                f"turning body can mislead. Add video_masks/ to be sure."
+                f"{episode.name}: videos without masks; orientations come from colours alone, which changing light on "
+                f"a turning body can falsify. Add video_masks/ to be sure."
             )
         if episode.footage is not None and len(episode.footage.videos) == 1:
             texts.append(f"{episode.name}: one camera; depth comes from the body's size alone.")

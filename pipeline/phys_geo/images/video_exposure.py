@@ -1,7 +1,7 @@
-"""The exposure of video cameras: gain and offset between the model's colours and theirs.
+"""Exposure of video cameras: gain and offset from the model's colours to theirs.
 
-Only the background is compared, which does not move: the scene's spheres without bodies, against the first and last
-frame of a few episodes.
+Only the static background is compared: the scene's spheres without moving bodies, with the first and last frame of a
+few episodes.
 """
 
 from __future__ import annotations
@@ -11,35 +11,37 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets.capture import Capture
-from ..datasets.models import Model
-from ..datasets.ply import Splats
-from ..schemas import Exposure
-from .image_errors import usable_cameras, video_view
-from .physics.rotation import quat_to_matrix
-from .splats.render import render
-from .splats.spheres import Spheres
+from ....datasets.capture.capture import Capture
+from ....datasets.models.model import Model
+from ....datasets.shapes.ply import Splats
+from ....schemas import Exposure
+from ...geometry.rotation import quat_to_matrix
+from ...geometry.spheres import Spheres
+from ...rendering.render import render
+from ...rendering.video_view import usable_cameras, video_view
 
 Array = NDArray[np.floating]
 Blocks = tuple[Array, Array]
 """Mean colours of blocks of pixels, in the model and in the frame, each of shape (n, 3)."""
 
 EPISODES = 2
-"""Episodes of a camera to look at."""
+"""Maximum number of episodes of a camera that are compared."""
 BLOCK_PX = 4
-"""Means over blocks of this side are compared: noise, blur and the error of cameras mostly cancel in them."""
+"""Side of the blocks whose mean colours are compared [px]; noise, blur and errors of cameras mostly cancel in them."""
 MARGIN_PX = 12
-"""Pixels nearer than this to a mask may hold the body's blur and contact shadow."""
+"""Minimum distance of compared pixels from a mask [px], because of the body's blur and contact shadow."""
 MIN_ALPHA = 0.95
-"""The scene is compared where its spheres hide what is behind them."""
+"""Minimum opacity of the rendered scene in compared pixels."""
 SATURATED = (0.02, 0.98)
-"""Colours outside this range are cut off by the sensor."""
+"""Range of colours that the sensor does not clip."""
 MIN_BLOCKS = 64
-"""With fewer blocks a camera's exposure is not estimated."""
+"""Minimum number of blocks for estimating a camera's exposure."""
 OFFSET_GAIN = 0.8
-"""An offset is taken up where it reduces the robust cost below this share of the cost without."""
+"""Maximum ratio of the robust cost with an offset to that without for the offset to be used."""
 MAD_TO_STD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 IRLS_STEPS = 20
+"""Number of iterations of re-weighted least squares."""
 
 
 def estimate_exposures(
@@ -48,19 +50,19 @@ def estimate_exposures(
     """Estimate the exposure of each calibrated video camera against the model's scene.
 
     Args:
-        model: With a scene.
-        capture: With calibrated cameras and videos.
-        split: The episodes to look at.
-        device: Where to render: auto, cpu or cuda.
+        model: Model with a scene.
+        capture: Capture with calibrated cameras and videos.
+        split: Name of the episodes.
+        device: Device of the renderer: auto, cpu or cuda.
 
     Returns:
-        image = gain * model + offset, by video camera; a camera that sees too little of the scene is left out.
+        Exposure by video camera, image = gain * model + offset; cameras that see too little of the scene are left out.
     """
     if model.scene is None:
         return {}
-    from .sg_gs import resolve_device
+    from ...runtime.device import resolve_device
 
-    background = _background(model, resolve_device(device))
+    background = _background(model, model.scene, resolve_device(device))
     episodes: dict[str, list[str]] = {}
     for episode in capture.episodes(split):
         for camera in usable_cameras(capture, episode)[0]:
@@ -75,10 +77,10 @@ def estimate_exposures(
 
 
 def fit_exposure(model_rgb: Array, image_rgb: Array) -> Exposure:
-    """Fit image = gain * model + offset, channel by channel, robustly.
+    """Fit image = gain * model + offset robustly to each channel.
 
-    Cauchy weights with the scale of the residuals' median absolute deviation: shadows and what is not in the model
-    count little. The offset stays 0 unless it explains the image clearly better.
+    Cauchy weights with the residuals' median absolute deviation as their scale reduce the influence of shadows and of
+    objects that are not in the model. The offset stays 0 unless it explains the image clearly better.
 
     Args:
         model_rgb: Colours of the model in [0, 1], shape (n, 3).
@@ -107,13 +109,13 @@ def _line(design: Array, values: Array) -> tuple[Array, float]:
 
 
 def _cost(residual: Array, scale: float) -> float:
+    """Return the sum of the Cauchy loss of residuals (n,)."""
     return float(np.log1p(np.square(residual / scale)).sum())
 
 
-def _background(model: Model, device: torch.device) -> Spheres:
-    """Return all that does not move: the scene and the fixed bodies."""
-    assert model.scene is not None
-    parts = [Spheres.from_numpy(model.scene, device=device)]
+def _background(model: Model, scene: Splats, device: torch.device) -> Spheres:
+    """Return the spheres of the scene and of the fixed bodies."""
+    parts = [Spheres.from_numpy(scene, device=device)]
     for body in model.file.bodies:
         splats: Splats | None = model.body_splats.get(body.name)
         if body.motion == "fixed" and splats is not None:
@@ -147,7 +149,7 @@ def _pairs(capture: Capture, background: Spheres, camera: str, episode: str) -> 
 
 
 def _blocks(model: NDArray, image: NDArray, usable: NDArray[np.bool_]) -> Blocks:
-    """Return the mean colours of the blocks all of whose pixels are usable and not saturated."""
+    """Return the mean colours of the blocks whose pixels are all usable and not saturated."""
     height, width = (size // BLOCK_PX for size in usable.shape)
     if min(height, width) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -163,5 +165,6 @@ def _blocks(model: NDArray, image: NDArray, usable: NDArray[np.bool_]) -> Blocks
 
 
 def _three(values: list[float]) -> tuple[float, float, float]:
+    """Return three channels as a tuple."""
     red, green, blue = (float(value) for value in values)
     return red, green, blue

@@ -1,4 +1,4 @@
-"""The videos of an episode as the image loss sees them: undistorted, reduced, with cameras and a common time line."""
+"""Videos of an episode for the image loss: undistorted and reduced, with cameras and a common time line."""
 
 from __future__ import annotations
 
@@ -11,42 +11,41 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.capture import Capture
-from ...schemas import InputDataError
+from ....datasets.capture.cameras import Camera
+from ....datasets.capture.capture import Capture
+from ....schemas import InputDataError
 
 MIN_FRAMES = 3
-"""Two frames show a velocity and nothing of contact."""
+"""Minimum number of frames of a video; two show only a velocity."""
 MIN_SEEN = 0.5
-"""Share of the instants in which some camera must see the free bodies."""
+"""Minimum share of the instants in which some camera sees the free bodies."""
 SAME_INSTANT_S = 1e-6
+"""Maximum difference of the times of frames at one instant [s]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Video:
-    """One camera's frames of one episode.
-
-    Attributes:
-        camera: Name of the camera.
-        times_s: Times of the frames [s], shape (T,).
-        frames: sRGB values in [0, 1], shape (T, H, W, 3).
-        covers: Share of each pixel that each body covers, shape (T, bodies, H, W); None without masks.
-        K: Camera matrix at this size [px], shape (3, 3).
-        viewmats: T_cam_world of each frame, shape (T, 4, 4).
-        unseen: Frames whose masks lack a free body, shape (T,); None where all show all. The body may be hidden, out
-            of view or missed by the segmentation: such a frame says nothing, not that the body is nowhere.
-    """
+    """One camera's frames of one episode."""
 
     camera: str
+    """Name of the camera."""
     times_s: NDArray[np.float64]
+    """Times of the frames [s], shape (T,)."""
     frames: Tensor
+    """sRGB values in [0, 1], shape (T, H, W, 3)."""
     covers: Tensor | None
+    """Share of each pixel that each body covers, shape (T, bodies, H, W); None without masks."""
     K: Tensor
+    """Camera matrix at this size [px], shape (3, 3)."""
     viewmats: Tensor
+    """T_cam_world of each frame, shape (T, 4, 4)."""
     unseen: NDArray[np.bool_] | None = None
+    """Frames whose masks lack a free body, shape (T,); None if there are none. The body may be hidden, out of view or
+    missed by the segmentation, so such a frame is ignored."""
 
     @property
     def shown(self) -> NDArray[np.int64]:
-        """Return the numbers of the frames that count: all but the unseen ones."""
+        """Return the indices of all frames but the unseen ones."""
         return np.arange(len(self.times_s)) if self.unseen is None else np.flatnonzero(~self.unseen)
 
     @property
@@ -57,23 +56,20 @@ class Video:
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """All videos of an episode on one time line.
-
-    Attributes:
-        episode: Its name.
-        videos: One for each calibrated camera.
-        times_s: The instants at which any camera took a frame that counts [s], shape (I,).
-        frame_at: Frame of each video at each instant, -1 for none or an unseen one, shape (videos, I).
-    """
+    """All videos of an episode on one time line."""
 
     episode: str
+    """Name of the episode."""
     videos: tuple[Video, ...]
+    """One video for each calibrated camera."""
     times_s: NDArray[np.float64]
+    """Instants at which any camera has a frame that is not unseen [s], shape (I,)."""
     frame_at: NDArray[np.int64]
+    """Frame of each video at each instant, -1 for none or an unseen one, shape (videos, I)."""
 
     @staticmethod
     def of(episode: str, videos: tuple[Video, ...]) -> Footage:
-        """Put videos on one time line; frames of the same time share an instant."""
+        """Put videos on one time line, on which frames of the same time share an instant."""
         times = _instants([video.times_s[video.shown] for video in videos])
         frame_at = np.full((len(videos), len(times)), -1)
         for row, video in enumerate(videos):
@@ -89,7 +85,7 @@ def load_footage(capture: Capture, episode: str, image_size: int, device: torch.
         capture: The capture.
         episode: Name of the episode.
         image_size: Longer side [px] to which frames are reduced.
-        device: Where the tensors live.
+        device: Device of the tensors.
 
     Raises:
         InputDataError: If there are no cameras, no video, fewer than three frames, or the masks are empty in most.
@@ -122,13 +118,13 @@ def load_footage(capture: Capture, episode: str, image_size: int, device: torch.
 
 
 def _instants(times_s: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the different times [s] among several rows, sorted."""
+    """Return the distinct times of several videos [s], sorted."""
     times = np.unique(np.concatenate(list(times_s)))
     return times[np.concatenate([[True], np.diff(times) > SAME_INSTANT_S])] if len(times) else times
 
 
 def _require_seen(capture: Capture, episode: str, videos: Sequence[Video]) -> None:
-    """Refuse an episode in which masks show the free bodies in too few instants."""
+    """Refuse an episode whose masks show the free bodies in too few instants."""
     every, seen = (_instants(rows) for rows in ([v.times_s for v in videos], [v.times_s[v.shown] for v in videos]))
     if len(seen) >= max(MIN_FRAMES, MIN_SEEN * len(every)):
         return
@@ -139,7 +135,7 @@ def _require_seen(capture: Capture, episode: str, videos: Sequence[Video]) -> No
         raise InputDataError(
             f"{where}: the masks of all {len(videos)} cameras are empty: none shows {bodies}.",
             "0 for the background, k for the k-th of [[bodies]].",
-            "correct the masks, or take them away: without any the whole picture counts.",
+            "correct the masks, or remove them; without masks the whole image is compared.",
         )
     raise InputDataError(
         f"{where}: {bodies} can be seen in {len(seen)} of {len(every)} instants, last at {seen[-1]:.3f} s "
@@ -151,55 +147,77 @@ def _require_seen(capture: Capture, episode: str, videos: Sequence[Video]) -> No
 
 
 def _last_seen(video: Video) -> str:
+    """Return the camera and its last frame that shows the free bodies, for a message."""
     shown = video.shown
     return f"{video.camera}: frame {shown[-1]} of {len(video.times_s)}" if len(shown) else f"{video.camera}: never"
 
 
 def _load(capture: Capture, name: str, episode: str, image_size: int, device: torch.device | str) -> Video:
+    """Read a camera's video of an episode, undistort and reduce it."""
     frames, labels = capture.video_frames(name, episode), capture.video_masks(name, episode)
-    if len(frames) < MIN_FRAMES:
-        raise InputDataError(
-            f"{capture.video_path(name, episode)}: {len(frames)} frames between the episode's start and end.",
-            f"at least {MIN_FRAMES}, which show how a velocity changes; some fifteen about an impact are good.",
-            f"film longer or faster, or correct [episodes] '{episode}' (start_s, end_s) and [video] frame_rate_hz.",
-        )
+    _require_enough_frames(capture, name, episode, len(frames))
     cameras = [capture.video_camera(name, episode, int(k)) for k in capture.frame_numbers(name, episode)]
     first = cameras[0]
-    if frames.shape[1:3] != (first.height, first.width):
-        raise InputDataError(
-            f"{capture.video_path(name, episode)}: frames of {frames.shape[2]}x{frames.shape[1]} pixels.",
-            f"{first.width}x{first.height}, the size of its camera.",
-            f"film in the size that was calibrated, or run 'cgwm calibrate {capture.root} --overwrite'.",
-        )
+    _require_size_of(first, capture, name, episode, frames)
     scale = min(1.0, image_size / max(first.width, first.height))
     width, height = round(scale * first.width), round(scale * first.height)
     images = [_reduced(first.undistorted(frame)[0].astype(np.float32) / 255, width, height) for frame in frames]
     covers = unseen = None
     if labels is not None:
         flat = [first.undistorted(label, labels=True)[0] for label in labels]
-        bodies = range(1, len(capture.manifest.bodies) + 1)
-        covers = np.stack(
-            [[_reduced((label == k).astype(np.float32), width, height) for k in bodies] for label in flat]
-        )
-        free = [k for k in bodies if capture.manifest.bodies[k - 1].motion == "free"]
-        lacking = np.array([any(not (label == k).any() for k in free) for label in flat])
-        unseen = lacking if lacking.any() else None
+        covers = _covers(flat, len(capture.manifest.bodies), width, height)
+        unseen = _lacking(capture, flat)
 
     def tensor(array: NDArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
 
     return Video(
-        name,
-        capture.frame_times(name, episode),
-        tensor(np.stack(images)),
-        None if covers is None else tensor(covers),
-        tensor(first.resized(width, height).K),
-        tensor(np.stack([camera.T_cam_world for camera in cameras])),
-        unseen,
+        camera=name,
+        times_s=capture.frame_times(name, episode),
+        frames=tensor(np.stack(images)),
+        covers=None if covers is None else tensor(covers),
+        K=tensor(first.resized(width, height).K),
+        viewmats=tensor(np.stack([camera.T_cam_world for camera in cameras])),
+        unseen=unseen,
     )
 
 
+def _require_enough_frames(capture: Capture, name: str, episode: str, count: int) -> None:
+    """Refuse a video with too few frames."""
+    if count < MIN_FRAMES:
+        raise InputDataError(
+            f"{capture.video_path(name, episode)}: {count} frames between the episode's start and end.",
+            f"at least {MIN_FRAMES}, which show a change of velocity; about fifteen around an impact are good.",
+            f"film longer or faster, or correct [episodes] '{episode}' (start_s, end_s) and [video] frame_rate_hz.",
+        )
+
+
+def _require_size_of(camera: Camera, capture: Capture, name: str, episode: str, frames: NDArray) -> None:
+    """Refuse frames (T, H, W, 3) of another size than their camera's."""
+    if frames.shape[1:3] != (camera.height, camera.width):
+        raise InputDataError(
+            f"{capture.video_path(name, episode)}: frames of {frames.shape[2]}x{frames.shape[1]} pixels.",
+            f"{camera.width}x{camera.height}, the size of its camera.",
+            f"film in the size that was calibrated, or run 'cgwm calibrate {capture.root} --overwrite'.",
+        )
+
+
+def _covers(labels: Sequence[NDArray], bodies: int, width: int, height: int) -> NDArray[np.float32]:
+    """Return the share of each pixel that each body covers, shape (T, bodies, height, width)."""
+    return np.stack(
+        [[_reduced((label == k).astype(np.float32), width, height) for k in range(1, bodies + 1)] for label in labels]
+    )
+
+
+def _lacking(capture: Capture, labels: Sequence[NDArray]) -> NDArray[np.bool_] | None:
+    """Return the frames whose labels lack a free body, shape (T,); None if there are none."""
+    free = [k for k, body in enumerate(capture.manifest.bodies, 1) if body.motion == "free"]
+    lacking = np.array([any(not (label == k).any() for k in free) for label in labels])
+    return lacking if lacking.any() else None
+
+
 def _reduced(image: NDArray, width: int, height: int) -> NDArray:
+    """Return an image (H, W, ...) resized by averaging areas."""
     if (image.shape[1], image.shape[0]) == (width, height):
         return image
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

@@ -1,20 +1,21 @@
-"""Where a body's mass is: its centre and second moments, from the motion about first contacts.
+"""Mass distribution of bodies: centre of mass and second moments from the motion around first contacts.
 
-A published inertia or the assumption of uniform density may be far off, and every impact turns the body by it.
+A published inertia or the assumption of uniform density may be far off, and it determines how every impact turns the
+body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..datasets.tracks import Track
-from ..schemas import InputDataError
-from .first_contacts import FirstContacts, fit_first_contacts
-from .physics.parameters import Parameter, mass_distribution
-from .physics.world import World
+from ....datasets.capture.tracks import Track
+from ....schemas import InputDataError
+from ...physics.parameters import Parameter, mass_distribution
+from ...physics.world import World
+from ...segments.first_contact_fit import EffectEstimate, fit_first_contacts
 
 LEAST_EPISODES = 8
-"""Fewer cannot tell where the mass is from how the body happens to bounce."""
+"""Minimum number of episodes; with fewer the mass distribution cannot be separated from the scatter of the impacts."""
 
 
 def fit_mass_distribution(
@@ -22,13 +23,13 @@ def fit_mass_distribution(
     episodes: Sequence[tuple[str, dict[str, Track]]],
     contact: Sequence[tuple[Parameter, float]],
     noise: tuple[float, float],
-) -> FirstContacts:
-    """Fit centre of mass and second moments of every free body, the contact's numbers beside them.
+) -> EffectEstimate:
+    """Fit centre of mass and second moments of every free body, together with the contact parameters.
 
     Args:
         world: The world; its centres and inertias are the start.
         episodes: Name and tracks by body of each training episode.
-        contact: The contact's numbers that are fitted along, with their start; found again later, open loop.
+        contact: Contact parameters that are fitted with them, and their start; the open-loop search refits them later.
         noise: Of the tracks (position [m], rotation [rad]).
 
     Raises:
@@ -51,6 +52,7 @@ def fit_mass_distribution(
 
 
 def _turns(track: Track | None) -> bool:
+    """Return whether a track has orientations."""
     return track is not None and track.quat_wxyz is not None
 
 

@@ -1,16 +1,14 @@
-"""Multiple shooting: parameters from motions that are cut into short segments, each with a state of its own.
+"""Multiple shooting: parameters from motions that are cut into short segments, each with its own initial state.
 
-A rollout over several impacts is a rough function of where it starts, and its derivatives lead nowhere. Over a segment
-of some hundredths of a second they lead to the minimum. The segments of an episode are tied: the state in which one
-ends and the one with which the next begins may differ by what the contact model itself may miss there, so that one
-impact that it cannot follow does not bend the parameters (Bock & Plitt 1984; with ties that give, weak-constraint
-assimilation, Tremolet 2006). Gauss-Newton on everything at once: the states at the start of all segments and the
-parameters.
+A rollout over several impacts is a rough function of its initial state, and its derivatives are useless. Over a segment
+of some hundredths of a second they lead to the minimum. The segments of an episode are tied: the final state of one and
+the initial state of the next may differ by the expected error of the contact model, so that an impact that it cannot
+reproduce does not bias the parameters (Bock & Plitt 1984; with soft ties, weak-constraint assimilation, Tremolet 2006).
+Gauss-Newton solves for everything at once: the initial states of all segments and the parameters.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,96 +17,97 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..physics.dispatch import rollout as rolled_out
-from ..physics.dispatch import rollouts_at_once
-from ..physics.measured import as_measured, true_times
-from ..physics.parameters import Parameter, apply_parameters
-from ..physics.rollout import Rollout
-from ..physics.rotation import quat_conjugate, quat_log, quat_multiply
-from ..physics.world import State, World
-from .least_squares import bound_stops, robust_loss
-from .observations import Observations
-from .trajectory import retract, state_prior
-from .warmup import FLIGHT_MARGIN_M, clearance
+from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ...optimization.levenberg_marquardt import bound_stops, robust_loss
+from ...physics.engine import rollout as rolled_out
+from ...physics.engine import rollouts_at_once
+from ...physics.observation_model import as_measured, true_times
+from ...physics.parameters import Parameter, apply_parameters
+from ...physics.rollout import Rollout
+from ...physics.world import State, World
+from ...trajectories.observations import Observations
+from ...trajectories.residuals import retract, state_prior
+from .shooting_segments import TiedSegments
 
 if TYPE_CHECKING:
-    from ...datasets.tracks import Track
+    from ....datasets.capture.tracks import Track
 
-SEGMENT_S = 0.03
-"""A segment lasts at least so long, and from one frame to another."""
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
-"""What the model may miss in a segment of flight: position [m], rotation [rad], velocity [m/s], omega [rad/s]."""
+"""Standard deviation of a tie over flight: position [m], rotation [rad], velocity [m/s], angular velocity [rad/s]."""
 TIE_SHARE = 0.01
-"""What it may miss of the velocity that contact gives a body, and of the turning that goes with it."""
+"""Model error in contact, as a share of the change of velocity in it, and of the corresponding change of spin."""
 ROBUST_SCALE = 4.0
-"""Of the robust loss of a frame [sigmas]; that of a tie is twice as wide."""
-RESTING_SIGMAS = 6.0
-"""A body that moves by less in a segment, in units of the noise, may be at rest."""
+"""Scale of the robust loss of a frame, in standard deviations; the scale of a tie is twice as large."""
 STATE_STEPS = (2e-4, 2e-3, 1e-2, 1e-1)
-"""Differences in position [m], rotation [rad], velocity [m/s], omega [rad/s] for the Jacobian."""
+"""Steps of the differences for the Jacobian: position [m], rotation [rad], velocity [m/s], angular velocity
+[rad/s]."""
 PARAMETER_STEP = 0.1
-"""The same of a parameter, in widths of its prior."""
+"""Step of the differences by a parameter, in standard deviations of its prior."""
 TOLERANCE = 1e-4
+"""Relative decrease of the cost in a step below which a descent has converged."""
 
 
 @dataclass(frozen=True)
-class Prior:
-    """A normal prior of the parameters in fitted coordinates: mean (P,), std (P,); and bounds (P, 2)."""
+class ShootingPrior:
+    """Normal prior of the parameters in fitted coordinates, with bounds."""
 
     mean: Tensor
+    """Mean, shape (P,)."""
     std: Tensor
+    """Standard deviation, shape (P,)."""
     bounds: Tensor
+    """Lower and upper bound, shape (P, 2)."""
 
 
-@dataclass(frozen=True)
-class Shot:
-    """Where the fit ended.
-
-    shared (P,); covariance (P, P): from the curvature, times the misfit where that is above 1; state: of the first
-    frame of each episode (E); cost; costs by accepted step; misfit: mean square of the tied residuals, in their own
-    units; chi2: median of a frame's, over what it should be.
-    """
+@dataclass(frozen=True, kw_only=True)
+class ShootingFit:
+    """End of a descent."""
 
     shared: Tensor
+    """Parameters in fitted coordinates, shape (P,)."""
     covariance: Tensor
+    """Covariance of the parameters from the curvature, multiplied by `scale`, shape (P, P)."""
     state: State
+    """State at the first frame of each episode (E)."""
     cost: float
+    """Final cost."""
     costs: list[float]
+    """Cost at the start and after each accepted step."""
     misfit: float
+    """Mean square of the tied residuals, in standard deviations of the ties."""
     chi2: float
+    """Median chi-square of a frame, relative to its expectation."""
     converged: bool
+    """Whether the descent ended before its last step."""
 
     @property
     def scale(self) -> float:
-        """By how much the variances in `covariance` have grown over those of the curvature."""
+        """Factor of the variances in `covariance` over those of the curvature."""
         return max(1.0, self.misfit, self.chi2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Shooting:
-    """The segments of episodes as one least-squares problem.
-
-    Attributes:
-        world: The world.
-        parameters: What is fitted (P).
-        segments: One item for each segment (B); frames at which the next one begins are not among those it has seen.
-        following: The segment that comes next in the same episode, -1 for the last, shape (B,).
-        end: The frame at which the next one begins, or the last one, shape (B,).
-        tie: Standard deviation of what may differ where segments meet, shape (B, S).
-        noise: Of the tracks (position [m], rotation [rad]), numbers or one for each frame and body (B, T, nf).
-        prior: Of the parameters.
-        ahead: Another first guess of the states: each moves to the next frame in a straight line.
-    """
+    """The segments of episodes as one least-squares problem."""
 
     world: World
+    """The world."""
     parameters: Sequence[Parameter]
+    """Fitted parameters (P)."""
     segments: Observations
+    """One item for each segment (B); the frame at which the next one begins counts as not seen."""
     following: Tensor
+    """Segment that comes next in the same episode, -1 for the last, shape (B,)."""
     end: Tensor
+    """Frame at which the next segment begins, or the last one, shape (B,)."""
     tie: Tensor
+    """Standard deviation of the difference of states where segments meet, shape (B, S)."""
     noise: tuple[float | Tensor, float | Tensor]
-    prior: Prior
+    """Noise of the tracks (position [m], rotation [rad]), one value or one for each frame and body (B, T, nf)."""
+    prior: ShootingPrior
+    """Prior of the parameters."""
     ahead: State
+    """Alternative first guess of the states, which moves to the next frame in a straight line."""
 
     @staticmethod
     def of(
@@ -117,64 +116,46 @@ class Shooting:
         episodes: Sequence[tuple[str, dict[str, Track]]],
         spans: Sequence[tuple[float, float]],
         noise: tuple[float, float],
-        prior: Prior,
+        prior: ShootingPrior,
         contacts_only: bool = False,
     ) -> Shooting:
         """Cut the span [s] of each episode into segments.
 
-        With `contacts_only` those are left out that tell nothing of contact and lie beside none that does: in flight,
-        and where all rests; not the first ones, whose states are where episodes begin.
+        With `contacts_only`, segments without information on contact are left out: in flight or at rest, and not next
+        to a segment with such information. The first segments stay, because episodes begin with their states.
         """
-        whole = Observations.of(world, episodes, spans)
-        cuts = [_cuts(times[:count]) for times, count in zip(whole.times_s, whole.frames.tolist(), strict=True)]
-        pieces = [(k, a, b) for k, places in enumerate(cuts) for a, b in itertools.pairwise(places)]
-        if contacts_only:
-            telling = _telling(world, whole, pieces, noise)
-            pieces = [piece for piece, tells in zip(pieces, telling, strict=True) if tells or piece[1] == 0]
-        items = [k for k, _, _ in pieces]
-        windows = [(float(whole.times_s[k, a]) - 1e-9, float(whole.times_s[k, b]) + 1e-9) for k, a, b in pieces]
-        segments = Observations.of(world, [episodes[k] for k in items], windows)
-        following, end, seen, turned = [], [], segments.seen.clone(), segments.turned.clone()
-        for row, k in enumerate(items):
-            last = row + 1 == len(items) or pieces[row + 1][:2] != (k, pieces[row][2])
-            following.append(-1 if last else row + 1)
-            end.append(int((segments.times_s[row] <= windows[row][1]).sum()) - 1)
-            if not last:  # the next segment has seen that frame
-                seen[row, end[-1] :], turned[row, end[-1] :] = 0.0, 0.0
-        starts = [first for _, first, _ in pieces]
-        ahead = segments.state
-        state = _moving(world, whole, items, starts, ahead)
-        segments = replace(segments, seen=seen, turned=turned, state=state)
+        tied = TiedSegments.of(world, episodes, spans, noise, contacts_only)
         like = world.gravity
         return Shooting(
-            world,
-            parameters,
-            segments,
-            torch.tensor(following),
-            torch.tensor(end),
-            torch.tensor([value for value in TIE for _ in range(3)] * len(segments.free))
+            world=world,
+            parameters=parameters,
+            segments=tied.segments,
+            following=tied.following,
+            end=tied.end,
+            tie=torch.tensor([value for value in TIE for _ in range(3)] * len(tied.segments.free))
             .to(like)
-            .repeat(len(items), 1),
-            noise,
-            prior,
-            ahead,
+            .repeat(len(tied.following), 1),
+            noise=noise,
+            prior=prior,
+            ahead=tied.ahead,
         )
 
     def fit(
         self, starts: Sequence[Tensor], iterations: int, best: int, done: Callable[[], object] = lambda: None
-    ) -> list[Shot]:
-        """Minimise from several parameters (P,) in fitted coordinates, and from both first guesses of the states.
+    ) -> list[ShootingFit]:
+        """Minimise the cost from several starts of the parameters and from both first guesses of the states.
 
-        Where it starts decides in which valley it ends. The best few go on, with ties from what contact then gives.
+        The start decides which minimum is reached. The best few descents are continued, with ties for the contact that
+        they found.
 
         Args:
-            starts: Where to start.
-            iterations: Most steps in each descent.
-            best: How many go on.
+            starts: Starts of the parameters in fitted coordinates, each of shape (P,).
+            iterations: Maximum number of steps in each descent.
+            best: Number of descents that are continued.
             done: Called after each descent.
 
         Returns:
-            Where those descents ended that went on, the lowest cost first.
+            Ends of the continued descents, the lowest cost first.
         """
         first = []
         for shared in starts:
@@ -189,7 +170,7 @@ class Shooting:
             done()
         return sorted(shots, key=lambda shot: shot.cost)
 
-    def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[Shot, State]:
+    def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[ShootingFit, State]:
         linear = self._linearised(shared, states)
         costs, damping, converged = [linear.cost], 1e-3, not math.isfinite(linear.cost)
         for _ in range(iterations):
@@ -212,7 +193,7 @@ class Shooting:
         return self._shot(linear, shared, states, costs, converged), states
 
     def _allowed(self, shared: Tensor, states: State) -> Tensor:
-        """Return the standard deviations (B, S) of what may differ where segments meet."""
+        """Return the standard deviations (B, S) of the difference of states where segments meet."""
         with torch.no_grad():
             motion = self._motion(self._world(shared[None]), states, torch.zeros_like(self.tie), 1)
         item, columns = torch.arange(len(self.end)), []
@@ -228,20 +209,20 @@ class Shooting:
             columns += [torch.hypot(part, part.new_tensor(least)) for part, least in zip(parts, TIE, strict=True)]
         return torch.nan_to_num(torch.stack(columns, 1), nan=1.0).repeat_interleave(3, 1)
 
-    def _shot(self, linear: _Linear, shared: Tensor, states: State, costs: list[float], converged: bool) -> Shot:
+    def _shot(self, linear: _Linear, shared: Tensor, states: State, costs: list[float], converged: bool) -> ShootingFit:
         covariance = torch.linalg.pinv(linear.matrix, hermitian=True)
         count = len(shared)
         names = self.segments.names
         first = [row for row, name in enumerate(names) if row == 0 or names[row - 1] != name]
-        shot = Shot(
-            shared,
-            covariance[:count, :count],
-            states.at(first),
-            linear.cost,
-            costs,
-            linear.misfit,
-            linear.chi2,
-            converged,
+        shot = ShootingFit(
+            shared=shared,
+            covariance=covariance[:count, :count],
+            state=states.at(first),
+            cost=linear.cost,
+            costs=costs,
+            misfit=linear.misfit,
+            chi2=linear.chi2,
+            converged=converged,
         )
         return replace(shot, covariance=shot.scale * shot.covariance)
 
@@ -281,7 +262,7 @@ class Shooting:
         return rolled_out(world, retract(base, changes, list(seen.free)), true_times(world, times), drives)
 
     def _gap(self, motion: Rollout, states: State, repeats: int) -> Tensor:
-        """Return how the end of each segment differs from the start of the next (K B, S)."""
+        """Return the difference of the end of each segment from the start of the next (K B, S)."""
         batch, free = len(self.following), list(self.segments.free)
         item = torch.arange(repeats * batch)
         end = self.end.repeat(repeats)
@@ -320,8 +301,8 @@ class Shooting:
     def _differences(self, shared: Tensor, states: State) -> tuple[Tensor, Tensor]:
         """Return rows (B, m) and their Jacobian (B, m, P + S) by central differences over `STEPS`.
 
-        Not exact derivatives: those of a body that rests on many spheres grow by a third in every step of 1 ms, while
-        differences over what the data can tell apart show how the motion answers.
+        Exact derivatives are unsuitable: for a body that rests on many spheres they grow by a third in every step of
+        1 ms, while differences over distances that the data resolve give the response of the motion.
         """
         batch, size = self.tie.shape
         count = len(shared)
@@ -349,7 +330,7 @@ class Shooting:
         cost, weight, tie_weight = self._parts(frames, ties, shared)
         total = count + batch * size
         matrix, slope = torch.zeros(total, total).to(shared), torch.zeros(total).to(shared)
-        own = state_prior(len(self.segments.free)).to(shared) * 1e-3
+        weak_prior = state_prior(len(self.segments.free)).to(shared) * 1e-3
         for row in range(batch):
             here = torch.cat([torch.arange(count), torch.arange(size) + count + row * size])
             local = jacobian[row, :-size].unflatten(0, (-1, 6))
@@ -357,7 +338,7 @@ class Shooting:
             flat = local.flatten(0, 1)
             matrix[here[:, None], here] += weighted.T @ flat
             slope[here] += weighted.T @ frames[row].flatten()
-            matrix[here[count:], here[count:]] += own
+            matrix[here[count:], here[count:]] += weak_prior
             after = int(self.following[row])
             if after >= 0:
                 there = torch.cat([here, torch.arange(size) + count + after * size])
@@ -372,69 +353,26 @@ class Shooting:
         chi2 = frames.square().sum(-1)
         chi2 = chi2[chi2 > 0]
         middle = float(chi2.median()) / 5.35 if len(chi2) else 0.0  # 5.35: median of chi-square, 6 degrees
-        return _Linear(matrix, slope, float(cost) if bool(cost.isfinite()) else math.inf, misfit, middle)
+        return _Linear(
+            matrix=matrix,
+            slope=slope,
+            cost=float(cost) if bool(cost.isfinite()) else math.inf,
+            misfit=misfit,
+            chi2=middle,
+        )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Linear:
-    """Normal equations of half the cost, and the cost; misfit and chi2 as in `Shot`."""
+    """Normal equations of half the cost at a point."""
 
     matrix: Tensor
+    """Curvature by parameters and states, shape (P + B S, P + B S)."""
     slope: Tensor
+    """Gradient by parameters and states, shape (P + B S,)."""
     cost: float
+    """Cost, infinite where the rollouts diverge."""
     misfit: float
+    """As in `ShootingFit`."""
     chi2: float
-
-
-def _cuts(times_s: Tensor) -> list[int]:
-    """Return the frames at which segments begin, and the last frame."""
-    places = [0]
-    for frame in range(1, len(times_s)):
-        if float(times_s[frame] - times_s[places[-1]]) >= SEGMENT_S:
-            places.append(frame)
-    if len(places) > 2 and places[-1] != len(times_s) - 1:
-        places.pop()  # the last segment takes up what is too short for one
-    return [*places, len(times_s) - 1] if places[-1] != len(times_s) - 1 else places
-
-
-def _telling(
-    world: World, whole: Observations, pieces: Sequence[tuple[int, int, int]], noise: tuple[float, float]
-) -> list[bool]:
-    """Return which pieces (episode, first and last frame) tell of contact: in it, or beside it, and not at rest."""
-    flying = clearance(world, whole) > FLIGHT_MARGIN_M
-    moved = whole.position_m.new_zeros(len(pieces))
-    for row, (k, a, b) in enumerate(pieces):
-        shift = (whole.position_m[k, b] - whole.position_m[k, a]).abs().amax() / noise[0]
-        turn = quat_log(quat_multiply(quat_conjugate(whole.quat_wxyz[k, a]), whole.quat_wxyz[k, b]))
-        moved[row] = torch.maximum(shift, turn.abs().amax() / noise[1])
-    touches = [not bool(flying[k, a : b + 1].all()) for k, a, b in pieces]
-    tells = [touch and bool(way > RESTING_SIGMAS) for touch, way in zip(touches, moved, strict=True)]
-    beside = [False, *tells, False]
-    near = [any(beside[row : row + 3]) for row in range(len(pieces))]
-    return near
-
-
-def _moving(world: World, whole: Observations, items: list[int], starts: list[int], state: State) -> State:
-    """Return first guesses of the states (B) at frames: velocities by differences that do not reach over an impact.
-
-    In flight a difference to the frame before or after it gives the velocity half a frame away, which gravity has
-    changed since; both count where both are flight. In contact the difference to the next frame is taken as it is.
-    """
-    flying = clearance(world, whole) > FLIGHT_MARGIN_M
-    velocity, omega = state.velocity_m_s.clone(), state.omega_body_rad_s.clone()
-    for row, (item, frame) in enumerate(zip(items, starts, strict=True)):
-        others = [frame + k for k in (-1, 1) if 0 <= frame + k < int(whole.frames[item])]
-        if bool(flying[item, frame]):
-            others = [k for k in others if bool(flying[item, k])] or others[:1]
-        else:
-            others = [k for k in others if k > frame] or others
-        for column, body in enumerate(whole.free):
-            rates, turns = [], []
-            for other in others:
-                span = whole.times_s[item, other] - whole.times_s[item, frame]
-                shift = whole.position_m[item, other, column] - whole.position_m[item, frame, column]
-                here, there = whole.quat_wxyz[item, frame, column], whole.quat_wxyz[item, other, column]
-                rates.append(shift / span - (0.5 * span * world.gravity[0] if bool(flying[item, frame]) else 0.0))
-                turns.append(quat_log(quat_multiply(quat_conjugate(here), there)) / span)
-            velocity[row, body], omega[row, body] = torch.stack(rates).mean(0), torch.stack(turns).mean(0)
-    return replace(state, velocity_m_s=velocity, omega_body_rad_s=omega)
+    """As in `ShootingFit`."""

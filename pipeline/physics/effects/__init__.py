@@ -1,4 +1,4 @@
-"""Physical and measurement effects: one file each, and the interface for one's own."""
+"""Physical and measurement effects: one file each, and the interface for custom effects."""
 
 from .effect import (
     ActiveEffect,

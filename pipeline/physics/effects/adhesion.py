@@ -1,18 +1,18 @@
-"""A ground that sticks."""
+"""Adhesion of a sticky ground."""
 
 from __future__ import annotations
 
-from ..rotation import cross
+from ...geometry.rotation import cross
 from .effect import BodyMotion, Effect, EffectConstant, EffectParameter, Values, Wrench
 
 
 class Adhesion(Effect):
-    """A pull F of the ground while a body is within the gap g, shared among the spheres that are."""
+    """Attraction F by the ground while a body is within the gap g, shared among the spheres within the gap."""
 
     name = "adhesion"
     summary = "A sticky ground: it pulls what touches it, and lets go within a small gap."
     formula = "force = -F w(h) n, w(h) = (1 - (h / g)^2)^2 for 0 < h < g, 1 below, 0 above; h of the lowest sphere"
-    parameters = (EffectParameter("F", "N", scale=0.2, limit=100.0, nonnegative=True),)
+    parameters = (EffectParameter(name="F", unit="N", scale=0.2, limit=100.0, nonnegative=True),)
     constants = (EffectConstant("g", "m", (5e-4, 1e-3, 2e-3, 5e-3)),)
     phase = "contact"
     needs = ("ground", "contact")
@@ -20,7 +20,7 @@ class Adhesion(Effect):
     source = "a force with compact support and a continuous derivative; it does not depend on the number of spheres"
 
     def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
-        """Return the pull on the spheres within the gap."""
+        """Return the attraction of the spheres within the gap."""
         arms, heights = motion.lowest_points()
         near = (1 - (heights / values["g"][:, None]).clamp(0.0, 1.0).square()).square()
         # the weights add up to that of the lowest sphere, so that more spheres do not pull more

@@ -1,10 +1,10 @@
-"""Friction of the ground that depends on the direction."""
+"""Friction of the ground that depends on the direction of the slip."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from ..contact import Touch
+from ..contact_law import Touch
 from .effect import Effect, EffectParameter, Values, vector
 
 
@@ -18,8 +18,8 @@ class AnisotropicFriction(Effect):
         "with |M^-1 f| <= N; the lower principal friction mu - |(a, b)| at least a tenth of the higher one"
     )
     parameters = (
-        EffectParameter("a", "1", scale=0.05, limit=1.0),
-        EffectParameter("b", "1", scale=0.05, limit=1.0),
+        EffectParameter(name="a", unit="1", scale=0.05, limit=1.0),
+        EffectParameter(name="b", unit="1", scale=0.05, limit=1.0),
     )
     phase = "contact"
     needs = ("ground", "contact")

@@ -9,11 +9,11 @@ class Buoyancy(Effect):
     """a = b upwards."""
 
     name = "buoyancy"
-    summary = "Lift of the displaced air or liquid; its added mass is left out."
+    summary = "Lift of the displaced air or liquid; its added mass is neglected."
     formula = "a = +b upwards"
-    parameters = (EffectParameter("b", "m/s2", scale=0.2, limit=20.0, nonnegative=True),)
+    parameters = (EffectParameter(name="b", unit="m/s2", scale=0.2, limit=20.0, nonnegative=True),)
     phase = "flight"
-    reveals = "slow drops of a light body, beside a heavy one of the same size"
+    reveals = "slow drops of a light body, and of a heavy one of the same size"
     source = "Archimedes; b = g rho_fluid / rho_body"
 
     def wrench(self, values: Values, motion: BodyMotion) -> Wrench:

@@ -1,13 +1,13 @@
-"""`cgwm effects`: which effects can be added, what they are, and a template of one's own."""
+"""Catalogue of effects for `cgwm effects`: list, description, and a template for custom effects."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from ..datasets.atomic import new_file
-from ..schemas import UsageError
-from ..schemas.effects import EffectCard, EffectConstantCard, EffectList, EffectParameterCard, NewEffect
-from .physics.effects.registry import aliases, effect_names, load_effect
+from ....datasets.io.atomic import new_file
+from ....schemas import UsageError
+from ....schemas.effects import EffectCard, EffectConstantCard, EffectList, EffectParameterCard, NewEffect
+from .registry import aliases, effect_names, load_effect
 
 
 def list_effects() -> EffectList:
@@ -16,7 +16,7 @@ def list_effects() -> EffectList:
 
 
 def show_effect(spec: str) -> EffectCard:
-    """Return what an effect says of itself.
+    """Return the description of an effect.
 
     Args:
         spec: Its name, or `path/to/file.py:ClassName`.
@@ -50,7 +50,7 @@ def show_effect(spec: str) -> EffectCard:
 
 
 def new_effect(file: Path | str, overwrite: bool = False) -> NewEffect:
-    """Write a template of one's own effect, which runs as it stands.
+    """Write a template of a custom effect, which runs unchanged.
 
     Raises:
         UsageError: If the name does not end with .py, or the file exists and `overwrite` is not set.
@@ -58,7 +58,7 @@ def new_effect(file: Path | str, overwrite: bool = False) -> NewEffect:
     path = Path(file)
     if path.suffix != ".py":
         raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
-    text = (Path(__file__).parent / "physics" / "effects" / "template.py").read_text(encoding="utf-8")
+    text = (Path(__file__).parent / "template.py").read_text(encoding="utf-8")
     text = text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")  # from outside the package
     with new_file(path, overwrite) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A clock that runs fast or slow."""
+"""Scale error of the clock."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class ClockScale(Effect):
     name = "clock_scale"
     summary = "Times on a wrong scale, as from a camera with another frame rate than given."
     formula = "t_measured = (1 + s) t_true"
-    parameters = (EffectParameter("s", "1", scale=0.01, limit=0.3),)
+    parameters = (EffectParameter(name="s", unit="1", scale=0.01, limit=0.3),)
     phase = "measurement"
-    reveals = "long free flight, beside a clock in the picture"
+    reveals = "long free flight, with a clock in the image"
     source = "definition"
 
     def times(self, values: Values, times_s: Tensor) -> Tensor:
-        """Return the true times."""
+        """Return the true times (B, T) [s]."""
         return times_s / (1 + values["s"])[:, None]

@@ -1,4 +1,4 @@
-"""A centre of mass that is not where it was thought to be."""
+"""Offset of the centre of mass."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from .effect import Effect, EffectParameter, Values, vector
 
 
 class ComOffset(Effect):
-    """The centre of mass of every free body moved by d in its frame; the inertia about it stays."""
+    """Centre of mass of every free body moved by d in its frame; the inertia about it does not change."""
 
     name = "com_offset"
-    summary = "A centre of mass beside the one that the shape says."
+    summary = "A centre of mass that differs from that of the shape."
     formula = "com becomes com + (d_x, d_y, d_z), body frame; the inertia about it stays"
-    parameters = tuple(EffectParameter(f"d_{axis}", "m", scale=0.003, limit=0.05) for axis in "xyz")
+    parameters = tuple(EffectParameter(name=f"d_{axis}", unit="m", scale=0.003, limit=0.05) for axis in "xyz")
     phase = "flight"
     needs = ("spin",)
     reveals = "free flight with fast spin about different axes, then impacts (against marker_offset)"

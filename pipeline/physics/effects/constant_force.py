@@ -1,4 +1,4 @@
-"""A constant acceleration."""
+"""Constant acceleration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class ConstantForce(Effect):
     name = "constant_force"
     summary = "A constant acceleration that nothing else explains."
     formula = "a = (f_x, f_y, f_z), world frame"
-    parameters = tuple(EffectParameter(f"f_{axis}", "m/s2", scale=0.3, limit=10.0) for axis in "xyz")
+    parameters = tuple(EffectParameter(name=f"f_{axis}", unit="m/s2", scale=0.3, limit=10.0) for axis in "xyz")
     phase = "flight"
     reveals = "long free flight from different heights, and rest on a turned or weighed set-up"
     source = "Newton's second law"

@@ -1,7 +1,7 @@
-"""What a physical effect is: a plug-in that changes forces, contacts, bodies or what is measured.
+"""Interface of effects: plug-ins that change forces, contacts, bodies or measurements.
 
-An effect is a class with a name, parameters and any of six methods; the others stay as they are. Everything is plain
-torch on batches, so that derivatives flow through it. It changes nothing when its parameters have the value 0.
+An effect is a class with a name, parameters and any of six methods. Everything is plain torch on batches, so that
+derivatives flow through it. An effect changes nothing when all its parameters are 0.
 """
 
 from __future__ import annotations
@@ -15,79 +15,90 @@ import torch
 from torch import Tensor
 
 from ....schemas import UsageError
-from ..sweeps import tangent_axes
+from ..impulse_solver import tangent_axes
 
 if TYPE_CHECKING:
-    from ..contact import Touch
+    from ..contact_law import Touch
     from ..world import Body, World
 
 Values = Mapping[str, Tensor]
 """The values of an effect's parameters and constants by name, each of shape (1,) or (n,)."""
 Phase = Literal["flight", "contact", "measurement"]
+"""Where an effect acts."""
 Need = Literal["ground", "drag", "contact", "spin", "driven"]
+"""Requirements of an effect, see `Effect.needs`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True)  # not kw_only: effects of users pass name and unit by position
 class EffectParameter:
-    """A number of an effect; 0 is neutral.
-
-    scale: a magnitude that matters, in its unit: what changes a motion of one second visibly; limit: the largest
-    magnitude admitted; nonnegative: whether it may not be negative; shared: whether one value serves all episodes, or
-    each group of episodes, or each episode, has its own.
-    """
+    """A parameter of an effect, whose neutral value is 0."""
 
     name: str
+    """Name."""
     unit: str
+    """Unit."""
     scale: float
+    """Magnitude that changes a motion of one second visibly, in its unit."""
     limit: float
+    """Largest admitted magnitude, in its unit."""
     nonnegative: bool = False
+    """Whether the value cannot be negative."""
     shared: Literal["all", "group", "episode"] = "all"
+    """Whether one value serves all episodes, each group of episodes, or each episode."""
 
 
 @dataclass(frozen=True)
 class EffectConstant:
-    """A number that means nothing while the effect is neutral: it is tried at each value of a grid."""
+    """A constant of an effect without meaning while the effect is neutral, which a fit tries on a grid."""
 
     name: str
+    """Name."""
     unit: str
+    """Unit."""
     grid: tuple[float, ...]
+    """Values to try, in its unit."""
 
     @property
     def default(self) -> float:
-        """The value in the middle of the grid."""
+        """Middle value of the grid."""
         return self.grid[len(self.grid) // 2]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BodyMotion:
-    """A free body in a step, world frame.
-
-    body; mass (n,) [kg]; inertia (n, 3, 3) [kg m2] about the centre of mass, world axes; com (n, 3) [m]; rotation
-    (n, 3, 3), body to world; velocity (n, 3) [m/s] of the centre of mass; omega (n, 3) [rad/s]; up (n or 1, 3):
-    against gravity; normal (n or 1, 3): of the ground, up where there is none; ground_offset (n or 1,) [m] along it,
-    None where there is no ground; air (n or 1, 3) [m/s]: velocity of the air, None where it stands still.
-    """
+    """Motion of a free body in a step, world frame, as effects receive it."""
 
     body: Body
+    """The body."""
     mass: Tensor
+    """Mass [kg], shape (n,)."""
     inertia: Tensor
+    """Inertia about the centre of mass, world axes [kg m2], shape (n, 3, 3)."""
     com: Tensor
+    """Centre of mass [m], shape (n, 3)."""
     rotation: Tensor
+    """Rotation, body to world, shape (n, 3, 3)."""
     velocity: Tensor
+    """Velocity of the centre of mass [m/s], shape (n, 3)."""
     omega: Tensor
+    """Angular velocity [rad/s], shape (n, 3)."""
     up: Tensor
+    """Unit vector against gravity, shape (n or 1, 3)."""
     normal: Tensor
+    """Unit normal of the ground, `up` without a ground, shape (n or 1, 3)."""
     ground_offset: Tensor | None = None
+    """Offset of the ground along its normal [m], shape (n or 1,); None without a ground."""
     air: Tensor | None = None
+    """Velocity of the air [m/s], shape (n or 1, 3); None for still air."""
 
     @property
     def airspeed(self) -> Tensor:
-        """Velocity (n, 3) [m/s] relative to the air."""
+        """Velocity (n, 3) [m/s] relative to the air, world frame."""
         return self.velocity if self.air is None else self.velocity - self.air
 
     @property
     def height(self) -> Tensor:
-        """Height (n,) [m] of the lowest sphere over the ground, infinite where there is none."""
+        """Height (n,) [m] of the lowest sphere above the ground, infinite without a ground."""
         return self.lowest_points()[1].amin(-1)
 
     def lowest_points(self) -> tuple[Tensor, Tensor]:
@@ -109,39 +120,41 @@ class BodyMotion:
 
 @dataclass(frozen=True)
 class Wrench:
-    """Force (n, 3) [N] through the centre of mass and torque (n, 3) [N m] about it, world frame."""
+    """Wrench on a free body, world frame."""
 
     force: Tensor | None = None
+    """Force through the centre of mass [N], shape (n, 3); None for none."""
     torque: Tensor | None = None
+    """Torque about the centre of mass [N m], shape (n, 3); None for none."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of the bodies' frames as measured: position_m (B, T, nb, 3), quat_wxyz (B, T, nb, 4).
-
-    up (1 or B, 3): against gravity; None where that is the world's z.
-    """
+    """Measured poses of the bodies' frames."""
 
     position_m: Tensor
+    """Positions, world frame [m], shape (B, T, nb, 3)."""
     quat_wxyz: Tensor
+    """Orientations, body to world, shape (B, T, nb, 4)."""
     up: Tensor | None = None
+    """Unit vector against gravity, shape (1 or B, 3); None for the world's z."""
 
 
 class Effect:
-    """A physical or a measurement effect. Subclass it, fill in the class variables, and write the hooks that it needs.
+    """Base class of physical and measurement effects; subclasses define class variables and the hooks that they need.
 
     Attributes:
-        name: What the user types.
-        summary: What it is, in one sentence.
-        formula: In plain text, with the parameters' names.
-        parameters: Its numbers.
-        constants: Numbers that are tried on a grid.
-        phase: Where it acts: in flight, in contact, or in the measurement alone.
-        needs: What it cannot do without: of the world "ground"; of the other effects "drag"; of the motion "contact",
-            "spin" (measured orientation), "driven" (a command). What the world or the effects lack is refused.
-        provides: What it is to other effects: "drag" where its wrench grows with `BodyMotion.airspeed`.
-        reveals: The motion that shows it best.
-        source: Where the formula comes from.
+        name: Name on the command line.
+        summary: Description in one sentence.
+        formula: Formula in plain text, with the parameters' names.
+        parameters: Parameters that a fit estimates.
+        constants: Constants that a fit tries on a grid.
+        phase: Where it acts: in flight, in contact, or only in the measurement.
+        needs: Requirements: "ground" of the world; "drag" of the other effects; "contact", "spin" (measured
+            orientation), "driven" (a command) of the motion. A world or effects that lack one are refused.
+        provides: "drag" where its wrench grows with `BodyMotion.airspeed`, for other effects that need it.
+        reveals: Motion that shows it best.
+        source: Source of the formula.
     """
 
     name: ClassVar[str]
@@ -156,7 +169,7 @@ class Effect:
     source: ClassVar[str]
 
     def world(self, values: Values, world: World) -> World:
-        """Return the world with other masses, geometry, gravity or ground; called once for a rollout."""
+        """Return the world with changed masses, geometry, gravity or ground; called once for a rollout."""
         return world
 
     def flow(self, values: Values, motion: BodyMotion) -> Tensor:
@@ -168,34 +181,36 @@ class Effect:
         raise NotImplementedError
 
     def contact(self, values: Values, touch: Touch) -> Touch:
-        """Return the contact with other numbers; called in every step for every pair of bodies that touches."""
+        """Return the contact with changed coefficients; called in every step for every pair of touching bodies."""
         raise NotImplementedError
 
     def times(self, values: Values, times_s: Tensor) -> Tensor:
-        """Return the true times (B, T) [s] of measurements at the times that were recorded."""
+        """Return the true times (B, T) [s] of measurements with the given recorded times."""
         raise NotImplementedError
 
     def observe(self, values: Values, poses: Poses) -> Poses:
-        """Return what is measured of the true poses."""
+        """Return the measured poses for the true ones."""
         raise NotImplementedError
 
     def has(self, hook: Literal["world", "flow", "wrench", "contact", "times", "observe"]) -> bool:
-        """Whether the effect has a hook of its own."""
+        """Return whether the effect overrides a hook."""
         return getattr(type(self), hook) is not getattr(Effect, hook)
 
 
 @dataclass(frozen=True)
 class ActiveEffect:
-    """An effect with the values (1 or B,) of its parameters and constants."""
+    """An effect with values of its parameters and constants."""
 
     effect: Effect
+    """The effect."""
     values: dict[str, Tensor]
+    """Values by name, each of shape (1,) or (B,)."""
 
     @staticmethod
     def of(
         effect: Effect, values: Mapping[str, float | Tensor] | None = None, like: Tensor | None = None
     ) -> ActiveEffect:
-        """Return an effect at the given values; parameters left out are 0, constants at the middle of their grids.
+        """Build an effect with the given values; missing parameters are 0, missing constants the middle of their grid.
 
         Raises:
             KeyError: If a name is not one of the effect's.
@@ -221,7 +236,7 @@ class ActiveEffect:
 
 
 def check_needs(effects: Sequence[ActiveEffect], ground: bool) -> None:
-    """Refuse effects that lack something in the world or among the other effects.
+    """Check that the world and the other effects have what each effect needs.
 
     Raises:
         UsageError: If one needs a ground and there is none, or a drag and no other effect is one.
@@ -258,7 +273,7 @@ def vector(values: Values, *names: str) -> Tensor:
 
 
 def length(x: Tensor) -> Tensor:
-    """Return the length (..., 1) of vectors (..., d), with derivative 0 where it vanishes."""
+    """Return the length (..., 1) of vectors (..., d), with derivative 0 at zero vectors."""
     return (x.square().sum(-1, keepdim=True) + 1e-24).sqrt()
 
 

@@ -1,4 +1,4 @@
-"""A measured frame that is turned against the true one."""
+"""Rotation of the measured frame against the true one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from ..rotation import quat_exp, quat_multiply, quat_rotate
+from ...geometry.rotation import quat_exp, quat_multiply, quat_rotate
 from .effect import Effect, EffectParameter, Poses, Values, horizontal, vector
 
 
@@ -20,8 +20,8 @@ class FrameTilt(Effect):
     summary = "A tracking system whose axes are not level: gravity and ground appear turned together."
     formula = "p_measured = R p_true, R_measured = R R_true, R = exp(tilt_x e_x + tilt_y e_y)"
     parameters = (
-        EffectParameter("tilt_x", "rad", scale=0.02, limit=0.5),
-        EffectParameter("tilt_y", "rad", scale=0.02, limit=0.5),
+        EffectParameter(name="tilt_x", unit="rad", scale=0.02, limit=0.5),
+        EffectParameter(name="tilt_y", unit="rad", scale=0.02, limit=0.5),
     )
     phase = "measurement"
     reveals = "free flight and rest on different places of the ground, whose heights then differ"

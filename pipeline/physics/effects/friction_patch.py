@@ -1,4 +1,4 @@
-"""A map of the ground's friction."""
+"""Map of the ground's friction."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..contact import Touch
-from ..sweeps import tangent_axes
+from ..contact_law import Touch
+from ..impulse_solver import tangent_axes
 from .effect import Effect, EffectConstant, EffectParameter, Values
 
 SIDE = 3
-"""Bumps along each side of the grid, whose middle lies at the foot of the world's origin on the ground."""
+"""Number of B-splines along each side of the grid, centred at the projection of the world's origin onto the ground."""
 
 
 class FrictionPatch(Effect):
     """mu + sum over i, j of c_ij B(x / p - i + 2) B(y / p - j + 2), on the ground.
 
-    B is the quadratic B-spline of width 3: once differentiable, nothing beyond 1.5, and where all c are equal the sum
-    is constant within the grid.
+    B is the quadratic B-spline of width 3: once differentiable, zero beyond 1.5; for equal c the sum is constant within
+    the grid.
     """
 
     name = "friction_patch"
@@ -29,7 +29,9 @@ class FrictionPatch(Effect):
         "B the quadratic B-spline, (x, y) from the world's origin in the ground's axes"
     )
     parameters = tuple(
-        EffectParameter(f"c_{i}{j}", "1", scale=0.1, limit=1.0) for i in range(1, SIDE + 1) for j in range(1, SIDE + 1)
+        EffectParameter(name=f"c_{i}{j}", unit="1", scale=0.1, limit=1.0)
+        for i in range(1, SIDE + 1)
+        for j in range(1, SIDE + 1)
     )
     constants = (EffectConstant("p", "m", (0.05, 0.1, 0.2)),)
     phase = "contact"
@@ -38,7 +40,7 @@ class FrictionPatch(Effect):
     source = "a tensor product of quadratic B-splines (de Boor 1978)"
 
     def contact(self, values: Values, touch: Touch) -> Touch:
-        """Return the contact with the friction of its place."""
+        """Return the contact with the friction at its position."""
         if not touch.ground:
             return touch
         axes = tangent_axes(touch.normal)[..., 1:, :]

@@ -1,4 +1,4 @@
-"""Gravity that is stronger or weaker than it was thought to be."""
+"""Scale error of gravity."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class GravityScale(Effect):
     name = "gravity_scale"
     summary = "Gravity of another strength."
     formula = "g becomes (1 + s) g"
-    parameters = (EffectParameter("s", "1", scale=0.02, limit=0.9),)
+    parameters = (EffectParameter(name="s", unit="1", scale=0.02, limit=0.9),)
     phase = "flight"
-    reveals = "drops from great heights, beside a length and a clock that were checked"
+    reveals = "drops from great heights, with a checked length and clock"
     source = "definition"
 
     def world(self, values: Values, world: World) -> World:

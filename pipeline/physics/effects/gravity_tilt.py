@@ -1,10 +1,10 @@
-"""Gravity that is not where it was thought to be."""
+"""Tilt of gravity against the world's axes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from ..rotation import quat_exp, quat_rotate
+from ...geometry.rotation import quat_exp, quat_rotate
 from ..world import World
 from .effect import Effect, EffectParameter, Values, horizontal, vector
 
@@ -16,8 +16,8 @@ class GravityTilt(Effect):
     summary = "A ground that is not level: gravity is turned against the world's axes, the ground is not."
     formula = "g becomes exp(tilt_x e_x + tilt_y e_y) g; the ground stays"
     parameters = (
-        EffectParameter("tilt_x", "rad", scale=0.02, limit=0.5),
-        EffectParameter("tilt_y", "rad", scale=0.02, limit=0.5),
+        EffectParameter(name="tilt_x", unit="rad", scale=0.02, limit=0.5),
+        EffectParameter(name="tilt_y", unit="rad", scale=0.02, limit=0.5),
     )
     phase = "flight"
     reveals = "free flight, then the same slide in several directions on the ground"

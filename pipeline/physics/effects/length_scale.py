@@ -1,4 +1,4 @@
-"""A measured length unit that is not the metre."""
+"""Scale error of the measured positions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class LengthScale(Effect):
     name = "length_scale"
     summary = "Positions measured on a wrong scale, as from a marker of another size than given."
     formula = "p_measured = (1 + s) p_true"
-    parameters = (EffectParameter("s", "1", scale=0.01, limit=0.3),)
+    parameters = (EffectParameter(name="s", unit="1", scale=0.01, limit=0.3),)
     phase = "measurement"
     reveals = "flight of a body whose size is known, down to its impact; a known distance"
     source = "definition"

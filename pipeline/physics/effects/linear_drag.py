@@ -1,4 +1,4 @@
-"""Drag that grows with the speed."""
+"""Drag that is linear in the speed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class LinearDrag(Effect):
     name = "linear_drag"
     summary = "Resistance of a viscous fluid, or of the air to a slow and light body."
     formula = "a = -c u"
-    parameters = (EffectParameter("c", "1/s", scale=0.2, limit=20.0, nonnegative=True),)
+    parameters = (EffectParameter(name="c", unit="1/s", scale=0.2, limit=20.0, nonnegative=True),)
     phase = "flight"
     provides = ("drag",)
     reveals = "long free flight, at different speeds (against quadratic_drag) and directions (against wind)"

@@ -1,8 +1,8 @@
-"""Lift of a body that spins while it flies."""
+"""Magnus lift of a spinning body in flight."""
 
 from __future__ import annotations
 
-from ..rotation import cross
+from ...geometry.rotation import cross
 from .effect import BodyMotion, Effect, EffectParameter, Values, Wrench
 
 
@@ -12,7 +12,7 @@ class MagnusLift(Effect):
     name = "magnus_lift"
     summary = "Sideways force on a body that spins while it moves through the air."
     formula = "a = s omega x u"
-    parameters = (EffectParameter("s", "1", scale=0.02, limit=2.0),)
+    parameters = (EffectParameter(name="s", unit="1", scale=0.02, limit=2.0),)
     phase = "flight"
     needs = ("spin",)
     reveals = "fast free flight with fast spin across the path, both ways round"

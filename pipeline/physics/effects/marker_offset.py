@@ -1,10 +1,10 @@
-"""A tracked point beside the body frame's origin."""
+"""Offset of the tracked point from the body frame's origin."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from ..rotation import quat_rotate
+from ...geometry.rotation import quat_rotate
 from .effect import Effect, EffectParameter, Poses, Values, vector
 
 
@@ -14,7 +14,7 @@ class MarkerOffset(Effect):
     name = "marker_offset"
     summary = "A tracked point that is not the origin of the body's frame."
     formula = "p_measured = p + R (d_x, d_y, d_z), d in the body frame; the collision shape stays"
-    parameters = tuple(EffectParameter(f"d_{axis}", "m", scale=0.003, limit=0.05) for axis in "xyz")
+    parameters = tuple(EffectParameter(name=f"d_{axis}", unit="m", scale=0.003, limit=0.05) for axis in "xyz")
     phase = "measurement"
     needs = ("spin",)
     reveals = "free flight with fast spin about different axes, then rest on different sides (against com_offset)"

@@ -1,4 +1,4 @@
-"""Drag that grows with the square of the speed."""
+"""Drag that is quadratic in the speed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class QuadraticDrag(Effect):
     name = "quadratic_drag"
     summary = "Air resistance of a fast body."
     formula = "a = -k |u| u"
-    parameters = (EffectParameter("k", "1/m", scale=0.05, limit=5.0, nonnegative=True),)
+    parameters = (EffectParameter(name="k", unit="1/m", scale=0.05, limit=5.0, nonnegative=True),)
     phase = "flight"
     provides = ("drag",)
     reveals = "fast free flight, at different speeds"

@@ -1,4 +1,4 @@
-"""Which effects there are, and how one is found: built in, in a user's file, or in an installed package."""
+"""Registry of effects: built-in ones, ones in users' files, and ones of installed packages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ....schemas import UsageError, did_you_mean
 from .effect import Effect, EffectConstant, EffectParameter, Need, Phase
 
 GROUP = "cgwm.effects"
-"""Entry points of this group are effects of installed packages: a name, and `module:ClassName`."""
+"""Group of the entry points that declare effects of installed packages: a name, and `module:ClassName`."""
 BUILT_IN = (
     "linear_drag",
     "quadratic_drag",
@@ -45,7 +45,7 @@ BUILT_IN = (
     "time_offset",
     "marker_offset",
 )
-"""Each lies in the file of its name, as the class of that name in CamelCase."""
+"""Built-in effects; each is in the file of its name, as the class of that name in CamelCase."""
 FLIGHT_ALIASES: tuple[dict[str, str], ...] = (
     {
         "gravity_scale": "",
@@ -57,12 +57,13 @@ FLIGHT_ALIASES: tuple[dict[str, str], ...] = (
     {"gravity_tilt": "", "frame_tilt": "", "constant_force": "horizontal", "wind": "at a fixed drag"},
     {"com_offset": "", "marker_offset": ""},
 )
-"""Effects that are the same thing exactly in free flight alone, each with the condition under which it is."""
+"""Groups of effects that are equivalent in free flight, each with the condition for it."""
 CONTACT_ALIASES: tuple[frozenset[str], ...] = (
     frozenset({"gravity_scale", "buoyancy", "clock_scale", "constant_force"}),
 )
-"""Of these, those that rigid contact does not tell apart either: weight, and with it friction, scales alike."""
+"""Groups that are equivalent in rigid contact too, since weight and friction scale alike."""
 Units = Literal["group", "episode"]
+"""Scope of specific parameter values: a group of episodes, or one episode."""
 _HOOKS = ("world", "flow", "wrench", "contact", "times", "observe")
 
 
@@ -72,11 +73,11 @@ def effect_names() -> list[str]:
 
 
 def load_effect(spec: str) -> Effect:
-    """Return an effect; only the module that it lies in is imported.
+    """Load an effect, importing only its module.
 
     Args:
-        spec: The name of a built-in effect or of an entry point, or `path/to/file.py:ClassName`; with `@group` or
-            `@episode` behind it each session, or episode, has numbers of its own.
+        spec: Name of a built-in effect or of an entry point, or `path/to/file.py:ClassName`; the suffix `@group` or
+            `@episode` gives each group, or each episode, specific values of the parameters.
 
     Raises:
         UsageError: If there is no such effect, its file or class is missing or fails, or it is badly declared.
@@ -98,7 +99,7 @@ def load_effect(spec: str) -> Effect:
 
 
 def split_units(spec: str) -> tuple[str, Units | None]:
-    """Return what to load, and what has numbers of its own.
+    """Split a specification into the effect to load, and what has specific parameter values.
 
     >>> split_units("quadratic_drag@group"), split_units("wind")
     (('quadratic_drag', 'group'), ('wind', None))
@@ -112,7 +113,7 @@ def split_units(spec: str) -> tuple[str, Units | None]:
 
 
 def aliases(name: str) -> list[str]:
-    """Return what an effect cannot be told apart from in free flight alone, in words."""
+    """Return the effects that are equivalent to an effect in free flight, in words."""
     found = []
     for group in FLIGHT_ALIASES:
         if name in group:
@@ -179,7 +180,7 @@ def _from_package(spec: str) -> Any:
     except Exception as error:  # an installed package may raise anything
         raise UsageError(
             f"effect '{spec}' ({entry.value}): cannot be imported: {type(error).__name__}: {error}.",
-            todo="mend or remove the package that brings it.",
+            todo="repair or remove the package that provides it.",
         ) from error
 
 
@@ -198,7 +199,7 @@ def _checked(found: Any, spec: str) -> Effect:
 
 
 def _fault(kind: type[Effect]) -> str:
-    """Return what is wrong with a declaration, or nothing."""
+    """Return the fault of a declaration, empty for none."""
     for field in ("name", "summary", "formula", "reveals", "source"):
         text = getattr(kind, field, None)
         if not isinstance(text, str) or not text.strip():

@@ -1,22 +1,22 @@
-"""The constant wrench that a model lacks in a short window, whatever makes it."""
+"""Constant residual wrench that a model lacks in a short window, whatever its cause."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
-from .effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench, vector
+from .effect import BodyMotion, Effect, EffectParameter, Values, Wrench, vector
 
 AXES = ("a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 
 
 class ResidualWrench(Effect):
-    """a = (a_x, a_y, a_z), alpha = (alpha_x, alpha_y, alpha_z), world frame; no candidate for what is missing."""
+    """a = (a_x, a_y, a_z), alpha = (alpha_x, alpha_y, alpha_z), world frame; not a candidate for a missing effect."""
 
     name = "residual_wrench"
     summary = "A constant acceleration and angular acceleration."
     formula = "a = (a_x, a_y, a_z), alpha = (alpha_x, alpha_y, alpha_z), world frame"
     parameters = tuple(
-        EffectParameter(name, unit, scale=scale, limit=1e6)
+        EffectParameter(name=name, unit=unit, scale=scale, limit=1e6)
         for name, unit, scale in zip(AXES, ("m/s2",) * 3 + ("rad/s2",) * 3, (0.3,) * 3 + (3.0,) * 3, strict=True)
     )
     phase = "flight"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..contact import Touch
+from ..contact_law import Touch
 from .effect import Effect, EffectParameter, Values
 
 
@@ -14,7 +14,7 @@ class RollingResistance(Effect):
     name = "rolling_resistance"
     summary = "Resistance to rolling, of a soft ground or a soft body."
     formula = "torque = -c_r N omega_t / |omega_t|"
-    parameters = (EffectParameter("c_r", "m", scale=5e-4, limit=0.02, nonnegative=True),)
+    parameters = (EffectParameter(name="c_r", unit="m", scale=5e-4, limit=0.02, nonnegative=True),)
     phase = "contact"
     needs = ("contact",)
     reveals = "a long, slow roll to rest: deceleration (5/7) c_r g / r of a ball of radius r"

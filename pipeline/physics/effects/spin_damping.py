@@ -1,4 +1,4 @@
-"""Damping of a body's spin by the air."""
+"""Damping of spin by the air."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class SpinDamping(Effect):
     name = "spin_damping"
     summary = "Resistance of the air to spinning."
     formula = "alpha = -d omega"
-    parameters = (EffectParameter("d", "1/s", scale=0.2, limit=20.0, nonnegative=True),)
+    parameters = (EffectParameter(name="d", unit="1/s", scale=0.2, limit=20.0, nonnegative=True),)
     phase = "flight"
     needs = ("spin",)
     reveals = "long free flight with fast spin"

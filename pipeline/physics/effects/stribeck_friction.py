@@ -1,10 +1,10 @@
-"""Friction that changes with the speed of the slip."""
+"""Friction that changes with the slip speed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from ..contact import Touch
+from ..contact_law import Touch
 from .effect import Effect, EffectConstant, EffectParameter, Values, length
 
 
@@ -14,11 +14,11 @@ class StribeckFriction(Effect):
     name = "stribeck_friction"
     summary = "Friction that is higher (or lower) at slow slip than at fast."
     formula = "mu(v_t) = mu + d exp(-|v_t| / v_s), at least 0"
-    parameters = (EffectParameter("d", "1", scale=0.1, limit=2.0),)
+    parameters = (EffectParameter(name="d", unit="1", scale=0.1, limit=2.0),)
     constants = (EffectConstant("v_s", "m/s", (0.02, 0.05, 0.1, 0.2, 0.5)),)
     phase = "contact"
     needs = ("contact",)
-    reveals = "slides from different speeds down to rest: the last centimetres brake otherwise than the first"
+    reveals = "slides from different speeds down to rest: the deceleration changes over the last centimetres"
     source = "Stribeck 1902, in the exponential form of Bo and Pavelescu 1982"
 
     def contact(self, values: Values, touch: Touch) -> Touch:

@@ -1,8 +1,8 @@
-"""An effect of one's own for cgwm. It runs as it stands:  cgwm effects show FILE.py:MyEffect.
+"""Custom effect for cgwm, which runs unchanged:  cgwm effects show FILE.py:MyEffect.
 
 Change the name, the texts and the formula. Everything is torch on batches of n rollouts, so that derivatives flow
-through it: use no `if` on values, no `.item()`, no numpy. At the parameters' value 0 it must change nothing, and have
-a finite derivative there (of sqrt(x) there is none; `length` is a norm that has one).
+through it: use no `if` on values, no `.item()`, no numpy. With all parameters 0 the effect must change nothing, and
+have a finite derivative (sqrt(x) has none at 0; `length` is a norm that has one).
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ from .effect import BodyMotion, Effect, EffectConstant, EffectParameter, Values,
 
 
 class MyEffect(Effect):
-    """A spring to the vertical line through the world's origin, that lets go far from it."""
+    """Spring to the vertical line through the world's origin that vanishes far from it."""
 
     name = "my_effect"
     summary = "A pull towards the middle of the table."
     formula = "a = -w x exp(-(x^2 + y^2) / r^2), and the same for y"
-    # Scale: a magnitude that changes a motion of 1 s visibly; four of them are
-    # what a fit calls not observable. A parameter that is
-    # physically never negative says nonnegative=True.
-    parameters = (EffectParameter("w", "1/s2", scale=0.5, limit=50.0),)
-    # A number that means nothing where all parameters are 0 is no parameter, but is tried on a grid.
+    # Scale: a magnitude that changes a motion of 1 s visibly; a fit calls the parameter not observable where its
+    # standard error exceeds four scales. A parameter that is physically never negative has nonnegative=True.
+    parameters = (EffectParameter(name="w", unit="1/s2", scale=0.5, limit=50.0),)
+    # A value without meaning where all parameters are 0 is a constant, which a fit tries on a grid.
     constants = (EffectConstant("r", "m", (0.1, 0.2, 0.5)),)
     phase = "flight"  # or "contact", or "measurement": where it acts
     needs = ()  # of "ground", "drag", "contact", "spin", "driven"
@@ -40,9 +39,9 @@ class MyEffect(Effect):
         pull = -values["w"] * motion.mass * near
         return Wrench(force=torch.stack((pull * x, pull * y, torch.zeros_like(pull)), -1))
 
-    # The other methods, of which an effect may have any. What is not written stays as it is.
+    # The other methods; an effect may have any of them.
     #
-    # contact(self, values, touch): the contact with other numbers; called in every step for every pair that touches.
+    # contact(self, values, touch): the contact with other coefficients; called in every step for each touching pair.
     #     return dataclasses.replace(touch, friction=touch.friction + values["d"][:, None])
     # world(self, values, world): the world with other masses, geometry or gravity; called once for a rollout.
     #     return dataclasses.replace(world, gravity=world.gravity * (1 + values["s"])[:, None])

@@ -1,4 +1,4 @@
-"""A delay between the command and the measurement."""
+"""Delay between commands and measurements."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ class TimeOffset(Effect):
     name = "time_offset"
     summary = "Measurements that are late (or early) against the commands."
     formula = "t_measured = t_true + o, the commands on the true clock"
-    parameters = (EffectParameter("o", "s", scale=0.01, limit=0.2),)
+    parameters = (EffectParameter(name="o", unit="s", scale=0.01, limit=0.2),)
     phase = "measurement"
     needs = ("driven",)
     reveals = "sudden starts, stops and turns of a driven body that touches a free one"
-    source = "definition; without a command the same motion begins earlier or later, which nothing can see"
+    source = "definition; without a command the same motion begins earlier or later, which is not observable"
 
     def times(self, values: Values, times_s: Tensor) -> Tensor:
-        """Return the true times."""
+        """Return the true times (B, T) [s]."""
         return times_s - values["o"][:, None]

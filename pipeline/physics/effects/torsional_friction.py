@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..contact import Touch
+from ..contact_law import Touch
 from .effect import Effect, EffectParameter, Values
 
 
@@ -14,7 +14,7 @@ class TorsionalFriction(Effect):
     name = "torsional_friction"
     summary = "Friction against spinning on the spot, of a contact that is a small area."
     formula = "torque = -c_t N sign(omega_n) n"
-    parameters = (EffectParameter("c_t", "m", scale=5e-4, limit=0.02, nonnegative=True),)
+    parameters = (EffectParameter(name="c_t", unit="m", scale=5e-4, limit=0.02, nonnegative=True),)
     phase = "contact"
     needs = ("contact", "spin")
     reveals = "a ball or a rounded body that spins on the spot: it stops at c_t m g / I"

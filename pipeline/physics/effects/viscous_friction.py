@@ -1,10 +1,10 @@
-"""Friction that grows with the slip."""
+"""Friction that grows with the slip speed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from ..contact import Touch
+from ..contact_law import Touch
 from .effect import Effect, EffectParameter, Values
 
 
@@ -12,9 +12,9 @@ class ViscousFriction(Effect):
     """Force -c_v v_t, shared among the points that touch."""
 
     name = "viscous_friction"
-    summary = "Drag of a lubricant: a force that grows with the slip, beside Coulomb's."
+    summary = "Drag of a lubricant: a force that grows with the slip, in addition to Coulomb friction."
     formula = "force = -c_v v_t, shared among the points that touch"
-    parameters = (EffectParameter("c_v", "N s/m", scale=0.1, limit=20.0, nonnegative=True),)
+    parameters = (EffectParameter(name="c_v", unit="N s/m", scale=0.1, limit=20.0, nonnegative=True),)
     phase = "contact"
     needs = ("contact",)
     reveals = "long slides from different speeds: the deceleration falls with the speed"

@@ -1,4 +1,4 @@
-"""A steady wind."""
+"""Steady wind."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class Wind(Effect):
     summary = "A steady, horizontal flow of the air, felt through the drag in the model."
     formula = "u becomes u - w in the drag and the lift of the model; w = w_x e_x + w_y e_y"
     parameters = (
-        EffectParameter("w_x", "m/s", scale=1.0, limit=20.0),
-        EffectParameter("w_y", "m/s", scale=1.0, limit=20.0),
+        EffectParameter(name="w_x", unit="m/s", scale=1.0, limit=20.0),
+        EffectParameter(name="w_y", unit="m/s", scale=1.0, limit=20.0),
     )
     phase = "flight"
     needs = ("drag",)
@@ -23,10 +23,10 @@ class Wind(Effect):
     source = "Galilean invariance of the drag"
 
     def flow(self, values: Values, motion: BodyMotion) -> Tensor:
-        """Return the velocity of the air."""
+        """Return the velocity of the air (n or 1, 3) [m/s]."""
         return self.along(values, motion.up)
 
     @staticmethod
     def along(values: Values, up: Tensor) -> Tensor:
-        """Return the same for the upward direction (n or 1, 3)."""
+        """Return the velocity (n or 1, 3) [m/s] of the wind for an upward direction (n or 1, 3)."""
         return horizontal(vector(values, "w_x", "w_y"), up)

@@ -1,7 +1,7 @@
-"""The fused kernel on the CPU, where there is a C++ compiler: the same source, built once and kept, one thread a core.
+"""Fused kernel on the CPU: the CUDA source, built once by a C++ compiler and cached, one thread per core.
 
-It gives what the torch engine gives to rounding, in a tenth of the time: a step of the torch engine is a hundred
-operations on small tensors, each of which costs more to begin than to do.
+Its results equal those of the torch engine up to rounding, in a tenth of the time: a step of the torch engine takes a
+hundred operations on small tensors, each of which is dominated by its overhead.
 """
 
 from __future__ import annotations
@@ -17,60 +17,35 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from ... import kernel_cache
-from ...compiler import compiler
-from ...threads import kernel_threads
-from ..driven import Drive
+from ....schemas import UsageError
+from ...runtime import kernel_build
+from ...runtime.kernel_build import compiler
+from ...runtime.resources import kernel_threads
+from ..kinematic import Drive
 from ..rollout import Rollout
 from ..world import State, World
 from .packing import reason_against
 from .rollout import roll
-from .structure import Structure
+from .structure import Structure, kernel_file
 
 if TYPE_CHECKING:
-    from ....datasets.tracks import Track
+    from ....datasets.capture.tracks import Track
 
 FLAGS = ("-std=c++17", "-O2", "-shared", "-fPIC", "-pthread", "-ffp-contract=off", "-w")
-"""Nothing that lets the compiler reorder sums, or use what only this processor has: what is kept serves others too."""
+"""Compiler options: no reordering of sums, and no instructions of this processor only, as others read the cache too."""
 BUILD_S = 120.0
-"""A compiler that takes longer is given up."""
+"""Time limit of the compiler [s]."""
+NO_COMPILER = "there is no C++ compiler (g++, clang++ or c++)"
 THREAD_ROLLOUTS = 16
-"""Fewer rollouts than this are not worth a thread."""
-
-_SHIM = """
-#include <atomic>
-#include <cmath>
-#include <thread>
-#include <vector>
-#define __device__
-#define __restrict__ __restrict
-"""
-_ENTRY = """
-extern "C" void run(int threads, PARAMETERS) {
-    const Problem problem = PROBLEM;
-    std::atomic<int> next(0);
-    auto work = [&]() {
-        for (int first; (first = next.fetch_add(8)) < environments;) {
-            for (int index = first; index < first + 8 && index < environments; index++) {
-                Lanes lanes = {0, false};
-                roll(problem, index, lanes);
-            }
-        }
-    };
-    std::vector<std::thread> others;
-    for (int k = 1; k < threads; k++) others.emplace_back(work);
-    work();
-    for (std::thread& other : others) other.join();
-}
-"""
+"""Minimum number of rollouts per thread."""
 
 
 def lacking(world: World) -> str | None:
-    """Return why the kernel cannot take a world on the CPU; None where it can."""
+    """Return why the kernel does not support a world on the CPU; None where it does."""
     if world.gravity.device.type != "cpu":
         return f"its tensors are on the device '{world.gravity.device.type}', not on the CPU"
     if compiler() is None:
-        return "there is no C++ compiler (g++, clang++ or c++)"
+        return NO_COMPILER
     return reason_against(world) or _trial()
 
 
@@ -81,11 +56,11 @@ def simulate_on_host(
     driven: Mapping[str, Track | Drive] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
-    """Do what `simulate_fused` does, for tensors on the CPU.
+    """Simulate a world by the fused kernel, for tensors on the CPU; arguments as in `simulate_fused`.
 
     Raises:
         InputDataError: As `simulate` does.
-        UsageError: If a reverse derivative is asked for.
+        UsageError: If a reverse derivative is requested.
     """
     return roll(_launch, world, state, times_s, driven, record_contacts, lanes=1)
 
@@ -98,32 +73,33 @@ def _launch(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: t
 
 @cache
 def _library(structure: Structure) -> ctypes.CDLL:
-    return _built(_SHIM + structure.source(host=True) + _ENTRY)
+    return _built(kernel_file("host_prelude") + structure.source(host=True) + kernel_file("host_entry"))
 
 
 @cache
 def _trial() -> str | None:
-    """Return why the compiler builds nothing that can be loaded; None where it does."""
+    """Return why the compiler cannot build a library that loads; None where it can."""
     try:
         _built('extern "C" int answer() { return 42; }')
     except (OSError, subprocess.SubprocessError) as error:
-        said = error.stderr if isinstance(error, subprocess.CalledProcessError) else ""
-        return f"the C++ compiler {compiler()} failed: {(said or str(error)).strip().splitlines()[-1]}"
+        message = error.stderr if isinstance(error, subprocess.CalledProcessError) else ""
+        return f"the C++ compiler {compiler()} failed: {(message or str(error)).strip().splitlines()[-1]}"
     return None
 
 
 def _built(source: str) -> ctypes.CDLL:
-    """Build a source, or take what an earlier run built of it."""
+    """Return the library of a source, built now or by an earlier process."""
     command = compiler()
-    assert command is not None  # see lacking
+    if command is None:
+        raise UsageError(f"{NO_COMPILER}.", todo="use simulate, which needs none.")
 
     def build(work: Path) -> Path:
         program, library = work / "rollout.cpp", work / "rollout.so"
         program.write_text(source, encoding="utf-8")
         steps = [command, *FLAGS, str(program), "-o", str(library)]
-        own = os.environ | {"TMPDIR": str(work)}
-        subprocess.run(steps, check=True, capture_output=True, text=True, timeout=BUILD_S, env=own)
+        environment = os.environ | {"TMPDIR": str(work)}
+        subprocess.run(steps, check=True, capture_output=True, text=True, timeout=BUILD_S, env=environment)
         return library
 
     recipe = "\n".join((command, platform.machine(), str(Path(command).stat().st_mtime_ns), *FLAGS, source))
-    return kernel_cache.built(recipe, ".so", build, lambda library: ctypes.CDLL(str(library)))
+    return kernel_build.built(recipe, ".so", build, lambda library: ctypes.CDLL(str(library)))

@@ -1,4 +1,4 @@
-"""A world, its start and its commands as the arrays that a fused kernel reads."""
+"""Layout of a world, its initial state and its commands as the input arrays of a fused kernel."""
 
 from __future__ import annotations
 
@@ -9,44 +9,50 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..contact import ContactLaw, coefficients
-from ..detection import GROUND, pairs_of, slot_count
-from ..driven import Drive
-from ..motion import start
-from ..rotation import quat_multiply, quat_normalize, quat_rotate
+from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
+from ..contact_detection import GROUND, pairs_of, slot_count
+from ..contact_law import ContactLaw, coefficients
+from ..kinematic import Drive
+from ..rigid_body import start
 from ..world import Body, State, World
 from . import wrenches
 from .structure import Structure
 
 if TYPE_CHECKING:
-    from ....datasets.tracks import Track
+    from ....datasets.capture.tracks import Track
 
 MOST_CONTACTS = 4096
+"""Maximum number of possible contacts of an environment."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Packed:
-    """The inputs of a kernel, in the frame whose z axis is the ground's normal.
-
-    table, steps, geometry, drives: as `Problem` in the source names them; they carry the derivatives. substeps
-    (T - 1,), spheres (C,), drive_starts, drive_last: int32. turn (4,): the rotation from the world into that frame;
-    None where they are one.
-    """
+    """Inputs of a kernel, in the frame whose z axis is the ground's normal; floating-point ones carry derivatives."""
 
     structure: Structure
+    """Constants of the kernel."""
     table: Tensor
+    """Values of each environment, shape (B, columns)."""
     steps: Tensor
+    """Step [s], stiffness, damping and start time [s] of each interval, shape (1 or B, intervals, 4)."""
     geometry: Tensor
+    """Centres in the body frame and radii of the spheres [m], shape (1 or B, spheres, 4)."""
     drives: Tensor
+    """Samples of the commands, shape (1 or B, samples, 14)."""
     substeps: Tensor
+    """Steps of each interval, int32, shape (T - 1,)."""
     spheres: Tensor
+    """Row of the sphere of each contact, int32, shape (C,)."""
     drive_starts: Tensor
+    """First sample of each command, int32, shape (commands,)."""
     drive_last: Tensor
+    """Index of the last interval of each command, int32, shape (1 or B, commands)."""
     turn: Tensor | None
+    """Rotation from the world into the kernel's frame, quaternion, shape (4,); None where they are equal."""
 
 
 def reason_against(world: World) -> str | None:
-    """Return why no kernel can take a world, on any device; None where one can."""
+    """Return why the kernel does not support a world on any device; None where it does."""
     tensors = [world.gravity, *(getattr(body, name) for body in world.bodies for name in ("mass", "com", "centers"))]
     kinds = {tensor.dtype for tensor in tensors}
     if len(kinds) > 1 or kinds - {torch.float32, torch.float64}:
@@ -69,9 +75,9 @@ def pack(
     driven: Mapping[str, Track | Drive],
     record: bool,
 ) -> Packed:
-    """Lay out the arguments of `simulate_fused`, for one thread and no derivative; derivatives flow through.
+    """Pack the arguments of `simulate_fused`, for one thread per environment; derivatives flow through.
 
-    The effects have changed the world already.
+    The world has been changed by its effects already.
 
     Raises:
         InputDataError: If a driven body has no track.
@@ -85,10 +91,9 @@ def pack(
     turned = turn is not None and len(world.bodies) > 1
     columns = _columns(world, state, turn, turned, effects)
     spheres = [_spheres(body) for body in world.bodies]
-    law, substeps = world.contact, world.substeps(times)
-    assert isinstance(law, ContactLaw)  # see reason_against
-    numbers = torch.tensor(substeps, dtype=torch.int32, device=times.device)
-    steps = _steps(law, times, numbers)
+    law, substeps = wrenches.closed_form(world), world.substeps(times)
+    counts = torch.tensor(substeps, dtype=torch.int32, device=times.device)
+    steps = _steps(law, times, counts)
     batch = max(
         x.shape[0]
         for x in (*columns, *spheres, steps, *(x for row in rows.values() for x in row))
@@ -100,30 +105,40 @@ def pack(
     if wrenches.takes_heights(world):
         listed, lowest = _with_lowest(world, starts, listed)
     structure = Structure(
-        single, False, 1, record, bool(effects), wrenches.magnets(world), wrenches.is_twisted(world), turned,
-        tuple(body.free for body in world.bodies),
-        tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
-        tuple(body.radii.shape[-1] for body in world.bodies), pairs, lowest,
-        surface=wrenches.has_surface(world), elliptic=wrenches.has_ellipse(world),
-    )  # fmt: skip
+        single=single,
+        dual=False,
+        lanes=1,
+        record=record,
+        effects=bool(effects),
+        magnets=wrenches.magnets(world),
+        twisted=wrenches.is_twisted(world),
+        turned=turned,
+        free=tuple(body.free for body in world.bodies),
+        drives=tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
+        spheres=tuple(body.radii.shape[-1] for body in world.bodies),
+        pairs=pairs,
+        lowest=lowest,
+        surface=wrenches.has_surface(world),
+        elliptic=wrenches.has_ellipse(world),
+    )
     return Packed(
-        structure,
-        torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
-        steps,
-        _joined(spheres, batch),
-        _joined([row for row, _ in rows.values()], batch) if rows else times.new_zeros(1, 0, 14),
-        numbers,
-        listed,
-        _drive_starts(rows, times),
-        _joined([last[:, None] for _, last in rows.values()], batch).to(torch.int32)
+        structure=structure,
+        table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
+        steps=steps,
+        geometry=_joined(spheres, batch),
+        drives=_joined([row for row, _ in rows.values()], batch) if rows else times.new_zeros(1, 0, 14),
+        substeps=counts,
+        spheres=listed,
+        drive_starts=_drive_starts(rows, times),
+        drive_last=_joined([last[:, None] for _, last in rows.values()], batch).to(torch.int32)
         if rows
-        else numbers.new_zeros(1, 0),
-        turn,
+        else counts.new_zeros(1, 0),
+        turn=turn,
     )
 
 
 def _steps(law: ContactLaw, times: Tensor, substeps: Tensor) -> Tensor:
-    """Return (1 or B, intervals, 4): step, stiffness, damping, time at the start; one row of zeros and time without."""
+    """Return step, stiffness, damping and start time of the intervals (1 or B, intervals, 4); one row for none."""
     if times.shape[1] == 1:
         return torch.cat((torch.zeros_like(times).expand(times.shape[0], 3), times), -1)[:, None]
     h = times.diff(dim=1) / substeps
@@ -132,7 +147,7 @@ def _steps(law: ContactLaw, times: Tensor, substeps: Tensor) -> Tensor:
 
 
 def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effects: list[Tensor]) -> list[Tensor]:
-    """Return the columns of the table: those of the world, then those of each body."""
+    """Return the columns of the table: first those of the world, then those of each body."""
     zero = torch.zeros_like(world.gravity[:, :1])
     offset = zero if world.ground_offset is None else world.ground_offset[:, None]
     columns = [_turned(turn, world.gravity), offset, world.contact.friction[:, None]]
@@ -156,7 +171,7 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
 
 
 def drive_rows(drive: Drive, turn: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return a command for the kernel: its samples (1 or B, S, 14) and the index of the last interval (1 or B,)."""
+    """Return the samples (1 or B, S, 14) of a command, and the index of its last interval (1 or B,)."""
     # the velocities go from a sample to the next; the last sample has none
     parts = (
         drive.times_s[..., None], _turned(turn, drive.position_m), _turned_quat(turn, drive.quat_wxyz),
@@ -172,13 +187,13 @@ def _drive_starts(rows: Mapping[int, tuple[Tensor, Tensor]], like: Tensor) -> Te
 
 
 def _spheres(body: Body) -> Tensor:
-    """Return centres and radii (1 or B, N, 4); an effect may give centres of each item's own, and leave the radii."""
+    """Return centres and radii (1 or B, N, 4) [m]; effects may give each item other centres with common radii."""
     batch = max(body.centers.shape[0], body.radii.shape[0])
     return torch.cat((body.centers.expand(batch, -1, -1), body.radii.expand(batch, -1)[..., None]), -1)
 
 
 def _contact_spheres(world: World, starts: list[int]) -> Tensor:
-    """Return for each contact (C,) the row of its sphere."""
+    """Return the row of the sphere of each contact, shape (C,)."""
     parts = [torch.zeros(0, dtype=torch.int64, device=world.gravity.device)]
     for a, b in pairs_of(world):
         on_plane = world.bodies[a].on_plane if b == GROUND else None
@@ -193,9 +208,9 @@ def _rows(body: Body, chosen: Tensor | None, start: int) -> Tensor:
 
 
 def _with_lowest(world: World, starts: list[int], listed: Tensor) -> tuple[Tensor, tuple[tuple[int, int], ...]]:
-    """Return the list of spheres, and where in it those are that may be the lowest of each body, and how many.
+    """Return the list of spheres with candidates for the lowest one of each body, and their first row and number.
 
-    They are those of the contacts with the ground; of bodies that touch nothing they are added at the end.
+    The candidates are the spheres that can touch the ground; those of bodies without contact are appended.
     """
     pairs, lowest, begin = pairs_of(world), [], 0
     within = {}
@@ -215,7 +230,7 @@ def _with_lowest(world: World, starts: list[int], listed: Tensor) -> tuple[Tenso
 
 
 def _joined(parts: list[Tensor], batch: int) -> Tensor:
-    """Concatenate along the second dimension; the first is 1 where it is 1 for all, else the batch."""
+    """Concatenate along the second dimension; the first is 1 where it is 1 for all parts, else the batch."""
     shared = all(part.shape[0] == 1 for part in parts)
     return torch.cat([part if shared else part.expand(batch, *part.shape[1:]) for part in parts], 1)
 

@@ -1,4 +1,4 @@
-"""Rollouts by the fused kernel: what `simulate` does, for CUDA tensors."""
+"""Simulation of a world by the fused kernel on CUDA."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ....schemas import UsageError
-from ... import nvrtc
+from ...geometry.rotation import quat_conjugate, quat_multiply, quat_rotate
+from ...runtime import kernel_build
 from ..checks import require_physical, require_state
-from ..driven import Drive
+from ..contact_record import ContactRecord
 from ..effects.effect import changed_by_effects
-from ..records import ContactRecord
+from ..kinematic import Drive
 from ..rollout import Rollout
-from ..rotation import quat_conjugate, quat_multiply, quat_rotate
 from ..world import State, World
 from .launch import launch, launch_away
 from .packing import Packed, pack, reason_against
 from .structure import Structure, lanes_for
 
 if TYPE_CHECKING:
-    from ....datasets.tracks import Track
+    from ....datasets.capture.tracks import Track
 
 Launch = Callable[[Structure, tuple[Tensor | None, ...], tuple[int, ...]], None]
 
@@ -32,11 +32,11 @@ FRAME_WIDTH, _LABEL_WIDTH = 16, 12
 
 
 def unsupported(world: World) -> str | None:
-    """Return why the fused kernel cannot take a world, which lies or rolls on CUDA; None where it can."""
+    """Return why the fused kernel does not support a world on CUDA; None where it does."""
     if "cuda" not in (world.rolls_on, world.gravity.device.type):
         return f"its tensors are on the device '{world.gravity.device.type}', not on CUDA"
-    if not nvrtc.available():
-        return "cuda.core is not installed, which compiles the kernel (pip install 'cgwm[gpu]')"
+    if not kernel_build.available():
+        return "cuda.core is not installed, which compiles the kernel (pip install cuda-core)"
     return reason_against(world)
 
 
@@ -48,12 +48,12 @@ def simulate_fused(
     record_contacts: bool = False,
     lanes: int | None = None,
 ) -> Rollout:
-    """Roll the world out from `state` in one kernel, as `simulate` does; all tensors on one CUDA device, or on the CPU.
+    """Simulate a world in one kernel, as `simulate` does, for tensors on one CUDA device or on the CPU.
 
-    A world on the CPU that rolls on CUDA (`World.rolls_on`) is packed on the CPU and sent in one piece.
+    A world on the CPU with `World.rolls_on` CUDA is packed on the CPU and copied in one piece.
 
     Forward derivatives (`forward_ad`, `batched_jacobian`) of poses and velocities are exact: the same program runs on
-    dual numbers. There are none of the contact record, and none in reverse.
+    dual numbers. The contact record has no derivatives, and reverse derivatives are not supported.
 
     Args:
         world: The world; its tensors and the state's broadcast over the batch B.
@@ -61,14 +61,14 @@ def simulate_fused(
         times_s: Frame times [s], increasing, shape (T,) or (B, T).
         driven: The command of each driven body: a track, or a prepared `Drive`.
         record_contacts: Whether to keep the contacts of every frame.
-        lanes: Threads that share an environment, a power of two up to 32; None chooses.
+        lanes: Threads per environment, a power of two up to 32; None for the default.
 
     Returns:
         The rollout at the frame times.
 
     Raises:
         InputDataError: As `simulate` does.
-        UsageError: If the kernel cannot take the world, or a reverse derivative is asked for.
+        UsageError: If the kernel does not support the world, or a reverse derivative is requested.
     """
     reason = unsupported(world)
     if reason is not None:
@@ -86,13 +86,13 @@ def roll(
     record_contacts: bool = False,
     lanes: int | None = None,
 ) -> Rollout:
-    """Do the work of `simulate_fused` with the given way to run the kernel."""
+    """Check and pack the arguments of `simulate_fused`, run the kernel by `run`, and return the rollout."""
     require_one_kind(world.gravity, *vars(state).values(), times_s)
     require_physical(world)
     require_state(state, world.body_names)
     world = changed_by_effects(world)
     if world.effects:
-        require_physical(world)  # an effect may have made a body that cannot be
+        require_physical(world)  # an effect may give a body an impossible inertia
     packed = pack(world, state, times_s, driven or {}, record_contacts)
     inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
     require_one_kind(*inputs)
@@ -125,7 +125,7 @@ def roll(
 
 
 def require_one_kind(*tensors: Tensor) -> None:
-    """Check that tensors have one type and lie on one device.
+    """Check that tensors share one type and one device.
 
     Raises:
         UsageError: If they do not.
@@ -137,7 +137,7 @@ def require_one_kind(*tensors: Tensor) -> None:
 
 
 def read_frames(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labels: Tensor | None) -> Rollout:
-    """Return what a kernel wrote: frames (B, T, nb, 16) and labels (B, T, contacts, 12), in the world's frame."""
+    """Return the rollout from the output of a kernel: frames (B, T, nb, 16) and labels (B, T, contacts, 12)."""
     position, quat, velocity = frames[..., :3], frames[..., 4:8], frames[..., 8:11]
     back = None if packed.turn is None else quat_conjugate(packed.turn)
     if back is not None:
@@ -151,5 +151,20 @@ def read_frames(world: World, times_s: Tensor, packed: Packed, frames: Tensor, l
         pairs = packed.structure.pairs
         body_a = torch.tensor([a for a, _, count in pairs for _ in range(count)])
         body_b = torch.tensor([b for _, b, count in pairs for _ in range(count)])
-        contacts = ContactRecord(body_a, body_b, impulse, place, normal, labels[..., 3], labels[..., 7] > 0.5)
-    return Rollout(times_s, position, quat, velocity, frames[..., 12:15], contacts)
+        contacts = ContactRecord(
+            body_a=body_a,
+            body_b=body_b,
+            impulse_n_s=impulse,
+            position_m=place,
+            normal=normal,
+            distance_m=labels[..., 3],
+            sliding=labels[..., 7] > 0.5,
+        )
+    return Rollout(
+        times_s=times_s,
+        position_m=position,
+        quat_wxyz=quat,
+        velocity_m_s=velocity,
+        omega_body_rad_s=frames[..., 12:15],
+        contacts=contacts,
+    )

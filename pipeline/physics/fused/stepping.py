@@ -1,4 +1,4 @@
-"""A world that the fused kernel takes on by one interval a launch, its arrays kept on the device in between."""
+"""Stepwise simulation by the fused kernel: one launch per interval, with arrays that stay on the device."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ....schemas import UsageError
 from ..checks import require_physical, require_state
-from ..driven import Drive
 from ..effects.effect import changed_by_effects
+from ..kinematic import Drive
 from ..world import State, World
 from .launch import launch
 from .packing import Packed, drive_rows, pack
@@ -20,20 +20,20 @@ from .structure import BODY_COLUMNS, MOTION_COLUMNS, lanes_for
 
 
 class FusedStepper:
-    """A `Stepper` by one launch of the kernel an interval.
+    """`Stepper` that launches the fused kernel once per interval.
 
-    What a rollout keeps from step to step (motions, and the contacts' impulses from which the next sweeps begin) stays
-    in an array on the device, so that nothing is packed anew. `advance` neither allocates outside of torch's caches nor
-    waits for the device: a CUDA graph can capture it.
+    The state between steps (motions, and the contact impulses that warm-start the solver) stays in an array on the
+    device, so that nothing is packed again. `advance` neither allocates outside of torch's caches nor waits for
+    the device: a CUDA graph can capture it.
 
     Args:
-        world: The world, of one environment, on a CUDA device.
+        world: The world, with a batch of one, on a CUDA device.
         interval_s: Length of an interval [s].
-        run: How to launch the kernel.
+        run: Function that launches the kernel; None for `launch`.
 
     Raises:
-        UsageError: If the kernel cannot take the world.
-        InputDataError: If masses, inertias, contact numbers or the step cannot be simulated.
+        UsageError: If the kernel does not support the world.
+        InputDataError: If masses, inertias, contact coefficients or the step cannot be simulated.
     """
 
     def __init__(self, world: World, interval_s: float, run: Launch | None = None) -> None:
@@ -43,14 +43,14 @@ class FusedStepper:
         require_physical(world)
         self._world = changed_by_effects(world)
         if world.effects:
-            require_physical(self._world)  # an effect may have made a body that cannot be
+            require_physical(self._world)  # an effect may give a body an impossible inertia
         self._run = run or launch
         self._times = torch.tensor([[0.0, interval_s]], dtype=torch.float64).to(world.gravity)
         self._driven = [body.name for body in world.bodies if body.motion == "driven"]
         self._resident: _Resident | None = None
 
     def reset(self, state: State, drives: Mapping[str, Drive]) -> None:
-        """See :class:`Stepper`; the state lies on the world's device and has its type, the drives lie on the CPU."""
+        """See :class:`Stepper`; the state has the device and type of the world, the drives are on the CPU."""
         like = self._world.gravity
         require_one_kind(like, *vars(state).values())
         require_state(state, self._world.body_names)
@@ -65,17 +65,15 @@ class FusedStepper:
         self.command(drives)
 
     def command(self, drives: Mapping[str, Drive]) -> None:
-        """See :class:`Stepper`; the drives lie on the CPU, and the interval before is over (the copy may be read)."""
-        resident = self._resident
-        assert resident is not None  # see reset
+        """See :class:`Stepper`; drives lie on the CPU, and the previous interval must have ended."""
+        resident = self._started()
         if self._driven:
             resident.sent.copy_(torch.cat([drive_rows(drives[name], resident.turn)[0] for name in self._driven], 1))
             resident.packed.drives.copy_(resident.sent, non_blocking=True)
 
     def advance(self) -> State:
         """See :class:`Stepper`; the next call overwrites the state."""
-        resident = self._resident
-        assert resident is not None  # see reset
+        resident = self._started()
         packed = resident.packed
         pointers = (packed.table, None, packed.steps, None, packed.geometry, None, packed.drives, None)
         pointers += (packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last)
@@ -85,20 +83,26 @@ class FusedStepper:
         last = read_frames(self._world, self._times, packed, resident.frames, None)
         return State(*(getattr(last, name)[:, -1] for name in State.__dataclass_fields__))
 
+    def _started(self) -> _Resident:
+        if self._resident is None:
+            raise UsageError("the stepper has no state yet.", todo="call reset first.")
+        return self._resident
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class _Resident:
-    """What stays where it is, so that a CUDA graph can read it.
-
-    packed: the inputs; turn: theirs, on the CPU; sent: commands on their way to the device; frames (1, 2, nb, 16);
-    carried (1, lanes, numbers): see `resume` in the source.
-    """
+    """Arrays at fixed addresses, so that a CUDA graph can read them."""
 
     packed: Packed
+    """Inputs of the kernel."""
     turn: Tensor | None
+    """Rotation of the kernel's frame, on the CPU; see `Packed.turn`."""
     sent: Tensor
+    """Commands on their way to the device, pinned memory."""
     frames: Tensor
+    """Frames that the kernel writes, shape (1, 2, nb, 16)."""
     carried: Tensor
+    """State between launches, see `resume` in `kernels/environment.cuh`, shape (1, lanes, values)."""
 
     @staticmethod
     def of(packed: Packed) -> _Resident:
@@ -108,9 +112,9 @@ class _Resident:
         arrays = {name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "drives")}
         drives = arrays["drives"]
         return _Resident(
-            replace(packed, structure=structure, **arrays),
-            None if packed.turn is None else packed.turn.cpu(),
-            torch.empty(drives.shape, dtype=drives.dtype, pin_memory=drives.is_cuda and drives.numel() > 0),
-            drives.new_empty(1, 2, bodies, FRAME_WIDTH),
-            drives.new_zeros(1, lanes, structure.carried_width),
+            packed=replace(packed, structure=structure, **arrays),
+            turn=None if packed.turn is None else packed.turn.cpu(),
+            sent=torch.empty(drives.shape, dtype=drives.dtype, pin_memory=drives.is_cuda and drives.numel() > 0),
+            frames=drives.new_empty(1, 2, bodies, FRAME_WIDTH),
+            carried=drives.new_zeros(1, lanes, structure.carried_width),
         )

@@ -1,96 +1,88 @@
-"""What a fused kernel is compiled for: the constants of one kind of world."""
+"""Compile-time constants of a fused kernel, and its composed source."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from ..detection import PAIR_SMOOTHING_M
-from ..ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
-from ..sweeps import CONTACT_ONSET_M
-from .arithmetic_source import ARITHMETIC
-from .collision_source import COLLISION
-from .contact_source import CONTACTS
-from .environment_source import ENVIRONMENT
-from .rollout_source import ROLLOUT
-from .surface_source import SURFACE
+from ...runtime import kernel_build
+from ..contact_detection import PAIR_SMOOTHING_M
+from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
+from ..impulse_solver import CONTACT_ONSET_M
 
 THREADS = 32
-"""Of a block: one warp, so that few environments still spread over all multiprocessors."""
+"""Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
 BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 2, 22
 TURN_COLUMNS, WORLD_COLUMNS = 4, 5
+"""Columns of the table of environments, by subject, as `load` in `kernels/environment.cuh` reads them."""
 MOTION_COLUMNS = 13
-"""The last ones of a body: position, orientation, velocity and spin."""
+"""Last columns of a body: position, orientation, velocity and spin."""
 _BUSY_THREADS = 262_144
-"""With so many threads an H200 is busy; more environments need fewer threads each."""
+"""Number of threads that fill an H200; more environments get fewer threads each."""
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
-"""How many contacts fit into a thread's registers, by (single precision, with derivatives)."""
+"""Number of contacts that fit into the registers of a thread, by (single precision, with derivatives)."""
 
-_LANGUAGE = """
-#if HOST
-#define INLINE inline
-#define EACH_BODY
-#define EACH_SLOT
-#define EACH_PAIR
-#define KEEP_LOOP
-#else
-#define INLINE __device__ __forceinline__
-#define EACH_BODY _Pragma("unroll")
-#define EACH_PAIR _Pragma("unroll 1")
-#if UNROLLED
-#define EACH_SLOT _Pragma("unroll")
-#else
-#define EACH_SLOT _Pragma("unroll 1")
-#endif
-#define KEEP_LOOP _Pragma("unroll 1")
-#endif
-"""
+_FILES = (
+    "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
+    "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
+    "contacts",  # contacts with ground and unions of spheres: contact_detection, impulse_solver, smooth_distance
+    "environment",  # what the kernel is given, and the state of an environment read from it
+    "collision",  # flight, and the contacts of a step with their impulses: formulas of rigid_body and contact_solver
+    "rollout",  # an environment from its first frame to its last, and what is written of it
+)
+"""Files of `kernels/` in the order in which they are compiled, after `language`, with the origin of their formulas."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Structure:
-    """The constants of a kernel.
-
-    single: float32, else float64; dual: with a derivative in one direction; lanes: threads of an environment, a power
-    of two up to 32; record: labels of contacts; effects: accelerations besides gravity; magnets: how many of them
-    are the ground's pull; twisted: whether there is a constant angular one; turned: whether the frame of bodies that
-    touch each other is not the world's; free (bodies,); drives (bodies,): number of the drive, -1 without; spheres
-    (bodies,): how many; pairs: bodies that may touch, -1 for the ground, each with its number of contacts; lowest
-    (bodies,): first row and number of the spheres whose heights count, where heights do; carried: whether each launch
-    goes on where the one before ended; surface: effects of the contact of one body with the ground; elliptic: one of
-    them is friction that depends on the direction.
-    """
+    """Compile-time constants of a kernel, from which its source is composed."""
 
     single: bool
+    """Whether to compute in float32; else float64."""
     dual: bool
+    """Whether to compute a derivative in one direction."""
     lanes: int
+    """Threads per environment, a power of two up to 32."""
     record: bool
+    """Whether to write contact labels."""
     effects: bool
+    """Whether there are accelerations in addition to gravity."""
     magnets: int
+    """Number of attractions by the ground."""
     twisted: bool
+    """Whether a constant angular acceleration acts."""
     turned: bool
+    """Whether the frame of bodies that touch each other differs from the world frame."""
     free: tuple[bool, ...]
+    """Whether each body moves freely, shape (bodies,)."""
     drives: tuple[int, ...]
+    """Number of each body's command, -1 without, shape (bodies,)."""
     spheres: tuple[int, ...]
+    """Number of spheres of each body, shape (bodies,)."""
     pairs: tuple[tuple[int, int, int], ...]
+    """Pairs of bodies that may touch, -1 for the ground, each with its number of contacts."""
     lowest: tuple[tuple[int, int], ...] = ()
+    """First row and number of each body's spheres whose heights count; empty where heights do not."""
     carried: bool = False
+    """Whether each launch continues where the previous one ended."""
     surface: bool = False
+    """Whether effects act on the contact of one body with the ground."""
     elliptic: bool = False
+    """Whether friction depends on the direction."""
 
     @property
     def contacts(self) -> int:
-        """How many contacts an environment may have."""
+        """Number of contacts that an environment may have."""
         return sum(count for _, _, count in self.pairs)
 
     @property
     def slots(self) -> int:
-        """How many of them each thread takes."""
+        """Number of contacts per thread."""
         return max(1, -(-self.contacts // self.lanes))
 
     @property
     def table_width(self) -> int:
-        """Numbers of an environment."""
+        """Number of columns of the table of environments."""
         world = WORLD_COLUMNS + self.turned * TURN_COLUMNS
         world += self.effects * WRENCH_COLUMNS + self.twisted * TWIST_COLUMNS + self.magnets * MAGNET_COLUMNS
         world += self.surface * SURFACE_COLUMNS
@@ -98,11 +90,11 @@ class Structure:
 
     @property
     def carried_width(self) -> int:
-        """Numbers that each thread hands to the next launch: motions of the bodies, impulses, whether any acts."""
+        """Number of values that each thread keeps for the next launch: motions, impulses, and whether any acts."""
         return len(self.free) * MOTION_COLUMNS + 3 * self.slots + 1
 
     def source(self, host: bool = False) -> str:
-        """Return the program; for the host, without the kernel's entry."""
+        """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry."""
         paired = len(self.free) > 1
         unrolled = self.slots <= _FREE_SLOTS[True, False]
         # the sums of labels take the registers of eight spheres
@@ -128,12 +120,16 @@ class Structure:
             "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]
-        parts = (ARITHMETIC, SURFACE, CONTACTS, ENVIRONMENT, COLLISION, ROLLOUT)
-        return "\n".join((*lines, _LANGUAGE, *functions, *parts))
+        return "\n".join((*lines, kernel_file("language"), *functions, *map(kernel_file, _FILES)))
+
+
+def kernel_file(name: str) -> str:
+    """Return the text of a file of `kernels/` after an empty line."""
+    return "\n" + kernel_build.source_file(__name__, f"kernels/{name}.cuh")
 
 
 def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool) -> int:
-    """Return how many threads should share an environment."""
+    """Return the number of threads that should share an environment, a power of two up to 32."""
     wanted = min(contacts, 32) if paired else min(contacts, _BUSY_THREADS // max(1, environments))
     wanted = max(wanted, -(-contacts // _FREE_SLOTS[single, dual]), 1)
     lanes = 1
@@ -147,6 +143,6 @@ def _starts(counts: Sequence[int]) -> list[int]:
 
 
 def _function(name: str, values: Iterable[int]) -> str:
-    """Return a list as a function, which the compiler resolves where the index is known."""
+    """Return the source of a function that looks up a list, which the compiler resolves for a known index."""
     cases = "".join(f"i == {index} ? {int(value)} : " for index, value in enumerate(values))
     return f"INLINE int {name}(int i) {{ return {cases}0; }}"

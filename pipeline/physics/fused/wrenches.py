@@ -1,4 +1,4 @@
-"""The effects of a world that the fused kernel knows: coefficients of accelerations in flight, and of the contact."""
+"""Effects that the fused kernel supports: their coefficients in flight and in contact."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..contact import ContactLaw
+from ....schemas import UsageError
+from ..contact_law import ContactLaw
 from ..effects.adhesion import Adhesion
 from ..effects.anisotropic_friction import AnisotropicFriction
 from ..effects.buoyancy import Buoyancy
@@ -18,6 +19,7 @@ from ..effects.ground_magnet import GroundMagnet
 from ..effects.linear_drag import LinearDrag
 from ..effects.magnus_lift import MagnusLift
 from ..effects.quadratic_drag import QuadraticDrag
+from ..effects.residual_wrench import ResidualWrench
 from ..effects.rolling_resistance import RollingResistance
 from ..effects.spin_damping import SpinDamping
 from ..effects.stribeck_friction import StribeckFriction
@@ -25,7 +27,6 @@ from ..effects.torsional_friction import TorsionalFriction
 from ..effects.velocity_restitution import VelocityRestitution
 from ..effects.viscous_friction import ViscousFriction
 from ..effects.wind import Wind
-from ..residual_wrench import ResidualWrench
 from ..world import World
 
 _KNOWN = (
@@ -46,9 +47,9 @@ _SURFACE = (
 
 
 def reason_against(world: World) -> str | None:
-    """Return what in a world's contact law or effects the kernel does not have; None where it has all."""
+    """Return the part of a world's contact law or effects that the kernel lacks, in words; None where it has all."""
     if not isinstance(world.contact, ContactLaw):
-        return f"the kernel does not have its contact law '{world.contact.name}'"
+        return _no_law(world)
     acting = [active.effect for active in world.effects if _acts(active.effect)]
     for effect in acting:
         if type(effect) not in (*_KNOWN, *_SURFACE):  # a user's subclass of a known one is another effect
@@ -61,8 +62,23 @@ def reason_against(world: World) -> str | None:
     return _against_surface(world, acting)
 
 
+def closed_form(world: World) -> ContactLaw:
+    """Return the contact law of a world that the kernel supports.
+
+    Raises:
+        UsageError: If the world has another contact law.
+    """
+    if not isinstance(world.contact, ContactLaw):
+        raise UsageError(f"{_no_law(world)}.", todo="use simulate, which can.")
+    return world.contact
+
+
+def _no_law(world: World) -> str:
+    return f"the kernel does not have its contact law '{world.contact.name}'"
+
+
 def _against_surface(world: World, acting: Sequence[Effect]) -> str | None:
-    """Return why the kernel cannot take effects of the contact in a world; None where it can, or there are none."""
+    """Return why the kernel does not support the contact effects of a world; None where it does, or without any."""
     surface = next((effect for effect in acting if isinstance(effect, _SURFACE)), None)
     if surface is not None and (len(world.bodies) > 1 or world.ground_normal is None):
         return f"the kernel has '{surface.name}' for one body on the ground only"
@@ -73,42 +89,42 @@ def _against_surface(world: World, acting: Sequence[Effect]) -> str | None:
 
 
 def _acts(effect: Effect) -> bool:
-    """Whether an effect acts within the steps; those that change the world or the measurement do so outside."""
+    """Return whether an effect acts within the steps, not only on the world before or on the measurement."""
     return any(effect.has(hook) for hook in ("flow", "wrench", "contact"))
 
 
 def magnets(world: World) -> int:
-    """Return how many pulls the ground has."""
+    """Return the number of attractions by the ground."""
     return sum(isinstance(active.effect, GroundMagnet) for active in world.effects)
 
 
 def takes_heights(world: World) -> bool:
-    """Whether heights over the ground are needed for more than contacts."""
+    """Return whether heights above the ground are needed in addition to contacts."""
     return magnets(world) > 0 or has_surface(world)
 
 
 def is_twisted(world: World) -> bool:
-    """Whether a constant angular acceleration acts."""
+    """Return whether a constant angular acceleration acts."""
     return any(isinstance(active.effect, ResidualWrench) for active in world.effects)
 
 
 def has_surface(world: World) -> bool:
-    """Whether an effect changes the contact with the ground; without contact none does."""
+    """Return whether an effect changes the contact with the ground; never where bodies do not touch."""
     return world.touching and any(isinstance(active.effect, _SURFACE) for active in world.effects)
 
 
 def has_ellipse(world: World) -> bool:
-    """Whether the friction depends on the direction."""
+    """Return whether the friction depends on the direction."""
     return world.touching and any(isinstance(active.effect, AnisotropicFriction) for active in world.effects)
 
 
 def coefficients(world: World) -> list[Tensor]:
-    """Return the coefficients (1 or B, k) of the effects, world frame; none where no effect acts.
+    """Return the coefficients (1 or B, k) of the effects, world frame; empty where no effect acts.
 
-    In this order: c, k, s, d; f (3) with the buoyancy; wind (3); a constant angular acceleration (3) where there is
-    one; A, l of each of the ground's pulls: a = -(c + k |u|) u + s omega x u + f - sum A exp(-height / l) n with
-    u = v - wind, and alpha = twist - d omega. Then those of the contact, where there are any, in the order of `Surface`
-    in the source.
+    Order: c, k, s, d; f (3) with the buoyancy; wind (3); a constant angular acceleration (3) if any; A, l of each
+    attraction by the ground: a = -(c + k |u|) u + s omega x u + f - sum A exp(-height / l) n with u = v - wind, and
+    alpha = twist - d omega. Then the coefficients of the contact, if any, in the order of `Surface` in
+    `kernels/surface.cuh`.
     """
     if not any(_acts(active.effect) for active in world.effects):
         return []
@@ -143,9 +159,8 @@ def coefficients(world: World) -> list[Tensor]:
 
 
 def _surface(world: World, zero: Tensor) -> list[Tensor]:
-    """Return the columns (1 or B, 1) of `Surface`; lengths and speeds of what does not act are 1."""
-    law = world.contact
-    assert isinstance(law, ContactLaw)  # see reason_against
+    """Return the columns (1 or B, 1) of `Surface`; lengths and speeds of effects that do not act are 1."""
+    law = closed_form(world)
     values: dict[type[Effect], Values] = {type(active.effect): active.values for active in world.effects}
 
     def number(kind: type[Effect], name: str, otherwise: float = 0.0) -> Tensor:

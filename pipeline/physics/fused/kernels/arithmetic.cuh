@@ -1,8 +1,3 @@
-"""CUDA source: numbers, dual numbers, vectors and rotations, and sums over the threads of an environment."""
-
-from __future__ import annotations
-
-ARITHMETIC = r"""
 #define FULL 0xffffffffu
 #if SINGLE
 typedef float Number;
@@ -267,4 +262,3 @@ struct Lanes {
     }
     __device__ Vec sum(Vec mine) const { return vec(sum(mine.x), sum(mine.y), sum(mine.z)); }
 };
-"""

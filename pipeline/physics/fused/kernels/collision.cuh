@@ -1,11 +1,3 @@
-"""CUDA source: flight, and the contacts of a step with their impulses.
-
-Its formulas are those of `physics/motion.py`, `physics/detection.py`, `physics/sweeps.py` and `physics/effects`.
-"""
-
-from __future__ import annotations
-
-COLLISION = r"""
 // Moves a free body over a step in which its velocity and angular momentum went to the given ones: positions follow
 // the mean velocity, the rotation what the mean angular momentum gives half-way through.
 INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
@@ -440,4 +432,3 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
 #endif
 }
-"""

@@ -1,11 +1,3 @@
-"""CUDA source: contacts of spheres with the ground and with unions of spheres, and their closed-form impulses.
-
-Its formulas are those of `physics/contact.py`, `physics/sweeps.py` and `physics/distance.py`, where they are derived.
-"""
-
-from __future__ import annotations
-
-CONTACTS = r"""
 struct Law {
     Real step_s, inverse_step, stiffness, damping, friction;
 #if SURFACE
@@ -291,4 +283,3 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
     for (int i = first; i < end; i++) share_out(list[i], list[i].stop_n * totals[i], weights[i]);
 }
 #endif
-"""

@@ -1,8 +1,3 @@
-"""CUDA source: what a kernel is given, and the state of an environment read from it."""
-
-from __future__ import annotations
-
-ENVIRONMENT = r"""
 struct Problem {
     Input table;     // (environments, TABLE_WIDTH): numbers of each environment, in the order in which `load` reads
     Input steps;     // (1 or environments, intervals, 4): step, stiffness, damping, time at the start
@@ -229,4 +224,3 @@ __device__ void drive(const Problem& problem, Environment& env, int b, Real time
     body.spin = moving ? omega : none();
 }
 #endif
-"""

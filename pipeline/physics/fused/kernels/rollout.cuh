@@ -1,8 +1,3 @@
-"""CUDA source: an environment from its first frame to its last, and what is written of it."""
-
-from __future__ import annotations
-
-ROLLOUT = r"""
 INLINE void step(const Problem& problem, Environment& env, Real time_after) {
     Mat rotations[BODIES];
     Motion motions[BODIES];
@@ -207,4 +202,3 @@ extern "C" __global__ void __launch_bounds__(THREADS) rollout(PARAMETERS) {
     roll(problem, lanes.idle ? environments - 1 : index, lanes);
 }
 #endif
-"""

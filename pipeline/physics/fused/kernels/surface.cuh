@@ -1,8 +1,3 @@
-"""CUDA source: effects of the contact between one body and the ground, by the formulas of `physics/effects`."""
-
-from __future__ import annotations
-
-SURFACE = r"""
 #if SURFACE
 struct Surface {
     Real stribeck, slow_speed;       // friction at slow slip, and how slow
@@ -120,4 +115,3 @@ INLINE Real shortened(Real square, Real limit) {
     return at_most(limit * inverse_root(square + Real(Number(1e-24))), Number(1));
 }
 #endif
-"""

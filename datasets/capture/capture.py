@@ -1,0 +1,37 @@
+"""Captures: opening and checking the directory that a user fills."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...schemas import CaptureManifest, read_toml
+from ..io.kinds import refuse_other_kind
+from .cameras import read_cameras
+from .check import check_capture
+from .folder import CaptureFolder
+
+
+class Capture(CaptureFolder):
+    """A capture directory that was opened with :meth:`open`."""
+
+    @classmethod
+    def open(cls, path: Path | str, check: bool = True, splits: Sequence[str] | None = None) -> Capture:
+        """Open a capture.
+
+        Args:
+            path: The directory.
+            check: Check everything that can be checked without decoding photos or videos.
+            splits: Restrict the capture to the episodes of these splits; others may be absent or wrong.
+
+        Raises:
+            InputDataError: For the first fault, with file, line or field.
+        """
+        root = Path(path)
+        refuse_other_kind(root, "capture")
+        manifest = read_toml(root / "capture.toml", CaptureManifest)
+        cameras = read_cameras(root, manifest.calibration.supplied_in_metres)
+        capture = cls(root, manifest, cameras, None if splits is None else tuple(splits))
+        if check:
+            check_capture(capture)
+        return capture

@@ -1,0 +1,1 @@
+"""Support for output: files that appear only when complete, progress bars and free space."""

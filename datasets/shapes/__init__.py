@@ -1,0 +1,1 @@
+"""Shapes on disk: meshes and spherical Gaussians."""

@@ -1,0 +1,52 @@
+"""Sentences of a diagnosis: the verdict in words, and the warnings about what the data do not show."""
+
+from __future__ import annotations
+
+from ...schemas import ResidualLaw
+from ..segments.prepare import Prepared
+from .verdict import Findings
+
+
+def sentence(findings: Findings, law: ResidualLaw | None) -> str:
+    """Return the verdict as one or two sentences.
+
+    Args:
+        findings: The findings.
+        law: The law of the residual wrench, whose covariate is named where no candidate explains the residual.
+    """
+    names = [c.evidence.candidate.spec for c in findings.chosen]
+    if findings.verdict == "none_missing":
+        return "Nothing is missing that these data could show."
+    if findings.verdict == "unexplained":
+        where = f"; the covariate that explains most of it is {law.where}" if law is not None else ""
+        return f"Something is missing in flight, and none of the candidates explains it{where}."
+    words = []
+    for one in findings.chosen:
+        others = [e.candidate.spec for e in one.equals[1:]]
+        words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
+    listed = " and ".join(word or name for word, name in zip(words, names, strict=True))
+    rest = " In addition, something remains unexplained." if findings.remaining else ""
+    return f"Missing: {listed}.{rest}"
+
+
+def unseen_motion(prepared: Prepared) -> str:
+    """Return the sentence that limits the verdict to the kind of motion that was measured; empty for both kinds."""
+    if not prepared.contact_items:
+        return " Only flight was measured, so the verdict does not cover contact."
+    if prepared.flight is None:
+        return " Only contact was measured, so the verdict does not cover flight."
+    return ""
+
+
+def motion_warnings(prepared: Prepared) -> list[str]:
+    """Return a warning if the episodes have no contact or no flight."""
+    if not prepared.contact_items:
+        return ["the tracks contain no usable contact: effects that act in contact cannot be tested."]
+    if prepared.flight is None:
+        return ["the tracks contain no usable flight: effects that act in flight cannot be tested."]
+    return []
+
+
+def law_warnings(findings: Findings) -> list[str]:
+    """Return a warning for each selected effect whose flights fit another law equally well."""
+    return [f"{law.effect}: these flights fit {law.formula} as well as its own law." for law in findings.as_good]

@@ -1,0 +1,1 @@
+"""Geometry kernels: rotations, meshes, solids and unions of spheres."""

@@ -1,0 +1,1 @@
+"""Fit the contact model to measured tracks."""

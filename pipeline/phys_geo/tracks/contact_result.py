@@ -1,0 +1,255 @@
+"""Results of a fit of the contact: estimates with intervals, derived quantities, and the record for `fit.json`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ....datasets.capture.tracks import Track
+from ....datasets.shapes.ply import Splats
+from ....schemas import ContactParameters, Correlation, FittedParameter
+from ...optimization.uncertainty import correlation_of
+from ...physics.contact_law import restitution
+from ...physics.parameters import GROUND_SHIFT, Parameter
+from ...physics.world import State, World
+from ...segments.first_contact_fit import EffectEstimate, bound_warnings, described
+from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactEstimate:
+    """Contact parameters with their covariance, in fitted coordinates."""
+
+    parameters: Sequence[Parameter]
+    """Fitted parameters (P); `GROUND_SHIFT`, if any, last."""
+    values: np.ndarray
+    """Estimate, shape (P,)."""
+    covariance: np.ndarray
+    """Covariance of the estimate, shape (P, P)."""
+    starts: dict[str, tuple[float, State]] = field(default_factory=dict)
+    """Time [s] and state of the first frame of each episode, by its name, where shooting found it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShootingRecord:
+    """Course and end of multiple shooting."""
+
+    costs: list[float]
+    """Cost of each continued descent, the lowest first."""
+    converged: bool
+    """Whether the best descent converged."""
+    misfit_ties: float
+    """Mean square of the tied residuals, in units of their standard deviation."""
+    misfit_frames: float
+    """Median chi-square of a frame, relative to its expectation."""
+    information_over: float
+    """Factor by which the information of the data was divided (`tempered`)."""
+    search_open_loop_m: float
+    """Open-loop error [m] of the search's estimate."""
+    open_loop_m: float
+    """Open-loop error [m] of the estimate of shooting."""
+    kept: bool
+    """Whether the estimate of shooting was kept, not that of the search."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entries for `fit.json`."""
+        return {
+            "shooting_costs": self.costs,
+            "shooting_converged": self.converged,
+            "shooting_misfit": {
+                "ties": self.misfit_ties,
+                "frames": self.misfit_frames,
+                "information_over": self.information_over,
+            },
+            "open_loop_m": {"search": self.search_open_loop_m, "shooting": self.open_loop_m},
+            "kept": "shooting" if self.kept else "search",
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitRecord:
+    """Course of a fit of the contact, with the entries in the order of `fit.json`."""
+
+    episodes: int
+    """Number of training episodes."""
+    search_episodes: int
+    """Number of episodes in the search."""
+    noise_estimated: tuple[float, float]
+    """Noise estimated from the tracks: position [m], rotation [rad]."""
+    mass_distribution: dict[str, Any] | None = None
+    """Record of the fit of the mass distribution, where there was one."""
+    effects: dict[str, Any] | None = None
+    """Record of the fit of the effects, where there was one."""
+    search_open_loop_m: list[float] | None = None
+    """Lowest open-loop error [m] after each generation of the search."""
+    search_effective_samples: float | None = None
+    """Effective number of samples of the search; None where nothing was searched."""
+    shooting: ShootingRecord | None = None
+    """Course of multiple shooting, where it was used."""
+    images: dict[str, Any] = field(default_factory=dict)
+    """Entries of a fit to videos."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entries for `fit.json`, without those of steps that were not taken."""
+        position_m, rotation_rad = self.noise_estimated
+        record: dict[str, Any] = {
+            "episodes": self.episodes,
+            "search_episodes": self.search_episodes,
+            "noise_estimated": {"position_m": position_m, "rotation_rad": rotation_rad},
+        }
+        optional = {
+            "mass_distribution": self.mass_distribution,
+            "effects": self.effects,
+            "search_open_loop_m": self.search_open_loop_m,
+            "search_effective_samples": self.search_effective_samples,
+        }
+        record |= {name: value for name, value in optional.items() if value is not None}
+        return record | ({} if self.shooting is None else self.shooting.to_json()) | self.images
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsFit:
+    """Result of the stage phys-geo."""
+
+    contact: ContactParameters
+    """Contact parameters for `model.json`."""
+    parameters: tuple[FittedParameter, ...]
+    """Fitted and derived parameters, with intervals, for `model.json`."""
+    ground_offset_m: float | None
+    """Fitted height of the ground [m]; None where it was not fitted."""
+    noise: tuple[float, float]
+    """Standard deviation of the tracks' errors: position [m], rotation [rad]."""
+    record: FitRecord
+    """Course of the fit, for `fit.json`."""
+    warnings: tuple[str, ...]
+    """Messages for the user."""
+    mass: EffectEstimate | None = None
+    """Mass distribution, where it was fitted."""
+    effects: EffectEstimate | None = None
+    """Effects, where they were fitted."""
+    constants: dict[str, float] = field(default_factory=dict)
+    """Chosen constants of effects, by `effect.constant`."""
+    starts: dict[str, tuple[float, State]] = field(default_factory=dict)
+    """Time [s] and state of the first frame of each episode, by its name, where shooting found it."""
+    collision: dict[str, Splats] = field(default_factory=dict)
+    """Colliding spheres by body, where the fit moved them."""
+    tracks: dict[str, dict[str, Track]] = field(default_factory=dict)
+    """Tracks found in videos, by episode and body."""
+    correlations: tuple[Correlation, ...] = ()
+    """Correlations of the contact parameters, then of those of effects and of the mass distribution."""
+
+
+def physics_fit(world: World, estimate: ContactEstimate, noise: tuple[float, float], record: FitRecord) -> PhysicsFit:
+    """Return the stage's result from an estimate of the contact parameters.
+
+    Args:
+        world: The world that was fitted.
+        estimate: The contact parameters.
+        noise: Of the tracks (position [m], rotation [rad]).
+        record: Course of the fit.
+    """
+    names, covariance = list(estimate.parameters), estimate.covariance
+    std = np.sqrt(np.diag(covariance))
+    fitted = [_parameter(p, z, s) for p, z, s in zip(names, estimate.values, std, strict=True)]
+    warnings = bound_warnings(names, fitted)
+    if GROUND_SHIFT in names and world.ground_offset is not None:
+        fitted[-1] = absolute_ground(fitted[-1], float(world.ground_offset[0]))
+    value = {p.name: p.estimate for p in fitted}
+    contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
+    warnings += [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
+    if record.episodes < ENOUGH_EPISODES:
+        warnings.append(
+            f"with fewer than {ENOUGH_EPISODES} episodes the intervals assume {_interval_assumption(record.shooting)}"
+        )
+    return PhysicsFit(
+        contact=contact,
+        parameters=(*fitted, *_derived(world, names, estimate.values, covariance)),
+        ground_offset_m=value.get("ground_offset_m"),
+        noise=noise,
+        record=record,
+        warnings=tuple(warnings),
+        starts=estimate.starts,
+        correlations=(correlation_of([p.name for p in fitted], covariance),),
+    )
+
+
+def _interval_assumption(shooting: ShootingRecord | None) -> str:
+    """Return the assumption behind the intervals of a fit to few episodes."""
+    if shooting is None or not shooting.kept:
+        return f"that one episode contains {ERRORS_PER_EPISODE:g} independent errors of the contact model"
+    if shooting.information_over >= 1.05:
+        return (
+            "that the errors of the contact model reduce the information of these data by a factor of "
+            f"{shooting.information_over:.2g}"
+        )
+    return "that the contact model is no less accurate in other episodes than in these"
+
+
+def absolute_ground(shift: FittedParameter, offset_m: float) -> FittedParameter:
+    """Return the parameter of the ground's height from that of its shift.
+
+    Args:
+        shift: The shift from the ground's height before the fit.
+        offset_m: That height [m].
+    """
+    return shift.model_copy(
+        update={
+            "name": "ground_offset_m",
+            "estimate": shift.estimate + offset_m,
+            "interval_95": _moved(shift.interval_95, offset_m),
+            "bounds": _moved(shift.bounds, offset_m),
+        }
+    )
+
+
+def _moved(interval: tuple[float, float] | None, by: float) -> tuple[float, float] | None:
+    """Return an interval shifted by a constant."""
+    return None if interval is None else (interval[0] + by, interval[1] + by)
+
+
+def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedParameter:
+    """Return a fitted parameter with its interval and prior."""
+    centre, width = parameter.prior
+    prior = f"normal{' in its logarithm' if parameter.logarithmic else ''} about {centre:g}, std {width:g}"
+    return described(parameter, coordinate, std).model_copy(update={"prior": prior})
+
+
+def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:
+    """Return restitution, stiffness and damping of a single contact below the centre of mass, to first order."""
+    index = {parameter.name: k for k, parameter in enumerate(names)}
+    tau, zeta = index["contact_time_s"], index["damping_ratio"]
+    mass = float(world.bodies[world.free[0]].mass[0])
+    formulas = {
+        "restitution": ("1", lambda z: restitution(z[zeta].exp())),
+        "stiffness_n_m": ("N/m", lambda z: mass / z[tau].exp().square()),
+        "damping_n_s_m": ("N s/m", lambda z: 2 * z[zeta].exp() * mass / z[tau].exp()),
+    }
+    derived = []
+    for name, (unit, formula) in formulas.items():
+        z = torch.tensor(best, dtype=torch.float64, requires_grad=True)
+        value = formula(z)
+        (slope,) = torch.autograd.grad(value, z)
+        std = math.sqrt(float(slope.numpy() @ covariance @ slope.numpy()))
+        estimate = float(value.detach())
+        reach = math.exp(min(1.96 * std / estimate, 30.0))  # first order in the logarithm, as they are positive
+        note = (
+            "speed ratio of a head-on impact" if name == "restitution" else f"of one contact that carries {mass:g} kg"
+        )
+        derived.append(
+            FittedParameter(
+                name=name,
+                unit=unit,
+                estimate=estimate,
+                std_error=std,
+                # an impact cannot gain energy
+                interval_95=(estimate / reach, min(estimate * reach, 1.0 if name == "restitution" else math.inf)),
+                state="derived",
+                note=note,
+            )
+        )
+    return derived

@@ -1,0 +1,147 @@
+"""Estimate of the contact parameters by multiple shooting, checked against that of the search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ....datasets.capture.tracks import Track
+from ....datasets.io.progress import progress
+from ....schemas import PhysConfig
+from ...optimization.importance_sampling import SearchResult
+from ...physics.parameters import GROUND_SHIFT, Parameter
+from ...physics.world import World
+from .contact_result import ContactEstimate, ShootingRecord
+from .multiple_shooting import Shooting, ShootingFit, ShootingPrior
+from .open_loop_search import SEVERAL_EPISODES, SearchBatch, open_loop_errors
+from .tempered_posterior import tempered
+
+OPEN_LOOP_TOLERANCE = 3.0
+"""Maximum ratio of the open-loop error of shooting to that of the search; above it the search's estimate is kept. The
+search may fit its three parameters to the end of a single rough motion, so a moderately larger error is accepted."""
+STARTS = ((0.5, 1.0), (1.0, 1.0), (1.7, 1.0), (1.0, 0.6), (1.0, 1.6))
+"""Further starts of shooting: friction and contact time as multiples of the priors' medians."""
+BEST = 3
+"""Number of descents that are continued. From `SEVERAL_EPISODES` on the cost has a single basin, and one is
+continued."""
+SHOT_ITERATIONS = 12
+"""Minimum value of the limit on steps in each descent of shooting."""
+MODEL_EXCESS = 20.0
+"""Additional division of the information of the data by each unit of the ties' misfit (`tempered`): where the ties are
+violated, the contact model errs by more than noise, and the errors of one episode are not independent. Chosen on the
+built-in scenes fall 0 to 5 (MuJoCo's contact); data that the model explains have no misfit and are unaffected."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShootingEpisodes:
+    """Episodes for multiple shooting."""
+
+    episodes: Sequence[tuple[str, dict[str, Track]]]
+    """Name and tracks by body of each episode."""
+    spans: Sequence[tuple[float, float]]
+    """Start and end of the part of each episode that is fitted [s]."""
+    batch: SearchBatch
+    """The same episodes with the initial states of the search."""
+
+
+def shoot_contact(
+    world: World,
+    data: ShootingEpisodes,
+    search: SearchResult,
+    names: Sequence[Parameter],
+    ground_known: bool,
+    noise: tuple[float, float],
+    config: PhysConfig,
+) -> tuple[ContactEstimate, ShootingRecord]:
+    """Fit the contact parameters by multiple shooting, and keep the search's estimate if shooting predicts worse.
+
+    Args:
+        world: The world.
+        data: The episodes.
+        search: Result of the search for the same parameters.
+        names: Parameters that were searched.
+        ground_known: Whether the height of the ground was fitted before.
+        noise: Of the tracks (position [m], rotation [rad]).
+        config: The stage's settings.
+    """
+    parameters = _with_ground(world, names, ground_known)
+    prior = _prior(parameters)
+    shots = _descended(world, data, parameters, _starts(prior, search, len(data.episodes)), prior, noise, config)
+    shot = shots[0]
+    shared, covariance, growth = tempered(shot, prior, MODEL_EXCESS)
+    errors = open_loop_errors(world, data.batch.observations, data.batch.warm, parameters)
+    cost = float(errors(shared[None]).mean())
+    keep = math.isfinite(shot.cost) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
+    record = ShootingRecord(
+        costs=[one.cost for one in shots],
+        converged=shot.converged,
+        misfit_ties=shot.misfit,
+        misfit_frames=shot.chi2,
+        information_over=growth,
+        search_open_loop_m=search.lowest,
+        open_loop_m=cost,
+        kept=keep,
+    )
+    if not keep:
+        return ContactEstimate(parameters=names, values=search.mean, covariance=search.covariance), record
+    first = data.batch.observations
+    starts = {
+        name: (float(time), shot.state.at([row]))
+        for row, (name, time) in enumerate(zip(first.names, first.times_s[:, 0], strict=True))
+    }
+    return ContactEstimate(parameters=parameters, values=shared, covariance=covariance, starts=starts), record
+
+
+def _with_ground(world: World, names: Sequence[Parameter], ground_known: bool) -> list[Parameter]:
+    """Return the parameters of the search, with the height of the ground if it has not been fitted."""
+    lacking = world.ground_normal is not None and GROUND_SHIFT not in names and not ground_known
+    return [*names, GROUND_SHIFT] if lacking else list(names)
+
+
+def _prior(parameters: Sequence[Parameter]) -> ShootingPrior:
+    """Return the prior of parameters (P) in fitted coordinates."""
+    return ShootingPrior(
+        torch.as_tensor(np.array([p.encode(p.prior[0]) for p in parameters])),
+        torch.tensor([p.prior[1] for p in parameters], dtype=torch.float64),
+        torch.tensor([p.limits for p in parameters], dtype=torch.float64),
+    )
+
+
+def _starts(prior: ShootingPrior, search: SearchResult, episodes: int) -> list[np.ndarray]:
+    """Return the starts of the descents (P,): the search's result and, with few episodes, `STARTS`."""
+    middle = prior.mean.numpy()
+    starts = [np.concatenate([search.mean, middle[len(search.mean) :]])]
+    for friction, contact_time in () if episodes >= SEVERAL_EPISODES else STARTS:
+        start = middle.copy()
+        start[:2] += np.log([friction, contact_time])  # the first two of `CONTACT_PARAMETERS`
+        starts.append(start)
+    return starts
+
+
+def _descended(
+    world: World,
+    data: ShootingEpisodes,
+    parameters: Sequence[Parameter],
+    starts: Sequence[np.ndarray],
+    prior: ShootingPrior,
+    noise: tuple[float, float],
+    config: PhysConfig,
+) -> list[ShootingFit]:
+    """Return the ends of the continued descents, the lowest cost first."""
+    several = len(data.episodes) >= SEVERAL_EPISODES
+    problem = Shooting.of(world, parameters, data.episodes, data.spans, noise, prior, several)
+    best = 1 if several else BEST
+    bar = progress(range(2 * len(starts) + best), "phys-geo: multiple shooting", total=2 * len(starts) + best)
+    steps = iter(bar)
+    shots = problem.fit(
+        [torch.as_tensor(start) for start in starts],
+        max(config.iterations, SHOT_ITERATIONS),
+        best,
+        lambda: next(steps, None),
+    )
+    bar.close()
+    return shots

@@ -1,0 +1,137 @@
+"""Segments for multiple shooting: episodes cut at frames, with first guesses of the states."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ...physics.world import State, World
+from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance
+from ...trajectories.observations import Observations
+
+if TYPE_CHECKING:
+    from ....datasets.capture.tracks import Track
+
+SEGMENT_S = 0.03
+"""Minimum duration of a segment [s]; segments begin and end at frames."""
+RESTING_SIGMAS = 6.0
+"""Maximum motion in a segment, in standard deviations of the noise, of a body that may be at rest."""
+
+_Piece = tuple[int, int, int]
+"""Part of an episode: its number, and its first and last frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiedSegments:
+    """Segments of episodes, with the order in which they follow each other."""
+
+    segments: Observations
+    """One item for each segment (B); the frame at which the next one begins counts as not seen."""
+    following: Tensor
+    """Segment that comes next in the same episode, -1 for the last, shape (B,)."""
+    end: Tensor
+    """Frame at which the next segment begins, or the last one, shape (B,)."""
+    ahead: State
+    """Alternative first guess of the states, which moves to the next frame in a straight line."""
+
+    @staticmethod
+    def of(
+        world: World,
+        episodes: Sequence[tuple[str, dict[str, Track]]],
+        spans: Sequence[tuple[float, float]],
+        noise: tuple[float, float],
+        contacts_only: bool,
+    ) -> TiedSegments:
+        """Cut the span [s] of each episode into segments; see `Shooting.of`."""
+        whole = Observations.of(world, episodes, spans)
+        pieces = _pieces(world, whole, noise, contacts_only)
+        items = [k for k, _, _ in pieces]
+        windows = [(float(whole.times_s[k, a]) - 1e-9, float(whole.times_s[k, b]) + 1e-9) for k, a, b in pieces]
+        segments = Observations.of(world, [episodes[k] for k in items], windows)
+        following, end, seen, turned = [], [], segments.seen.clone(), segments.turned.clone()
+        for row, k in enumerate(items):
+            last = row + 1 == len(items) or pieces[row + 1][:2] != (k, pieces[row][2])
+            following.append(-1 if last else row + 1)
+            end.append(int((segments.times_s[row] <= windows[row][1]).sum()) - 1)
+            if not last:  # the next segment has seen that frame
+                seen[row, end[-1] :], turned[row, end[-1] :] = 0.0, 0.0
+        ahead = segments.state
+        state = _moving(world, whole, items, [first for _, first, _ in pieces], ahead)
+        return TiedSegments(
+            segments=replace(segments, seen=seen, turned=turned, state=state),
+            following=torch.tensor(following),
+            end=torch.tensor(end),
+            ahead=ahead,
+        )
+
+
+def _pieces(world: World, whole: Observations, noise: tuple[float, float], contacts_only: bool) -> list[_Piece]:
+    """Return the segments of episodes; with `contacts_only` those near contact, and the first of each episode."""
+    cuts = [_cuts(times[:count]) for times, count in zip(whole.times_s, whole.frames.tolist(), strict=True)]
+    pieces = [(k, a, b) for k, places in enumerate(cuts) for a, b in itertools.pairwise(places)]
+    if not contacts_only:
+        return pieces
+    informative = _informative(world, whole, pieces, noise)
+    return [piece for piece, near in zip(pieces, informative, strict=True) if near or piece[1] == 0]
+
+
+def _cuts(times_s: Tensor) -> list[int]:
+    """Return the frames at which segments begin, and the last frame."""
+    places = [0]
+    for frame in range(1, len(times_s)):
+        if float(times_s[frame] - times_s[places[-1]]) >= SEGMENT_S:
+            places.append(frame)
+    if len(places) > 2 and places[-1] != len(times_s) - 1:
+        places.pop()  # the last segment absorbs a remainder that is too short
+    return [*places, len(times_s) - 1] if places[-1] != len(times_s) - 1 else places
+
+
+def _informative(world: World, whole: Observations, pieces: Sequence[_Piece], noise: tuple[float, float]) -> list[bool]:
+    """Return which segments (episode, first and last frame) are informative: in contact and moving, or next to such."""
+    flying = clearance(world, whole) > FLIGHT_MARGIN_M
+    moved = whole.position_m.new_zeros(len(pieces))
+    for row, (k, a, b) in enumerate(pieces):
+        shift = (whole.position_m[k, b] - whole.position_m[k, a]).abs().amax() / noise[0]
+        turn = quat_log(quat_multiply(quat_conjugate(whole.quat_wxyz[k, a]), whole.quat_wxyz[k, b]))
+        moved[row] = torch.maximum(shift, turn.abs().amax() / noise[1])
+    touches = [not bool(flying[k, a : b + 1].all()) for k, a, b in pieces]
+    moving = [touch and bool(way > RESTING_SIGMAS) for touch, way in zip(touches, moved, strict=True)]
+    padded = [False, *moving, False]
+    return [any(padded[row : row + 3]) for row in range(len(pieces))]
+
+
+def _moving(world: World, whole: Observations, items: list[int], starts: list[int], state: State) -> State:
+    """Return first guesses of the states (B) at frames, with velocities from differences within one phase of motion.
+
+    In flight a difference to a neighbouring frame gives the velocity half a frame away, which is corrected for gravity;
+    both neighbours are used where both are in flight. In contact the difference to the next frame is used unchanged.
+    """
+    flying = clearance(world, whole) > FLIGHT_MARGIN_M
+    velocity, omega = state.velocity_m_s.clone(), state.omega_body_rad_s.clone()
+    for row, (item, frame) in enumerate(zip(items, starts, strict=True)):
+        fall = world.gravity[0] if bool(flying[item, frame]) else None
+        others = _neighbours(frame, int(whole.frames[item]), flying[item])
+        for column, body in enumerate(whole.free):
+            rates, turns = [], []
+            for other in others:
+                span = whole.times_s[item, other] - whole.times_s[item, frame]
+                shift = whole.position_m[item, other, column] - whole.position_m[item, frame, column]
+                here, there = whole.quat_wxyz[item, frame, column], whole.quat_wxyz[item, other, column]
+                rates.append(shift / span - (0.0 if fall is None else 0.5 * span * fall))
+                turns.append(quat_log(quat_multiply(quat_conjugate(here), there)) / span)
+            velocity[row, body], omega[row, body] = torch.stack(rates).mean(0), torch.stack(turns).mean(0)
+    return replace(state, velocity_m_s=velocity, omega_body_rad_s=omega)
+
+
+def _neighbours(frame: int, count: int, flying: Tensor) -> list[int]:
+    """Return the frames next to one of `count` frames from which its velocity is taken; flying (T,): by frame."""
+    others = [frame + k for k in (-1, 1) if 0 <= frame + k < count]
+    if bool(flying[frame]):
+        return [k for k in others if bool(flying[k])] or others[:1]
+    return [k for k in others if k > frame] or others

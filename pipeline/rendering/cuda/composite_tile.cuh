@@ -1,0 +1,149 @@
+#define LOG2E 1.4426950408889634f
+#define WARPS 4
+#define FULL 0xffffffffu
+
+struct View {
+    const float* Ks;
+    const float2* rays;  // x, y on the plane z = 1 of every pixel; only with RAYS, where cameras distort
+    int columns, tile_rows, width, height;
+};
+
+struct Lists {
+    const float4* centres;
+    const float* log_opacities;
+    const float4* spans;
+    const float* features;
+    const int* rows;
+    int N;
+};
+
+struct Pixel {
+    float x, y, dx, dy, inverse;
+    int target;
+    bool shown;
+};
+
+struct Patch {  // the 8 x 8 pixels of a warp: the ray at its middle, and its bounds in the unit of the spans
+    float x0, y0, low_x, low_y, high_x, high_y;
+};
+
+__device__ __forceinline__ float2 ray_at(const View& view, int camera, float u, float v) {
+    int column = min((int)u, view.width - 1), row = min((int)v, view.height - 1);
+    return view.rays[(camera * view.height + row) * view.width + column];
+}
+
+// Sets the patch of a warp and the two pixels of each lane, and returns the tile.
+__device__ __forceinline__ int look(const View& view, Patch& patch, Pixel* pixels) {
+    int warp = threadIdx.x >> 5, lane = threadIdx.x & 31, tile = blockIdx.x, tiles = view.columns * view.tile_rows;
+    int camera = tile / tiles, within = tile - camera * tiles;
+    float left = (within % view.columns) * 16 + (warp & 1) * 8, top = (within / view.columns) * 16 + (warp >> 1) * 8;
+#if RAYS
+    float2 middle = ray_at(view, camera, left + 4.0f, top + 4.0f);
+    patch.x0 = middle.x;
+    patch.y0 = middle.y;
+#else
+    const float* K = view.Ks + camera * 9;
+    patch.x0 = (left + 4.0f - K[2]) / K[0];
+    patch.y0 = (top + 4.0f - K[5]) / K[4];
+    patch.low_x = left + 0.5f;
+    patch.low_y = top + 0.5f;
+    patch.high_x = left + 7.5f;
+    patch.high_y = top + 7.5f;
+#endif
+#pragma unroll
+    for (int h = 0; h < 2; h++) {
+        float u = left + (lane & 7), v = top + (lane >> 3) + 4 * h;
+        Pixel& pixel = pixels[h];
+#if RAYS
+        float2 ray = ray_at(view, camera, u, v);
+        pixel.x = ray.x;
+        pixel.y = ray.y;
+        pixel.dx = ray.x - middle.x;
+        pixel.dy = ray.y - middle.y;
+#else
+        pixel.x = (u + 0.5f - K[2]) / K[0];
+        pixel.y = (v + 0.5f - K[5]) / K[4];
+        pixel.dx = (u + 0.5f - left - 4.0f) / K[0];
+        pixel.dy = (v + 0.5f - top - 4.0f) / K[4];
+#endif
+        pixel.inverse = 1.0f / (1.0f + pixel.x * pixel.x + pixel.y * pixel.y);
+        pixel.shown = u < view.width && v < view.height;
+        pixel.target = (camera * view.height + (int)v) * view.width + (int)u;
+    }
+#if RAYS
+    patch.low_x = fminf(pixels[0].x, pixels[1].x);
+    patch.low_y = fminf(pixels[0].y, pixels[1].y);
+    patch.high_x = fmaxf(pixels[0].x, pixels[1].x);
+    patch.high_y = fmaxf(pixels[0].y, pixels[1].y);
+    for (int apart = 16; apart > 0; apart >>= 1) {
+        patch.low_x = fminf(patch.low_x, __shfl_xor_sync(FULL, patch.low_x, apart));
+        patch.low_y = fminf(patch.low_y, __shfl_xor_sync(FULL, patch.low_y, apart));
+        patch.high_x = fmaxf(patch.high_x, __shfl_xor_sync(FULL, patch.high_x, apart));
+        patch.high_y = fmaxf(patch.high_y, __shfl_xor_sync(FULL, patch.high_y, apart));
+    }
+#endif
+    return tile;
+}
+
+__device__ bool reaches(const float4& span, const Patch& patch) {
+    return span.x <= patch.high_x && span.z >= patch.low_x && span.y <= patch.high_y && span.w >= patch.low_y;
+}
+
+// The squared distance from a centre to the ray (x0 + dx, y0 + dy, 1), times 1 + x^2 + y^2, is quadratic in (dx, dy):
+// (a - z dx)^2 + (b - z dy)^2 + (c - py dx + px dy)^2 with a = px - z x0, b = py - z y0, c = a y0 - b x0.
+__device__ void expand(const float4& p, const Patch& patch, float4& low, float4& high) {
+    float a = p.x - p.z * patch.x0, b = p.y - p.z * patch.y0, c = a * patch.y0 - b * patch.x0;
+    float k = p.w * LOG2E;
+    low.x = k * (a * a + b * b + c * c);
+    low.y = -2.0f * k * (a * p.z + c * p.y);
+    low.z = -2.0f * k * (b * p.z - c * p.x);
+    high.x = k * (p.z * p.z + p.y * p.y);
+    high.y = -2.0f * k * p.x * p.y;
+    high.z = k * (p.z * p.z + p.x * p.x);
+    high.w = p.z;
+}
+
+__device__ float alpha_at(const float4& low, const float4& high, const Pixel& pixel) {
+    float square = low.x + pixel.dx * (low.y + pixel.dx * high.x + pixel.dy * high.y) +
+                   pixel.dy * (low.z + pixel.dy * high.z);
+    return exp2f(square * pixel.inverse + low.w);
+}
+
+template <int CHANNELS>
+struct Staged {  // up to 32 spheres that reach a patch
+    float4 lows[32], highs[32];
+    float colors[32][CHANNELS];
+};
+
+struct Sources {  // where they come from, which only the derivative needs
+    float4 points[32];
+    int places[32];
+};
+
+// Puts those of the next 32 spheres of a tile that reach the patch into shared memory, and returns how many they are.
+template <int CHANNELS>
+__device__ __forceinline__ int stage(const Lists& lists, const Patch& patch, int first, int end, int channel,
+                                     Staged<CHANNELS>& staged, Sources* sources) {
+    int lane = threadIdx.x & 31;
+    int row = first + lane < end ? lists.rows[first + lane] : 0;
+    bool hit = first + lane < end && reaches(lists.spans[row], patch);
+    unsigned mask = __ballot_sync(FULL, hit);
+    if (hit) {
+        int slot = __popc(mask & ((1u << lane) - 1)), sphere = row % lists.N;
+        float4 point = lists.centres[row], low, high;
+        expand(point, patch, low, high);
+        low.w = lists.log_opacities[sphere] * LOG2E;
+        staged.lows[slot] = low;
+        staged.highs[slot] = high;
+        if (sources != nullptr) {
+            sources->points[slot] = point;
+            sources->places[slot] = row;
+        }
+#pragma unroll
+        for (int c = 0; c < CHANNELS; c++) {
+            staged.colors[slot][c] = lists.features[(BY_CAMERA ? row : sphere) * F + channel + c];
+        }
+    }
+    __syncwarp();
+    return __popc(mask);
+}

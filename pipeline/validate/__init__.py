@@ -1,0 +1,5 @@
+"""Validation of captures, models and datasets."""
+
+from .stage import validate
+
+__all__ = ["validate"]
