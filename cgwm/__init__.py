@@ -5,13 +5,7 @@ stage is first used, so that importing :mod:`cgwm` costs milliseconds.
 """
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
-
-try:
-    __version__ = version("cgwm")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0.0.0"
 
 _PUBLIC = {
     "CalibrateConfig": ".schemas",
@@ -101,6 +95,8 @@ if TYPE_CHECKING:
         UsageError,
     )
 
+    __version__: str
+
 __all__ = [
     "CalibrateConfig",
     "Capture",
@@ -149,7 +145,18 @@ def __getattr__(name: str) -> Any:
     """Import a public name on first use."""
     if name in _PUBLIC:
         return getattr(import_module(_PUBLIC[name], __name__), name)
+    if name == "__version__":
+        return _version()
     raise AttributeError(f"module 'cgwm' has no attribute {name!r}")
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version  # a fifth of the time of `cgwm --help`
+
+    try:
+        return version("cgwm")
+    except PackageNotFoundError:  # a source tree that was never installed
+        return "0.0.0"
 
 
 def __dir__() -> list[str]:

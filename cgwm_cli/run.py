@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from ..schemas import FileModel
 
 INTERRUPTED = 130
+REPEAT_S = 0.5
+"""Time between an interrupt and the check whether some code has swallowed it."""
 _interrupted = False
 _typed: list[str] = []
 _RAY_ADDRESS = re.compile(r"auto|local|ray://.+|[\w.-]+:\d+")
@@ -54,8 +56,7 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
         typer.Exit: With the exit code, if the work failed.
     """
     watched = _is_watched(quiet, debug)
-    if not watched:
-        _hush()
+    warned = [] if watched else _hush()
     printed: list[str] = []
 
     def emit(result: FileModel, summary: Callable[[Any], str]) -> None:
@@ -65,8 +66,12 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
             printed.append(summary(result))
 
     try:
-        with _stdout_for_results_only(watched):
-            yield emit
+        try:
+            with _stdout_for_results_only(watched):
+                yield emit
+        finally:
+            for text in () if quiet else warned:
+                print(f"Warning: {text}", file=sys.stderr)
         for text in printed:
             print(text, flush=True)
     except (typer.Exit, BrokenPipeError):
@@ -140,6 +145,7 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
 
 def _say_interrupted(state: str = "") -> int:
     """Print that the command was interrupted and the state that the work reports; most work leaves no output."""
+    _set_alarm(0.0)
     state = state or "no output was written."
     print(f"Interrupted; {state}", file=sys.stderr)
     return INTERRUPTED
@@ -147,12 +153,13 @@ def _say_interrupted(state: str = "") -> int:
 
 def _catch_signals() -> None:
     """Make SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, so that unfinished output is cleaned up."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    handlers = {"SIGINT": _interrupt, "SIGTERM": _interrupt, "SIGHUP": _interrupt, "SIGALRM": _interrupt_again}
+    for name, handler in handlers.items():
         number = getattr(signal, name, None)
         # a signal that the parent process set to be ignored (nohup, a background job) stays ignored
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             with contextlib.suppress(ValueError):  # not in the main thread
-                signal.signal(number, _interrupt)
+                signal.signal(number, handler)
 
 
 def _leave(code: int) -> NoReturn:
@@ -170,7 +177,29 @@ def _leave(code: int) -> NoReturn:
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
     global _interrupted  # noqa: PLW0603  remembered because a library may convert the exception
     _interrupted = True
+    _set_alarm(REPEAT_S)
     raise KeyboardInterrupt
+
+
+def _interrupt_again(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt again if the one before was swallowed, and leave the code that cleans up alone.
+
+    An interrupt is lost where Python cannot raise it (in a finalizer, a weak reference's callback) and where a library
+    catches everything. While it propagates, `finally`, `except` and `__exit__` run with it as the handled exception.
+    """
+    _set_alarm(REPEAT_S)
+    error = sys.exc_info()[1]
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return
+        error = error.__cause__ or error.__context__
+    raise KeyboardInterrupt
+
+
+def _set_alarm(seconds: float) -> None:
+    """Have SIGALRM delivered after so many seconds; zero cancels it. There is no SIGALRM on Windows."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def _is_watched(quiet: bool, debug: bool) -> bool:
@@ -178,14 +207,25 @@ def _is_watched(quiet: bool, debug: bool) -> bool:
     return debug or (sys.stderr.isatty() and not quiet)
 
 
-def _hush() -> None:
-    """Silence logs and warnings; the progress bars of cgwm.datasets.io.progress read the variable."""
+def _hush() -> list[str]:
+    """Silence logs and warnings, and return a list to which cgwm's own warnings are added.
+
+    The progress bars of cgwm.datasets.io.progress read the variable.
+    """
     import logging
     import warnings
 
     os.environ["CGWM_QUIET"] = "1"
     warnings.simplefilter("ignore")
-    logging.disable(logging.CRITICAL)
+    logging.disable(logging.INFO)
+    logging.getLogger().addHandler(logging.NullHandler())
+    warned: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: warned.append(record.getMessage())  # type: ignore[method-assign]
+    own = logging.getLogger("cgwm")
+    own.addHandler(handler)
+    own.propagate = False
+    return warned
 
 
 @contextlib.contextmanager

