@@ -126,11 +126,10 @@ def measure(size: tuple[int, int, int, int], with_peer: bool) -> dict[str, objec
         others.append(("gsplat", lambda tensors: peer(tensors, width, height)))
     pairs = int(rasterize(*tensors, Raster(width, height, *THRESHOLDS))[4])
     row["pairs"] = pairs
-    for kernels in ("cuda", "triton"):
-        plain = Raster(width, height, *THRESHOLDS, kernels=kernels)
-        roomy = Raster(width, height, *THRESHOLDS, capacity=int(1.25 * pairs), kernels=kernels)
-        others.append((kernels, lambda tensors, raster=plain: rasterize(*tensors, raster)[:3]))
-        others.append((f"{kernels}_graph", lambda tensors, raster=roomy: rasterize(*tensors, raster)[:3]))
+    plain = Raster(width, height, *THRESHOLDS)
+    roomy = Raster(width, height, *THRESHOLDS, capacity=int(1.25 * pairs))
+    others.append(("cuda", lambda tensors: rasterize(*tensors, plain)[:3]))
+    others.append(("cuda_graph", lambda tensors: rasterize(*tensors, roomy)[:3]))
     pictures = {}
     for name, call in others:
         clock = captured_ms if name.endswith("graph") else median_ms

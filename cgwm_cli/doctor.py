@@ -34,7 +34,6 @@ def _summary(report: DoctorReport) -> str:
         ["python", f"{report.python} on {report.platform}"],
         ["cores, memory", f"{report.cpu_cores}, {report.memory_gib:.1f} GiB"],
         ["CUDA", ", ".join(report.cuda_devices) or "no device"],
-        ["Triton", report.triton or "not installed (optional)"],
         ["cuda-core", report.cuda_core or "not installed (optional)"],
         ["EGL", "loads" if report.egl else "not found (optional)"],
         ["COLMAP", f"{report.colmap or 'missing'}, {'CUDA' if report.colmap_cuda else 'CPU'} SIFT"],

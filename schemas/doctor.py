@@ -38,8 +38,6 @@ class DoctorReport(FileModel):
     packages: tuple[PackageState, ...]
     cuda_devices: tuple[str, ...] = ()
     """Names of the CUDA devices that torch sees."""
-    triton: str | None = None
-    """Triton's version; on a CUDA device its kernels render, and it comes with torch's CUDA wheels."""
     cuda_core: str | None = None
     """Version of cuda-core, which compiles the CUDA kernels; a dependency on Linux x86-64 only."""
     egl: bool = False

@@ -1,9 +1,14 @@
 """What `cgwm doctor` finds, and what it says when something is missing."""
 
+import subprocess
+import sys
+from collections.abc import Iterator
 from importlib import metadata
 
 import pytest
+import torch
 from cgwm.pipeline.runtime import doctor as module
+from cgwm.pipeline.runtime import kernel_build
 from cgwm.pipeline.runtime.doctor import cpu_cores, doctor, memory_bytes, satisfies
 from cgwm.schemas import DoctorReport
 
@@ -73,3 +78,42 @@ def test_a_package_that_does_not_import_is_told(monkeypatch: pytest.MonkeyPatch)
 )
 def test_versions_against_bounds(version: str, requirement: str, expected: bool) -> None:
     assert satisfies(version, requirement) is expected
+
+
+@pytest.fixture
+def device_without_cuda_core(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A machine with a CUDA device on which no kernel can be built."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda index=0: "a device")
+    monkeypatch.setattr(kernel_build, "_core", lambda: None)
+    for cached in (kernel_build.unavailable, kernel_build.available):
+        cached.cache_clear()
+    yield
+    for cached in (kernel_build.unavailable, kernel_build.available):
+        cached.cache_clear()
+
+
+@pytest.mark.usefixtures("device_without_cuda_core")
+def test_a_device_whose_kernels_cannot_run_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    assert not kernel_build.available()
+    assert not kernel_build.available()
+    (record,) = caplog.records
+    assert "cannot run on a device: cuda-core 1.0 or later" in record.getMessage()
+    assert "pip install 'cuda-core>=1.0,<2'" in record.getMessage()
+    assert "cuda-core" in doctor().uses["renderer"]
+
+
+def test_a_warning_reaches_stderr_that_is_no_terminal() -> None:
+    code = """
+import logging, sys, typer
+from cgwm.cli.run import running
+with running(quiet="quiet" in sys.argv):
+    logging.getLogger("of.a.library").warning("nobody reads this")
+    logging.getLogger("cgwm").warning("it is slow because of %s", "this")
+"""
+    said = [
+        subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True).stderr
+        for words in ([], ["quiet"])
+    ]
+    assert said == ["Warning: it is slow because of this\n", ""]

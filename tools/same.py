@@ -56,6 +56,7 @@ DROPPED_TESTS: Mapping[str, str] = {
     r"^test_(all_is_complete|docstring_examples_run)\[cgwm\.": "named by the module, which has moved",
     r"^test_the_commands_exist\[": "named by a line of the README, which became pages",
     r"^test_(errors_and_exit_codes|the_outcome_is_said_plainly|the_page_has_the_numbers)\[": "by a reworded message",
+    r"\[(.*-)?(triton|cuda)(-.*)?\]$": "the GPU renderer has one kind of kernels",
 }
 """Tests (a pattern of their names) that this tree need not have, with the reason."""
 DROPPED_ASSERTS = 0

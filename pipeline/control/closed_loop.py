@@ -209,7 +209,7 @@ class ClosedLoop:
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
-            for _ in range(3):  # Triton compiles, and libraries take their memory
+            for _ in range(3):  # kernels are compiled, and libraries take their memory
                 self._picture.of(state, capacity)
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()

@@ -18,6 +18,7 @@ from ..geometry.spheres import Spheres
 from ..physics.world import State
 from ..rendering.relighting import Relighting
 from ..rendering.render import render
+from ..runtime import kernel_build
 
 
 class FrameRenderer:
@@ -91,6 +92,7 @@ class FrameRenderer:
             capacity=capacity,
         )
         if picture.pairs is None and self._scales.is_cuda:
-            raise UsageError("the renderer's kernels need Triton, which is not installed.", todo="see 'cgwm doctor'.")
+            reason = kernel_build.unavailable()
+            raise UsageError(f"the renderer's CUDA kernels cannot run: {reason}.", todo="see 'cgwm doctor'.")
         frame = (picture.features[0].clamp(0, 1) * 255).round().to(torch.uint8)
         return frame, self._scales.new_zeros(()) if picture.pairs is None else picture.pairs

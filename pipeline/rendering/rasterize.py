@@ -1,30 +1,20 @@
 """Renderer on CUDA: the sequence of kernels, and their derivative for torch.
 
-Spheres are sorted by distance once, over all cameras; then pairs of tiles and spheres are written in that order and
-sorted by tile with a stable sort. Keys of 16 bits need two passes of a radix sort; a key of tile and depth would need
-six.
+The torch path in `render` is their twin. Spheres are sorted by distance once, over all cameras; then pairs of tiles and
+spheres are written in that order and sorted by tile with a stable sort. Keys of 16 bits need two passes of a radix
+sort; a key of tile and depth would need six.
 """
-
-# pyright: reportArgumentType=false, reportCallIssue=false
-# (Triton annotates what is constant when it compiles; callers pass plain numbers, and num_warps in addition.)
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..runtime import kernel_build
-from . import binning, cuda_kernels, triton_kernels
+from .cuda_kernels import BACKWARD_THREADS, CHANNELS, TILE, gradient_width, launch
 from .rays import LEAST_DETERMINANT, UNDISTORT_STEPS
-
-TILE = 16
-"""Side of a tile [px]."""
-BLOCK = 16
-"""Number of spheres of a tile that a Triton program processes together."""
-_WARPS = TILE * TILE // 64
 
 
 @dataclass(frozen=True)
@@ -44,10 +34,6 @@ class Raster:
     nothing waits, so that a CUDA graph can capture the call; pairs beyond it are lost, and the caller compares the
     number of pairs that `rasterize` returns.
     """
-    kernels: Literal["auto", "cuda", "triton"] = "auto"
-    """Kernels that composite: the CUDA ones (faster) or the Triton ones; auto takes the CUDA ones where cuda.core is
-    installed to compile them.
-    """
 
     @property
     def columns(self) -> int:
@@ -64,21 +50,16 @@ class Raster:
         """Thresholds on alpha and on transmittance, for the kernels."""
         return float(self.min_alpha), float(self.min_transmittance)
 
-    @property
-    def compiled(self) -> bool:
-        """Whether the CUDA kernels composite."""
-        return self.kernels == "cuda" or (self.kernels == "auto" and kernel_build.available())
-
 
 class _Lists(NamedTuple):
     """Spheres that each tile composites, nearest first."""
 
     centres: Tensor
-    """See `binning.project`, shape (C, N, 4)."""
+    """See `cuda/project.cuh`, shape (C, N, 4)."""
     log_opacities: Tensor
-    """See `binning.project`, shape (N,)."""
+    """See `cuda/project.cuh`, shape (N,)."""
     spans: Tensor
-    """See `binning.project`, shape (C * N, 4)."""
+    """See `cuda/project.cuh`, shape (C * N, 4)."""
     rows: Tensor
     """Row camera * N + sphere of each pair, shape (M,)."""
     starts: Tensor
@@ -88,7 +69,7 @@ class _Lists(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Rays of distorting cameras, as `triton_kernels.trace` writes them; every field is None for pinhole cameras."""
+    """Rays of distorting cameras, as `cuda/trace.cuh` writes them; every field is None for pinhole cameras."""
 
     rays: Tensor | None = None
     """Rays (x, y) on the plane z = 1, shape (C, H, W, 2)."""
@@ -148,16 +129,11 @@ class _Rasterize(torch.autograd.Function):
         left, depth, median = (features.new_empty(shape) for _ in range(3))
         tiles = cameras * raster.columns * raster.rows
         numbers = (scales.shape[0], raster.columns, raster.rows, raster.width, raster.height)
-        if raster.compiled:
-            tensors = (*lists[:3], features, *lists[3:5], Ks, rays.rays, out, left, depth, median)
-            for first in range(0, channels, cuda_kernels.CHANNELS):
-                cuda_kernels.launch("composite_forward", tiles, tensors, (*numbers, *raster.thresholds), first)
-        else:
-            triton_kernels.composite_forward[(tiles,)](
-                *lists[:2], features, *lists[3:5], Ks, rays.rays, out, left, depth, median,
-                *numbers, *raster.thresholds,
-                F=channels, CHANNELS=_filled(channels), BY_CAMERA=by_camera, TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
-            )  # fmt: skip
+        tensors = (*lists[:3], features, *lists[3:5], Ks, rays.rays, out, left, depth, median)
+        kind = {"RAYS": int(distortion is not None), "BY_CAMERA": int(by_camera)}
+        for first in range(0, channels, CHANNELS):
+            part = {"F": channels, "FIRST": first, "COUNT": min(CHANNELS, channels - first)}
+            launch("composite_forward", means.device, tiles, tensors, (*numbers, *raster.thresholds), **part, **kind)
         ctx.save_for_backward(means, scales, opacities, features, viewmats, Ks, rays.rays, out, left, depth, *lists)
         ctx.raster = raster
         ctx.mark_non_differentiable(median, lists.pairs)
@@ -171,24 +147,19 @@ class _Rasterize(torch.autograd.Function):
         count, channels, cameras = scales.shape[0], features.shape[1], viewmats.shape[0]
         tiles = cameras * raster.columns * raster.rows
         numbers = (count, raster.columns, raster.rows, raster.width, raster.height)
-        rows = torch.zeros(cameras, count, cuda_kernels.gradient_width(channels), device=means.device)
+        rows = torch.zeros(cameras, count, gradient_width(channels), device=means.device)
         pictures = (out, left, depth, grad_out, grad_alpha, grad_depth, rows)
-        if raster.compiled:
-            tensors = (*lists[:3], features, *lists[3:5], Ks, rays, *pictures)
-            cuda_kernels.launch("composite_backward", tiles, tensors, (*numbers, *raster.thresholds))
-        else:
-            triton_kernels.composite_backward[(tiles,)](
-                *lists[:2], features, *lists[3:5], Ks, rays, *pictures, *numbers, *raster.thresholds,
-                F=channels, CHANNELS=_filled(channels), WIDE=rows.shape[2], TILE=TILE, BLOCK=BLOCK, num_warps=_WARPS,
-            )  # fmt: skip
+        tensors = (*lists[:3], features, *lists[3:5], Ks, rays, *pictures)
+        part = {"F": channels, "FIRST": 0, "COUNT": min(CHANNELS, channels), "RAYS": int(rays is not None)}
+        thresholds = raster.thresholds
+        launch("composite_backward", means.device, tiles, tensors, (*numbers, *thresholds), **part, BY_CAMERA=0)
         by_sphere = [torch.empty_like(value) for value in (means, scales, opacities, features)]
-        group = min(16, _filled(cameras))
-        block = max(32, 256 // group)
         if count:
-            binning.project_backward[(-(-count // block),)](
-                rows, viewmats, scales, opacities, *by_sphere, cameras, count,
-                F=channels, WIDE=rows.shape[2], PER_CAMERA=means.dim() == 3, GROUP=group, BLOCK=block,
-            )  # fmt: skip
+            group = min(16, 1 << (cameras - 1).bit_length())
+            blocks = -(-count // (BACKWARD_THREADS // group))
+            tensors = (rows, viewmats, scales, opacities, *by_sphere)
+            sizes = (cameras, count, int(means.dim() == 3))
+            launch("project_backward", means.device, blocks, tensors, sizes, F=channels, GROUP=group)
         grad_viewmats = None
         if ctx.needs_input_grad[4]:
             by_centre = rows[..., :3]
@@ -198,20 +169,14 @@ class _Rasterize(torch.autograd.Function):
         return *by_sphere, grad_viewmats, None, None, None
 
 
-def _filled(channels: int) -> int:
-    """Return the next power of two, as Triton requires for the side of a tensor."""
-    return 1 << (channels - 1).bit_length()
-
-
 def _trace(Ks: Tensor, distortion: Tensor, raster: Raster) -> _Rays:
     cameras = Ks.shape[0]
     distortion = distortion.detach().to(Ks).expand(cameras, -1).contiguous()
     rays = Ks.new_empty(cameras, raster.height, raster.width, 2)
     bounds = Ks.new_empty(cameras, raster.rows, raster.columns, 4)
-    triton_kernels.trace[(cameras * raster.columns * raster.rows,)](
-        Ks, distortion, rays, bounds, raster.columns, raster.rows, raster.width, raster.height,
-        TERMS=distortion.shape[1], STEPS=UNDISTORT_STEPS, LEAST=LEAST_DETERMINANT, TILE=TILE, num_warps=_WARPS,
-    )  # fmt: skip
+    numbers = (raster.columns, raster.rows, raster.width, raster.height, distortion.shape[1], UNDISTORT_STEPS)
+    blocks = cameras * raster.columns * raster.rows
+    launch("trace", Ks.device, blocks, (Ks, distortion, rays, bounds), (*numbers, float(LEAST_DETERMINANT)))
     return _Rays(rays, bounds, bounds.amin(1), bounds.amin(2))
 
 
@@ -226,11 +191,11 @@ def _bin(
     distances = torch.empty(total, device=device)
     spans = torch.empty(total, 4, device=device)
     counts = torch.empty(total, device=device, dtype=torch.int32)
-    binning.project[(cameras, max(1, -(-count // binning.PROJECT_BLOCK)))](
-        means, scales, opacities, viewmats, Ks, *rays[1:], centres, log_opacities, distances, spans, counts,
-        count, raster.width, raster.height, raster.columns, raster.rows, raster.min_alpha,
-        PER_CAMERA=means.dim() == 3, HAS_LEAST=raster.min_alpha > 0, TILE=TILE, BLOCK=binning.PROJECT_BLOCK,
-    )  # fmt: skip
+    grid, rays_there = (raster.columns, raster.rows), int(rays.rays is not None)
+    tensors = (means, scales, opacities, viewmats, Ks, *rays[1:], centres, log_opacities, distances, spans, counts)
+    numbers = (cameras, count, *grid, int(means.dim() == 3), float(raster.min_alpha))
+    if total:
+        launch("project", device, total, tensors, numbers, RAYS=rays_there)
     order = torch.argsort(distances)
     ends = counts.gather(0, order).cumsum(0, dtype=torch.int32)
     pairs = ends[-1] if total else torch.zeros((), device=device, dtype=torch.int32)
@@ -241,10 +206,9 @@ def _bin(
     if raster.capacity is not None:
         keys.fill_(torch.iinfo(key_type).max)  # unused entries sort behind all tiles
     if total:
-        binning.emit[(-(-total // binning.EMIT_BLOCK),)](
-            order, ends, spans, *rays[1:], keys, rows, total, count, capacity, raster.columns, raster.rows,
-            TILE=TILE, BLOCK=binning.EMIT_BLOCK,
-        )  # fmt: skip
+        wide_keys = int(key_type == torch.int32)
+        numbers = (total, count, capacity, *grid, wide_keys)
+        launch("emit", device, total, (order, ends, spans, *rays[1:], keys, rows), numbers, RAYS=rays_there)
     keys, place = torch.sort(keys, stable=True)
     starts = torch.searchsorted(keys, torch.arange(tiles + 1, device=device, dtype=key_type), out_int32=True)
     return _Lists(

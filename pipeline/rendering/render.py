@@ -11,16 +11,16 @@ when the camera rotates.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from torch import Tensor
 
+from ..runtime import kernel_build
 from .composite_reference import TileLists, composite
+from .rasterize import Raster, rasterize
 from .rays import pixel_rays
 
 MIN_ALPHA = 1 / 255
@@ -88,7 +88,7 @@ def render(
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn if its centre lies
     in front of the camera by more than its scale, and its position is finite. float32 tensors on CUDA are rendered by
-    the kernels of `rasterize`, all others (and systems without Triton) by plain torch, with the same result.
+    the kernels of `rasterize`, all others (and where the kernels cannot run) by plain torch, with the same result.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
@@ -126,7 +126,7 @@ def render(
         height=height,
         groups=groups,
     )
-    if means.is_cuda and means.dtype == torch.float32 and _has_triton():
+    if means.is_cuda and means.dtype == torch.float32 and kernel_build.available():
         drawn = _draw_by_kernels(scene, min_alpha, min_transmittance, group_transmittance, capacity)
         drawn = drawn if median else replace(drawn, median_depth=None)
     else:
@@ -164,8 +164,6 @@ def _draw_by_kernels(
     scene: _Scene, min_alpha: float, min_transmittance: float, group_transmittance: float, capacity: int | None
 ) -> RenderOutput:
     """Render on CUDA, by the kernels of `rasterize`, without a background."""
-    from .rasterize import Raster, rasterize  # imports Triton
-
     raster = Raster(
         width=scene.width,
         height=scene.height,
@@ -260,12 +258,6 @@ def _alone(coefficients: Tensor, tile_ids: Tensor, chosen: Tensor, lists: TileLi
     counts = torch.bincount(tile_ids[chosen], minlength=lists.counts.shape[0])
     subset = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
     return composite(coefficients[chosen], coefficients[chosen, :1], subset)[1]
-
-
-@cache
-def _has_triton() -> bool:
-    """Return whether Triton is installed; torch's CUDA wheels for Linux contain it."""
-    return importlib.util.find_spec("triton") is not None
 
 
 def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...schemas.doctor import DoctorReport, Missing, PackageState
-from .kernel_build import compiler
+from .kernel_build import compiler, unavailable
 
 _IMPORT_NAMES = {"opencv-python-headless": "cv2"}
 _CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
@@ -40,7 +40,6 @@ def doctor() -> DoctorReport:
         memory_gib=round(memory_bytes() / _GIB, 2),
         packages=tuple(packages),
         cuda_devices=cuda,
-        triton=_version("triton"),
         cuda_core=_version("cuda-core"),
         egl=_has_egl(),
         colmap=_colmap_version(pycolmap),
@@ -197,11 +196,10 @@ def _zstd_fault() -> str:
 
 
 def _renderer(cuda: bool) -> str:
-    if not cuda or not _version("triton"):
+    if not cuda:
         return "torch, in tiles"
-    if _version("cuda-core"):
-        return "CUDA kernels, compiled at run time"
-    return "Triton kernels (pip install cuda-core for those in CUDA, 1.5 to 5 times faster)"
+    reason = unavailable()
+    return "CUDA kernels, compiled at run time" if reason is None else f"torch, in tiles: {reason}"
 
 
 def _rollouts() -> str:

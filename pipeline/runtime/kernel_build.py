@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import logging
 import os
 import shutil
 import subprocess
@@ -12,10 +13,12 @@ from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import torch
-from torch import Tensor
+# torch is imported in the functions that need it, because `doctor` asks for the compiler where torch may be missing
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 
 @cache
@@ -27,9 +30,33 @@ def _core() -> Any:
     return core if hasattr(core, "Program") else None  # before 1.0 it was experimental by name
 
 
+@cache
+def unavailable() -> str | None:
+    """Return why CUDA kernels cannot run on this machine; None where they can. A small kernel is built and loaded."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return "no CUDA device was found"
+    if _core() is None:
+        return "cuda-core 1.0 or later, which compiles them, is not installed (pip install 'cuda-core>=1.0,<2')"
+    try:
+        compiled('extern "C" __global__ void nothing() {}', "nothing", torch.cuda.current_device())
+    except Exception as error:  # cuda.core, NVRTC and the driver raise their own
+        return f"cuda-core cannot build one for this device: {type(error).__name__}: {error}"
+    return None
+
+
+@cache
 def available() -> bool:
-    """Return whether cuda.core is installed, which compiles and launches kernels."""
-    return _core() is not None
+    """Return whether CUDA kernels run here; where a device is there and they cannot, the log says once why."""
+    import torch
+
+    reason = unavailable()
+    if reason is not None and torch.cuda.is_available():
+        name = torch.cuda.get_device_name()
+        text = "the CUDA kernels cannot run on %s: %s. PyTorch renders and simulates instead, many times slower."
+        logging.getLogger("cgwm").warning(text, name, reason)
+    return reason is None
 
 
 @cache
@@ -45,6 +72,8 @@ def source_file(module: str, path: str) -> str:
 
 def compiled(source: str, name: str, device: int) -> Any:
     """Return a kernel of a source for a device, built now or by an earlier process; the caller keeps it."""
+    import torch
+
     core = _core()
     core.Device(device).set_current()
     major, minor = torch.cuda.get_device_capability(device)
@@ -64,6 +93,8 @@ def launch(
     kernel: Any, device: torch.device, blocks: int, threads: int, tensors: tuple[Tensor | None, ...], *words: Any
 ) -> None:
     """Launch a kernel on torch's current stream; pointers come first, null where a tensor is None."""
+    import torch
+
     pointers = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
     stream = _stream(torch.cuda.current_stream(device).cuda_stream)
     _core().launch(stream, _config(blocks, threads), kernel, *pointers, *words)

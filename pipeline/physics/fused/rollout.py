@@ -36,7 +36,7 @@ def unsupported(world: World) -> str | None:
     if "cuda" not in (world.rolls_on, world.gravity.device.type):
         return f"its tensors are on the device '{world.gravity.device.type}', not on CUDA"
     if not kernel_build.available():
-        return "cuda.core is not installed, which compiles the kernel (pip install cuda-core)"
+        return str(kernel_build.unavailable())
     return reason_against(world)
 
 

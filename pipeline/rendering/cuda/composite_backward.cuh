@@ -52,8 +52,8 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
         if (__all_sync(FULL, fmaxf(left[0], left[1]) <= min_transmittance)) break;
         int count = stage(lists, patch, first, end, 0, staged, &sources);
         for (int j = 0; j < count; j++) {
-            float4 low = staged.lows[j], high = staged.highs[j];
-            float raw[2] = {alpha_at(low, high, pixels[0]), alpha_at(low, high, pixels[1])};
+            Seen seen = staged.spheres[j];
+            float raw[2] = {alpha_at(seen, pixels[0]), alpha_at(seen, pixels[1])};
             if (!__any_sync(FULL, fmaxf(raw[0], raw[1]) >= min_alpha)) continue;
             float4 point = sources.points[j];
             float values[GROUPS * VALUES];

@@ -22,15 +22,15 @@ extern "C" __global__ void __launch_bounds__(128) composite_forward(
         if (__all_sync(FULL, fmaxf(left[0], left[1]) <= min_transmittance)) break;
         int count = stage(lists, patch, first, end, FIRST, staged, nullptr);
         for (int j = 0; j < count; j++) {
-            float4 low = staged.lows[j], high = staged.highs[j];
+            Seen seen = staged.spheres[j];
 #pragma unroll
             for (int h = 0; h < 2; h++) {
-                float raw = alpha_at(low, high, pixels[h]);
+                float raw = alpha_at(seen, pixels[h]);
                 if (raw >= min_alpha) {
                     float alpha = fminf(raw, 0.99f), weight = alpha * left[h], after = left[h] - weight;
                     if (FIRST == 0) {
-                        depth[h] += weight * high.w;
-                        if (left[h] > 0.5f && after <= 0.5f) median[h] = high.w;
+                        depth[h] += weight * seen.other.z;
+                        if (left[h] > 0.5f && after <= 0.5f) median[h] = seen.other.z;
                     }
                     left[h] = after;
 #pragma unroll

@@ -17,14 +17,14 @@ struct Lists {
     int N;
 };
 
-struct Pixel {
-    float x, y, dx, dy, inverse;
+struct Pixel {  // inverse: 1 / (1 + x^2 + y^2)
+    float x, y, inverse;
     int target;
     bool shown;
 };
 
-struct Patch {  // the 8 x 8 pixels of a warp: the ray at its middle, and its bounds in the unit of the spans
-    float x0, y0, low_x, low_y, high_x, high_y;
+struct Patch {  // bounds of the 8 x 8 pixels of a warp in the unit of the spans
+    float low_x, low_y, high_x, high_y;
 };
 
 __device__ __forceinline__ float2 ray_at(const View& view, int camera, float u, float v) {
@@ -37,14 +37,8 @@ __device__ __forceinline__ int look(const View& view, Patch& patch, Pixel* pixel
     int warp = threadIdx.x >> 5, lane = threadIdx.x & 31, tile = blockIdx.x, tiles = view.columns * view.tile_rows;
     int camera = tile / tiles, within = tile - camera * tiles;
     float left = (within % view.columns) * 16 + (warp & 1) * 8, top = (within / view.columns) * 16 + (warp >> 1) * 8;
-#if RAYS
-    float2 middle = ray_at(view, camera, left + 4.0f, top + 4.0f);
-    patch.x0 = middle.x;
-    patch.y0 = middle.y;
-#else
+#if !RAYS
     const float* K = view.Ks + camera * 9;
-    patch.x0 = (left + 4.0f - K[2]) / K[0];
-    patch.y0 = (top + 4.0f - K[5]) / K[4];
     patch.low_x = left + 0.5f;
     patch.low_y = top + 0.5f;
     patch.high_x = left + 7.5f;
@@ -58,13 +52,9 @@ __device__ __forceinline__ int look(const View& view, Patch& patch, Pixel* pixel
         float2 ray = ray_at(view, camera, u, v);
         pixel.x = ray.x;
         pixel.y = ray.y;
-        pixel.dx = ray.x - middle.x;
-        pixel.dy = ray.y - middle.y;
 #else
         pixel.x = (u + 0.5f - K[2]) / K[0];
         pixel.y = (v + 0.5f - K[5]) / K[4];
-        pixel.dx = (u + 0.5f - left - 4.0f) / K[0];
-        pixel.dy = (v + 0.5f - top - 4.0f) / K[4];
 #endif
         pixel.inverse = 1.0f / (1.0f + pixel.x * pixel.x + pixel.y * pixel.y);
         pixel.shown = u < view.width && v < view.height;
@@ -89,29 +79,30 @@ __device__ bool reaches(const float4& span, const Patch& patch) {
     return span.x <= patch.high_x && span.z >= patch.low_x && span.y <= patch.high_y && span.w >= patch.low_y;
 }
 
-// The squared distance from a centre to the ray (x0 + dx, y0 + dy, 1), times 1 + x^2 + y^2, is quadratic in (dx, dy):
-// (a - z dx)^2 + (b - z dy)^2 + (c - py dx + px dy)^2 with a = px - z x0, b = py - z y0, c = a y0 - b x0.
-__device__ void expand(const float4& p, const Patch& patch, float4& low, float4& high) {
-    float a = p.x - p.z * patch.x0, b = p.y - p.z * patch.y0, c = a * patch.y0 - b * patch.x0;
-    float k = p.w * LOG2E;
-    low.x = k * (a * a + b * b + c * c);
-    low.y = -2.0f * k * (a * p.z + c * p.y);
-    low.z = -2.0f * k * (b * p.z - c * p.x);
-    high.x = k * (p.z * p.z + p.y * p.y);
-    high.y = -2.0f * k * p.x * p.y;
-    high.z = k * (p.z * p.z + p.x * p.x);
-    high.w = p.z;
+// A sphere as the pixels see it. The squared distance from its centre p to the ray (x, y, 1), times 1 + x^2 + y^2, is
+// |p x (x, y, 1)|^2 = z^2 dx^2 + z^2 dy^2 + (py dx - px dy)^2 with dx = x - px / z and dy = y - py / z: a quadratic form
+// without terms that cancel, however small the sphere is beside a pixel.
+struct Seen {
+    float4 form;   // px / z, py / z, and the factors of dx^2 and of dx dy in the exponent of 2
+    float4 other;  // the factor of dy^2, the logarithm of the opacity to base 2, z
+};
+
+__device__ Seen seen_from(const float4& p, float log_opacity) {
+    float k = p.w * LOG2E, square = p.z * p.z;
+    return {make_float4(p.x / p.z, p.y / p.z, k * (square + p.y * p.y), -2.0f * k * p.x * p.y),
+            make_float4(k * (square + p.x * p.x), log_opacity * LOG2E, p.z, 0.0f)};
 }
 
-__device__ float alpha_at(const float4& low, const float4& high, const Pixel& pixel) {
-    float square = low.x + pixel.dx * (low.y + pixel.dx * high.x + pixel.dy * high.y) +
-                   pixel.dy * (low.z + pixel.dy * high.z);
-    return exp2f(square * pixel.inverse + low.w);
+__device__ __forceinline__ float alpha_at(const Seen& seen, const Pixel& pixel) {
+    float dx = pixel.x - seen.form.x, dy = pixel.y - seen.form.y;
+    // in this order the two pixels of a lane, which have one x without distortion, share what depends on dx alone
+    float square = dy * (seen.other.x * dy + seen.form.w * dx) + seen.form.z * dx * dx;
+    return exp2f(square * pixel.inverse + seen.other.y);
 }
 
 template <int CHANNELS>
 struct Staged {  // up to 32 spheres that reach a patch
-    float4 lows[32], highs[32];
+    Seen spheres[32];
     float colors[32][CHANNELS];
 };
 
@@ -130,11 +121,8 @@ __device__ __forceinline__ int stage(const Lists& lists, const Patch& patch, int
     unsigned mask = __ballot_sync(FULL, hit);
     if (hit) {
         int slot = __popc(mask & ((1u << lane) - 1)), sphere = row % lists.N;
-        float4 point = lists.centres[row], low, high;
-        expand(point, patch, low, high);
-        low.w = lists.log_opacities[sphere] * LOG2E;
-        staged.lows[slot] = low;
-        staged.highs[slot] = high;
+        float4 point = lists.centres[row];
+        staged.spheres[slot] = seen_from(point, lists.log_opacities[sphere]);
         if (sources != nullptr) {
             sources->points[slot] = point;
             sources->places[slot] = row;
