@@ -82,6 +82,15 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
         raise typer.Exit(_report(error, debug)) from None
 
 
+@contextlib.contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Run work that an interrupt ends as it should end, such as a server."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _set_alarm(0.0)
+
+
 def with_values(arguments: list[str]) -> list[str]:
     """Add the value of a `--ray` without one, because typer has no options with an optional value.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .options import Debug, Json, Quiet
-from .run import running
+from .run import running, until_interrupted
 
 if TYPE_CHECKING:
     from ..schemas import ViewReport
@@ -38,7 +38,7 @@ def view(
             emit(ViewReport(url=viewer.url, showing=str(thing)), _summary)
         if open_:
             _open(viewer.url)
-        with contextlib.suppress(KeyboardInterrupt):
+        with until_interrupted():
             viewer.run()
 
 
