@@ -56,7 +56,8 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
         typer.Exit: With the exit code, if the work failed.
     """
     watched = _is_watched(quiet, debug)
-    warned = [] if watched else _hush()
+    if not watched:
+        _hush()
     printed: list[str] = []
 
     def emit(result: FileModel, summary: Callable[[Any], str]) -> None:
@@ -66,12 +67,8 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
             printed.append(summary(result))
 
     try:
-        try:
-            with _stdout_for_results_only(watched):
-                yield emit
-        finally:
-            for text in () if quiet else warned:
-                print(f"Warning: {text}", file=sys.stderr)
+        with _warnings_kept(discarded=watched or quiet), _stdout_for_results_only(watched):
+            yield emit
         for text in printed:
             print(text, flush=True)
     except (typer.Exit, BrokenPipeError):
@@ -216,11 +213,8 @@ def _is_watched(quiet: bool, debug: bool) -> bool:
     return debug or (sys.stderr.isatty() and not quiet)
 
 
-def _hush() -> list[str]:
-    """Silence logs and warnings, and return a list to which cgwm's own warnings are added.
-
-    The progress bars of cgwm.datasets.io.progress read the variable.
-    """
+def _hush() -> None:
+    """Silence logs and warnings; the progress bars of cgwm.datasets.io.progress read the variable."""
     import logging
     import warnings
 
@@ -228,13 +222,27 @@ def _hush() -> list[str]:
     warnings.simplefilter("ignore")
     logging.disable(logging.INFO)
     logging.getLogger().addHandler(logging.NullHandler())
+
+
+@contextlib.contextmanager
+def _warnings_kept(discarded: bool) -> Iterator[None]:
+    """Print cgwm's own warnings at the end, because what is printed inside is discarded, unless they are, too."""
+    if discarded:
+        yield
+        return
+    import logging
+
     warned: list[str] = []
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: warned.append(record.getMessage())  # type: ignore[method-assign]
-    own = logging.getLogger("cgwm")
-    own.addHandler(handler)
-    own.propagate = False
-    return warned
+    logger = logging.getLogger("cgwm")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        for text in warned:
+            print(f"Warning: {text}", file=sys.stderr)
 
 
 @contextlib.contextmanager
