@@ -29,7 +29,8 @@ from cgwm.datasets.synthetic import plan_scene, read_truth
 from cgwm.datasets.synthetic.dynamics import STEPS_PER_S, Motion
 from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.datasets.synthetic.plan import EpisodePlan, ScenePlan
-from cgwm.datasets.synthetic.record import POSITION_STD, ROTATION_STD, build_set, measure_tracks, record
+from cgwm.datasets.synthetic.record import build_set, record
+from cgwm.datasets.synthetic.tracker import POSITION_STD, ROTATION_STD, measure_tracks
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.physics import Body, ContactLaw, World

@@ -6,25 +6,22 @@ import importlib.metadata
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from ..datasets.capture.cameras import require_metric
 from ..datasets.capture.capture import Capture
 from ..datasets.capture.colmap_model import find_colmap_model
 from ..datasets.capture.geometry_maps import KINDS
 from ..datasets.capture.sparse_points import POINTS_NAME
 from ..datasets.io.atomic import refuse_existing, sha256
 from ..datasets.models.model import Model, read_model, write_model
-from ..datasets.shapes.ply import Splats
 from ..schemas import (
     Body,
     BodyModel,
-    ContactParameters,
     EffectModel,
     FitFile,
     FittedParameter,
@@ -33,20 +30,17 @@ from ..schemas import (
     PhysConfig,
     Pose,
     Provenance,
-    Solver,
     SplatConfig,
     UsageError,
 )
-from .phys_geo.effects.requested_effects import fit_with_effects, fitted_effects, with_effects
+from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
-from .phys_geo.tracks.contact_result import PhysicsFit
-from .physics.effects.registry import load_effect
-from .physics.world import World, symmetric
+from .phys_geo.stage import fit_motion
+from .physics.world import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
 from .runtime.device import resolve_device
 from .runtime.resources import enough_memory
 from .sg_gs.stage import SgGsResult, fit_scene
-from .trajectories.observations import track_episodes
 
 Stage = Literal["all", "sg-gs", "phys-geo"]
 
@@ -170,7 +164,7 @@ def _fitted_model(request: _Request, checkpoint: Checkpoint, moves: bool, warnin
         model = _start(request.capture, request.stage, request.parent, splat_config, checkpoint)
     if moves:
         with enough_memory(*_needs(phys_config)):
-            return _with_physics(model, request.capture, request.split, phys_config, checkpoint, warnings)
+            return fit_motion(model, request.capture, request.split, phys_config, checkpoint, warnings)
     if phys_config.effects:
         raise InputDataError(
             f"{request.capture.root}: --effects, but split '{request.split}' has no motion to fit them to.",
@@ -273,15 +267,13 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
     for body in capture.manifest.bodies:
         found = scene.bodies[body.name]
         mass = body.mass_kg or ASSUMED_DENSITY_KG_M3 * found.mass_properties.volume_m3
-        inertia = (
-            _six(symmetric(body.inertia_kg_m2)) if body.inertia_kg_m2 else _six(mass * found.mass_properties.inertia_m2)
-        )
+        inertia = symmetric(body.inertia_kg_m2) if body.inertia_kg_m2 else mass * found.mass_properties.inertia_m2
         bodies.append(
             BodyModel(
                 name=body.name,
                 motion=body.motion,
                 mass_kg=mass,
-                inertia_kg_m2=inertia,
+                inertia_kg_m2=inertia_elements(inertia),
                 com_m=body.com_m or _three(found.mass_properties.com_m),
                 photo_pose=found.photo_pose or Pose(),
                 shape=body.shape,
@@ -357,142 +349,6 @@ def _has_motion(capture: Capture, split: str) -> bool:
     return any(capture.tracks(name) or capture.videos(name) for name in episodes)
 
 
-def _with_physics(
-    model: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warnings: Sequence[str]
-) -> Model:
-    """Return the model with fitted physics and, where there are videos, exposures and light."""
-    _require_fittable(model, capture, config)
-    ready = replace(model, file=_physics_start(model, capture, config))
-    started = time.perf_counter()
-    found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
-    found = replace(found, warnings=(*found.warnings, *warnings))
-    seconds = round(time.perf_counter() - started, 2)
-    record = found.record.to_json() | {"seconds": seconds, "supervise": config.supervise}
-    record |= {"warnings": list(found.warnings)}
-    fitted = _merge(ready.file, found)
-    fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
-    ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
-    if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
-        ready = _with_appearance(ready, capture, split, config, found)
-    return ready
-
-
-def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> None:
-    """Refuse a model or a capture from whose motion no physics can be fitted."""
-    uses_photos = any(name in model.body_splats for name in capture.body_names)
-    if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
-        require_metric(capture.cameras)
-    if not any(body.motion == "free" for body in model.file.bodies):
-        raise InputDataError(
-            f"{capture.root / 'capture.toml'}: no body is free, so no motion contains information about contact.",
-            'motion = "free" for the body whose physics is wanted.',
-        )
-
-
-def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelFile:
-    """Return the model file from which the fit of the physics starts."""
-    effects = with_effects(model.file.effects, config.effects)
-    # warnings of an earlier fit of the physics do not apply to this one
-    stale = set(model.fit.stages.get("phys-geo", {}).get("warnings", ()))
-    return model.file.model_copy(
-        update={
-            "contact": model.file.contact or ContactParameters(),
-            # the ground of the capture, as an earlier fit may have moved the model's
-            "ground": capture.manifest.world.ground or model.file.ground,
-            "solver": Solver(step_s=config.step_s),
-            "effects": effects,
-            "warnings": tuple(text for text in model.file.warnings if text not in stale),
-        }
-    )
-
-
-def _fitted_motion(
-    ready: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warm_started: bool
-) -> PhysicsFit:
-    """Fit the physics to tracks or videos; `warm_started`: whether the contact parameters come from an earlier fit."""
-    world = replace(World.from_model(ready), rolls_on=resolve_device(config.device).type)
-    if config.supervise == "tracks":
-        measured = capture.manifest.measurement
-        noise = (measured.position_std_m, measured.rotation_std_rad)
-        return fit_with_effects(world, track_episodes(capture, split), config, noise, warm_started, capture.groups)
-    if config.mass_distribution:
-        raise UsageError(
-            f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not identify it.",
-            "--supervise tracks.",
-            "fit to tracks, or leave phys-geo.mass_distribution at false.",
-        )
-    from .phys_geo.images.image_fit import fit_physics_from_images
-
-    return fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both", checkpoint)
-
-
-def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:
-    """Return the model with the exposure of the video cameras and the light on the bodies."""
-    from .phys_geo.images.lighting_fit import learn_appearance
-    from .phys_geo.images.video_exposure import estimate_exposures
-
-    exposures = estimate_exposures(model, capture, split, config.device)
-    model = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
-    # with images alone measured tracks are not used
-    return learn_appearance(model, capture, exposures, split, found.tracks if config.supervise == "images" else None)
-
-
-def _with_collision(model: Model, moved: Mapping[str, Splats]) -> Model:
-    """Return the model with moved collision spheres; where they are also the visual ones, both are moved."""
-    shown = {name: spheres for name, spheres in moved.items() if model.collision[name] is model.body_splats.get(name)}
-    return replace(model, collision=model.collision | dict(moved), body_splats=model.body_splats | shown)
-
-
-def _has_video(capture: Capture, split: str) -> bool:
-    """Return whether any episode of a split has a video."""
-    return any(capture.videos(name) for name in capture.episodes(split))
-
-
-def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
-    """Return the model file with the results of the fit in place of earlier ones."""
-    fresh = {parameter.name for parameter in found.parameters}
-    kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
-    correlations = [block for block in file.correlations if not fresh & set(block.parameters)]
-    ground = file.ground
-    if ground is not None and found.ground_offset_m is not None:
-        ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
-    return file.model_copy(
-        update={
-            "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),
-            "contact": found.contact,
-            "ground": ground,
-            "parameters": (*found.parameters, *kept),
-            "correlations": (*found.correlations, *correlations),
-            "effects": fitted_effects(
-                file.effects,
-                {e.name: load_effect(e.name).name for e in file.effects},
-                found.parameters,
-                found.constants,
-                {} if found.effects is None else found.effects.own,
-                {} if found.effects is None else found.effects.spread,
-            ),
-            "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
-            "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
-        }
-    )
-
-
-def _with_mass(bodies: Sequence[BodyModel], world: World) -> tuple[BodyModel, ...]:
-    """Return the bodies with the centres of mass and inertias that the free ones have in a world."""
-    placed = {body.name: body for body in world.bodies}
-    return tuple(
-        body.model_copy(
-            update={
-                "com_m": _three(placed[body.name].com[0].numpy()),
-                "inertia_kg_m2": _six(placed[body.name].inertia[0].numpy()),
-            }
-        )
-        if body.motion == "free"
-        else body
-        for body in bodies
-    )
-
-
 def _input_hashes(capture: Capture, split: str, effects: Sequence[EffectModel]) -> dict[str, str]:
     """Return the SHA-256 hashes of manifest, cameras, tracks and effect files, by name."""
     names = ["capture.toml", "cameras.json"]
@@ -506,12 +362,6 @@ def _input_hashes(capture: Capture, split: str, effects: Sequence[EffectModel]) 
 def _versions() -> dict[str, str]:
     """Return the versions of cgwm and its numerical libraries."""
     return {name: importlib.metadata.version(name) for name in ("cgwm", "torch", "numpy", "scipy")}
-
-
-def _six(matrix: np.ndarray) -> tuple[float, float, float, float, float, float]:
-    """Return the elements xx, yy, zz, xy, xz, yz of a symmetric matrix (3, 3)."""
-    xx, yy, zz, xy, xz, yz = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
-    return xx, yy, zz, xy, xz, yz
 
 
 def _three(vector: np.ndarray) -> tuple[float, float, float]:

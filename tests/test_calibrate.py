@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cgwm.datasets.capture.cameras import read_cameras, require_metric
 from cgwm.datasets.capture.sparse_points import read_points
-from cgwm.pipeline.calibrate import calibrate, colmap, stage
+from cgwm.pipeline.calibrate import attempts, calibrate, colmap
 from cgwm.pipeline.calibrate.consistency_check import PairCheck, SelfCheck
 from cgwm.pipeline.calibrate.markers import dictionary
 from cgwm.pipeline.calibrate.photos import background_flow
@@ -245,7 +245,7 @@ def _failed_check(model, pairs) -> SelfCheck:
 
 def test_models_that_contradict_themselves_are_never_returned(scene, tmp_path, monkeypatch):
     root = _fresh(scene, tmp_path, photos=4)
-    monkeypatch.setattr(stage, "check_model", _failed_check)
+    monkeypatch.setattr(attempts, "check_model", _failed_check)
     with pytest.raises(NotConvergedError) as error:
         calibrate(root, CalibrateConfig(max_features=400, retries=1))
     assert "All 2 camera models contradict their own matches (2 attempts)" in str(error.value)
@@ -255,12 +255,12 @@ def test_models_that_contradict_themselves_are_never_returned(scene, tmp_path, m
 
 def test_a_rejected_model_is_followed_by_another_seed_on_the_same_matches(scene, tmp_path, monkeypatch):
     root = _fresh(scene, tmp_path, photos=4)
-    checks = [_failed_check, stage.check_model]
+    checks = [_failed_check, attempts.check_model]
 
     def check_model(model, pairs):
         return checks.pop(0)(model, pairs)
 
-    monkeypatch.setattr(stage, "check_model", check_model)
+    monkeypatch.setattr(attempts, "check_model", check_model)
     built = []
     build = colmap.build_database
     monkeypatch.setattr(colmap, "build_database", lambda *given: (built.append(given), build(*given)))
@@ -278,14 +278,14 @@ def test_self_check_on_a_real_model_and_the_same_model_broken(scene, tmp_path):
     colmap.build_database(tmp_path / "a.db", tmp_path, images, colmap.SfmSettings(max_features=700))
     model = colmap.map_database(tmp_path / "a.db", tmp_path, seed=0)[0]
     pairs = colmap.read_pairs(tmp_path / "a.db")
-    right = stage.check_model(model, pairs)
+    right = attempts.check_model(model, pairs)
     assert right.passed
     assert right.strong
     turn = rotation_about([0, 0, 1], np.radians(8.0))
     poses = {name: pose.copy() for name, pose in model.T_cam_world.items()}
     for name in list(poses)[: len(poses) // 2]:
         poses[name][:3, :3] = poses[name][:3, :3] @ turn
-    assert not stage.check_model(replace(model, T_cam_world=poses), pairs).passed
+    assert not attempts.check_model(replace(model, T_cam_world=poses), pairs).passed
 
 
 def test_interruption_leaves_nothing(scene, tmp_path, monkeypatch):
@@ -305,14 +305,14 @@ def test_interruption_leaves_nothing(scene, tmp_path, monkeypatch):
 
 
 def test_every_plan_starts_with_the_users_settings():
-    plan = stage._plan(CalibrateConfig(seed=7, max_features=1000, retries=6))
+    plan = attempts._plan(CalibrateConfig(seed=7, max_features=1000, retries=6))
     assert plan[0] == colmap.SfmSettings(seed=7, max_features=1000)
     assert len(plan) == 7
     assert len({settings.seed for settings in plan}) == 7
     assert plan[0].matches == plan[1].matches != plan[2].matches
     assert plan[3].max_features == 2000
     assert plan[3].peak_threshold < plan[0].peak_threshold
-    assert stage._plan(CalibrateConfig(retries=0)) == [replace(plan[0], seed=0, max_features=4096)]
+    assert attempts._plan(CalibrateConfig(retries=0)) == [replace(plan[0], seed=0, max_features=4096)]
 
 
 def test_a_moving_camera_is_told_from_a_moving_body():

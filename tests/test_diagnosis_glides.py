@@ -20,7 +20,8 @@ from cgwm.pipeline.physics.parameters import FRICTION
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from cgwm.pipeline.segments.segments import Segments
-from cgwm.pipeline.segments.sliding_fit import StartedSliding, soft_world, without_loads
+from cgwm.pipeline.segments.sliding_fit import StartedSliding
+from cgwm.pipeline.segments.sliding_residuals import soft_world, without_loads
 from cgwm.pipeline.segments.sliding_segments import find_sliding_segments
 from cgwm.pipeline.trajectories.segmentation import Segment
 from diagnosis_data import Effects, tosses, world_with

@@ -31,7 +31,7 @@ from ...schemas import (
 from ..capture.cameras import Camera
 from ..capture.images import write_image
 from ..capture.manifest import write_manifest
-from ..capture.tracks import Track, write_tracks
+from ..capture.tracks import write_tracks
 from ..io.progress import progress
 from .dynamics import (
     BODY_GROUP,
@@ -60,15 +60,13 @@ from .rig import (
     video_cameras,
 )
 from .sensor import draw_gain, expose
+from .tracker import POSITION_STD, ROTATION_STD, measure_tracks, track_times
 from .truth import TRUTH_FILE, TRUTH_MESH, TrueContact, TrueMotion, TrueObject, TruthFile
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Vector3 = tuple[float, float, float]
 
-TRACK_RATE = 120
-POSITION_STD = 0.0005
-ROTATION_STD = np.radians(0.3)
 EXPOSURE_STEPS = (-8, 0, 8)
 """Moments, in steps of the simulation, whose mean is one video frame: an exposure of 1/150 s about its time."""
 _AWAY = -100.0  # height at which a body is out of sight, below the mat
@@ -262,54 +260,6 @@ def _touched(scene: Set, camera: Camera, moments: Array) -> Window | None:
 def _qpos(plan: ScenePlan, body_qpos: Array) -> Array:
     """Return MuJoCo positions with the object at `body_qpos`, shape (7,), and the fingertip out of sight."""
     return np.concatenate([body_qpos, [0, 0, _AWAY]]) if plan.fingertip else body_qpos
-
-
-def track_times(plan: ScenePlan, episode: EpisodePlan) -> Array:
-    """Return the times of an episode's track [s]: from zero to the last frame's end at TRACK_RATE."""
-    return np.arange(round(episode.frame_count / plan.frame_rate * TRACK_RATE) + 1) / TRACK_RATE
-
-
-def measure_tracks(plan: ScenePlan, episode: EpisodePlan) -> dict[str, Track]:
-    """Return what a tracker measures: the object with noise, the fingertip's command as it is.
-
-    The noise is normal and independent: POSITION_STD along each axis, and a turn about the body's axes with
-    ROTATION_STD about each.
-    """
-    rng = np.random.default_rng([plan.seed, 11, zlib.crc32(episode.name.encode())])
-    times = track_times(plan, episode)
-    rows = episode.motion.qpos[episode.motion.rows(times)]
-    quats = []
-    for quat_wxyz, turn in zip(rows[:, 3:7], ROTATION_STD * rng.standard_normal((len(rows), 3)), strict=True):
-        quats.append(_turned(quat_wxyz, turn))
-    position = rows[:, :3] + POSITION_STD * rng.standard_normal((len(rows), 3))
-    tracks = {
-        OBJECT: Track(
-            time_s=times,
-            position_m=np.round(position, 7),
-            quat_wxyz=np.asarray(quats, np.float64).round(9),
-            velocity_m_s=None,
-            omega_body_rad_s=None,
-        )
-    }
-    if plan.fingertip:
-        tracks[FINGERTIP] = Track(
-            time_s=times,
-            position_m=rows[:, 7:10],
-            quat_wxyz=np.tile([1.0, 0, 0, 0], (len(rows), 1)),
-            velocity_m_s=None,
-            omega_body_rad_s=None,
-        )
-    return tracks
-
-
-def _turned(quat_wxyz: Array, rotation_vector: Array) -> Array:
-    """Return the orientation turned by a small rotation vector [rad] in body axes."""
-    x, y, z = rotation_vector
-    angle = float(np.linalg.norm(rotation_vector))
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    # Rodrigues' formula.
-    step = np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
-    return quat_from_matrix(matrix_from_quat(quat_wxyz) @ step)
 
 
 def manifest(scene: Set) -> CaptureManifest:

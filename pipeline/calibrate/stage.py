@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,50 +22,26 @@ from ...schemas import (
     CamerasFile,
     CaptureManifest,
     InputDataError,
-    NotConvergedError,
     PosedImage,
     PosedVideo,
     Scale,
     UsageError,
     read_toml,
 )
-from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict, PairFigures, SelfCheckFigures
+from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict
 from . import colmap
-from .consistency_check import SelfCheck, check_model
+from .attempts import MIN_PHOTOS, Candidate, check_figures, photo_count, photo_labels, search, verdict
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
 from .photos import Inputs, gather, video_label
-from .reconstruction import Array, SfmCamera, SfmModel, Similarity, VerifiedPair, world_from_cam
+from .reconstruction import Array, SfmCamera, SfmModel, Similarity, world_from_cam
 from .world_frame import dominant_plane, ground_frame
 
 CAMERAS_NAME = "cameras.json"
 REPORT_NAME = "calibration.json"
 
-MIN_PHOTOS = 3
-MIN_REGISTERED_FRACTION = 0.5
-"""Minimum fraction of registered photos; below it the calibration fails."""
-_LOW_PEAK_THRESHOLD = 0.002  # conventions: worked for weak texture
-_THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
-_TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
 _MANY_WITHOUT_STRONG = 0.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Candidate:
-    """Result of an attempt."""
-
-    model: SfmModel
-    """The largest connected model."""
-    check: SelfCheck
-    """Self-check of that model."""
-    models: tuple[SfmModel, ...]
-    """All connected models."""
-    pairs: tuple[VerifiedPair, ...]
-    """Verified pairs of images."""
-    features: dict[str, int]
-    """Number of features by image."""
-    attempt: int
-    """Number of the attempt."""
+"""Share of registered images without a pair of many verified matches above which a warning is given."""
 
 
 def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = False) -> CalibrationReport:
@@ -95,7 +70,7 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     capture = _open(capture_root, overwrite)
     with tempfile.TemporaryDirectory(prefix="cgwm-calibrate-") as folder:
         inputs = gather(capture, Path(folder))
-        best, attempts = _search(Path(folder), inputs, config)
+        best, attempts = search(Path(folder), inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)
     model = best.model.transformed(similarity)
     cameras = _cameras_file(model, _scale(frame))
@@ -134,194 +109,6 @@ def _open(root: Path, overwrite: bool) -> Capture:
         )
     dictionary(capture.manifest.calibration.aruco_dictionary)
     return capture
-
-
-def _plan(config: CalibrateConfig) -> list[colmap.SfmSettings]:
-    """Return the settings of the attempts: other seeds first, then other matching, then more features."""
-    base = colmap.SfmSettings(seed=config.seed, max_features=config.max_features, max_image_size=config.max_image_size)
-    more = replace(
-        base,
-        max_features=2 * config.max_features,
-        max_image_size=2 * config.max_image_size,
-        peak_threshold=_LOW_PEAK_THRESHOLD,
-        verification_trials=_THOROUGH_TRIALS,
-    )
-    plan = [
-        base,
-        replace(base, seed=config.seed + 1),
-        replace(base, seed=config.seed + 2, guided_matching=True),
-        replace(more, seed=config.seed + 3),
-        replace(more, seed=config.seed + 4, guided_matching=True, max_ratio=_TIGHT_RATIO),
-    ]
-    further = config.retries + 1 - len(plan)
-    plan += [replace(plan[3 + k % 2], seed=config.seed + 5 + k) for k in range(max(further, 0))]
-    return plan[: config.retries + 1]
-
-
-def _search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[_Candidate, list[CalibrationAttempt]]:
-    """Try settings until a model passes; if it lacks images, try once more with more features."""
-    attempts: list[CalibrationAttempt] = []
-    passed: list[_Candidate] = []
-    last: _Candidate | None = None
-    built: colmap.SfmSettings | None = None
-    for settings in _plan(config):
-        if passed and len(passed[0].model.T_cam_world) == len(inputs.sources):
-            break
-        incomplete = bool(passed) or (built is not None and (last is None or last.check.passed))
-        if incomplete and built is not None and settings.features == built.features:
-            continue  # Another seed registers no more images, but more features may.
-        second_try = bool(passed)
-        candidate, attempt = _attempt(folder, inputs, settings, built, len(attempts))
-        attempts.append(attempt)
-        built, last = settings, candidate
-        if candidate is not None and candidate.check.passed:
-            passed.append(candidate)
-        if second_try:
-            break
-    best = max(passed, key=lambda candidate: _rank(candidate, inputs), default=None)
-    if best is None or _photo_count(best.model, inputs) < _needed(inputs):
-        raise _not_converged(inputs, attempts, best, last)
-    attempts[best.attempt] = attempts[best.attempt].model_copy(update={"outcome": "taken"})
-    return best, attempts
-
-
-def _attempt(
-    folder: Path, inputs: Inputs, settings: colmap.SfmSettings, built: colmap.SfmSettings | None, number: int
-) -> tuple[_Candidate | None, CalibrationAttempt]:
-    names = {source.image.name: source.label for source in inputs.sources}
-    reuse = built is not None and built.matches == settings.matches
-    database = folder / f"attempt-{number}.db"
-    if reuse:
-        for path in sorted(folder.glob(f"attempt-{number - 1}.*")):
-            if path.is_file():
-                path.rename(folder / path.name.replace(f"-{number - 1}.", f"-{number}."))
-    else:
-        colmap.build_database(database, inputs.root, [source.image for source in inputs.sources], settings)
-    models = tuple(model.renamed(names) for model in colmap.map_database(database, inputs.root, settings.seed))
-    pairs = tuple(
-        replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in colmap.read_pairs(database)
-    )
-    candidate = None
-    if models:
-        features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
-        candidate = _Candidate(
-            model=models[0],
-            check=check_model(models[0], pairs),
-            models=models,
-            pairs=pairs,
-            features=features,
-            attempt=number,
-        )
-    return candidate, _attempt_figures(settings, candidate)
-
-
-def _attempt_figures(settings: colmap.SfmSettings, candidate: _Candidate | None) -> CalibrationAttempt:
-    outcome = "no_model" if candidate is None else "passed" if candidate.check.passed else "self_check_failed"
-    return CalibrationAttempt(
-        seed=settings.seed,
-        max_features=settings.max_features,
-        max_image_size=settings.max_image_size,
-        peak_threshold=settings.peak_threshold,
-        guided_matching=settings.guided_matching,
-        max_ratio=settings.max_ratio,
-        models=len(candidate.models) if candidate else 0,
-        registered=len(candidate.model.T_cam_world) if candidate else 0,
-        points=len(candidate.model.points) if candidate else 0,
-        reprojection_error_px=candidate.model.reprojection_error_px if candidate else None,
-        self_check=_check_figures(candidate.check) if candidate else None,
-        outcome=outcome,
-    )
-
-
-def _check_figures(check: SelfCheck) -> SelfCheckFigures:
-    worst = check.worst
-    return SelfCheckFigures(
-        passed=check.passed,
-        pairs=len(check.pairs),
-        strong_pairs=len(check.strong),
-        worst=worst
-        and PairFigures(
-            images=(worst.image_a, worst.image_b), inliers=worst.inliers, consistent=round(worst.consistent, 4)
-        ),
-        images_without_strong_pair=check.images_without_strong_pair,
-    )
-
-
-def _rank(candidate: _Candidate, inputs: Inputs) -> tuple[int, int, int]:
-    return _photo_count(candidate.model, inputs), len(candidate.model.T_cam_world), -candidate.attempt
-
-
-def _photo_count(model: SfmModel, inputs: Inputs) -> int:
-    return sum(label in model.T_cam_world for label in _photo_labels(inputs))
-
-
-def _photo_labels(inputs: Inputs) -> list[str]:
-    return [source.label for source in inputs.sources if not source.image.name.startswith("videos/")]
-
-
-def _needed(inputs: Inputs) -> int:
-    return max(MIN_PHOTOS, int(np.ceil(MIN_REGISTERED_FRACTION * len(_photo_labels(inputs)))))
-
-
-def _not_converged(
-    inputs: Inputs, attempts: Sequence[CalibrationAttempt], best: _Candidate | None, last: _Candidate | None
-) -> NotConvergedError:
-    photos = len(_photo_labels(inputs))
-    rejected = [attempt for attempt in attempts if attempt.outcome == "self_check_failed"]
-    if best is None and rejected:
-        worst = rejected[0].self_check.worst if rejected[0].self_check else None
-        where = ""
-        if worst:
-            where = (
-                f" For example {worst.images[0]} and {worst.images[1]} share {worst.inliers} verified matches, of "
-                f"which {100 * worst.consistent:.0f} % agree with the cameras."
-            )
-        return NotConvergedError(
-            f"All {len(rejected)} camera models contradict their own matches ({len(attempts)} attempts).{where}",
-            "models in which every pair of images with 200 or more verified matches is at least 50 % consistent.",
-            "remove blurred photos and those in which something moved; repeated or symmetric texture can cause this: "
-            "put an object or printed pattern with unique texture next to it, and photograph in steps of 10 degrees.",
-        )
-    candidate = best or last
-    registered = _photo_count(candidate.model, inputs) if candidate else 0
-    causes: dict[str, int] = {}
-    for label in _photo_labels(inputs):
-        reason = _verdict(label, candidate).reason.split(":", 1)[0] if candidate else "no model"
-        if reason:
-            causes[reason] = causes.get(reason, 0) + 1
-    listed = ", ".join(f"{count} {reason}" for reason, count in sorted(causes.items(), key=lambda item: -item[1]))
-    return NotConvergedError(
-        f"{registered} of {photos} photos registered after {len(attempts)} attempts. The others: {listed}.",
-        f"at least {_needed(inputs)} of {photos}.",
-        "take sharp photos in steps of 10 degrees or less, all around and from two heights, with the same focal "
-        "length; keep textured surroundings in view; nothing may move between the photos.",
-    )
-
-
-def _verdict(label: str, candidate: _Candidate) -> ImageVerdict:
-    touching = [pair for pair in candidate.pairs if label in (pair.image_a, pair.image_b)]
-    features, matches = candidate.features.get(label, 0), sum(len(pair.xy_a) for pair in touching)
-    registered = label in candidate.model.T_cam_world
-    inliers = len(candidate.model.observations[label][1]) if registered else 0
-    reason = ""
-    if not registered:
-        part = next((model for model in candidate.models if label in model.T_cam_world), None)
-        if label not in candidate.features:
-            reason = "unreadable: COLMAP cannot decode it"
-        elif part is not None:
-            reason = f"in another part: connected to {len(part.T_cam_world) - 1} images, not to the largest part"
-        elif not touching:
-            reason = f"without matches: {features} features, none verified in another image"
-        else:
-            reason = f"without a pose: {matches} matches with {len(touching)} images, too few see reliable points"
-    return ImageVerdict(
-        registered=registered,
-        reason=reason,
-        features=features,
-        matched_images=len(touching),
-        matches=matches,
-        inliers=inliers,
-    )
 
 
 def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Similarity, str, list[str]]:
@@ -405,14 +192,14 @@ def _report(
     capture: Capture,
     inputs: Inputs,
     config: CalibrateConfig,
-    best: _Candidate,
+    best: Candidate,
     attempts: Sequence[CalibrationAttempt],
     model: SfmModel,
     scale: Scale,
     world_frame: str,
 ) -> CalibrationReport:
-    verdicts = {source.label: _verdict(source.label, best) for source in inputs.sources}
-    photos = _photo_labels(inputs)
+    verdicts = {source.label: verdict(source.label, best) for source in inputs.sources}
+    photos = photo_labels(inputs)
     videos = {
         label.removeprefix(video_label("")): verdict for label, verdict in verdicts.items() if label not in photos
     }
@@ -420,12 +207,12 @@ def _report(
     tilt, height = _ground_check(capture, model, scale)
     return CalibrationReport(
         photos=len(photos),
-        photos_registered=_photo_count(best.model, inputs),
+        photos_registered=photo_count(best.model, inputs),
         images={label: verdicts[label] for label in photos},
         videos=videos,
         points=len(model.points),
         reprojection_error_px=model.reprojection_error_px,
-        self_check=_check_figures(best.check),
+        self_check=check_figures(best.check),
         attempts=tuple(attempts),
         scale=scale,
         world_frame=world_frame,
@@ -438,7 +225,7 @@ def _report(
     )
 
 
-def _warnings(best: _Candidate) -> list[str]:
+def _warnings(best: Candidate) -> list[str]:
     warnings = []
     others = [len(set(model.T_cam_world) - set(best.model.T_cam_world)) for model in best.models[1:]]
     if any(others):

@@ -60,17 +60,10 @@ def triangulate(
     point = _best_hypothesis(poses, rays, focal)
     if point is None:
         return None
-    good = _errors(point, poses, rays, focal) < MAX_ERROR_PX
-    for _ in range(_GAUSS_NEWTON_STEPS):
-        residual, jacobian = _residual(point, poses[good], rays[good], focal[good])
-        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
-        point = point - step
-        refined = _errors(point, poses, rays, focal) < MAX_ERROR_PX
-        if refined.sum() < 2:
-            return None
-        if np.array_equal(refined, good) and np.linalg.norm(step) < 1e-12 * np.linalg.norm(point):
-            break
-        good = refined
+    refined = _refined(point, poses, rays, focal)
+    if refined is None:
+        return None
+    point, good = refined
     residual, jacobian = _residual(point, poses[good], rays[good], focal[good])
     rms = float(np.sqrt(np.mean(residual**2) * 2.0))
     freedom = max(len(residual) - 3, 1)
@@ -119,6 +112,26 @@ def _best_hypothesis(poses: Array, rays: Array, focal: Array) -> Array | None:
     cost = np.minimum(errors, MAX_ERROR_PX).sum(axis=1)
     best = np.lexsort((cost, -agreeing))[0]
     return points[best] if agreeing[best] >= 2 else None
+
+
+def _refined(point: Array, poses: Array, rays: Array, focal: Array) -> tuple[Array, NDArray[np.bool_]] | None:
+    """Refine a point by Gauss-Newton on the reprojection error of the views that agree with it.
+
+    Returns:
+        The point and the views that agree, shape (view,); None if fewer than two do.
+    """
+    good = _errors(point, poses, rays, focal) < MAX_ERROR_PX
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        residual, jacobian = _residual(point, poses[good], rays[good], focal[good])
+        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+        point = point - step
+        refined = _errors(point, poses, rays, focal) < MAX_ERROR_PX
+        if refined.sum() < 2:
+            return None
+        if np.array_equal(refined, good) and np.linalg.norm(step) < 1e-12 * np.linalg.norm(point):
+            break
+        good = refined
+    return point, good
 
 
 def _midpoints(centers: Array, directions: Array) -> Array:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..physics.world import World
 from ..segments.candidates import Candidate, Variant, admissible, base_values, variants_of, with_variants
-from ..segments.sliding_fit import SlidingFit, StartedSliding, fit_sliding, noiseless_misfits, nuisance_parameters
+from ..segments.sliding_descent import SlidingFit
+from ..segments.sliding_fit import StartedSliding, fit_sliding, noiseless_misfits, nuisance_parameters
 from .contact_tests.sliding import batches
 
 SAFE = 1.5

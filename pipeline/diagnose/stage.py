@@ -28,9 +28,9 @@ from ..physics.world import World
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..segments.candidates import Candidate, admissible
+from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
-from ..segments.random_effects import with_known_groups
 from ..segments.residual_wrench import Omnibus, covariates_of, wrench_windows
 from .detection_limits import DetectionLimit
 from .effect_selection import Evidence

@@ -26,7 +26,8 @@ from ..physics.world import World
 from ..rendering.video_view import renderable, usable_cameras
 from ..runtime.device import resolve_device
 from ..runtime.resources import enough_memory, one_torch_thread
-from ..segments.random_effects import group_parameters, with_fitted_groups, with_known_groups
+from ..segments.group_parameters import group_parameters, with_known_groups
+from ..segments.random_effects import with_fitted_groups
 from ..trajectories.track_noise import estimate_noise
 from .image_errors import VideoComparison, VideoErrors
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, Episode, EpisodePrediction, predict

@@ -252,3 +252,9 @@ def symmetric(six: tuple[float, ...]) -> np.ndarray:
     """Return the symmetric matrix (3, 3) of (xx, yy, zz) or (xx, yy, zz, xy, xz, yz)."""
     xx, yy, zz, xy, xz, yz = (*six, 0.0, 0.0, 0.0)[:6]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def inertia_elements(matrix: np.ndarray) -> tuple[float, float, float, float, float, float]:
+    """Return the elements (xx, yy, zz, xy, xz, yz) of a symmetric matrix (3, 3)."""
+    xx, yy, zz, xy, xz, yz = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+    return xx, yy, zz, xy, xz, yz

@@ -1,10 +1,8 @@
 """Random effects: effect parameters that differ between groups (sessions or episodes), with a shared prior.
 
-A parameter of group u is normally distributed about the mean over groups, with a standard deviation tau that is
-estimated too (a linear mixed model, Laird & Ware, "Random-effects models for longitudinal data", 1982). A descent with
-the widest prior finds where all parameters and states fit; there the problem is linearised, and
-expectation-maximisation gives means, tau and the parameters of the groups. A group with little information is shrunk
-towards the others.
+A descent with the widest prior finds where all parameters and states fit; there the problem is linearised, and
+expectation-maximisation gives means, standard deviations between groups and the parameters of the groups
+(`mixed_model.py`).
 
 Residuals of neighbouring frames are not independent errors: what a model misses bends a whole episode. The variance of
 the residuals and their correlation rho from frame to frame reduce the effective sample size of an episode to (1 - rho)
@@ -23,11 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.capture.tracks import Track
-from ...schemas import FittedParameter, InputDataError, ModelFile
+from ...schemas import FittedParameter, ModelFile
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..optimization.uncertainty import correlation_of, student_quantile
 from ..physics.effects.registry import load_effect
-from ..physics.parameters import GROUND_SHIFT, Parameter, apply_parameters, effect_parameters
+from ..physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from ..physics.world import World
 from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors
 from ..trajectories.initial_state import flight_frames
@@ -35,53 +33,17 @@ from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
 from ..trajectories.track_noise import MAD_TO_STD
 from .first_contact_fit import ITERATIONS, MODEL_ERROR, EffectEstimate, described, windows_of
+from .group_parameters import group_of, group_parameters, with_known_groups
+from .mixed_model import Array, GroupLayout, GroupPosterior, GroupPrior, posterior
 from .segments import PARAMETER_STEP
-
-Array = NDArray[np.float64]
 
 REST_S = 0.1
 """Length [s] of the window at the end of an episode, where a body at rest shows the ground's height and tilt."""
 FIRST_ITERATIONS = 6
 """Steps of the first descent, which measures how large residuals are."""
-ROUNDS = 300
-"""Number of iterations of expectation-maximisation."""
-LEAST_SHARE = 1e-3
-"""Lower bound of tau, as a share of the widest prior: where groups do not differ, tau would go to 0."""
 STATE_INFORMATION = 1e-4
 """Weight of the prior on states relative to the usual one: the start of a long fall is far from the line through its
 first frames."""
-
-
-@dataclass(frozen=True)
-class GroupPrior:
-    """The prior of group-specific parameters that a fit has found."""
-
-    mean: Mapping[str, float]
-    """Mean over groups, by `effect.parameter`."""
-    spread: Mapping[str, float]
-    """Standard deviation between groups in fitted coordinates, by `effect.parameter`."""
-
-
-def group_of(shared: str, episode: str, groups: Mapping[str, str]) -> str:
-    """Return the group that an episode belongs to, for parameters shared within `shared`.
-
-    Args:
-        shared: "all", "group" or "episode".
-        episode: Name of the episode.
-        groups: Group of each episode that belongs to one.
-
-    Raises:
-        InputDataError: If the parameter is one of groups and the episode belongs to none.
-    """
-    if shared == "episode":
-        return episode
-    if shared == "group" and episode not in groups:
-        raise InputDataError(
-            f"an effect has separate parameters for each group, and episode '{episode}' belongs to no group.",
-            f"[episodes.{episode}] group in capture.toml, for every episode.",
-            "name the groups, or give each episode separate parameters: NAME@episode.",
-        )
-    return groups[episode] if shared == "group" else ""
 
 
 def fit_random_effects(
@@ -113,72 +75,18 @@ def fit_random_effects(
         NotConvergedError: If the rollouts diverge at the start.
     """
     batch, ends, stds = _batch(world, episodes, noise, flying, after_s)
-    layout = _Layout.of([*wanted, *along], batch.names, groups, ties)
+    layout = GroupLayout.of([*wanted, *along], batch.names, groups, ties)
     solution, rows = _descend(world, batch, ends, stds, layout)
     errors = WindowErrors.of(rows, solution, batch, ends)
-    found = _tied(solution, errors, layout, None if ties is None else layout.known_tau(ties))
+    found = posterior(solution, errors, layout, None if ties is None else layout.known_tau(ties))
     result = _result(world, wanted, layout, found, batch.names, groups, solution)
     if flying or GROUND_SHIFT not in layout.parameters:
         return result
     return _with_ground_shift(result, layout, found)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Layout:
-    """The place of every parameter of every group in one vector of N values, with the widest priors."""
-
-    parameters: list[Parameter]
-    """Parameters (P)."""
-    groups: list[list[str]]
-    """Groups of each parameter, in the order of their values; one empty name for a parameter shared by all."""
-    place: NDArray[np.int64]
-    """Index of the value that each item uses, shape (B, P)."""
-    owner: NDArray[np.int64]
-    """Index of the parameter of each value, shape (N,)."""
-    centre: Array
-    """Prior means in fitted coordinates, shape (N,)."""
-    width: Array
-    """Widest prior standard deviations, shape (N,)."""
-
-    @staticmethod
-    def of(
-        start: Sequence[tuple[Parameter, float]],
-        episodes: Sequence[str],
-        groups: Mapping[str, str],
-        ties: GroupPrior | None,
-    ) -> _Layout:
-        """Lay out parameters, with the values that they start from, for items of the given episodes (B)."""
-        parameters = [p for p, _ in start]
-        units = [[group_of(p.shared, name, groups) for name in episodes] for p in parameters]
-        names = [list(dict.fromkeys(column)) for column in units]
-        first = np.cumsum([0, *(len(column) for column in names)])
-        place = np.stack([[first[k] + names[k].index(u) for u in column] for k, column in enumerate(units)], 1)
-        owner = np.repeat(np.arange(len(parameters)), [len(column) for column in names])
-        given = {p.name: p.encode(value) for p, value in start} | dict(ties.mean if ties else {})
-        return _Layout(
-            parameters=parameters,
-            groups=names,
-            place=place,
-            owner=owner,
-            centre=np.array([given[parameters[k].name] for k in owner]),
-            width=np.array([parameters[k].prior[1] for k in owner]),
-        )
-
-    def places(self, parameter: int) -> NDArray[np.int64]:
-        """Return the indices of the values of a parameter."""
-        return np.flatnonzero(self.owner == parameter)
-
-    def tied(self) -> list[NDArray[np.int64]]:
-        """Return the indices of the values of each parameter that differs between groups."""
-        return [self.places(k) for k, p in enumerate(self.parameters) if p.shared != "all"]
-
-    def known_tau(self, ties: GroupPrior) -> Array:
-        """Return the prior standard deviations (N,) that an earlier fit has found."""
-        return np.array([ties.spread.get(self.parameters[k].name, self.width[i]) for i, k in enumerate(self.owner)])
-
-
 def _descend(
-    world: World, batch: Observations, ends: NDArray[np.bool_], stds: tuple[Tensor, Tensor], layout: _Layout
+    world: World, batch: Observations, ends: NDArray[np.bool_], stds: tuple[Tensor, Tensor], layout: GroupLayout
 ) -> tuple[Solution, Tensor]:
     """Return the solution with the widest priors, and its residuals (B, F, 6) in sigmas.
 
@@ -217,7 +125,7 @@ def _descend(
     return descended(first.shared, first.states, (stds[0] * scale, stds[1] * scale), ITERATIONS)
 
 
-def _with_ground_shift(result: EffectEstimate, layout: _Layout, found: _Tied) -> EffectEstimate:
+def _with_ground_shift(result: EffectEstimate, layout: GroupLayout, found: GroupPosterior) -> EffectEstimate:
     """Return the estimate with the ground moved to the height that the ends of episodes show."""
     world = result.world
     if world.ground_offset is None:
@@ -289,72 +197,6 @@ def _batch(
     return batch, np.array(ends), (stds[0], stds[1])
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Tied:
-    """Values of all groups (N) with their estimated prior."""
-
-    values: Array
-    """Values in fitted coordinates, shape (N,)."""
-    covariance: Array
-    """Their covariance, shape (N, N)."""
-    mean: Array
-    """Prior means, shape (N,)."""
-    tau: Array
-    """Prior standard deviations, shape (N,)."""
-    dof: float
-    """Degrees of freedom."""
-    errors: Array
-    """Factor by which the error variance of each item exceeds that of independent errors, shape (B,)."""
-
-
-def _tied(solution: Solution, errors: WindowErrors, layout: _Layout, known_tau: Array | None) -> _Tied:
-    """Return parameters and priors that maximise the likelihood of the linearised problem.
-
-    The error variance is that found with the widest prior: shrunk groups fit worse, and would be weighted down for it.
-    """
-    centre, width, tied = layout.centre, layout.width, layout.tied()
-    parts, slopes, at = solution.by_item.numpy(), solution.scores.numpy(), solution.shared.numpy()
-    factor = _factors(parts, slopes, at, errors, centre, width)
-    matrix = (parts / factor[:, None, None]).sum(0)
-    right = ((slopes + parts @ at) / factor[:, None]).sum(0)
-    mean, tau = centre.copy(), width.copy() if known_tau is None else known_tau
-    values, covariance = _solved(matrix, right, mean, tau)
-    for _ in range(ROUNDS if known_tau is None else 0):
-        for places in tied:
-            if len(places) > 1:
-                mean[places] = values[places].mean()
-                square = ((values[places] - mean[places]) ** 2 + np.diag(covariance)[places]).sum() / (len(places) - 1)
-                tau[places] = np.clip(np.sqrt(square), LEAST_SHARE * width[places], width[places])
-        values, covariance = _solved(matrix, right, mean, tau)
-    dof = float(errors.independent.sum()) - len(values)
-    return _Tied(values=values, covariance=covariance, mean=mean, tau=tau, dof=max(dof, 1.0), errors=factor)
-
-
-def _factors(parts: Array, slopes: Array, at: Array, errors: WindowErrors, centre: Array, width: Array) -> Array:
-    """Return the factor (B,) by which the error variance of each item exceeds that of independent errors."""
-    factor = np.ones(len(parts))
-    for _ in range(10):
-        matrix = (parts / factor[:, None, None]).sum(0)
-        right = ((slopes + parts @ at) / factor[:, None]).sum(0)
-        values, covariance = _solved(matrix, right, centre, width)
-        away = values - at
-        chi2 = errors.chi2 - 2 * slopes @ away + np.einsum("p,bpq,q->b", away, parts, away)
-        lost = np.einsum("pq,bqp->b", covariance, parts) / factor
-        free = errors.independent - lost
-        for k in np.unique(errors.kind):
-            some = errors.kind == k
-            pooled = max(chi2[some].sum(), 1e-12) / max(free[some].sum(), 1.0)
-            # an episode that fits worse than the others gets less weight
-            factor[some] = np.maximum(pooled, chi2[some] / np.maximum(free[some], 1.0))
-    return factor
-
-
-def _solved(matrix: Array, right: Array, mean: Array, tau: Array) -> tuple[Array, Array]:
-    """Return the posterior mean and covariance of a linear problem with a normal prior."""
-    covariance = np.linalg.inv(matrix + np.diag(tau**-2.0))
-    return (covariance @ (right + mean / tau**2)).astype(np.float64), covariance.astype(np.float64)
-
-
 @dataclass(frozen=True)
 class _Reported:
     """The wanted parameters as `model.json` has them."""
@@ -402,7 +244,7 @@ class _Reported:
                 self.rows.append(one.model_copy(update=update))
 
 
-def _reported(wanted: Sequence[Parameter], layout: _Layout, found: _Tied) -> _Reported:
+def _reported(wanted: Sequence[Parameter], layout: GroupLayout, found: GroupPosterior) -> _Reported:
     """Return the wanted parameters, which come first in the layout, with intervals."""
     reach, reported = student_quantile(0.975, found.dof), _Reported()
     for k, p in enumerate(wanted):
@@ -420,8 +262,8 @@ def _reported(wanted: Sequence[Parameter], layout: _Layout, found: _Tied) -> _Re
 def _result(
     world: World,
     wanted: Sequence[tuple[Parameter, float]],
-    layout: _Layout,
-    found: _Tied,
+    layout: GroupLayout,
+    found: GroupPosterior,
     episodes: Sequence[str],
     groups: Mapping[str, str],
     solution: Solution,
@@ -463,15 +305,6 @@ def _result(
     )
 
 
-def with_known_groups(world: World, file: ModelFile, episodes: Sequence[str], groups: Mapping[str, str]) -> World:
-    """Return the world in which episodes of groups that the fit has seen use the parameters of their group.
-
-    Other episodes use the mean over the groups of the fit.
-    """
-    own = {name: _known(world, file, name, groups) for name in episodes}
-    return replace(world, own={name: values for name, values in own.items() if values})
-
-
 def with_fitted_groups(
     world: World,
     episodes: Sequence[tuple[str, dict[str, Track]]],
@@ -495,22 +328,3 @@ def with_fitted_groups(
     ties = GroupPrior({p.name: centre[p.name] for p in own}, spread)
     found = fit_random_effects(known, unknown, groups, [(p, centre[p.name]) for p in own], (), noise, flying, 0.0, ties)
     return replace(known, own=dict(found.world.own))
-
-
-def group_parameters(world: World) -> list[Parameter]:
-    """Return the parameters that differ between groups or episodes."""
-    return [p for p in effect_parameters(world) if p.shared != "all"]
-
-
-def _known(world: World, file: ModelFile, episode: str, groups: Mapping[str, str]) -> dict[str, float]:
-    """Return the group-specific parameters that the fit knows of an episode, by `effect.parameter`."""
-    found: dict[str, float] = {}
-    by_effect = {load_effect(effect.name).name: effect.own for effect in file.effects if effect.own}
-    for p in group_parameters(world):
-        effect, _, number = p.name.partition(".")
-        if p.shared == "group" and episode not in groups:
-            continue
-        value = by_effect.get(effect, {}).get(group_of(p.shared, episode, groups), {}).get(number)
-        if value is not None:
-            found[p.name] = value
-    return found

@@ -123,11 +123,8 @@ def scene_seeds(
     shell_budget = int((_SHELL_SHARE_GROUND if ground is not None else _SHELL_SHARE) * max_spheres)
     rest = max_spheres - shell_budget
     parts: list[tuple[Array, Array]] = []
-    standing = points = None if points is None else points[~_on_bodies(points, views)]
-    if points is None and ground is None and not shows_bodies(views):
-        standing = _random_points(views, rest, rng)
-    elif points is not None and ground is not None:
-        standing = points[points @ np.array(ground.normal) - ground.offset_m > 0.02 * spread]
+    points = None if points is None else points[~_on_bodies(points, views)]
+    standing = _off_ground_points(views, ground, points, rest, rng)
     if standing is not None and len(standing) > 3:
         parts.append(_with_neighbour_scales(standing, rest if ground is None else rest // 4, rng))
     if ground is not None:
@@ -137,6 +134,26 @@ def scene_seeds(
         sample = sample.chosen(~hits)
     parts.append(_shell(sample, cameras, points, shell_budget))
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def _off_ground_points(
+    views: Sequence[View], ground: Ground | None, points: Array | None, count: int, rng: np.random.Generator
+) -> Array | None:
+    """Return points (n, 3) on the surfaces above the ground, or None where nothing is known about them.
+
+    Args:
+        views: The photos.
+        ground: The ground, or None.
+        points: SfM points that lie on no body, shape (m, 3), or None.
+        count: Number of random points where there is neither a ground nor a point nor a mask of a body.
+        rng: Generator of the random points.
+    """
+    if points is None:
+        return _random_points(views, count, rng) if ground is None and not shows_bodies(views) else None
+    if ground is None:
+        return points
+    spread = _spread(np.stack([view.camera.center for view in views]))
+    return points[points @ np.array(ground.normal) - ground.offset_m > 0.02 * spread]
 
 
 def shows_bodies(views: Sequence[View]) -> bool:

@@ -25,7 +25,8 @@ from ...segments.contact_phases import is_round
 from ...segments.prepare import Prepared
 from ...segments.segment_fit import refit
 from ...segments.segments import Segments
-from ...segments.sliding_fit import SlidingFit, StartedSliding, fit_sliding
+from ...segments.sliding_descent import SlidingFit
+from ...segments.sliding_fit import StartedSliding, fit_sliding
 from ...trajectories.segmentation import Segment
 from ..effect_selection import Evidence
 from ..score_test import ScoreTest

@@ -25,7 +25,8 @@ from ...segments.candidates import (
     variants_of,
 )
 from ...segments.prepare import Prepared
-from ...segments.sliding_fit import SlidingFit, StartedSliding, fit_sliding
+from ...segments.sliding_descent import SlidingFit
+from ...segments.sliding_fit import StartedSliding, fit_sliding
 from ..effect_selection import Evidence
 from ..score_test import ScoreTest
 

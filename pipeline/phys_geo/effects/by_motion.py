@@ -25,13 +25,8 @@ from ...segments.impact_fit import BASE, LEAST, ImpactBase, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import linearised, refit
-from ...segments.sliding_fit import (
-    StartedSliding,
-    contact_effect_parameters,
-    fit_sliding,
-    information_by_segment,
-    nuisance_parameters,
-)
+from ...segments.sliding_descent import information_by_segment
+from ...segments.sliding_fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
 from .identified_effects import at_neutral, identified_effects
 
 ITERATIONS = 25

@@ -96,12 +96,7 @@ def fit_physics_from_images(
     problem = image_problem(estimate, filmed_episodes(episodes), start, config)
     refined = _refine(problem, estimate.contact.covariance, config)
     clock.lap("images")
-    record = {
-        "image_loss": _loss_record(problem.objective, refined) | {"photometric": not outlines},
-        **_episodes_record(episodes),
-        "start_state": problem.start_state,
-        "parameters_from_tracks": {p.name: p.estimate for p in start.parameters},
-        "geometry": _geometry_record(problem.objective, refined),
+    record = _record(problem, refined, start, episodes, photometric=not outlines) | {
         "image_size_px": config.image_size,
         "seconds_by_step": clock.seconds,
     }
@@ -112,6 +107,23 @@ def fit_physics_from_images(
         collision=_moved(model, problem.objective, refined),
         tracks={episode.name: episode.tracks for episode in episodes if episode.found is not None},
     )
+
+
+def _record(
+    problem: ImageProblem,
+    refined: Refined,
+    start: PhysicsFit,
+    episodes: Sequence[VideoEpisode],
+    photometric: bool,
+) -> dict[str, Any]:
+    """Return what `fit.json` records of the refinement on images; `photometric`: whether its loss is of colours."""
+    return {
+        "image_loss": _loss_record(problem.objective, refined) | {"photometric": photometric},
+        **_episodes_record(episodes),
+        "start_state": problem.start_state,
+        "parameters_from_tracks": {p.name: p.estimate for p in start.parameters},
+        "geometry": _geometry_record(problem.objective, refined),
+    }
 
 
 def _require_shared_effects(world: World) -> None:

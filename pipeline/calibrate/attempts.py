@@ -1,0 +1,246 @@
+"""Attempts of structure from motion with different settings, until a model passes its self-check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...schemas import CalibrateConfig, NotConvergedError
+from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
+from . import colmap
+from .consistency_check import SelfCheck, check_model
+from .photos import Inputs
+from .reconstruction import SfmModel, VerifiedPair
+
+MIN_PHOTOS = 3
+"""Minimum number of photos, and of registered ones."""
+MIN_REGISTERED_FRACTION = 0.5
+"""Minimum fraction of registered photos; below it the calibration fails."""
+_LOW_PEAK_THRESHOLD = 0.002  # conventions: worked for weak texture
+_THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
+_TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """Result of an attempt."""
+
+    model: SfmModel
+    """The largest connected model."""
+    check: SelfCheck
+    """Self-check of that model."""
+    models: tuple[SfmModel, ...]
+    """All connected models."""
+    pairs: tuple[VerifiedPair, ...]
+    """Verified pairs of images."""
+    features: dict[str, int]
+    """Number of features by image."""
+    attempt: int
+    """Number of the attempt."""
+
+
+def search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[Candidate, list[CalibrationAttempt]]:
+    """Try settings until a model passes its self-check; if it lacks images, try once more with more features.
+
+    Args:
+        folder: Empty directory for the databases and models of COLMAP.
+        inputs: The images.
+        config: Settings of the stage.
+
+    Returns:
+        The attempt whose model has the most photos, and figures of all attempts.
+
+    Raises:
+        NotConvergedError: If no model passes, or too few photos are registered.
+    """
+    attempts: list[CalibrationAttempt] = []
+    passed: list[Candidate] = []
+    last: Candidate | None = None
+    built: colmap.SfmSettings | None = None
+    for settings in _plan(config):
+        if passed and len(passed[0].model.T_cam_world) == len(inputs.sources):
+            break
+        incomplete = bool(passed) or (built is not None and (last is None or last.check.passed))
+        if incomplete and built is not None and settings.features == built.features:
+            continue  # Another seed registers no more images, but more features may.
+        second_try = bool(passed)
+        candidate, attempt = _attempt(folder, inputs, settings, built, len(attempts))
+        attempts.append(attempt)
+        built, last = settings, candidate
+        if candidate is not None and candidate.check.passed:
+            passed.append(candidate)
+        if second_try:
+            break
+    best = max(passed, key=lambda candidate: _rank(candidate, inputs), default=None)
+    if best is None or photo_count(best.model, inputs) < _needed(inputs):
+        raise _not_converged(inputs, attempts, best, last)
+    attempts[best.attempt] = attempts[best.attempt].model_copy(update={"outcome": "taken"})
+    return best, attempts
+
+
+def _plan(config: CalibrateConfig) -> list[colmap.SfmSettings]:
+    """Return the settings of the attempts: other seeds first, then other matching, then more features."""
+    base = colmap.SfmSettings(seed=config.seed, max_features=config.max_features, max_image_size=config.max_image_size)
+    more = replace(
+        base,
+        max_features=2 * config.max_features,
+        max_image_size=2 * config.max_image_size,
+        peak_threshold=_LOW_PEAK_THRESHOLD,
+        verification_trials=_THOROUGH_TRIALS,
+    )
+    plan = [
+        base,
+        replace(base, seed=config.seed + 1),
+        replace(base, seed=config.seed + 2, guided_matching=True),
+        replace(more, seed=config.seed + 3),
+        replace(more, seed=config.seed + 4, guided_matching=True, max_ratio=_TIGHT_RATIO),
+    ]
+    further = config.retries + 1 - len(plan)
+    plan += [replace(plan[3 + k % 2], seed=config.seed + 5 + k) for k in range(max(further, 0))]
+    return plan[: config.retries + 1]
+
+
+def _attempt(
+    folder: Path, inputs: Inputs, settings: colmap.SfmSettings, built: colmap.SfmSettings | None, number: int
+) -> tuple[Candidate | None, CalibrationAttempt]:
+    names = {source.image.name: source.label for source in inputs.sources}
+    reuse = built is not None and built.matches == settings.matches
+    database = folder / f"attempt-{number}.db"
+    if reuse:
+        for path in sorted(folder.glob(f"attempt-{number - 1}.*")):
+            if path.is_file():
+                path.rename(folder / path.name.replace(f"-{number - 1}.", f"-{number}."))
+    else:
+        colmap.build_database(database, inputs.root, [source.image for source in inputs.sources], settings)
+    models = tuple(model.renamed(names) for model in colmap.map_database(database, inputs.root, settings.seed))
+    pairs = tuple(
+        replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in colmap.read_pairs(database)
+    )
+    candidate = None
+    if models:
+        features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
+        candidate = Candidate(
+            model=models[0],
+            check=check_model(models[0], pairs),
+            models=models,
+            pairs=pairs,
+            features=features,
+            attempt=number,
+        )
+    return candidate, _attempt_figures(settings, candidate)
+
+
+def _attempt_figures(settings: colmap.SfmSettings, candidate: Candidate | None) -> CalibrationAttempt:
+    outcome = "no_model" if candidate is None else "passed" if candidate.check.passed else "self_check_failed"
+    return CalibrationAttempt(
+        seed=settings.seed,
+        max_features=settings.max_features,
+        max_image_size=settings.max_image_size,
+        peak_threshold=settings.peak_threshold,
+        guided_matching=settings.guided_matching,
+        max_ratio=settings.max_ratio,
+        models=len(candidate.models) if candidate else 0,
+        registered=len(candidate.model.T_cam_world) if candidate else 0,
+        points=len(candidate.model.points) if candidate else 0,
+        reprojection_error_px=candidate.model.reprojection_error_px if candidate else None,
+        self_check=check_figures(candidate.check) if candidate else None,
+        outcome=outcome,
+    )
+
+
+def check_figures(check: SelfCheck) -> SelfCheckFigures:
+    """Return the figures of a self-check for `calibration.json`."""
+    worst = check.worst
+    return SelfCheckFigures(
+        passed=check.passed,
+        pairs=len(check.pairs),
+        strong_pairs=len(check.strong),
+        worst=worst
+        and PairFigures(
+            images=(worst.image_a, worst.image_b), inliers=worst.inliers, consistent=round(worst.consistent, 4)
+        ),
+        images_without_strong_pair=check.images_without_strong_pair,
+    )
+
+
+def _rank(candidate: Candidate, inputs: Inputs) -> tuple[int, int, int]:
+    return photo_count(candidate.model, inputs), len(candidate.model.T_cam_world), -candidate.attempt
+
+
+def photo_count(model: SfmModel, inputs: Inputs) -> int:
+    """Return the number of photos that a model registers, without frames of videos."""
+    return sum(label in model.T_cam_world for label in photo_labels(inputs))
+
+
+def photo_labels(inputs: Inputs) -> list[str]:
+    """Return the labels of the photos, without frames of videos."""
+    return [source.label for source in inputs.sources if not source.image.name.startswith("videos/")]
+
+
+def _needed(inputs: Inputs) -> int:
+    return max(MIN_PHOTOS, int(np.ceil(MIN_REGISTERED_FRACTION * len(photo_labels(inputs)))))
+
+
+def _not_converged(
+    inputs: Inputs, attempts: Sequence[CalibrationAttempt], best: Candidate | None, last: Candidate | None
+) -> NotConvergedError:
+    photos = len(photo_labels(inputs))
+    rejected = [attempt for attempt in attempts if attempt.outcome == "self_check_failed"]
+    if best is None and rejected:
+        worst = rejected[0].self_check.worst if rejected[0].self_check else None
+        where = ""
+        if worst:
+            where = (
+                f" For example {worst.images[0]} and {worst.images[1]} share {worst.inliers} verified matches, of "
+                f"which {100 * worst.consistent:.0f} % agree with the cameras."
+            )
+        return NotConvergedError(
+            f"All {len(rejected)} camera models contradict their own matches ({len(attempts)} attempts).{where}",
+            "models in which every pair of images with 200 or more verified matches is at least 50 % consistent.",
+            "remove blurred photos and those in which something moved; repeated or symmetric texture can cause this: "
+            "put an object or printed pattern with unique texture next to it, and photograph in steps of 10 degrees.",
+        )
+    candidate = best or last
+    registered = photo_count(candidate.model, inputs) if candidate else 0
+    causes: dict[str, int] = {}
+    for label in photo_labels(inputs):
+        reason = verdict(label, candidate).reason.split(":", 1)[0] if candidate else "no model"
+        if reason:
+            causes[reason] = causes.get(reason, 0) + 1
+    listed = ", ".join(f"{count} {reason}" for reason, count in sorted(causes.items(), key=lambda item: -item[1]))
+    return NotConvergedError(
+        f"{registered} of {photos} photos registered after {len(attempts)} attempts. The others: {listed}.",
+        f"at least {_needed(inputs)} of {photos}.",
+        "take sharp photos in steps of 10 degrees or less, all around and from two heights, with the same focal "
+        "length; keep textured surroundings in view; nothing may move between the photos.",
+    )
+
+
+def verdict(label: str, candidate: Candidate) -> ImageVerdict:
+    """Return whether an attempt registered an image, why not, and how many features and matches it has."""
+    touching = [pair for pair in candidate.pairs if label in (pair.image_a, pair.image_b)]
+    features, matches = candidate.features.get(label, 0), sum(len(pair.xy_a) for pair in touching)
+    registered = label in candidate.model.T_cam_world
+    inliers = len(candidate.model.observations[label][1]) if registered else 0
+    reason = ""
+    if not registered:
+        part = next((model for model in candidate.models if label in model.T_cam_world), None)
+        if label not in candidate.features:
+            reason = "unreadable: COLMAP cannot decode it"
+        elif part is not None:
+            reason = f"in another part: connected to {len(part.T_cam_world) - 1} images, not to the largest part"
+        elif not touching:
+            reason = f"without matches: {features} features, none verified in another image"
+        else:
+            reason = f"without a pose: {matches} matches with {len(touching)} images, too few see reliable points"
+    return ImageVerdict(
+        registered=registered,
+        reason=reason,
+        features=features,
+        matched_images=len(touching),
+        matches=matches,
+        inliers=inliers,
+    )

@@ -1,0 +1,179 @@
+"""The stage phys-geo: fit the physics of a model to tracks or videos, then the appearance of the videos."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from ...datasets.capture.cameras import require_metric
+from ...datasets.capture.capture import Capture
+from ...datasets.models.model import Model
+from ...datasets.shapes.ply import Splats
+from ...schemas import (
+    BodyModel,
+    ContactParameters,
+    FitFile,
+    InputDataError,
+    ModelFile,
+    PhysConfig,
+    Solver,
+    UsageError,
+)
+from ..physics.effects.registry import load_effect
+from ..physics.world import World, inertia_elements
+from ..runtime.checkpoint import Checkpoint
+from ..runtime.device import resolve_device
+from ..trajectories.observations import track_episodes
+from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
+from .tracks.contact_result import PhysicsFit
+
+
+def fit_motion(
+    model: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warnings: Sequence[str]
+) -> Model:
+    """Return the model with physics fitted to motion and, where there are videos, exposures and light.
+
+    Args:
+        model: The model to start from, with shapes of its bodies.
+        capture: The capture.
+        split: Name of the episodes to fit.
+        config: The stage's settings.
+        checkpoint: Checkpoint to which the poses found in videos are written.
+        warnings: Warnings about the inputs, to which those of the fit are added.
+
+    Raises:
+        InputDataError: If no body is free, cameras are unscaled, or the episodes lack what is to be fitted.
+        UsageError: If settings contradict each other.
+        NotConvergedError: If the fit diverges.
+    """
+    _require_fittable(model, capture, config)
+    ready = replace(model, file=_physics_start(model, capture, config))
+    started = time.perf_counter()
+    found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
+    found = replace(found, warnings=(*found.warnings, *warnings))
+    seconds = round(time.perf_counter() - started, 2)
+    record = found.record.to_json() | {"seconds": seconds, "supervise": config.supervise}
+    record |= {"warnings": list(found.warnings)}
+    fitted = _merge(ready.file, found)
+    fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
+    ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
+    if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
+        ready = _with_appearance(ready, capture, split, config, found)
+    return ready
+
+
+def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> None:
+    """Refuse a model or a capture from whose motion no physics can be fitted."""
+    uses_photos = any(name in model.body_splats for name in capture.body_names)
+    if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
+        require_metric(capture.cameras)
+    if not any(body.motion == "free" for body in model.file.bodies):
+        raise InputDataError(
+            f"{capture.root / 'capture.toml'}: no body is free, so no motion contains information about contact.",
+            'motion = "free" for the body whose physics is wanted.',
+        )
+
+
+def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelFile:
+    """Return the model file from which the fit of the physics starts."""
+    effects = with_effects(model.file.effects, config.effects)
+    # warnings of an earlier fit of the physics do not apply to this one
+    stale = set(model.fit.stages.get("phys-geo", {}).get("warnings", ()))
+    return model.file.model_copy(
+        update={
+            "contact": model.file.contact or ContactParameters(),
+            # the ground of the capture, as an earlier fit may have moved the model's
+            "ground": capture.manifest.world.ground or model.file.ground,
+            "solver": Solver(step_s=config.step_s),
+            "effects": effects,
+            "warnings": tuple(text for text in model.file.warnings if text not in stale),
+        }
+    )
+
+
+def _fitted_motion(
+    ready: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warm_started: bool
+) -> PhysicsFit:
+    """Fit the physics to tracks or videos; `warm_started`: whether the contact parameters come from an earlier fit."""
+    world = replace(World.from_model(ready), rolls_on=resolve_device(config.device).type)
+    if config.supervise == "tracks":
+        measured = capture.manifest.measurement
+        noise = (measured.position_std_m, measured.rotation_std_rad)
+        return fit_with_effects(world, track_episodes(capture, split), config, noise, warm_started, capture.groups)
+    if config.mass_distribution:
+        raise UsageError(
+            f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not identify it.",
+            "--supervise tracks.",
+            "fit to tracks, or leave phys-geo.mass_distribution at false.",
+        )
+    from .images.image_fit import fit_physics_from_images
+
+    return fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both", checkpoint)
+
+
+def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:
+    """Return the model with the exposure of the video cameras and the light on the bodies."""
+    from .images.lighting_fit import learn_appearance
+    from .images.video_exposure import estimate_exposures
+
+    exposures = estimate_exposures(model, capture, split, config.device)
+    model = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
+    # with images alone measured tracks are not used
+    return learn_appearance(model, capture, exposures, split, found.tracks if config.supervise == "images" else None)
+
+
+def _with_collision(model: Model, moved: Mapping[str, Splats]) -> Model:
+    """Return the model with moved collision spheres; where they are also the visual ones, both are moved."""
+    shown = {name: spheres for name, spheres in moved.items() if model.collision[name] is model.body_splats.get(name)}
+    return replace(model, collision=model.collision | dict(moved), body_splats=model.body_splats | shown)
+
+
+def _has_video(capture: Capture, split: str) -> bool:
+    """Return whether any episode of a split has a video."""
+    return any(capture.videos(name) for name in capture.episodes(split))
+
+
+def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
+    """Return the model file with the results of the fit in place of earlier ones."""
+    fresh = {parameter.name for parameter in found.parameters}
+    kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
+    correlations = [block for block in file.correlations if not fresh & set(block.parameters)]
+    ground = file.ground
+    if ground is not None and found.ground_offset_m is not None:
+        ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
+    return file.model_copy(
+        update={
+            "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),
+            "contact": found.contact,
+            "ground": ground,
+            "parameters": (*found.parameters, *kept),
+            "correlations": (*found.correlations, *correlations),
+            "effects": fitted_effects(
+                file.effects,
+                {e.name: load_effect(e.name).name for e in file.effects},
+                found.parameters,
+                found.constants,
+                {} if found.effects is None else found.effects.own,
+                {} if found.effects is None else found.effects.spread,
+            ),
+            "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
+            "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
+        }
+    )
+
+
+def _with_mass(bodies: Sequence[BodyModel], world: World) -> tuple[BodyModel, ...]:
+    """Return the bodies with the centres of mass and inertias that the free ones have in a world."""
+    placed = {body.name: body for body in world.bodies}
+    return tuple(
+        body.model_copy(
+            update={
+                "com_m": tuple(placed[body.name].com[0].tolist()),
+                "inertia_kg_m2": inertia_elements(placed[body.name].inertia[0].numpy()),
+            }
+        )
+        if body.motion == "free"
+        else body
+        for body in bodies
+    )

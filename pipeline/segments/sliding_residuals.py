@@ -1,0 +1,137 @@
+"""Residuals of sliding segments in a world with a soft contact, and their finite differences.
+
+The contact law is soft and without rebound, so that contacts do not rattle; the normal force that carries the weight is
+the same for every law.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..geometry.rotation import quat_to_matrix
+from ..physics.impulse_solver import tangent_axes
+from ..physics.parameters import Parameter
+from ..physics.world import World
+from ..trajectories.residuals import STATE_SIZE
+from ..trajectories.segmentation import GroundPlane
+from .contact_phases import is_round
+from .impact_law import contact_law
+from .segments import Segments
+
+TIME_S = 0.01
+"""Contact time [s] of the soft, critically damped law."""
+SWEEPS = 4
+"""Maximum number of solver iterations: enough where impulses change slowly from step to step."""
+STATE_STEPS = (1e-4, 1e-3, 1e-3, 1e-2)
+"""Steps of central differences by position [m], rotation [rad], velocity [m/s] and angular velocity [rad/s]."""
+PARAMETER_STEP = 0.02
+"""Step of differences by parameters, in widths of their priors."""
+LOADS_UNKNOWN = 0.01
+"""Model error of the load distribution over more than three contact points, as a share of the weight: a body is never
+perfectly flat, and engines differ by as much. The torque about the normal that it may cause is not used as evidence."""
+
+
+def soft_world(world: World) -> World:
+    """Return the world with a soft contact without rebound, in which the body rests as high as on a hard one."""
+    law, gravity = contact_law(world), float(world.gravity[0].norm())
+    soft = replace(
+        law,
+        contact_time_s=torch.full_like(law.contact_time_s, TIME_S),
+        damping_ratio=torch.ones_like(law.damping_ratio),
+    )
+    offset = GroundPlane.of(world).offset + gravity * TIME_S**2
+    sweeps = min(world.sweeps, SWEEPS)
+    return replace(world, contact=soft, ground_offset=offset, step_s=0.5 * TIME_S, sweeps=sweeps)
+
+
+def chi2_by_segment(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
+    """Return the chi2 (B,) of each segment; 1e12 where a rollout diverged."""
+    rows = without_loads(segments, segments.residuals(parameters, values, jacobian=False)[0])
+    return torch.nan_to_num(rows.square().sum((1, 2)), nan=1e12, posinf=1e12)
+
+
+def without_loads(segments: Segments, rows: Tensor) -> Tensor:
+    """Return residuals (B, T, 6) in sigmas with the model error of the load distribution whitened.
+
+    Derived. With the columns of U the residuals of rotations about the normal by angular accelerations that are
+    constant and that grow with time, whose standard deviation is s, the covariance of the residuals is 1 + s^2 U U^T;
+    they are multiplied by its inverse root.
+    """
+    seen, world = segments.observations, segments.world
+    body = world.bodies[seen.free[0]]
+    if is_round(body):
+        return rows
+    normal = GroundPlane.of(world).normal
+    turned = seen.turned[:, :, 0, None] / segments.noise[1]
+    times = (seen.times_s - seen.times_s[:, :1])[..., None]
+    share = times / times.amax(1, keepdim=True).clamp_min(1e-9)
+    axis = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
+    turn = 0.5 * times.square() * axis * turned
+    turns = torch.stack([torch.cat((torch.zeros_like(axis), one), -1) for one in (turn, share / 3 * turn)], -1)
+    reach = body.centers[0].norm(dim=-1).max()
+    torque = contact_law(world).friction[0] * world.gravity[0].norm() * body.mass[0] * reach
+    spread = LOADS_UNKNOWN * torque / body.inertia[0].diagonal().mean()
+    turns = segments.innovations(turns)
+    directions, sizes, _ = torch.linalg.svd(turns.flatten(1, 2), full_matrices=False)
+    known = 1 - (1 + (spread * sizes).square()).rsqrt()
+    along = directions.mT @ rows.flatten(1)[..., None]
+    return rows - (directions @ (known[..., None] * along)).view_as(rows)
+
+
+def finite_differences(
+    segments: Segments, parameters: Sequence[Parameter], values: Tensor, free: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return residuals (B, R) in sigmas, their derivatives (B, R, S + K) and the basis (B, 12, K) of the states.
+
+    Args:
+        segments: Sliding segments (B) with states.
+        parameters: Parameters of their world (P).
+        values: Of each segment (B, P), in fitted coordinates.
+        free: Indices (B, S) of the parameters by which the first S derivatives are; -1 for a derivative of 0.
+
+    Returns:
+        Residuals; derivatives by these parameters and along the columns of the basis; and the basis, the changes of
+        state that keep the body on the ground.
+    """
+    basis = _basis(segments)
+    k, (n, size) = basis.shape[-1], free.shape
+    steps = torch.tensor([PARAMETER_STEP * p.prior[1] for p in parameters]).to(values)
+    still = torch.zeros(n, STATE_SIZE).to(values)
+    changes, moves = [still], [values]
+    for column in range(size):
+        at = free[:, column, None].clamp_min(0)
+        changes.append(still)
+        moves.append(values.scatter_add(1, at, steps[at] * (free[:, column, None] >= 0)))
+    changes += [sign * basis[..., j] for j in range(k) for sign in (1.0, -1.0)]
+    moves += [values] * (2 * k)
+    every = segments.select(list(range(n)) * len(changes)).moved(torch.cat(changes))
+    rows = every.residuals(parameters, torch.cat(moves), jacobian=False)[0]
+    rows = without_loads(every, rows).flatten(1).unflatten(0, (len(changes), n))
+    rows = torch.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
+    by_value = (rows[1 : 1 + size] - rows[0]).movedim(0, -1) / steps[free.clamp_min(0)][:, None]
+    by_state = 0.5 * (rows[1 + size :: 2] - rows[2 + size :: 2]).movedim(0, -1)
+    return rows[0], torch.cat((by_value, by_state), -1), basis
+
+
+def _basis(segments: Segments) -> Tensor:
+    """Return the changes of state (B, 12, K) that keep the body on the ground, each as large as a difference step."""
+    seen, world = segments.observations, segments.world
+    index, count = seen.free[0], len(segments.items)
+    normal = GroundPlane.of(world).normal
+    tangents = tangent_axes(normal)[1:].T  # (3, 2)
+    if is_round(world.bodies[index]):
+        turns = torch.eye(3).to(normal).expand(count, 3, 3)
+    else:
+        up = quat_to_matrix(seen.state.quat_wxyz[:, index]).transpose(-1, -2) @ normal
+        turns = up[..., None]
+    size = turns.shape[-1]
+    basis = torch.zeros(count, STATE_SIZE, 4 + 2 * size).to(normal)
+    basis[:, 0:3, 0:2] = STATE_STEPS[0] * tangents
+    basis[:, 3:6, 2 : 2 + size] = STATE_STEPS[1] * turns
+    basis[:, 6:9, 2 + size : 4 + size] = STATE_STEPS[2] * tangents
+    basis[:, 9:12, 4 + size :] = STATE_STEPS[3] * turns
+    return basis
