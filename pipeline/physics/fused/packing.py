@@ -205,9 +205,9 @@ def _spheres(body: Body) -> Tensor:
 
 
 def _listed_spheres(world: World) -> tuple[Tensor, tuple[tuple[int, int], ...]]:
-    """Return the row of the sphere of each contact (C,), with the candidates for the lowest spheres if effects need it.
+    """Return the row of the sphere of each contact (C,), and the place in it of the candidates for each lowest sphere.
 
-    The second value has the first row and the number of these candidates of each body; it is empty without them.
+    A place is a first row and a number of rows; there are none if no effect depends on heights.
     """
     starts = [sum(body.radii.shape[-1] for body in world.bodies[:index]) for index in range(len(world.bodies))]
     listed = _contact_spheres(world, starts)
