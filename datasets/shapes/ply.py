@@ -145,7 +145,7 @@ def _require_metres(path: Path, comments: list[str]) -> None:
         raise InputDataError(f"{path}: its header says 'comment unit {unit}'.", "metre.")
 
 
-def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, Array]:
+def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, NDArray[np.float64]]:
     """Return the needed columns in float64; all of them must exist and be finite."""
     lacking = [name for name in _NEEDED if name not in columns]
     if lacking:
