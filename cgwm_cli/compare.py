@@ -11,6 +11,8 @@ from .options import AnyDevice, Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ..schemas import CompareResult, ModelComparison, PairedDifference
 
 
@@ -45,8 +47,16 @@ def _summary(result: CompareResult) -> str:
     from .output import table, warnings
 
     header = ["", *(model.model for model in result.models)]
-    rows = [
-        [name, *(_figure(model, key, scale) for model in result.models)]
+    rows = [*_error_rows(result.models), *_chi2_rows(result.models)]
+    lines = [result.verdict, table(rows, header), *(_pair(pair) for pair in result.pairs)]
+    said = [*result.warnings, *dict.fromkeys(words for model in result.models for words in model.warnings)]
+    return "\n".join([*lines, *warnings(said), *([f"Page: {result.report}"] if result.report else [])])
+
+
+def _error_rows(models: Sequence[ModelComparison]) -> list[list[str]]:
+    """Return one row for each median error that at least one model has."""
+    return [
+        [name, *(_figure(model, key, scale) for model in models)]
         for name, key, scale in (
             ("translation error, median [mm]", "translation_error_m", 1e3),
             ("rotation error, median [deg]", "rotation_error_deg", 1.0),
@@ -54,16 +64,18 @@ def _summary(result: CompareResult) -> str:
             ("state-fitted residual, median [mm]", "state_fitted_residual_m", 1e3),
             ("noise of the start alone, median [mm]", "state_noise_floor_m", 1e3),
         )
-        if any(getattr(model, key) is not None for model in result.models)
+        if any(getattr(model, key) is not None for model in models)
     ]
-    rows.append(["short predictions, reduced chi2", *(_number(model.reduced_chi2) for model in result.models)])
-    for phase in result.models[0].by_phase:
-        found = [model.by_phase[phase] for model in result.models]
+
+
+def _chi2_rows(models: Sequence[ModelComparison]) -> list[list[str]]:
+    """Return the reduced chi2 of short predictions, in total and in each phase that occurs."""
+    rows = [["short predictions, reduced chi2", *(_number(model.reduced_chi2) for model in models)]]
+    for phase in models[0].by_phase:
+        found = [model.by_phase[phase] for model in models]
         if any(figures is not None for figures in found):
             rows.append([f"  in {phase}", *(_number(figures.reduced_chi2 if figures else None) for figures in found)])
-    lines = [result.verdict, table(rows, header), *(_pair(pair) for pair in result.pairs)]
-    said = [*result.warnings, *dict.fromkeys(words for model in result.models for words in model.warnings)]
-    return "\n".join([*lines, *warnings(said), *([f"Page: {result.report}"] if result.report else [])])
+    return rows
 
 
 def _figure(model: ModelComparison, key: str, scale: float) -> str:

@@ -11,6 +11,8 @@ from .options import AnyDevice, Debug, Json, Overwrite, Quiet
 from .run import running
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, RankedEffect
 
 SHOWN = 8
@@ -72,33 +74,52 @@ def diagnose(
 
 
 def _summary(result: DiagnoseResult) -> str:
-    from .output import millimetres, table, warnings
+    from .output import table, warnings
 
-    lines = [result.sentence]
-    shown = [entry for entry in result.ranking if entry.effect in result.selected]
-    shown += [entry for entry in result.ranking if entry not in shown]
-    lines.append(table([_row(entry) for entry in shown[:SHOWN]], ["effect", "acts in", "judged in", "p", "estimate"]))
+    rows = [_row(entry) for entry in _shown(result)]
+    lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "estimate"])]
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
         lines.append(
             f"flight, mean chi2 of the residual: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
         )
-    lines += _limits(result.contact_limits)
-    for entry in result.ranking:
-        if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
-            errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
-            lines.append(f"{entry.effect}: error of short predictions in episodes held out from its fit {errors}")
+    lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking)]
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
         lines.append(f"law of the residual: {terms}; explained by {result.residual_law.where}")
     if result.next_experiment is not None:
         lines += _experiment(result.next_experiment)
+    return "\n".join([*lines, *_next_command(result), *warnings(result.warnings)])
+
+
+def _shown(result: DiagnoseResult) -> list[RankedEffect]:
+    """Return the candidates of the table: the selected ones, then the best of the others."""
+    shown = [entry for entry in result.ranking if entry.effect in result.selected]
+    shown += [entry for entry in result.ranking if entry not in shown]
+    return shown[:SHOWN]
+
+
+def _held_out_errors(ranking: Sequence[RankedEffect]) -> list[str]:
+    """Return the errors, without and with each effect, in episodes that its fit did not use."""
+    from .output import millimetres
+
+    lines = []
+    for entry in ranking:
+        if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
+            errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
+            lines.append(f"{entry.effect}: error of short predictions in episodes held out from its fit {errors}")
+    return lines
+
+
+def _next_command(result: DiagnoseResult) -> list[str]:
+    """Return the file of the residual's law, if one was written, and the command that fits the found effects."""
+    lines = []
     if result.saved_law is not None:
         lines.append(f"Wrote {result.saved_law.rpartition(':')[0]}.")
     added = [*result.selected, *([result.saved_law] if result.saved_law is not None else [])]
     if added:
         lines.append(f"Next: cgwm fit CAPTURE --from MODEL --effects {','.join(added)} --out NEW")
-    return "\n".join([*lines, *warnings(result.warnings)])
+    return lines
 
 
 def _limits(limits: tuple[ContactLimit, ...]) -> list[str]:

@@ -74,12 +74,7 @@ def synthesize(
         from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
         from .settings import StageSettings
 
-        if shard is not None and (shards is not None or ray is not None):
-            other = "--shards" if shards is not None else "--ray"
-            raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
-        if workers > 1 and (shard is not None or ray is not None):
-            other = "--shard makes one" if shard is not None else "--ray has its own workers"
-            raise UsageError(f"--workers {workers} makes several shards at a time here; {other}.", "one of the two.")
+        _refuse_contradictions(shard, shards, ray, workers)
         index, count = _shard(shard) if shard is not None else (None, shards)
         settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
             "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
@@ -106,6 +101,17 @@ def synthesize(
                 settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
             made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview, workers)
             emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
+
+
+def _refuse_contradictions(shard: str | None, shards: int | None, ray: str | None, workers: int) -> None:
+    from ..schemas import UsageError
+
+    if shard is not None and (shards is not None or ray is not None):
+        other = "--shards" if shards is not None else "--ray"
+        raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
+    if workers > 1 and (shard is not None or ray is not None):
+        other = "--shard makes one" if shard is not None else "--ray has its own workers"
+        raise UsageError(f"--workers {workers} makes several shards at a time here; {other}.", "one of the two.")
 
 
 def _shard(text: str) -> tuple[int, int]:

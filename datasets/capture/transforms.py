@@ -120,8 +120,7 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
         width, height = round(values["w"]), round(values["h"])
     else:
         width, height = image_size(image)
-    fx = values.get("fl_x") or _focal(where, values, "camera_angle_x", width)
-    fy = values.get("fl_y") or (_focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx)
+    fx, fy = _focal_lengths(where, values, width, height)
     distortion = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     distortion = distortion if distortion[4] else distortion[:4]
     return CameraIntrinsics(
@@ -134,6 +133,13 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
         cy=values.get("cy", height / 2),
         distortion=distortion if any(distortion) else (),
     )
+
+
+def _focal_lengths(where: str, values: dict[str, float], width: int, height: int) -> tuple[float, float]:
+    """Return fx and fy [px], from focal lengths or angles of view; fy is fx where neither is given for it."""
+    fx = values.get("fl_x") or _focal(where, values, "camera_angle_x", width)
+    fy = values.get("fl_y") or (_focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx)
+    return fx, fy
 
 
 def _focal(where: str, values: dict[str, float], name: str, size_px: int) -> float:

@@ -56,13 +56,7 @@ def import_balldrops(
         if only is not None and only not in balls:
             raise InputDataError(f"{path}: no ball '{only}'.", f"{', '.join(balls)}.")
         recordings = [recording for recording in recordings if only in (None, recording.group)]
-        table = _table(path.with_name(_TABLE))
-        known = [table.get(_key(ball), (None, None)) for ball in balls if only in (None, ball)]
-        radii = [radius for _, radius in known if radius is not None]
-        if not radii:
-            raise InputDataError(f"{path.with_name(_TABLE)}: no circumference of {only or 'any ball'}.", todo=_TODO)
-        shape = Shape(sphere=SphereShape(radius_m=float(np.median(radii))))
-        body = Body(name=BALL, mass_kg=known[0][0] if only else None, shape=shape)
+        body = _body(path.with_name(_TABLE), balls, only)
         splits = {
             split: tuple(r.name for r in recordings if r.name.endswith("-1") == (split == "train"))
             for split in ("train", "test")
@@ -99,6 +93,17 @@ def _drops(path: Path) -> list[Recording]:
         track = Units("m").track(f"{path}: {name}, drop {number}", values[:, 0], position)
         recordings.append(Recording(name=f"{name}-{number}", tracks={BALL: track}, group=name))
     return recordings
+
+
+def _body(path: Path, balls: list[str], only: str | None) -> Body:
+    """Return the body of all drops: a sphere of the balls' median radius, or the single ball with its mass."""
+    table = _table(path)
+    known = [table.get(_key(ball), (None, None)) for ball in balls if only in (None, ball)]
+    radii = [radius for _, radius in known if radius is not None]
+    if not radii:
+        raise InputDataError(f"{path}: no circumference of {only or 'any ball'}.", todo=_TODO)
+    shape = Shape(sphere=SphereShape(radius_m=float(np.median(radii))))
+    return Body(name=BALL, mass_kg=known[0][0] if only else None, shape=shape)
 
 
 def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:

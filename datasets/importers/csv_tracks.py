@@ -120,6 +120,12 @@ def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> 
 def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Units) -> _Header:
     names = [name.strip() for name in found]
     index = {key: k for key in COLUMNS if (k := _place(path, names, key, columns)) is not None}
+    _require_columns(path, names, index)
+    return _Header(index, _units(path, names, index, units))
+
+
+def _require_columns(path: Path, names: list[str], index: Mapping[str, int]) -> None:
+    """Check that time and position have columns, and either all or none of the orientation."""
     lacking = [key for key in _REQUIRED if key not in index]
     if not lacking and any(key in index for key in _QUATERNION):
         lacking = [key for key in _QUATERNION if key not in index]
@@ -129,15 +135,19 @@ def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Uni
             f"a header line with {', '.join(_REQUIRED)}, and all of {', '.join(_QUATERNION)} or none.",
             f"name it: --columns {lacking[0]}=NAME.",
         )
+
+
+def _units(path: Path, names: list[str], index: Mapping[str, int], units: Units) -> Units:
+    """Return the units of the options and of the column names, which must not contradict each other."""
     for kind, legal, keys in (("length", _LENGTHS, _REQUIRED[1:]), ("time", _TIMES, _REQUIRED[:1])):
-        told = {unit for key in keys if (unit := _plain(names[index[key]])[1]) in legal}
-        told |= {getattr(units, kind)} - {None}
-        if len(told) > 1:
+        named = {unit for key in keys if (unit := _plain(names[index[key]])[1]) in legal}
+        named |= {getattr(units, kind)} - {None}
+        if len(named) > 1:
             raise InputDataError(
-                f"{path}: units of {kind} that differ: {', '.join(sorted(told))}.", "one unit for all columns."
+                f"{path}: units of {kind} that differ: {', '.join(sorted(named))}.", "one unit for all columns."
             )
-        units = replace(units, **{kind: next(iter(told), None)})
-    return _Header(index, units)
+        units = replace(units, **{kind: next(iter(named), None)})
+    return units
 
 
 def _place(path: Path, names: list[str], key: str, columns: Mapping[str, str]) -> int | None:

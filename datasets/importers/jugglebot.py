@@ -89,23 +89,39 @@ def flight(time: Array, position: Array) -> tuple[int, int]:
     Raises:
         ValueError: If the flight around the highest point takes less than 0.3 s.
     """
+    first, last = _extended_by_fit(time, position, *_around_top(time, position))
+    first, last = first + _MARGIN, last - _MARGIN
+    if last <= first or time[last] - time[first] < _SHORTEST_S:
+        raise ValueError(f"the flight takes less than {_SHORTEST_S:g} s")
+    return first, last
 
-    def flies(k: int) -> bool:
-        near = np.abs(time - time[k]) < _HALF_WINDOW_S
-        if np.count_nonzero(near) < 10:
-            return False
-        acceleration = 2 * np.polyfit(time[near] - time[k], position[near], 2)[0]
-        return float(np.hypot(np.hypot(*acceleration[:2]), acceleration[2] + GRAVITY_M_S2)) < _TOLERANCE_M_S2
 
+def _around_top(time: Array, position: Array) -> tuple[int, int]:
+    """Return the first and the last sample around the highest point with the acceleration of a thrown ball."""
     top = int(np.argmax(position[:, 2]))
-    first = next((k for k in range(top, len(time)) if time[k] < time[top] + 0.1 and flies(k)), -1)
+    near_top = (k for k in range(top, len(time)) if time[k] < time[top] + 0.1)
+    first = next((k for k in near_top if _falls_freely(time, position, k)), -1)
     if first < 0:
         raise ValueError("nothing flies at the highest point")
     last = first
-    while first > 0 and flies(first - 1):
+    while first > 0 and _falls_freely(time, position, first - 1):
         first -= 1
-    while last < len(time) - 1 and flies(last + 1):
+    while last < len(time) - 1 and _falls_freely(time, position, last + 1):
         last += 1
+    return first, last
+
+
+def _falls_freely(time: Array, position: Array, k: int) -> bool:
+    """Return whether the acceleration near sample k is that of gravity."""
+    near = np.abs(time - time[k]) < _HALF_WINDOW_S
+    if np.count_nonzero(near) < 10:
+        return False
+    acceleration = 2 * np.polyfit(time[near] - time[k], position[near], 2)[0]
+    return float(np.hypot(np.hypot(*acceleration[:2]), acceleration[2] + GRAVITY_M_S2)) < _TOLERANCE_M_S2
+
+
+def _extended_by_fit(time: Array, position: Array, first: int, last: int) -> tuple[int, int]:
+    """Return the range of samples (first, last), extended until the measurement deviates from a quartic in time."""
     middle = time[(first + last) // 2]
     fit = np.polyfit(time[first : last + 1] - middle, position[first : last + 1], 4)
     powers = (time - middle)[:, None] ** np.arange(4, -1, -1)
@@ -114,9 +130,6 @@ def flight(time: Array, position: Array) -> tuple[int, int]:
         first -= 1
     while last < len(time) - 2 and on[last + 1 : last + 3].any():
         last += 1
-    first, last = first + _MARGIN, last - _MARGIN
-    if last <= first or time[last] - time[first] < _SHORTEST_S:
-        raise ValueError(f"the flight takes less than {_SHORTEST_S:g} s")
     return first, last
 
 

@@ -208,18 +208,30 @@ def _recordings(source: Path, n_train: int) -> list[_Recording]:
     recordings = []
     for file in files:
         push = read_json(file, _Push)
-        numbered = {_number(file, frame): frame for frame in push.image_datas}
-        wanted = [numbered[k] for k in range(len(push.pose_datas)) if k in numbered]
-        frames = tuple(frame for frame in wanted if (file.parent / frame.file_path).is_file())
-        if frames and len(frames) < len(push.pose_datas):
-            raise InputDataError(
-                f"{file.parent}: {len(frames)} pictures for {len(push.pose_datas)} poses.",
-                "one a pose, or none.",
-                _TODO,
-            )
+        frames = _frames(file, push)
         several = len([other for other in files if other.parent == file.parent]) > 1
         name = f"{file.parent.name}-{file.stem}" if several else file.parent.name
         recordings.append(_Recording(name, push, file.parent, frames))
+    _require_enough_frames(source, recordings, n_train)
+    return recordings
+
+
+def _frames(file: Path, push: _Push) -> tuple[_Frame, ...]:
+    """Return the frames of a push with pictures, in the order of its poses: one for each pose, or none."""
+    numbered = {_number(file, frame): frame for frame in push.image_datas}
+    wanted = [numbered[k] for k in range(len(push.pose_datas)) if k in numbered]
+    frames = tuple(frame for frame in wanted if (file.parent / frame.file_path).is_file())
+    if frames and len(frames) < len(push.pose_datas):
+        raise InputDataError(
+            f"{file.parent}: {len(frames)} pictures for {len(push.pose_datas)} poses.",
+            "one a pose, or none.",
+            _TODO,
+        )
+    return frames
+
+
+def _require_enough_frames(source: Path, recordings: list[_Recording], n_train: int) -> None:
+    """Check that some push has pictures, and that each of these has more frames than are fitted."""
     filmed = [recording for recording in recordings if recording.frames]
     if not filmed:
         raise InputDataError(f"{source / 'dataset'}: no push has its pictures (r_0_<frame>.png).", todo=_TODO)
@@ -228,7 +240,6 @@ def _recordings(source: Path, n_train: int) -> list[_Recording]:
         raise InputDataError(
             f"{n_train} frames to fit on; the shortest push with pictures has {shortest}.", f"3 to {shortest - 1}."
         )
-    return recordings
 
 
 def _number(file: Path, frame: _Frame) -> int:

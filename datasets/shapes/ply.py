@@ -117,20 +117,8 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
     """
     path = Path(path)
     columns, comments = _read_vertices(path)
-    unit = next((comment.split()[1] for comment in comments if comment.startswith("unit ")), "metre")
-    if unit not in ("metre", "meter", "m"):
-        raise InputDataError(f"{path}: its header says 'comment unit {unit}'.", "metre.")
-    lacking = [name for name in _NEEDED if name not in columns]
-    if lacking:
-        raise InputDataError(
-            f"{path}: no property '{lacking[0]}'; it is no 3D Gaussian splatting file.",
-            "the properties " + ", ".join(_NEEDED) + ".",
-        )
-    table = {name: np.asarray(columns[name], np.float64) for name in _NEEDED}
-    for name, values in table.items():
-        bad = int(np.count_nonzero(~np.isfinite(values)))
-        if bad:
-            raise InputDataError(f"{path}: '{name}' is not finite in {bad} of {len(values)} splats.")
+    _require_metres(path, comments)
+    table = _finite_columns(path, columns)
     log_scales = np.stack([table[f"scale_{k}"] for k in range(3)], axis=1)
     uneven = int(np.count_nonzero(np.ptp(log_scales, axis=1) > _ISOTROPY_TOLERANCE))
     if uneven:
@@ -149,6 +137,28 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
         normals=_unit_normals(columns),
         harmonics=higher,
     )
+
+
+def _require_metres(path: Path, comments: list[str]) -> None:
+    unit = next((comment.split()[1] for comment in comments if comment.startswith("unit ")), "metre")
+    if unit not in ("metre", "meter", "m"):
+        raise InputDataError(f"{path}: its header says 'comment unit {unit}'.", "metre.")
+
+
+def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, NDArray[np.float64]]:
+    """Return the needed columns in float64; all of them must exist and be finite."""
+    lacking = [name for name in _NEEDED if name not in columns]
+    if lacking:
+        raise InputDataError(
+            f"{path}: no property '{lacking[0]}'; it is no 3D Gaussian splatting file.",
+            "the properties " + ", ".join(_NEEDED) + ".",
+        )
+    table = {name: np.asarray(columns[name], np.float64) for name in _NEEDED}
+    for name, values in table.items():
+        bad = int(np.count_nonzero(~np.isfinite(values)))
+        if bad:
+            raise InputDataError(f"{path}: '{name}' is not finite in {bad} of {len(values)} splats.")
+    return table
 
 
 def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:

@@ -42,6 +42,20 @@ def footage_of(models: Sequence[ComparedModel], capture: Capture, device: str) -
         capture: Capture with the videos.
         device: Device to render on.
     """
+    found: dict[str, list[dict[str, Any]]] = {}
+    used = 0
+    for name, camera in _videos_by_interest(models):
+        sheets = _sheets(models, capture, str(resolve_device(device)), name, camera)
+        size = len(sheets["real"]) + sum(len(uri or "") for uri in sheets["models"])
+        if found and used + size > MOST_BYTES:
+            break
+        used += size
+        found.setdefault(name, []).append(sheets)
+    return found
+
+
+def _videos_by_interest(models: Sequence[ComparedModel]) -> list[tuple[str, str]]:
+    """Return (episode, camera) of the videos: the first camera of each episode, worst first, then the second ones."""
     filmed = {
         (one.prediction.episode, video.camera): None
         for model in models
@@ -51,22 +65,12 @@ def footage_of(models: Sequence[ComparedModel], capture: Capture, device: str) -
     errors = models[-1].errors_m
     names = sorted({name for name, _ in filmed}, key=lambda name: -errors.get(name, 0.0))[:MOST_EPISODES]
     cameras = {name: [camera for episode, camera in filmed if episode == name] for name in names}
-    order = [
+    return [
         (name, cameras[name][k])
         for k in range(max(map(len, cameras.values()), default=0))
         for name in names
         if k < len(cameras[name])
     ]
-    found: dict[str, list[dict[str, Any]]] = {}
-    used = 0
-    for name, camera in order:
-        sheets = _sheets(models, capture, str(resolve_device(device)), name, camera)
-        size = len(sheets["real"]) + sum(len(uri or "") for uri in sheets["models"])
-        if found and used + size > MOST_BYTES:
-            break
-        used += size
-        found.setdefault(name, []).append(sheets)
-    return found
 
 
 def _sheets(

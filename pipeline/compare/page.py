@@ -117,30 +117,36 @@ def _median_mm(summary: ErrorSummary | None) -> float | None:
 def _models(result: CompareResult, names: Sequence[str]) -> str:
     header = ["model", "effects", "median [mm]", "mean [mm]", "at the end [mm]", "rotation [deg]", "PSNR object [dB]"]
     header += ["state-fitted [mm]", "start's noise [mm]", "reduced χ²"]
-    rows = []
-    for model, name in zip(result.models, names, strict=True):
-        turn, image = model.rotation_error_deg, model.psnr_object_db
-        rows.append(
-            [
-                f"<b>{text(name)}</b>" if model.model == result.best else text(name),
-                text(", ".join(model.effects)) or "–",
-                fixed(model.translation_error_m.median, 2, _MM),
-                fixed(model.translation_error_m.mean, 2, _MM),
-                fixed(model.translation_error_m.final, 2, _MM),
-                fixed(turn.median if turn else None, 2),
-                fixed(image.median if image else None),
-                fixed(_median_mm(model.state_fitted_residual_m), 2),
-                fixed(_median_mm(model.state_noise_floor_m), 2),
-                number(model.reduced_chi2),
-            ]
-        )
-    for zero, figures in result.models[0].baselines.items():
-        move, turn = (figures.get(key) or {} for key in ("translation_error_m", "rotation_error_deg"))
-        values = [fixed(move.get(key), 2, _MM) for key in ("median", "mean", "final")]
-        rows.append([f"({zero} object)", "–", *values, fixed(turn.get("median"), 2), "–", "–", "–", "–"])
+    rows = [
+        _model_row(model, f"<b>{text(name)}</b>" if model.model == result.best else text(name))
+        for model, name in zip(result.models, names, strict=True)
+    ]
+    rows += [_baseline_row(name, figures) for name, figures in result.models[0].baselines.items()]
     shown = [k for k in range(len(header)) if k < 2 or any(row[k] != "–" for row in rows)]
     header, rows = [header[k] for k in shown], [[row[k] for k in shown] for row in rows]
     return _sortable(header, rows, range(2, len(header)))
+
+
+def _model_row(model: ModelComparison, name: str) -> list[str]:
+    turn, image = model.rotation_error_deg, model.psnr_object_db
+    return [
+        name,
+        text(", ".join(model.effects)) or "–",
+        fixed(model.translation_error_m.median, 2, _MM),
+        fixed(model.translation_error_m.mean, 2, _MM),
+        fixed(model.translation_error_m.final, 2, _MM),
+        fixed(turn.median if turn else None, 2),
+        fixed(image.median if image else None),
+        fixed(_median_mm(model.state_fitted_residual_m), 2),
+        fixed(_median_mm(model.state_noise_floor_m), 2),
+        number(model.reduced_chi2),
+    ]
+
+
+def _baseline_row(name: str, figures: Mapping[str, Any]) -> list[str]:
+    move, turn = (figures.get(key) or {} for key in ("translation_error_m", "rotation_error_deg"))
+    values = [fixed(move.get(key), 2, _MM) for key in ("median", "mean", "final")]
+    return [f"({name} object)", "–", *values, fixed(turn.get("median"), 2), "–", "–", "–", "–"]
 
 
 def _pairs(result: CompareResult, names: Sequence[str]) -> str:

@@ -76,23 +76,38 @@ def detection_limits(
     acting = [c for c in kept if c.effect.phase == "contact"]
     asked = [c for c in acting if c.effect.name not in blind_to]
     spread = max(1.0, started.base.cost / float(started.segments.dof.sum()))
+    least_chi2 = spread * score[0], spread * score[1]
+    limits = _lowest_limits(started, variants_of(asked, world.gravity[0, :1]), least_chi2)
+    sizes = {}
+    for one, misfit in zip(limits, _misfits(started, limits), strict=True):
+        if misfit > least_chi2[len(one.variant.parameters) > 1]:
+            sizes[asked[one.variant.place].effect.name] = one
+    return [_limit(candidate, sizes.get(candidate.effect.name)) for candidate in acting]
+
+
+def _lowest_limits(
+    started: StartedSliding, variants: Sequence[Variant], least_chi2: tuple[float, float]
+) -> list[_VariantLimit]:
+    """Return the lowest limit of each candidate over its constants, where it is an admissible size.
+
+    Args:
+        started: The sliding segments and their fit.
+        variants: The candidates with each choice of their constants.
+        least_chi2: Minimum decrease of chi2 by a selected effect of one parameter, and of one with more.
+    """
     best: dict[int, _VariantLimit] = {}
-    for part in batches(variants_of(asked, world.gravity[0, :1])):
+    for part in batches(variants):
         start = [(started.base.segments, started.base.values[0])] * len(part)
         fits = fit_sliding(started.segments.world, part, start, started.told, iterations=1)
         for variant, fit in zip(part, fits, strict=True):
-            one = _variant_limit(variant, fit, SAFE * math.sqrt(spread * score[len(variant.parameters) > 1]))
+            one = _variant_limit(variant, fit, SAFE * math.sqrt(least_chi2[len(variant.parameters) > 1]))
             if variant.place not in best or one.times < best[variant.place].times:
                 best[variant.place] = one
-    limits = list(best.values())
-    limits = [
-        one for one in limits if one.times <= min(n.limit / n.scale for n in one.variant.active.effect.parameters)
+    return [
+        one
+        for one in best.values()
+        if one.times <= min(n.limit / n.scale for n in one.variant.active.effect.parameters)
     ]
-    sizes = {}
-    for one, misfit in zip(limits, _misfits(started, limits), strict=True):
-        if misfit > spread * score[len(one.variant.parameters) > 1]:
-            sizes[asked[one.variant.place].effect.name] = one
-    return [_limit(candidate, sizes.get(candidate.effect.name)) for candidate in acting]
 
 
 def _variant_limit(variant: Variant, fit: SlidingFit, sigmas: float) -> _VariantLimit:

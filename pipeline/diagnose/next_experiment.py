@@ -29,6 +29,7 @@ from .fisher_information import Layout, experiment_states, information_of_data, 
 from .verdict import Findings
 
 Array = NDArray[np.float64]
+Pairs = list[tuple[str, str]]
 
 NEAR_BIC = 2 * math.log(1000)
 """Maximum difference of BIC with which a second effect is a rival of the first without being its equal: odds of
@@ -127,10 +128,8 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Exp
     if rivals is None:
         return None
     ranked = ranked_experiments(prepared, rivals, throws, findings.contact_chi2)
-    pairs = list(itertools.combinations(rivals.names, 2))
-    open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
-    closed = {name for pair in pairs if pair not in open_pairs for name in pair}
-    left = tuple(name for name in rivals.names if name in closed)
+    open_pairs, closed_pairs = _pairs_by_separation(ranked, rivals)
+    left = _names_in(closed_pairs, rivals)
     advice = _advice(rivals, left)
     unseparated = f"no throw tells {' and '.join(left)} apart"
     if not open_pairs:
@@ -138,16 +137,28 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Exp
         return NextExperiment(what=what, initial_state={}, separates=left, expected_gain_nats=0.0, not_separated=left)
     ranked = sorted(ranked, key=lambda r: r.order(open_pairs))
     best = ranked[0]
-    separates = {name for pair in open_pairs for name in pair}
     return NextExperiment(
         what=f"{best.throw.what}; {unseparated}: {advice}" if left else best.throw.what,
         initial_state=best.state,
-        separates=tuple(name for name in rivals.names if name in separates),
+        separates=_names_in(open_pairs, rivals),
         expected_gain_nats=float(f"{best.gain(open_pairs):.3g}"),
         least_gain_nats=float(f"{best.least_gain(open_pairs):.3g}"),
         not_separated=left,
         ranked=tuple(_entry(place, one, open_pairs) for place, one in enumerate(ranked)),
     )
+
+
+def _pairs_by_separation(ranked: Sequence[RankedExperiment], rivals: Rivals) -> tuple[Pairs, Pairs]:
+    """Return the pairs of rivals that some throw separates, and the other pairs."""
+    pairs = list(itertools.combinations(rivals.names, 2))
+    open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
+    return open_pairs, [pair for pair in pairs if pair not in open_pairs]
+
+
+def _names_in(pairs: Pairs, rivals: Rivals) -> tuple[str, ...]:
+    """Return the rivals that are in at least one of the pairs, in their order."""
+    found = {name for pair in pairs for name in pair}
+    return tuple(name for name in rivals.names if name in found)
 
 
 def _entry(place: int, one: RankedExperiment, pairs: Sequence[tuple[str, str]]) -> dict[str, object]:

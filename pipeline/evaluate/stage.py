@@ -269,14 +269,15 @@ def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: 
         return {}
     require_metric(capture.cameras)
     found = {name: usable_cameras(capture, name) for name in filmed}
-    unknown = sorted({camera for _, lacking in found.values() for camera in lacking})
+    usable = {name: cameras for name, (cameras, _) in found.items() if cameras}
+    unknown = {camera for _, lacking in found.values() for camera in lacking}
     if unknown:
-        warnings.append(f"no PSNR from {_listed(unknown)}: no pose in the capture's cameras.")
-    known = sorted({camera for cameras, _ in found.values() for camera in cameras})
-    unexposed = [camera for camera in known if camera not in model.file.exposures]
+        warnings.append(f"no PSNR from {_listed(sorted(unknown))}: no pose in the capture's cameras.")
+    unexposed = {camera for cameras in usable.values() for camera in cameras} - set(model.file.exposures)
     if unexposed:
-        warnings.append(f"the model has no exposure of {_listed(unexposed)}: its colours are compared as they are.")
-    return {name: cameras for name, (cameras, _) in found.items() if cameras}
+        names = _listed(sorted(unexposed))
+        warnings.append(f"the model has no exposure of {names}: its colours are compared as they are.")
+    return usable
 
 
 def _video_times(capture: Capture, episode: str, cameras: Sequence[str]) -> Array:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .effects.effect import ActiveEffect
-from .world import World, stretched_inertia
+from .world import Body, World, stretched_inertia
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,26 +180,34 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
     column = {parameter.name: values[:, index] for index, parameter in enumerate(parameters)}
     law = world.contact
     world = replace(world, contact=replace(law, **{name: column[name] for name in vars(law) if name in column}))
-    effects = [
-        replace(
-            active,
-            values={name: column.get(f"{active.effect.name}.{name}", value) for name, value in active.values.items()},
-        )
-        for active in world.effects
-    ]
-    world = replace(world, effects=tuple(effects))
+    world = replace(world, effects=tuple(_with_values(active, column) for active in world.effects))
     if "ground_shift_m" in column and world.ground_offset is not None:
         world = replace(world, ground_offset=world.ground_offset + column["ground_shift_m"])
     for index, body in enumerate(world.bodies):
-        com = [column.get(f"{body.name}.com_{axis}_m") for axis in "xyz"]
-        if any(value is not None for value in com):
-            given = [body.com[:, k] if value is None else value for k, value in enumerate(com)]
-            world = world.with_body(index, com=torch.stack(torch.broadcast_tensors(*given), -1))
-        factors = [column.get(f"{body.name}.moment_{axis}") for axis in "xyz"]
-        if any(factor is not None for factor in factors):
-            known = [torch.ones_like(values[:, 0]) if factor is None else factor for factor in factors]
-            world = world.with_body(index, inertia=scaled_inertia(body.inertia, torch.stack(known, -1)))
+        changes = _mass_distribution_of(body, column)
+        world = world.with_body(index, **changes) if changes else world
     return world
+
+
+def _with_values(active: ActiveEffect, column: Mapping[str, Tensor]) -> ActiveEffect:
+    """Return an effect with the given values (B,) of its parameters, by `effect.parameter`."""
+    values = {name: column.get(f"{active.effect.name}.{name}", value) for name, value in active.values.items()}
+    return replace(active, values=values)
+
+
+def _mass_distribution_of(body: Body, column: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the centre of mass (B, 3) and the inertia (B, 3, 3) of a body, each where values of it are given."""
+    changes = {}
+    com = [column.get(f"{body.name}.com_{axis}_m") for axis in "xyz"]
+    if any(value is not None for value in com):
+        given = [body.com[:, k] if value is None else value for k, value in enumerate(com)]
+        changes["com"] = torch.stack(torch.broadcast_tensors(*given), -1)
+    factors = {axis: column.get(f"{body.name}.moment_{axis}") for axis in "xyz"}
+    like = next((factor for factor in factors.values() if factor is not None), None)
+    if like is not None:
+        known = [torch.ones_like(like) if factor is None else factor for factor in factors.values()]
+        changes["inertia"] = scaled_inertia(body.inertia, torch.stack(known, -1))
+    return changes
 
 
 def with_own(world: World, own: Mapping[str, Tensor], repeats: int = 1) -> World:

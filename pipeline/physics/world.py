@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
@@ -140,29 +140,10 @@ class World:
         def tensor(value: object) -> Tensor:
             return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)[None]
 
-        bodies = []
-        for index, body in enumerate(file.bodies):
-            if geometry is None:
-                spheres = model.collision[body.name]
-                centers, radii = tensor(spheres.means), tensor(spheres.scales * body.radius_factor)
-                place = tensor((*body.photo_pose.position_m, *body.photo_pose.quat_wxyz))
-                on_plane = plane_contacts(centers[0], radii[0])
-            else:
-                known = geometry.bodies[index]
-                centers, radii, place, on_plane = known.centers, known.radii, known.place, known.on_plane
-            bodies.append(
-                Body(
-                    name=body.name,
-                    motion=body.motion,
-                    mass=tensor(body.mass_kg),
-                    inertia=tensor(symmetric(body.inertia_kg_m2)),
-                    com=tensor(body.com_m),
-                    centers=centers,
-                    radii=radii,
-                    place=place,
-                    on_plane=on_plane,
-                )
-            )
+        bodies = [
+            _body(model, index, tensor, None if geometry is None else geometry.bodies[index])
+            for index in range(len(file.bodies))
+        ]
         law = ContactLaw(
             *(tensor(v) for v in (file.contact.friction, file.contact.contact_time_s, file.contact.damping_ratio))
         )
@@ -210,6 +191,36 @@ class State:
     def joined(*states: State) -> State:
         """Concatenate the batches of several states."""
         return State(*(torch.cat([getattr(state, field.name) for state in states]) for field in fields(State)))
+
+
+def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry: Body | None) -> Body:
+    """Return a body of a model, with the spheres and the place of `geometry` if it is given.
+
+    Args:
+        model: The model.
+        index: Index of the body in the model.
+        tensor: Function that returns a value as a tensor with a batch dimension of 1.
+        geometry: The same body with other parameters.
+    """
+    entry = model.file.bodies[index]
+    if geometry is None:
+        spheres = model.collision[entry.name]
+        centers, radii = tensor(spheres.means), tensor(spheres.scales * entry.radius_factor)
+        place = tensor((*entry.photo_pose.position_m, *entry.photo_pose.quat_wxyz))
+        on_plane = plane_contacts(centers[0], radii[0])
+    else:
+        centers, radii, place, on_plane = geometry.centers, geometry.radii, geometry.place, geometry.on_plane
+    return Body(
+        name=entry.name,
+        motion=entry.motion,
+        mass=tensor(entry.mass_kg),
+        inertia=tensor(symmetric(entry.inertia_kg_m2)),
+        com=tensor(entry.com_m),
+        centers=centers,
+        radii=radii,
+        place=place,
+        on_plane=on_plane,
+    )
 
 
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:

@@ -12,7 +12,7 @@ import numpy as np
 from ...datasets.capture.cameras import Camera
 from ...datasets.io.atomic import sha256
 from ...datasets.models.model import Model, read_model
-from ...schemas import DatasetManifest, InputDataError, SamplingPlan, SynthesizeConfig, UsageError
+from ...schemas import DatasetManifest, InputDataError, ModelFile, SamplingPlan, SynthesizeConfig, UsageError
 from ..physics.world import World
 from ..rendering.label_renderer import LabelRenderer
 from ..runtime.device import resolve_device
@@ -138,19 +138,27 @@ def manifest_of(path: Path, job: Job, notes: tuple[str, ...]) -> DatasetManifest
 def notes_of(job: Job) -> tuple[str, ...]:
     """Return the notes on the rollouts for the user."""
     notes = [] if job.renderer is not None else [STATE_ONLY]
-    kept = not_varied(job.model.file)
-    if kept and job.plan.parameter_spread > 0:
-        notes.append(f"kept at their estimate, because nothing sets them in a rollout: {', '.join(kept)}")
-    spread = [p.name for p in job.model.file.parameters if p.std_error and p.name not in kept]
-    if job.plan.parameter_spread > 0 and not spread:
-        notes.append("no physical parameter has a standard error, so all rollouts have the same physics")
-    together = {name for block in job.model.file.correlations for name in block.parameters}
-    alone = [name for name in spread if name not in together and name not in DERIVED]
-    if job.plan.parameter_spread > 0 and len(alone) > 1:
-        notes.append(f"drawn each by itself, because the model has no correlations of them: {', '.join(alone)}")
+    if job.plan.parameter_spread > 0:
+        notes += _parameter_notes(job.model.file)
     if job.plan.light_turn_deg.support != (0.0, 0.0) and job.model.file.light is None:
         notes.append("light_turn_deg turns nothing: the model has no light")
     unseen = [b.name for b in job.model.file.bodies if b.name not in job.model.body_splats]
     if job.renderer is not None and unseen:
         notes.append(f"not in the images, because they have no visual spheres: {', '.join(unseen)}")
     return tuple(notes)
+
+
+def _parameter_notes(file: ModelFile) -> list[str]:
+    """Return the notes on physical parameters that are not drawn, or not drawn jointly, in a plan with a spread."""
+    notes = []
+    kept = not_varied(file)
+    if kept:
+        notes.append(f"kept at their estimate, because nothing sets them in a rollout: {', '.join(kept)}")
+    spread = [p.name for p in file.parameters if p.std_error and p.name not in kept]
+    if not spread:
+        notes.append("no physical parameter has a standard error, so all rollouts have the same physics")
+    together = {name for block in file.correlations for name in block.parameters}
+    alone = [name for name in spread if name not in together and name not in DERIVED]
+    if len(alone) > 1:
+        notes.append(f"drawn each by itself, because the model has no correlations of them: {', '.join(alone)}")
+    return notes

@@ -98,9 +98,27 @@ def _joined(
     sources: Sequence[Path], manifests: Sequence[DatasetManifest], hashes: bool
 ) -> tuple[list[_Shard], list[str]]:
     """Return the checked shards of all sources in the order of their numbers, and notes for the user."""
-    faults = list(_differing(sources, manifests))
+    shards, notes, doubled = _by_number(sources, manifests)
+    faults = [*_differing(sources, manifests), *doubled]
+    faults += [*_shard_faults(shards, manifests[0], hashes), *_missing(shards, manifests[0])]
+    if faults:
+        where = ", ".join(str(source) for source in sources[:3]) + (", ..." if len(sources) > 3 else "")
+        more = [f"and {len(faults) - SHOWN_FAULTS} more"] if len(faults) > SHOWN_FAULTS else []
+        raise InputDataError(
+            "\n  ".join([f"{where}: the shards cannot be joined:", *faults[:SHOWN_FAULTS], *more]),
+            f"shards 0 to {manifests[0].shard_count - 1} of one model, one set of options and one set of versions.",
+            "make those shards with the command that made the others; --resume --overwrite keeps what is whole.",
+        )
+    return shards, notes + _device_notes(shards)
+
+
+def _by_number(
+    sources: Sequence[Path], manifests: Sequence[DatasetManifest]
+) -> tuple[list[_Shard], list[str], list[str]]:
+    """Return one shard of each number, in order, notes on equal copies of them, and faults of different ones."""
     found: dict[int, _Shard] = {}
     notes: list[str] = []
+    faults: list[str] = []
     for source, manifest in zip(sources, manifests, strict=True):
         for entry in manifest.shards:
             shard, first = _Shard(source, entry), found.setdefault(entry.index, _Shard(source, entry))
@@ -110,29 +128,29 @@ def _joined(
                 notes.append(f"{entry.file} is in {first.root} and, byte for byte, in {source}: the first is taken")
             else:
                 faults.append(f"two shards have the number {entry.index}: {first.file} and {shard.file}.")
-    shards = [found[index] for index in sorted(found)]
-    faults += _shard_faults(shards, manifests[0], hashes)
-    lacking = missing_shards(manifests[0].model_copy(update={"shards": tuple(shard.entry for shard in shards)}))
-    if lacking:
-        count = manifests[0].shard_count
-        names = ", ".join(shard_name(index, count) for index in lacking[:3]) + (", ..." if len(lacking) > 3 else "")
-        faults.append(f"{len(lacking)} of {count} shards are missing: {names} (--array={ranges(lacking)}).")
-    if faults:
-        where = ", ".join(str(source) for source in sources[:3]) + (", ..." if len(sources) > 3 else "")
-        more = [f"and {len(faults) - SHOWN_FAULTS} more"] if len(faults) > SHOWN_FAULTS else []
-        raise InputDataError(
-            "\n  ".join([f"{where}: the shards cannot be joined:", *faults[:SHOWN_FAULTS], *more]),
-            f"shards 0 to {manifests[0].shard_count - 1} of one model, one set of options and one set of versions.",
-            "make those shards with the command that made the others; --resume --overwrite keeps what is whole.",
-        )
+    return [found[index] for index in sorted(found)], notes, faults
+
+
+def _missing(shards: Sequence[_Shard], manifest: DatasetManifest) -> list[str]:
+    """Return one fault that lists the missing shards; empty if none is missing."""
+    lacking = missing_shards(manifest.model_copy(update={"shards": tuple(shard.entry for shard in shards)}))
+    if not lacking:
+        return []
+    count = manifest.shard_count
+    names = ", ".join(shard_name(index, count) for index in lacking[:3]) + (", ..." if len(lacking) > 3 else "")
+    return [f"{len(lacking)} of {count} shards are missing: {names} (--array={ranges(lacking)})."]
+
+
+def _device_notes(shards: Sequence[_Shard]) -> list[str]:
+    """Return one note that lists the shards of each device; empty if all are of the same one."""
     devices = {str(shard.entry.device) for shard in shards}
-    if len(devices) > 1:
-        parts = (
-            f"{ranges(shard.entry.index for shard in shards if str(shard.entry.device) == device)} on {device}"
-            for device in sorted(devices)
-        )
-        notes.append(f"shards {', '.join(parts)}: these agree to rounding, not to the byte")
-    return shards, notes
+    if len(devices) < 2:
+        return []
+    parts = (
+        f"{ranges(shard.entry.index for shard in shards if str(shard.entry.device) == device)} on {device}"
+        for device in sorted(devices)
+    )
+    return [f"shards {', '.join(parts)}: these agree to rounding, not to the byte"]
 
 
 def _differing(sources: Sequence[Path], manifests: Sequence[DatasetManifest]) -> Iterator[str]:

@@ -50,27 +50,34 @@ def draw_parameters(
         The model with these parameters, and the parameters; derived ones (restitution, ...) are consistent with them.
     """
     replaced = replaced or {}
-    quantiles = {parameter.name: float(rng.random()) for parameter in file.parameters}
-    for block in file.correlations:
-        normal = _root(block) @ ndtri([quantiles[name] for name in block.parameters])
-        quantiles |= dict(zip(block.parameters, map(float, ndtr(normal)), strict=True))
+    quantiles = _joint_quantiles(file, rng)
     known = {parameter.name: parameter for parameter in file.parameters}
     values = {name: draw(replaced[name], rng) for name in sorted(replaced)}
     for name, parameter in known.items():
         if name not in values and can_vary(file, name):
             values[name] = _draw(parameter, spread, quantiles[name]) if spread > 0 else parameter.estimate
+    names = [*known, *sorted(set(values) - set(known))]
     drawn = file
-    for name in [*known, *sorted(set(values) - set(known))]:
+    for name in names:
         if name in values and not (name in known and values[name] == known[name].estimate):
             drawn = with_parameter(drawn, name, values[name])
     entries = []
-    for name in [*known, *sorted(set(values) - set(known))]:
+    for name in names:
         old = known.get(name) or FittedParameter(name=name, unit=_unit(file, name), estimate=_present(file, name))
         value = values.get(name, _derived(drawn, name, old.estimate))
         entries.append(
             RolloutParameter(name=name, unit=old.unit, value=value, estimate=old.estimate, std_error=old.std_error)
         )
     return drawn, tuple(entries)
+
+
+def _joint_quantiles(file: ModelFile, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the quantile of each parameter within its own distribution, by the copula of those fitted together."""
+    quantiles = {parameter.name: float(rng.random()) for parameter in file.parameters}
+    for block in file.correlations:
+        normal = _root(block) @ ndtri([quantiles[name] for name in block.parameters])
+        quantiles |= dict(zip(block.parameters, map(float, ndtr(normal)), strict=True))
+    return quantiles
 
 
 def with_correlations(model: Model) -> ModelFile:

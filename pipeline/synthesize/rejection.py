@@ -68,28 +68,45 @@ class Rejection:
             for index in free
         }
         rules = self.rules
-        if rules.off_table_m is not None:
-            for index, center in centers.items():
-                away = center - self.home_m[index]
-                level = away - (away @ self.up)[:, None] * self.up
-                if np.linalg.norm(level, axis=1).max() > rules.off_table_m:
-                    return "off_table_m"
+        if self._leaves_table(centers):
+            return "off_table_m"
         if rules.no_contact and not self._touched(labels, free):
             return "no_contact"
-        if rules.penetration_m is not None:
-            deepest = -labels.contacts.distance_m.min(initial=0.0)
-            if deepest > rules.penetration_m:
-                return "penetration_m"
-        if rules.unrest_m_s is not None:
-            for index in free:
-                spin = float(np.linalg.norm(labels.omega_body_rad_s[-1, index])) * self.extents[index].radius_m
-                if np.linalg.norm(labels.velocity_m_s[-1, index]) + spin > rules.unrest_m_s:
-                    return "unrest_m_s"
-        if rules.unseen_share is not None and labels.cameras:
-            for center in centers.values():
-                if self._unseen_share(labels, center) > rules.unseen_share:
-                    return "unseen_share"
+        if rules.penetration_m is not None and -labels.contacts.distance_m.min(initial=0.0) > rules.penetration_m:
+            return "penetration_m"
+        if self._moves_at_end(labels, free):
+            return "unrest_m_s"
+        if self._leaves_view(labels, centers):
+            return "unseen_share"
         return None
+
+    def _leaves_table(self, centers: Mapping[int, np.ndarray]) -> bool:
+        """Return whether a body's centre (T, 3) [m] is ever too far, along the ground, from its place in the photos."""
+        if self.rules.off_table_m is None:
+            return False
+        for index, center in centers.items():
+            away = center - self.home_m[index]
+            level = away - (away @ self.up)[:, None] * self.up
+            if np.linalg.norm(level, axis=1).max() > self.rules.off_table_m:
+                return True
+        return False
+
+    def _moves_at_end(self, labels: RolloutLabels, free: Sequence[int]) -> bool:
+        """Return whether a point of a free body may be too fast in the last frame."""
+        if self.rules.unrest_m_s is None:
+            return False
+        for index in free:
+            spin = float(np.linalg.norm(labels.omega_body_rad_s[-1, index])) * self.extents[index].radius_m
+            if np.linalg.norm(labels.velocity_m_s[-1, index]) + spin > self.rules.unrest_m_s:
+                return True
+        return False
+
+    def _leaves_view(self, labels: RolloutLabels, centers: Mapping[int, np.ndarray]) -> bool:
+        """Return whether the centre (T, 3) [m] of a body is outside all pictures in too many frames."""
+        limit = self.rules.unseen_share
+        if limit is None or not labels.cameras:
+            return False
+        return any(self._unseen_share(labels, center) > limit for center in centers.values())
 
     @staticmethod
     def _touched(labels: RolloutLabels, free: Sequence[int]) -> bool:

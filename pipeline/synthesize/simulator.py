@@ -176,12 +176,7 @@ def _joined(things: list[T]) -> T:
     found: Any = first
     if isinstance(first, Tensor):
         tensors: list[Any] = things
-        if all(other is first for other in tensors):
-            return found
-        if first.ndim and first.shape[0] == 1:
-            found = torch.cat(tensors)
-        elif not all(torch.equal(first, other) for other in tensors):
-            raise ValueError(f"worlds differ in a tensor of shape {tuple(first.shape)}, which has no batch.")
+        found = _joined_tensors(tensors)
     elif isinstance(first, Mapping):
         mappings: list[Any] = things
         found = {key: _joined([mapping[key] for mapping in mappings]) for key in first}
@@ -191,6 +186,18 @@ def _joined(things: list[T]) -> T:
     elif is_dataclass(first) and not isinstance(first, type):
         found = replace(first, **{f.name: _joined([getattr(thing, f.name) for thing in things]) for f in fields(first)})
     return found
+
+
+def _joined_tensors(tensors: list[Tensor]) -> Tensor:
+    """Concatenate tensors with a batch dimension of 1; one that all share, or one without a batch, stays single."""
+    first = tensors[0]
+    if all(other is first for other in tensors):
+        return first
+    if first.ndim and first.shape[0] == 1:
+        return torch.cat(tensors)
+    if not all(torch.equal(first, other) for other in tensors):
+        raise ValueError(f"worlds differ in a tensor of shape {tuple(first.shape)}, which has no batch.")
+    return first
 
 
 def _state(starts: Sequence[Start]) -> State:

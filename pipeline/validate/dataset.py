@@ -261,17 +261,28 @@ def _check_contacts(demo: Node, count: int, model: Model | None, findings: _Find
         text = f"contacts: body indices outside 0 to {bodies - 1} (-1 = ground, only as body_b)."
         yield Fault(check="contacts", text=text)
         return
+    yield from _check_normals(contacts)
+    yield from _check_pulls(demo, contacts)
+    yield from check_motion(demo, contacts, model, findings.motion)
+
+
+def _check_normals(contacts: dict[str, np.ndarray]) -> Iterator[Fault]:
+    """Check that the normals of contacts have length 1."""
     errors = np.abs(np.linalg.norm(contacts["normal_world"], axis=-1) - 1)
-    if rows and not errors.max() <= QUATERNION_TOLERANCE:
+    if len(contacts["body_a"]) and not errors.max() <= QUATERNION_TOLERANCE:
         row = int(errors.argmax())
-        frame = int(np.searchsorted(offsets, row, side="right")) - 1
+        frame = int(np.searchsorted(contacts["offsets"], row, side="right")) - 1
         text = f"contacts/normal_world: frame {frame}, row {row}: the length differs from 1 by {errors[row]:.2g}."
         yield Fault(check="contacts", text=text, frame=frame, value=float(errors[row]), limit=QUATERNION_TOLERANCE)
+
+
+def _check_pulls(demo: Node, contacts: dict[str, np.ndarray]) -> Iterator[Fault]:
+    """Check that contacts do not pull; effects may add forces that do."""
+    rows = len(contacts["body_a"])
     pulls = (contacts["impulse_world"] * contacts["normal_world"]).sum(-1)
     scale = float(np.abs(contacts["impulse_world"]).max()) if rows else 0.0
     if rows and pulls.min() < -1e-6 * scale and not json.loads(str(demo.attrs["effects_json"])):
         row = int(pulls.argmin())
-        frame = int(np.searchsorted(offsets, row, side="right")) - 1
+        frame = int(np.searchsorted(contacts["offsets"], row, side="right")) - 1
         text = f"contacts/impulse_world: frame {frame}: a contact pulls by {-pulls.min():.2g} N s; contacts only push."
         yield Fault(check="contacts", text=text, frame=frame, value=float(pulls.min()), limit=0.0)
-    yield from check_motion(demo, contacts, model, findings.motion)

@@ -67,6 +67,26 @@ class _Painted:
         return self.depth > 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Picture:
+    """The labels of a picture."""
+
+    camera: str
+    """Name of the camera."""
+    frame: int
+    """Index of the frame in the rollout."""
+    mask: np.ndarray
+    """Index of the visible body + 1, shape (H, W); 0 for the background."""
+    depth: np.ndarray
+    """Depth [m], shape (H, W)."""
+    amodal: list[np.ndarray]
+    """Pixels that each body would cover alone, bool, shape (H, W)."""
+
+    def fault(self, check: str, text: str, value: float, limit: float, body: str | None = None) -> Fault:
+        """Return a fault at this picture."""
+        return Fault(check=check, text=text, frame=self.frame, camera=self.camera, body=body, value=value, limit=limit)
+
+
 def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindings) -> Iterator[Fault]:
     """Compare every body in every picture of a rollout with its pose."""
     names = [name.decode() for name in demo["bodies/names"][()]]
@@ -81,75 +101,62 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
                 check="shape", text=f"obs/{camera_name}_mask: shape {sets[0].shape[1:]}; the camera has {size}."
             )
             continue
-        amodal_set = demo[f"obs/{camera_name}_amodal"]
+        sets.append(demo[f"obs/{camera_name}_amodal"])
         counts = {key: demo[f"bodies/{key}"][:, number] for key in ("visible_px", "amodal_px", "visible_fraction")}
-        for first in range(0, count, sets[0].chunks[0] if sets[0].chunks else count):
-            frames = range(first, min(count, first + (sets[0].chunks[0] if sets[0].chunks else count)))
-            masks, depths = (item[frames.start : frames.stop] for item in sets)
-            amodals = amodal_set[frames.start : frames.stop]
-            for frame in frames:
-                mask, depth = masks[frame - first], depths[frame - first]
-                place = f"obs/{camera_name}_mask, frame {frame}"
-                if mask.max(initial=0) > len(names):
-                    text = f"{place}: label {mask.max()}; there are {len(names)} bodies."
-                    yield Fault(
-                        check="labels",
-                        text=text,
-                        frame=frame,
-                        camera=camera_name,
-                        value=float(mask.max()),
-                        limit=len(names),
-                    )
-                    continue
-                bits = [amodals[frame - first] >> np.uint8(body) & 1 > 0 for body in range(len(names))]
-                listed = {key: values[frame] for key, values in counts.items()}
-                yield from _check_counts(mask, bits, listed, names, frame, camera_name)
-                painted = {
-                    body: _paint(model, name, position[frame, body], quat[frame, body], camera)
-                    for body, name in enumerate(names)
-                    if name in model.body_splats
-                }
-                for body, spheres in painted.items():
-                    others = [other for index, other in painted.items() if index != body]
-                    shown = mask == body + 1
-                    whole = _compare_amodal(spheres, bits[body], findings)
-                    fault = _compare(spheres, others, shown, depth, findings) or whole
-                    if fault is not None:
-                        check, text, value, limit = fault
-                        place = f"obs/{camera_name}, frame {frame}, body '{names[body]}'"
-                        yield Fault(
-                            check=check,
-                            text=f"{place}: {text}",
-                            frame=frame,
-                            camera=camera_name,
-                            body=names[body],
-                            value=value,
-                            limit=limit,
-                        )
+        for picture in _pictures(sets, camera_name, count, len(names)):
+            highest, frame = picture.mask.max(initial=0), picture.frame
+            if highest > len(names):
+                text = f"obs/{camera_name}_mask, frame {frame}: label {highest}; there are {len(names)} bodies."
+                yield picture.fault("labels", text, float(highest), len(names))
+                continue
+            yield from _check_counts(picture, {key: values[frame] for key, values in counts.items()}, names)
+            painted = {
+                body: _paint(model, name, position[frame, body], quat[frame, body], camera)
+                for body, name in enumerate(names)
+                if name in model.body_splats
+            }
+            yield from _check_bodies(picture, painted, names, findings)
 
 
-def _check_counts(
-    mask: np.ndarray, amodal: list[np.ndarray], listed: dict[str, np.ndarray], names: list[str], frame: int, camera: str
-) -> Iterator[Fault]:
+def _pictures(sets: list[Node], camera: str, count: int, bodies: int) -> Iterator[_Picture]:
+    """Read the pictures of a camera from its masks, depths and amodal masks, in the blocks of the file."""
+    step = sets[0].chunks[0] if sets[0].chunks else count
+    for first in range(0, count, step):
+        last = min(count, first + step)
+        masks, depths, amodals = (item[first:last] for item in sets)
+        for frame in range(first, last):
+            amodal = amodals[frame - first]
+            alone = [amodal >> np.uint8(body) & 1 > 0 for body in range(bodies)]
+            mask, depth = masks[frame - first], depths[frame - first]
+            yield _Picture(camera=camera, frame=frame, mask=mask, depth=depth, amodal=alone)
+
+
+def _check_counts(picture: _Picture, listed: dict[str, np.ndarray], names: list[str]) -> Iterator[Fault]:
     """Check `visible_px` and `amodal_px` of `bodies/` against the masks, and `visible_fraction` against their ratio."""
-    visible = np.bincount(mask.ravel(), minlength=len(names) + 1)[1 : len(names) + 1]
-    whole = np.array([part.sum() for part in amodal])
+    visible = np.bincount(picture.mask.ravel(), minlength=len(names) + 1)[1 : len(names) + 1]
+    whole = np.array([part.sum() for part in picture.amodal])
     fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
     found = {"visible_px": visible, "amodal_px": whole, "visible_fraction": fraction}
     for key, values in listed.items():
         for name, value, expected in zip(names, values, found[key], strict=True):
             if not abs(value - expected) <= 1e-6:
-                text = f"bodies/{key}: frame {frame}, camera {camera}, body '{name}': {value:g}; "
+                text = f"bodies/{key}: frame {picture.frame}, camera {picture.camera}, body '{name}': {value:g}; "
                 text += f"the masks have {expected:g}."
-                yield Fault(
-                    check="labels",
-                    text=text,
-                    frame=frame,
-                    camera=camera,
-                    body=name,
-                    value=float(value),
-                    limit=float(expected),
-                )
+                yield picture.fault("labels", text, float(value), float(expected), name)
+
+
+def _check_bodies(
+    picture: _Picture, painted: dict[int, _Painted], names: list[str], findings: PictureFindings
+) -> Iterator[Fault]:
+    """Compare mask, depth and amodal mask of each body with its projected spheres; yield one fault for each at most."""
+    for body, spheres in painted.items():
+        others = [other for index, other in painted.items() if index != body]
+        whole = _compare_amodal(spheres, picture.amodal[body], findings)
+        fault = _compare(spheres, others, picture.mask == body + 1, picture.depth, findings) or whole
+        if fault is not None:
+            check, text, value, limit = fault
+            place = f"obs/{picture.camera}, frame {picture.frame}, body '{names[body]}'"
+            yield picture.fault(check, f"{place}: {text}", value, limit, names[body])
 
 
 def _paint(model: Model, name: str, position: np.ndarray, quat: np.ndarray, camera: Camera) -> _Painted:

@@ -98,31 +98,11 @@ def pack(
         x.shape[0]
         for x in (*columns, *spheres, steps, *(x for row in rows.values() for x in row))
     )  # fmt: skip
-    pairs = tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world))
-    single = world.gravity.dtype == torch.float32
-    starts = [sum(body.radii.shape[-1] for body in world.bodies[:index]) for index in range(len(world.bodies))]
-    listed, lowest = _contact_spheres(world, starts), ()
-    if wrenches.takes_heights(world):
-        listed, lowest = _with_lowest(world, starts, listed)
-    structure = Structure(
-        single=single,
-        dual=False,
-        lanes=1,
-        record=record,
-        effects=bool(effects),
-        magnets=wrenches.magnets(world),
-        twisted=wrenches.is_twisted(world),
-        turned=turned,
-        free=tuple(body.free for body in world.bodies),
-        drives=tuple(list(rows).index(index) if index in rows else -1 for index in range(len(world.bodies))),
-        spheres=tuple(body.radii.shape[-1] for body in world.bodies),
-        pairs=pairs,
-        lowest=lowest,
-        surface=wrenches.has_surface(world),
-        elliptic=wrenches.has_ellipse(world),
-    )
+    listed, lowest = _listed_spheres(world)
     return Packed(
-        structure=structure,
+        structure=_structure(
+            world, record=record, effects=bool(effects), turned=turned, driven=list(rows), lowest=lowest
+        ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
         geometry=_joined(spheres, batch),
@@ -134,6 +114,38 @@ def pack(
         if rows
         else counts.new_zeros(1, 0),
         turn=turn,
+    )
+
+
+def _structure(
+    world: World, *, record: bool, effects: bool, turned: bool, driven: list[int], lowest: tuple[tuple[int, int], ...]
+) -> Structure:
+    """Return the constants of the kernel, for one thread per environment and without derivatives.
+
+    Args:
+        world: The world.
+        record: Whether contacts are recorded.
+        effects: Whether effects have coefficients in the table.
+        turned: Whether the rotation of the kernel's frame is in the table.
+        driven: Indices of the driven bodies.
+        lowest: First row and number of the candidates for the lowest sphere of each body.
+    """
+    return Structure(
+        single=world.gravity.dtype == torch.float32,
+        dual=False,
+        lanes=1,
+        record=record,
+        effects=effects,
+        magnets=wrenches.magnets(world),
+        twisted=wrenches.is_twisted(world),
+        turned=turned,
+        free=tuple(body.free for body in world.bodies),
+        drives=tuple(driven.index(index) if index in driven else -1 for index in range(len(world.bodies))),
+        spheres=tuple(body.radii.shape[-1] for body in world.bodies),
+        pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
+        lowest=lowest,
+        surface=wrenches.has_surface(world),
+        elliptic=wrenches.has_ellipse(world),
     )
 
 
@@ -190,6 +202,16 @@ def _spheres(body: Body) -> Tensor:
     """Return centres and radii (1 or B, N, 4) [m]; effects may give each item other centres with common radii."""
     batch = max(body.centers.shape[0], body.radii.shape[0])
     return torch.cat((body.centers.expand(batch, -1, -1), body.radii.expand(batch, -1)[..., None]), -1)
+
+
+def _listed_spheres(world: World) -> tuple[Tensor, tuple[tuple[int, int], ...]]:
+    """Return the row of the sphere of each contact (C,), and the place in it of the candidates for each lowest sphere.
+
+    A place is a first row and a number of rows; there are none if no effect depends on heights.
+    """
+    starts = [sum(body.radii.shape[-1] for body in world.bodies[:index]) for index in range(len(world.bodies))]
+    listed = _contact_spheres(world, starts)
+    return _with_lowest(world, starts, listed) if wrenches.takes_heights(world) else (listed, ())
 
 
 def _contact_spheres(world: World, starts: list[int]) -> Tensor:

@@ -94,17 +94,7 @@ def roll(
     if world.effects:
         require_physical(world)  # an effect may give a body an impossible inertia
     packed = pack(world, state, times_s, driven or {}, record_contacts)
-    inputs = (packed.table, packed.steps, packed.geometry, packed.drives)
-    require_one_kind(*inputs)
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-        raise UsageError(
-            "the fused kernel has no reverse derivatives.",
-            "forward ones (batched_jacobian), or none (torch.no_grad()).",
-            "use simulate for derivatives in reverse.",
-        )
-    duals = [forward_ad.unpack_dual(tensor) for tensor in inputs]
-    values = [dual.primal.contiguous() for dual in duals]
-    tangents = [None if dual.tangent is None else dual.tangent.contiguous() for dual in duals]
+    values, tangents = _values_and_tangents(packed.table, packed.steps, packed.geometry, packed.drives)
     dual = any(tangent is not None for tangent in tangents)
     if dual and record_contacts:
         raise UsageError("the fused kernel has no derivatives of the contact record.", "record_contacts=False.")
@@ -122,6 +112,24 @@ def roll(
     if frame_tangents is not None:
         frames = forward_ad.make_dual(frames, frame_tangents)
     return read_frames(world, times_s, packed, frames, labels)
+
+
+def _values_and_tangents(*inputs: Tensor) -> tuple[list[Tensor], list[Tensor | None]]:
+    """Return the values of the kernel's inputs and their forward derivatives, contiguous; None without derivatives.
+
+    Raises:
+        UsageError: If the inputs are of several kinds, or a reverse derivative is requested.
+    """
+    require_one_kind(*inputs)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        raise UsageError(
+            "the fused kernel has no reverse derivatives.",
+            "forward ones (batched_jacobian), or none (torch.no_grad()).",
+            "use simulate for derivatives in reverse.",
+        )
+    duals = [forward_ad.unpack_dual(tensor) for tensor in inputs]
+    values = [dual.primal.contiguous() for dual in duals]
+    return values, [None if dual.tangent is None else dual.tangent.contiguous() for dual in duals]
 
 
 def require_one_kind(*tensors: Tensor) -> None:
