@@ -3,6 +3,9 @@
 Source of the layout: COLMAP documentation, "Output format", and `scripts/python/read_write_model.py` there.
 """
 
+# Why `pycolmap.Reconstruction` does not do this: it hung for minutes on damaged bytes, where a capture needs a message,
+# and it requires points3D, which captures may lack.
+
 from __future__ import annotations
 
 import math
