@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 from cgwm.datasets.models.model import read_model
+from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.geometry.mesh import Mesh
 from cgwm.pipeline.geometry.surface_distance import Gap, Union
 from cgwm.schemas import SplatConfig
 from mesh_photos import Painted, built_in, scanned, write_capture

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from cgwm.datasets.capture.cameras import Camera, to_intrinsics
 from cgwm.datasets.capture.images import write_image
+from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.datasets.synthetic.objects import make_object
 from cgwm.datasets.synthetic.rig import look_at, make_paint
 from cgwm.pipeline.geometry.directions import fibonacci_directions
-from cgwm.pipeline.geometry.mesh import Mesh
 from cgwm.schemas import CamerasFile, PosedImage, Scale
 from numpy.typing import NDArray
 

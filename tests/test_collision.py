@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.pipeline.geometry.directions import fibonacci_directions
-from cgwm.pipeline.geometry.mesh import Mesh, mesh_mass_properties, mesh_volume, read_mesh
+from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume, read_mesh
 from cgwm.pipeline.geometry.primitives import spheres_volume
 from cgwm.pipeline.sg_gs.collision_spheres import distil, shape_to_spheres, support_of_spheres, union_distance
 from cgwm.schemas import InputDataError, Shape

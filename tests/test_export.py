@@ -16,7 +16,7 @@ import pytest
 from cgwm.cli import main
 from cgwm.cli.usage import option_name
 from cgwm.datasets.capture.cameras import Camera, camera_of, to_intrinsics
-from cgwm.datasets.capture.colmap_model import read_colmap_model, rotation_from_quat_wxyz
+from cgwm.datasets.capture.colmap_model import read_colmap_model
 from cgwm.datasets.capture.images import read_rgb, write_image
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.capture.transforms import read_transforms
@@ -256,7 +256,9 @@ def test_glb_has_one_node_a_body_and_the_splats_of_the_extension(model: Path, tm
     np.testing.assert_allclose(Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(cube["translation"], [0.1, -0.05, 0.2])
     np.testing.assert_allclose(
-        Rotation.from_quat(cube["rotation"]).as_matrix(), rotation_from_quat_wxyz(np.array(QUAT)), atol=1e-12
+        Rotation.from_quat(cube["rotation"]).as_matrix(),
+        Rotation.from_quat(QUAT, scalar_first=True).as_matrix(),
+        atol=1e-12,
     )
     assert "translation" not in scene
     for node, splats in ((scene, source.scene), (cube, source.body_splats["cube"])):

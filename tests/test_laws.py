@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.datasets.synthetic.objects import make_object
-from cgwm.pipeline.geometry.mesh import Mesh, mesh_mass_properties, mesh_volume
+from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume
 from cgwm.pipeline.geometry.rotation import quat_rotate
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, damping_ratio_of, restitution, simulate
 from cgwm.pipeline.physics.smooth_distance import plane_contacts

@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.pipeline.geometry.directions import fibonacci_directions
-from cgwm.pipeline.geometry.mesh import Mesh, mesh_volume
+from cgwm.pipeline.geometry.mesh import mesh_volume
 from cgwm.pipeline.geometry.surface_distance import Union, union_surface
 from cgwm.pipeline.sg_gs.collision_spheres import distil
 

@@ -12,10 +12,10 @@ import pytest
 from cgwm.datasets.io.atomic import sha256
 from cgwm.datasets.models.model import write_model
 from cgwm.datasets.rollouts.dataset import shard_name
-from cgwm.pipeline.geometry.viewpoint import quat_product
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import EffectModel, InputDataError, SynthesizeConfig, UsageError
+from scipy.spatial.transform import Rotation
 from small_model import small_model, write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=2, duration_s=0.4, width=80, height=60, device="cpu", seed=2)
@@ -46,8 +46,8 @@ def change(dataset: Path, edit: Callable[[h5py.Group], None], demo: int = 1) -> 
 
 
 def turned(quat: np.ndarray, angle_deg: float) -> np.ndarray:
-    half = np.radians(angle_deg) / 2
-    return quat_product(quat, np.array([np.cos(half), 0, 0, np.sin(half)]))
+    turn = Rotation.from_rotvec([0, 0, angle_deg], degrees=True)
+    return (Rotation.from_quat(quat, scalar_first=True) * turn).as_quat(scalar_first=True)
 
 
 def test_a_fresh_dataset_is_clean(good: Path) -> None:

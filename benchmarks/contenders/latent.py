@@ -317,8 +317,8 @@ def _stacked(rows: list[Sequences], device: torch.device | str) -> Sequences:
 def _interpolated(grid: Array, position: Tensor, quat_wxyz: Tensor, times_s: Array) -> tuple[Array, Array]:
     at = np.clip(times_s, grid[0], grid[-1])
     place = np.stack([np.interp(at, grid, position[:, axis].numpy()) for axis in range(3)], -1).astype(np.float64)
-    turns = Slerp(grid, Rotation.from_quat(np.roll(quat_wxyz.numpy(), -1, -1)))(at)
-    return place, np.roll(turns.as_quat(), 1, -1)
+    turns = Slerp(grid, Rotation.from_quat(quat_wxyz.numpy(), scalar_first=True))(at)
+    return place, turns.as_quat(scalar_first=True)
 
 
 def _small(camera: Camera) -> Camera:

@@ -3,6 +3,9 @@
 Source of the layout: COLMAP documentation, "Output format", and `scripts/python/read_write_model.py` there.
 """
 
+# Why `pycolmap.Reconstruction` does not do this: it hung for minutes on damaged bytes, where a capture needs a message,
+# and it requires points3D, which captures may lack.
+
 from __future__ import annotations
 
 import math
@@ -78,20 +81,11 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
         raise InputDataError(f"{folder}: not a COLMAP model that can be read: {error}.") from None
 
 
-def rotation_from_quat_wxyz(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix, shape (3, 3), of a quaternion (w, x, y, z) of any norm but 0."""
-    w, x, y, z = np.asarray(quat_wxyz, np.float64) / np.linalg.norm(quat_wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _world_from_camera(quat_wxyz: np.ndarray, translation: np.ndarray) -> Matrix4:
-    rotation = rotation_from_quat_wxyz(quat_wxyz).T
+    # slow to import, and captures without a COLMAP model do not need it
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix().T
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = -rotation @ translation

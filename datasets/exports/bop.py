@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..capture.cameras import Camera
-from ..capture.colmap_model import rotation_from_quat_wxyz
 from ..capture.images import write_depth, write_image
 from ..io.atomic import new_directory
 from ..io.progress import progress
@@ -114,7 +114,7 @@ class _Scene:
         self.poses[image_id], self.facts[image_id] = [], []
         self.coco.add_image(image_id, camera.width, camera.height)
         for body in range(self.position.shape[1]):
-            R_world = rotation_from_quat_wxyz(self.quat[picture.frame, body])
+            R_world = Rotation.from_quat(self.quat[picture.frame, body], scalar_first=True).as_matrix()
             t_cam = T_cam_world[:3, :3] @ self.position[picture.frame, body] + T_cam_world[:3, 3]
             pose = {"cam_R_m2c": (T_cam_world[:3, :3] @ R_world).ravel().tolist(), "cam_t_m2c": (1e3 * t_cam).tolist()}
             self.poses[image_id].append({**pose, "obj_id": body + 1})

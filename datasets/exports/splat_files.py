@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ..capture.colmap_model import rotation_from_quat_wxyz
 from ..io.atomic import new_directory
 from ..models.model import Model
 from ..shapes.ply import Splats, write_splats
@@ -50,7 +50,7 @@ def in_world(model: Model, poses: dict[str, tuple[np.ndarray, np.ndarray]] | Non
     for name, splats in model.body_splats.items():
         photo = model.body(name).photo_pose
         position, quat = (poses or {}).get(name, (np.array(photo.position_m), np.array(photo.quat_wxyz)))
-        rotation = rotation_from_quat_wxyz(quat)
+        rotation = Rotation.from_quat(quat, scalar_first=True).as_matrix()
         normals = None if splats.normals is None else splats.normals @ rotation.T
         parts.append(replace(splats, means=splats.means @ rotation.T + position, normals=normals))
     return _joined(parts)

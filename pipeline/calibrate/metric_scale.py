@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...schemas import InputDataError, KnownCameraDistance, KnownDistance, Marker, NotConvergedError
 from .markers import marker_corners
@@ -223,15 +224,8 @@ def _world_corners(marker: Marker) -> Array:
     pose = marker.pose
     if pose is None:
         raise ValueError(f"marker {marker.id} has no pose")
-    w, x, y, z = pose.quat_wxyz
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return marker_corners(marker.side_m) @ rotation.T + np.array(pose.position_m)
+    turn = Rotation.from_quat(pose.quat_wxyz, scalar_first=True)
+    return turn.apply(marker_corners(marker.side_m)) + np.array(pose.position_m)
 
 
 def _marked_point(model: SfmModel, pixels: Mapping[str, tuple[float, float]], field: str) -> TriangulatedPoint:

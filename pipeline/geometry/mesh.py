@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from ...datasets.shapes import meshes
+from ...datasets.shapes.meshes import Mesh
 from ...schemas import InputDataError
 from .solid_grid import Array, MassProperties, Volume
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A triangle mesh."""
-
-    vertices: Array
-    """Positions [m], shape (V, 3)."""
-    faces: NDArray[np.int64]
-    """Vertex indices, counter-clockwise seen from outside, shape (F, 3)."""
-
-    def corners(self) -> Array:
-        """Return the triangles' corners [m], shape (F, 3 corners, 3)."""
-        return self.vertices[self.faces]
 
 
 def read_mesh(path: Path) -> Mesh:
     """Read a closed mesh from a .obj or .stl file (binary or text), in metres.
 
     Raises:
-        InputDataError: If the file is missing or has another format, or the mesh has no triangles or is not closed.
+        InputDataError: If the file is missing, cut off or of another format, or the mesh is empty or not closed.
     """
     if not path.is_file():
         raise InputDataError(f"{path}: no such file.", todo="correct the path of the mesh in capture.toml.")
-    suffix = path.suffix.lower()
-    if suffix not in (".obj", ".stl"):
-        raise InputDataError(f"{path}: a mesh of the kind '{suffix}' cannot be read.", ".obj, .stl.")
-    try:
-        mesh = _read_obj(path) if suffix == ".obj" else _read_stl(path)
-    except (ValueError, IndexError) as error:
-        raise InputDataError(f"{path}: not a readable {suffix} mesh: {error}.") from None
-    if mesh.faces.shape[0] < 4 or not np.isfinite(mesh.vertices).all():
+    mesh = meshes.read_mesh(path, merge=False)
+    if mesh.faces.shape[0] < 4:
         raise InputDataError(f"{path}: no closed mesh; found {mesh.faces.shape[0]} triangles.")
     _check_closed(mesh, path)
     # triangles of a mesh that is inside out are flipped
@@ -50,15 +31,13 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def mesh_mass_properties(mesh: Mesh) -> MassProperties:
-    """Return the exact mass properties of a mesh, by signed tetrahedra from the origin (divergence theorem)."""
-    triangles = mesh.corners()
-    volumes = np.linalg.det(triangles) / 6
-    volume = volumes.sum()
-    com = (volumes[:, None] * triangles.sum(1)).sum(0) / (4 * volume)
-    sums = triangles.sum(1)
-    outer = np.einsum("f,fci,fcj->ij", volumes, triangles, triangles) + np.einsum("f,fi,fj->ij", volumes, sums, sums)
-    second = outer / (20 * volume) - np.outer(com, com)
-    return MassProperties(float(volume), com, np.trace(second) * np.eye(3) - second)
+    """Return the exact mass properties of a closed mesh.
+
+    Raises:
+        InputDataError: If it encloses no volume.
+    """
+    solid = meshes.solid_properties(mesh)
+    return MassProperties(solid.volume_m3, solid.com_m, solid.inertia_per_kg)
 
 
 def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
@@ -126,33 +105,3 @@ def _check_closed(mesh: Mesh, path: Path) -> None:
             "a closed (watertight) surface.",
             "close its holes in a mesh editor.",
         )
-
-
-def _read_obj(path: Path) -> Mesh:
-    vertices: list[list[float]] = []
-    faces: list[list[int]] = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        words = line.split()
-        if words[:1] == ["v"]:
-            vertices.append([float(word) for word in words[1:4]])
-        elif words[:1] == ["f"]:
-            ring = [int(word.split("/")[0]) for word in words[1:]]
-            ring = [index - 1 if index > 0 else len(vertices) + index for index in ring]
-            faces += [[ring[0], ring[k], ring[k + 1]] for k in range(1, len(ring) - 1)]
-    corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
-    if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):
-        raise ValueError(f"a face names vertex {int(corners.max()) + 1} of {len(vertices)}")
-    return Mesh(np.array(vertices, dtype=float).reshape(-1, 3), corners)
-
-
-def _read_stl(path: Path) -> Mesh:
-    data = path.read_bytes()
-    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
-    if len(data) == 84 + 50 * count:
-        record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-        soup = np.frombuffer(data, record, count, 84)["corners"].astype(float).reshape(-1, 3)
-    else:
-        lines = (line.split() for line in data.decode("utf-8").splitlines())
-        soup = np.array([[float(w) for w in words[1:4]] for words in lines if words[:1] == ["vertex"]]).reshape(-1, 3)
-    vertices, index = np.unique(soup, axis=0, return_inverse=True)
-    return Mesh(vertices, index.reshape(-1, 3).astype(np.int64))

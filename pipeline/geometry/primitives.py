@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from ...datasets.shapes.meshes import Mesh
 from ...datasets.shapes.ply import read_splats
 from ...schemas import InputDataError, Shape
 from .directions import fibonacci_directions
-from .mesh import Mesh, mesh_mass_properties, mesh_volume, read_mesh
+from .mesh import mesh_mass_properties, mesh_volume, read_mesh
 from .solid_grid import Array, MassProperties, Volume, crossings, grid_points
 from .surface_distance import union_distance
 

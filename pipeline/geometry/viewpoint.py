@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -17,18 +18,14 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def rotation_matrix(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(quat_wxyz, float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm; NaN where one has no direction.
 
-
-def quat_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the Hamilton product of two quaternions (4,), w x y z."""
-    w, v = first[0], first[1:]
-    W, V = second[0], second[1:]
-    return np.concatenate([[w * W - v @ V], w * V + W * v + np.cross(v, V)])
+    scipy refuses quaternions that are zero or not finite, but validation reads them from damaged datasets.
+    """
+    quat_wxyz = np.asarray(quat_wxyz, float)
+    norm = np.linalg.norm(quat_wxyz, axis=-1)
+    directed = np.isfinite(norm) & (norm > 0)
+    matrices = np.full((*norm.shape, 3, 3), np.nan)
+    if directed.any():
+        matrices[directed] = Rotation.from_quat(quat_wxyz[directed], scalar_first=True).as_matrix()
+    return matrices

@@ -9,11 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...datasets.capture.tracks import Track
 from ...datasets.models.model import Model
 from ...schemas import BodyModel, Distribution, NotConvergedError, SamplingPlan
-from ..geometry.viewpoint import quat_product, rotation_matrix
+from ..geometry.viewpoint import rotation_matrix
 from .distributions import draw
 from .plan import Extent, StartRanges, extent, horizontal_direction, up_direction
 from .pusher_paths import commanded_velocity, push_track
@@ -150,8 +151,8 @@ def _upright(model: Model, index: int, plan: SamplingPlan, rng: np.random.Genera
     photo = np.asarray(model.file.bodies[index].photo_pose.quat_wxyz, float)
     if plan.orientation == "photo":
         return photo
-    half = 0.5 * rng.uniform(0, 2 * math.pi)
-    return quat_product(np.concatenate([[math.cos(half)], math.sin(half) * up_direction(model.file)]), photo)
+    turn = Rotation.from_rotvec(rng.uniform(0, 2 * math.pi) * up_direction(model.file))
+    return (turn * Rotation.from_quat(photo, scalar_first=True)).as_quat(scalar_first=True)
 
 
 def _place(model: Model, index: int, offset_m: float, rng: np.random.Generator) -> np.ndarray:

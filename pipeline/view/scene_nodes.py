@@ -127,7 +127,7 @@ def linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def quat_of(rotation: NDArray[Any]) -> NDArray[np.float64]:
     """Return the quaternion w x y z (4,) of a rotation matrix (3, 3)."""
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
 def turn_from_z(normal: Any) -> NDArray[np.float64]:

@@ -25,9 +25,9 @@ from torch import Tensor
 from ....datasets.capture.cameras import require_metric
 from ....datasets.capture.capture import Capture
 from ....datasets.models.model import Model
+from ....datasets.shapes.meshes import Mesh
 from ....datasets.shapes.ply import Splats
 from ....schemas import PhysConfig, UsageError
-from ...geometry.mesh import Mesh
 from ...physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, effect_parameters
 from ...physics.world import World
 from ...runtime.checkpoint import Checkpoint

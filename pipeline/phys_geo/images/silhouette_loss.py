@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from ....datasets.models.model import Model
+from ....datasets.shapes.meshes import Mesh
 from ....schemas import InputDataError
-from ...geometry.mesh import Mesh, sample_surface
+from ...geometry.mesh import sample_surface
 from ...geometry.spheres import Spheres
 from .backdrop import Backdrop
 from .crops import Window, window_of

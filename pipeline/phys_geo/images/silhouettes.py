@@ -21,9 +21,9 @@ from torch import Tensor
 
 from ....datasets.capture.capture import Capture
 from ....datasets.models.model import Model
+from ....datasets.shapes.meshes import Mesh
 from ....schemas import BodyModel, InputDataError
 from ...geometry.directions import fibonacci_directions
-from ...geometry.mesh import Mesh
 from ...geometry.primitives import shape_mesh
 from ...geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
 from .crops import Window

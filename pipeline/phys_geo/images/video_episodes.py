@@ -15,8 +15,8 @@ from torch import Tensor
 from ....datasets.capture.capture import Capture
 from ....datasets.capture.tracks import Track
 from ....datasets.models.model import Model
+from ....datasets.shapes.meshes import Mesh
 from ....schemas import InputDataError
-from ...geometry.mesh import Mesh
 from ...physics.kinematic import Drive
 from ...physics.world import World
 from ...runtime.checkpoint import Slot
