@@ -3,7 +3,7 @@ __device__ __forceinline__ float2 tangents(float x, float z, float reach) {
     float front = z * z - reach * reach;
     if (z <= reach || front <= 0.0f) return make_float2(-INFINITY_F, INFINITY_F);
     float root = reach * sqrtf(fmaxf(x * x + front, 0.0f));
-    // The product of the two is (x^2 - reach^2) / front; dividing it by the larger one avoids cancellation in the other.
+    // The product of the two is (x^2 - reach^2) / front; dividing it by the larger one gives the other accurately.
     float numerator = x * z + (x < 0.0f ? -root : root);
     float one = numerator / front, other = (x * x - reach * reach) / numerator;
     return make_float2(fminf(one, other), fmaxf(one, other));
