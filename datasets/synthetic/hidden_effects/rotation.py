@@ -1,4 +1,4 @@
-"""Rotations and cross products of single vectors, faster than the general library functions."""
+"""Rotations and cross products without the overhead of general library functions."""
 
 from __future__ import annotations
 
