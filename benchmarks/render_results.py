@@ -157,7 +157,7 @@ def render(folder: Path = RESULTS) -> str:
         "# Results",
         "",
         f"Of {len(every)} figures {counts[True]} meet their target, {counts[False]} miss it, {counts[None]} have no "
-        "target or too few data to decide (*open*). Written by `make results` from `benchmarks/results/*.jsonl`; a "
+        "target or leave it undecided (*open*). Written by `make results` from `benchmarks/results/*.jsonl`; a "
         "figure stays valid until it is measured again. A date in brackets marks a figure that was transcribed from an "
         "older journal (with the commit that entered it where the journal named none).",
         "",
