@@ -9,7 +9,7 @@ import numpy as np
 from render_results import record
 
 RIGHT = ("exact", "class")
-"""How a case is judged that is right: the exact name or the whole class, and no effect too many."""
+"""Judgements that count as right: the exact name, or exactly the effects equivalent to it; no additional effect."""
 Row = dict[str, Any]
 
 
@@ -41,9 +41,9 @@ def figures(rows: Sequence[Row], acts: Callable[[str], str], bound: Callable[[in
         if row.get("effects"):
             kind = "pairs" if len(row["effects"]) > 1 else acts(row["effects"][0])
             kinds.setdefault(kind, []).append(row)
-    whole = "named exactly or as their whole class"
-    yield _share(f"effects that act in flight, {whole}", kinds["flight"], "98 %", 0.98)
-    yield _share(f"effects of the measurement, {whole}", kinds["measurement"], "98 %", 0.98)
+    right = "named exactly or up to equivalence"
+    yield _share(f"effects that act in flight, {right}", kinds["flight"], "98 %", 0.98)
+    yield _share(f"effects of the measurement, {right}", kinds["measurement"], "98 %", 0.98)
     large, small = (_of_size(kinds["contact"], size) for size in ("large", "small"))
     yield _share("large effects of contact, named", large, "80 %", 0.8)
     yield _share("small effects of contact, named", small)

@@ -157,9 +157,9 @@ def render(folder: Path = RESULTS) -> str:
         "# Results",
         "",
         f"Of {len(every)} figures {counts[True]} meet their target, {counts[False]} miss it, {counts[None]} have no "
-        "target, or do not decide it. Written by `make results` from `benchmarks/results/*.jsonl`; a figure stays "
-        "valid until it is measured again. A date in brackets marks a figure that was transcribed from an older "
-        "journal (with the commit that entered it where the journal named none).",
+        "target or leave it undecided (*open*). Written by `make results` from `benchmarks/results/*.jsonl`; a "
+        "figure stays valid until it is measured again. A date in brackets marks a figure that was transcribed from an "
+        "older journal (with the commit that entered it where the journal named none).",
         "",
         "| claim | figure | today | target | |",
         "| --- | --- | --- | --- | --- |",

@@ -65,7 +65,7 @@ def diagnose(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Find the missing physical or measurement effect, and the effects that these data cannot distinguish."""
+    """Find the missing physical or measurement effect, and those that these data cannot distinguish from it."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.diagnose import diagnose as work
 

@@ -203,7 +203,7 @@ def _interrupt_again(number: int, frame: FrameType | None) -> None:
 
 
 def _set_alarm(seconds: float) -> None:
-    """Have SIGALRM delivered after so many seconds; zero cancels it. There is no SIGALRM on Windows."""
+    """Schedule SIGALRM after a number of seconds; zero cancels it. There is no SIGALRM on Windows."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, seconds)
 

@@ -25,7 +25,7 @@ from cgwm.pipeline.segments.prepare import Prepared, prepare
 from cgwm.pipeline.segments.residual_wrench import covariates_of, omnibus, residual_wrenches, wrench_windows
 from cgwm.pipeline.segments.segment_states import fit_states
 from cgwm.pipeline.segments.segments import FLIGHT_STEP_S, Segments
-from cgwm.pipeline.trajectories.noise import flight_noise, without_outliers
+from cgwm.pipeline.trajectories.flight_noise import flight_noise, without_outliers
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.schemas import InputDataError
 from diagnosis_data import NOISE, tosses, world_with, write_capture

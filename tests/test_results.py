@@ -138,7 +138,7 @@ def test_diagnose_records_the_figures_of_the_page(tmp_path: Path, monkeypatch: p
     found = render_results.read_figures(tmp_path / "diagnose.jsonl")
     assert [one.figure for one in found] == [one.figure for one in CLAIMS["diagnose"]["figures"]]
     new = {one.figure: one for one in found if one.status == "measured"}
-    flight = new["effects that act in flight, named exactly or as their whole class"]
+    flight = new["effects that act in flight, named exactly or up to equivalence"]
     assert (flight.value, flight.met, flight.note) == ("1 of 2 (50 %)", False, "large 1 of 1, small 0 of 1")
     assert new["large effects of contact, named"].note == "1 missed silently"
     assert (

@@ -1,8 +1,8 @@
-"""A dataset in BOP's scenewise layout: a scene for each rollout, all cameras and frames in it.
+"""A dataset in BOP's scenewise layout: one scene for each rollout, with all cameras and frames.
 
 Source: bop_toolkit, docs/bop_datasets_format.md. Millimetres, OpenCV axes, and the top-left pixel's centre at (0, 0)
-(`misc.depth_im_to_dist_im_fast` there), so that principal points lose half a pixel. Objects are numbered from 1 in the
-order of the bodies; the model frame is the body frame.
+(`misc.depth_im_to_dist_im_fast` there), so that principal points are smaller by half a pixel. Objects are
+numbered from 1 in the order of the bodies; the model frame is the body frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .bop_models import ObjectModel, write_models
 from .selection import Picture, Selection
 
 DEPTH_STEPS_MM = (0.1, 1.0, 10.0)
-"""Units of depth images; an image takes the finest that reaches its farthest pixel."""
+"""Units of depth images [mm]; each image uses the finest unit that can represent its farthest pixel."""
 SPLIT_FOLDERS = {"train": "train", "valid": "val"}
 NO_AMODAL = (
     "the dataset has no amodal masks, so that mask/, scene_gt_info.json and scene_gt_coco.json are missing (visible "
@@ -47,7 +47,7 @@ def write_bop(
         overwrite: Replace what exists.
 
     Returns:
-        What was counted, and notes on what is left out.
+        Counts, and notes on what is left out.
     """
     folders = _split_folders(chosen)
     counts = {"scenes": 0, "images": 0, "instances": 0, "objects": len(models)}
@@ -80,7 +80,7 @@ class _Scene:
         self.coco = CocoScene(chosen.bodies(number))
 
     def write(self) -> tuple[int, int, bool]:
-        """Write the scene; return the numbers of images and instances, and whether whole silhouettes were known."""
+        """Write the scene; return the numbers of images and instances, and whether amodal masks were available."""
         for kind in ("rgb", "depth", "mask_visib"):
             (self.folder / kind).mkdir(parents=True, exist_ok=True)
         whole = True
@@ -129,7 +129,7 @@ class _Scene:
 
 
 def _facts(visible: NDArray[np.bool_], silhouette: NDArray[np.bool_], depth_m: NDArray[np.float32]) -> dict[str, Any]:
-    """Return an entry of `scene_gt_info.json`; silhouettes end at the image's edge here."""
+    """Return an entry of `scene_gt_info.json`; silhouettes are clipped at the image border."""
     total, seen = int(silhouette.sum()), int(visible.sum())
     return {
         "bbox_obj": _box(silhouette) if seen else _NOWHERE,
@@ -193,6 +193,6 @@ def _description(chosen: Selection, models: Mapping[str, ObjectModel], whole: bo
 
 
 def _write_json(path: Path, content: dict[Any, Any]) -> None:
-    """Write an entry a line, by number, as bop_toolkit does."""
+    """Write one entry per line, keyed by number, as bop_toolkit does."""
     rows = [f'  "{key}": {json.dumps(content[key])}' for key in sorted(content)]
     path.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")

@@ -1,7 +1,7 @@
 """A BOP scene's masks and boxes as COCO annotations, `scene_gt_coco.json`.
 
-Source: bop_toolkit, `scripts/calc_gt_coco.py` and `pycoco_utils.py`: boxes of whole silhouettes, run lengths of visible
-masks (column after column, beginning with the background), bodies with less than a tenth visible to be ignored.
+Source: bop_toolkit, `scripts/calc_gt_coco.py` and `pycoco_utils.py`: boxes of amodal masks, run lengths of visible
+masks (column-major, starting with the background); bodies of which less than a tenth is visible are marked as ignored.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ LEAST_VISIBLE = 0.1
 
 
 class CocoScene:
-    """Gathers the annotations of a scene.
+    """Collects the annotations of a scene.
 
     Args:
-        bodies: Their names; body k is the category k + 1.
+        bodies: Names of the bodies; body k is the category k + 1.
     """
 
     def __init__(self, bodies: list[str]):
@@ -31,7 +31,7 @@ class CocoScene:
         self._images.append({"id": number, "file_name": f"rgb/{number:06d}.png", "width": width, "height": height})
 
     def add(self, image: int, body: int, visible: NDArray[np.bool_], silhouette: NDArray[np.bool_]) -> None:
-        """Add a body in an image, unless nothing of it is visible; both masks have the shape (H, W)."""
+        """Add the annotation of a body in an image, unless it is invisible; both masks have the shape (H, W)."""
         area = int(visible.sum())
         if area == 0:
             return
@@ -43,7 +43,7 @@ class CocoScene:
         self._annotations.append({**entry, "ignore": bool(area < LEAST_VISIBLE * silhouette.sum())})
 
     def content(self) -> dict[str, Any]:
-        """Return what stands in the file."""
+        """Return the content of the file."""
         about = {"description": "exported by cgwm", "version": "1"}
         parts = {"categories": self._categories, "images": self._images, "annotations": self._annotations}
         return {"info": about, "licenses": [], **parts}
@@ -51,6 +51,6 @@ class CocoScene:
 
 def run_lengths(mask: NDArray[np.bool_]) -> dict[str, list[int]]:
     """Return COCO's uncompressed run lengths of a mask (H, W)."""
-    flat = np.concatenate([[False], mask.ravel(order="F")])  # so that the first run is background, of length 0 or more
+    flat = np.concatenate([[False], mask.ravel(order="F")])  # the first run is background, possibly of length 0
     edges = np.flatnonzero(flat[:-1] != flat[1:])
     return {"counts": np.diff(edges, prepend=0, append=mask.size).tolist(), "size": list(mask.shape)}

@@ -1,4 +1,4 @@
-"""The objects' shapes for BOP: triangle meshes with normals and colours, in millimetres, and `models_info.json`."""
+"""Object models for BOP: triangle meshes with normals and colours, in millimetres, and `models_info.json`."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class ObjectModel:
     colors: NDArray[np.uint8]
     """uint8 RGB of the corners, shape (V, 3)."""
     origin: str
-    """Where the mesh comes from, in words."""
+    """Description of the origin of the mesh."""
 
     def normals(self) -> Array:
-        """Return the corners' unit normals: of the faces around, weighted by area; shape (V, 3)."""
+        """Return the unit normals of the corners, the area-weighted mean of the adjacent faces; shape (V, 3)."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         by_face = np.cross(b - a, c - a)
         total = np.zeros_like(self.vertices)
@@ -38,7 +38,7 @@ class ObjectModel:
 
 
 def write_models(folder: Path, models: list[ObjectModel]) -> None:
-    """Write `obj_000001.ply` and so on (text, as BOP asks for), and `models_info.json`, both in millimetres."""
+    """Write `obj_000001.ply` etc. (ASCII, as BOP requires), and `models_info.json`, both in millimetres."""
     folder.mkdir()
     facts = {}
     for number, model in enumerate(models, 1):

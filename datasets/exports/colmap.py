@@ -1,7 +1,7 @@
 """A model's photos and spheres as a COLMAP model: cameras, images, points3D, rigs and frames (.bin).
 
-Source of the layout: COLMAP documentation, "Output format"; rigs and frames as COLMAP 4 writes them (each image a frame
-of its own, each camera a rig of its own).
+Source of the layout: COLMAP documentation, "Output format"; rigs and frames as COLMAP 4 writes them (one frame for each
+image, one rig for each camera).
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _CAMERA_SENSOR = 0
 def write_colmap(
     path: Path, cameras: CamerasFile, points: Splats, photos: Path | None = None, overwrite: bool = False
 ) -> dict[str, int]:
-    """Write `sparse/0/*.bin`, and `images/` where the photos are at hand.
+    """Write `sparse/0/*.bin`, and `images/` if the photos are available.
 
-    The axes, the pixel origin and the unit of COLMAP's model are those of the cameras. Centres of spheres become the
-    points; no image has 2D points, so that tracks are empty and the error is -1, COLMAP's word for unknown.
+    The COLMAP model has the axes, pixel origin and unit of the cameras. Its points are the centres of the spheres;
+    images have no 2D points, so that tracks are empty and the error is -1, COLMAP's value for unknown.
 
     Args:
         path: The directory to write.
         cameras: Photos with poses.
-        points: Spheres in the world's frame; their centres and colours are taken.
-        photos: The folder of the photos; those that are there are copied.
+        points: Spheres in the world frame, of which centres and colours are written.
+        photos: Folder of the photos; existing ones are copied.
         overwrite: Replace what exists.
 
     Returns:
-        Numbers of cameras, images, points, and photos that were copied.
+        Numbers of cameras, images, points, and copied photos.
     """
     camera_ids = {name: number for number, name in enumerate(cameras.cameras, 1)}
     sensors = [camera_ids[image.camera] for image in cameras.images.values()]

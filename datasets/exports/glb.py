@@ -1,7 +1,7 @@
 """A model as binary glTF with KHR_gaussian_splatting: one node for the scene and one for each body.
 
 Source: KHR_gaussian_splatting (Khronos, kernel "ellipse"): linear scales, opacities in [0, 1], quaternions x y z w,
-harmonics with 3DGS's signs. glTF's up is +y, so that all nodes hang below one that turns the world's +z to it.
+harmonics with 3DGS's signs. glTF's up axis is +y: all nodes have one root, which rotates the world's +z to it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _Z_TO_Y_UP_XYZW = (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 
 
 class _Buffer:
-    """The file's one buffer, and the accessors into it."""
+    """The single buffer of the file, and the accessors into it."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -48,7 +48,7 @@ class _Buffer:
 
 
 def write_glb(path: Path | str, model: Model, overwrite: bool = False) -> dict[str, int]:
-    """Write the visual spheres of a model, bodies at their photo poses; return the number of spheres by node.
+    """Write the visual spheres of a model, with bodies in their photo poses; return the number of spheres by node.
 
     Args:
         path: The file, .glb.
@@ -96,7 +96,7 @@ def _primitive(buffer: _Buffer, splats: Splats) -> dict[str, Any]:
     opacities = np.asarray(splats.opacities, np.float64)[:, None]
     attributes = {
         "POSITION": buffer.add(splats.means, bounds=True),
-        # what viewers without the extension show: points of linear colour
+        # for viewers without the extension: points with linear colours
         "COLOR_0": buffer.add(np.concatenate([_linear(colors), opacities], 1)),
         f"{EXTENSION}:ROTATION": buffer.add(np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))),
         f"{EXTENSION}:SCALE": buffer.add(np.repeat(np.asarray(splats.scales, np.float64)[:, None], 3, axis=1)),
@@ -113,6 +113,6 @@ def _primitive(buffer: _Buffer, splats: Splats) -> dict[str, Any]:
 
 
 def _linear(srgb: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return linear values of sRGB ones, clamped to [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values to linear ones, clamped to [0, 1] (IEC 61966-2-1)."""
     clamped = np.clip(srgb, 0.0, 1.0)
     return np.where(clamped <= 0.04045, clamped / 12.92, ((clamped + 0.055) / 1.055) ** 2.4)

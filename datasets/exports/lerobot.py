@@ -1,7 +1,7 @@
 """A dataset as a LeRobot v3 dataset: parquet tables, H.264 videos, statistics.
 
 Source of the layout: lerobot 0.4, `datasets/lerobot_dataset.py` (codebase version v3.0). Videos are lossy; the HDF5
-file stays the master. What LeRobot has no place for (cameras, parameters, where an episode comes from) stands in
+file stays the master. Data for which LeRobot has no field (cameras, parameters, the source of an episode) are in
 `meta/cgwm.json`.
 """
 
@@ -47,12 +47,12 @@ def write_lerobot(path: Path, chosen: Selection, task: str | None = None, overwr
     Args:
         path: The directory to write.
         chosen: The dataset, its rollouts, cameras and frames.
-        task: The task's text; by default one that names the bodies.
+        task: Description of the task; the default names the bodies.
         overwrite: Replace what exists.
 
     Raises:
         InputDataError: If pyarrow or av is not installed.
-        UsageError: If a picture's side is odd, which H.264 cannot take.
+        UsageError: If an image side is odd, which H.264 does not support.
     """
     require_packages()
     sizes = {name: chosen.camera(0, name, 0) for name in chosen.cameras}
@@ -73,7 +73,7 @@ def write_lerobot(path: Path, chosen: Selection, task: str | None = None, overwr
 
 
 class _Writer:
-    """The state of a dataset that is being written."""
+    """Writer of a LeRobot dataset, with the state of the episodes written so far."""
 
     def __init__(self, folder: Path, chosen: Selection, task: str):
         self.folder, self.chosen, self.task = folder, chosen, task
@@ -91,7 +91,7 @@ class _Writer:
         self.waiting: list[dict[str, np.ndarray]] = []
 
     def episode(self, number: int) -> None:
-        """Write the rollout at a place of the selection as the next episode."""
+        """Write the rollout at an index of the selection as the next episode."""
         chosen, reader = self.chosen, self.chosen.reader
         frames, episode = chosen.frames(number), len(self.rows)
         count = len(frames)
@@ -147,7 +147,7 @@ class _Writer:
             self.waiting = []
 
     def _source(self, number: int) -> dict[str, Any]:
-        """Return what LeRobot has no place for: where an episode comes from, its parameters and cameras."""
+        """Return the data for which LeRobot has no field: source, parameters and cameras of an episode."""
         reader = self.chosen.reader
         cameras = {}
         for name in self.chosen.cameras:

@@ -1,4 +1,4 @@
-"""How LeRobot v3 names and types its files: `chunk-000/file-000`, and tables in parquet."""
+"""File names of LeRobot v3 (`chunk-000/file-000`), and its parquet and JSON files."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def require_packages() -> None:
 
 @dataclass
 class FilePlaces:
-    """The number of a file, within its chunk."""
+    """Number of a file and of its chunk."""
 
     chunk: int = 0
     file: int = 0
 
     def advance(self) -> None:
-        """Go to the next file."""
+        """Advance to the next file."""
         self.chunk, self.file = divmod(self.chunk * FILES_PER_CHUNK + self.file + 1, FILES_PER_CHUNK)
 
     def name(self, suffix: str) -> str:
@@ -48,7 +48,7 @@ class FilePlaces:
 
 
 def write_frames(path: Path, columns: Mapping[str, np.ndarray], features: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write frames as parquet: vectors as lists of fixed length, in the types that the features name."""
+    """Write frames as parquet: vectors as lists of fixed length, with the types given by the features."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -56,14 +56,14 @@ def write_frames(path: Path, columns: Mapping[str, np.ndarray], features: Mappin
     for name, values in columns.items():
         kind, width = pa.type_for_alias(features[name]["dtype"]), features[name]["shape"][0]
         flat = pa.array(np.ascontiguousarray(values).ravel(), kind)
-        # a feature of the shape (1,) is a plain number to LeRobot
+        # LeRobot stores a feature of shape (1,) as a scalar
         arrays[name] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(arrays), path, compression="snappy")
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of numbers, texts and nested lists as parquet."""
+    """Write rows of numbers, strings and nested lists as parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -75,7 +75,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """Write the tasks as a table whose index, in the sense of pandas, is the text."""
+    """Write the tasks as a table whose pandas index is the description."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -92,7 +92,7 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON, arrays as lists."""
+    """Write JSON, with arrays as lists."""
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(content, indent=1, default=lambda value: value.tolist())
     path.write_text(text + "\n", encoding="utf-8")

@@ -1,7 +1,7 @@
-"""LeRobot's statistics of an episode and of all: minimum, maximum, mean, deviation, count and five quantiles.
+"""LeRobot's statistics of one and of all episodes: minimum, maximum, mean, deviation, count and five quantiles.
 
-Source: lerobot 0.4, `datasets/compute_stats.py`. Deviations are of the population; pictures count by frames and are in
-[0, 1], shape (3, 1, 1); quantiles of all episodes are the means of theirs, weighted by count, as LeRobot makes them.
+Source: lerobot 0.4, `datasets/compute_stats.py`. Deviations are population deviations; image values are in [0, 1],
+shape (3, 1, 1), counted by frame; quantiles of all episodes are count-weighted means of their quantiles, as in LeRobot.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def vector_stats(values: NDArray[np.floating]) -> Stats:
 
 
 class PictureStats:
-    """Gathers the pictures of an episode, thinned out as LeRobot does: about 100 frames, a pixel in every few."""
+    """Collects the images of an episode, subsampled as in LeRobot: about 100 frames, and every n-th pixel."""
 
     def __init__(self, frames: int):
         self._wanted = set(np.round(np.linspace(0, frames - 1, min(frames, _SAMPLED_FRAMES))).astype(int).tolist())
@@ -33,7 +33,7 @@ class PictureStats:
         self._kept: list[NDArray[np.uint8]] = []
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Take the next picture, uint8 RGB (H, W, 3)."""
+        """Add the next image, uint8 RGB (H, W, 3)."""
         if self._seen in self._wanted:
             step = max(1, max(image.shape[:2]) // _SAMPLED_SIDE)
             self._kept.append(image[::step, ::step].reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""The videos of a LeRobot dataset: H.264 in MP4, episodes one after the other, a new file when one is large.
+"""The videos of a LeRobot dataset: H.264 in MP4, several episodes per file up to a maximum size.
 
 Every second frame is a key frame, as LeRobot itself writes, so that single frames decode quickly.
 """
@@ -19,11 +19,11 @@ PIXEL_FORMAT = "yuv420p"
 QUALITY_CRF = 18
 KEY_FRAME_EVERY = 2
 MAX_FILE_BYTES = 200 << 20
-"""An episode begins a new file where the last one has more."""
+"""Size above which the next episode begins a new file."""
 
 
 class EpisodeVideos:
-    """One camera's videos.
+    """Writer of the videos of one camera.
 
     Args:
         root: The dataset's directory.
@@ -67,7 +67,7 @@ class EpisodeVideos:
         return columns
 
     def close(self) -> None:
-        """Write what the encoder still holds, and close the file."""
+        """Flush the encoder, and close the file."""
         if self._container is not None:
             self._container.mux(self._stream.encode())
             self._container.close()

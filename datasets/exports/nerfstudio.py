@@ -1,7 +1,7 @@
 """One rollout as nerfstudio's `transforms.json`, with the time of each frame.
 
-Poses are camera to world with OpenGL axes, in metres, the world's z up; principal points share nerfstudio's pixel
-origin. `time` runs from 0 to 1 over the rollout, as readers of moving scenes want it; `time_s` has the seconds.
+Poses are camera to world with OpenGL axes, in metres, z of the world up; the pixel origin is that of nerfstudio. `time`
+runs from 0 to 1 over the rollout, as readers of dynamic scenes expect; `time_s` is in seconds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .selection import Picture, Selection
 from .splat_files import in_world
 
 MaskUse = Literal["none", "scene", "bodies"]
-"""What `mask_path` keeps: nothing is masked; what stands still; the bodies that move."""
+"""Pixels that `mask_path` keeps: all, the static scene, or the moving bodies."""
 DEPTH_UNIT_M = 1e-3
 MAX_DEPTH = 65535
 
@@ -106,7 +106,7 @@ def _write(folder: Path, kind: str, camera: str, frame: int, pixels: NDArray[Any
 
 
 def _first_points(chosen: Selection, number: int) -> Splats:
-    """Return the model's spheres where they are at the rollout's first frame."""
+    """Return the spheres of the model, posed as in the first frame of the rollout."""
     model = read_model(chosen.path / chosen.manifest.model)
     position = chosen.reader.read(number, "bodies/pos", 0, 1)[0]
     quat = chosen.reader.read(number, "bodies/quat_wxyz", 0, 1)[0]

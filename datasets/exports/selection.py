@@ -1,4 +1,4 @@
-"""What of a dataset is exported: which rollouts, cameras and frames; and their pictures, a few at a time."""
+"""Selection of the rollouts, cameras and frames of a dataset to export, with chunk-wise reading of their images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..rollouts.dataset import missing_shards, read_manifest
 from ..rollouts.loader import RolloutReader
 
 READ_FRAMES = 8
-"""Frames read at a time: those of a chunk, which is decoded as a whole."""
+"""Number of frames read at a time: a chunk, which is decoded as a whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,12 +39,12 @@ class Selection:
 
     Args:
         path: DATASET.
-        split: Only the rollouts of `mask/<split>`; all where left out.
-        cameras: Names of the cameras; all where left out.
-        every: Every n-th frame, beginning with the first.
+        split: Only the rollouts of `mask/<split>`; by default all.
+        cameras: Names of the cameras; by default all.
+        every: Step between exported frames, beginning with the first.
 
     Raises:
-        InputDataError: If `path` is no dataset, or has no images.
+        InputDataError: If `path` is not a dataset, or has no images.
         UsageError: If there is no such split or camera.
     """
 
@@ -74,12 +74,12 @@ class Selection:
 
     @property
     def notes(self) -> list[str]:
-        """Say what the dataset itself lacks."""
+        """Return notes on what the dataset itself lacks."""
         lacking = missing_shards(self.manifest)
         return [f"the dataset lacks {len(lacking)} of {self.manifest.shard_count} shards"] if lacking else []
 
     def frames(self, number: int) -> range:
-        """Return the frames of the rollout at place `number` that are exported."""
+        """Return the exported frames of the rollout at index `number`."""
         return range(0, self.reader.rollouts[number].frames, self.every)
 
     def frame_rate_hz(self, number: int = 0) -> float:
@@ -114,9 +114,9 @@ class Selection:
         """Yield the exported frames of a camera, reading a chunk at a time.
 
         Args:
-            number: Place of the rollout in `reader`.
+            number: Index of the rollout in `reader`.
             camera: The camera.
-            labels: Read depth and masks too; otherwise they are empty.
+            labels: Whether to read depth and masks; otherwise they are empty.
         """
         keys = [f"obs/{camera}_image"] + ([f"obs/{camera}_depth", f"obs/{camera}_mask"] if labels else [])
         frames, last = self.frames(number), self.reader.rollouts[number].frames
@@ -138,7 +138,7 @@ class Selection:
                 )
 
     def _amodal(self, number: int, camera: str, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Return the whole silhouettes of a chunk, shape (n, B, H, W); bit k of a pixel is body k's."""
+        """Return the amodal masks of a chunk, shape (n, B, H, W); bit k of a pixel belongs to body k."""
         key = f"obs/{camera}_amodal"
         if key not in self.reader.group(number):
             return None

@@ -1,4 +1,4 @@
-"""A model's visual spheres as .ply of 3D Gaussian splatting: one file of all, or a folder with one for each part."""
+"""The visual spheres of a model as .ply of 3D Gaussian splatting: one file, or a folder with one for each part."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..shapes.ply import Splats, write_splats
 
 
 def write_splat_files(path: Path, model: Model, sh_degree: int = 0, overwrite: bool = False) -> dict[str, int]:
-    """Write the spheres; return how many are in which file.
+    """Write the spheres; return the number of spheres by file.
 
     Args:
-        path: A name that ends in .ply takes all of them, bodies at their photo poses, in the world's frame. Any other
-            becomes a folder with `scene.ply` (world frame) and `<body>.ply` (body frame).
+        path: If it ends in .ply, one file with all spheres in the world frame, bodies in their photo poses. Otherwise
+            a folder with `scene.ply` (world frame) and `<body>.ply` (body frame).
         model: A model with visual spheres.
-        sh_degree: Pad with zeros up to this degree of harmonics; INRIA's own loader wants 3.
+        sh_degree: Pad with zeros up to this degree of harmonics; INRIA's loader requires 3.
         overwrite: Replace what exists.
     """
     if path.suffix.lower() == ".ply":
@@ -40,11 +40,11 @@ def write_splat_files(path: Path, model: Model, sh_degree: int = 0, overwrite: b
 
 
 def in_world(model: Model, poses: dict[str, tuple[np.ndarray, np.ndarray]] | None = None) -> Splats:
-    """Return all visual spheres in the world's frame.
+    """Return all visual spheres in the world frame.
 
     Args:
         model: A model with visual spheres.
-        poses: position_m (3,) and quat_wxyz (4,) by body; the photo poses where left out.
+        poses: position_m (3,) and quat_wxyz (4,) by body; by default the photo poses.
     """
     parts = [] if model.scene is None else [model.scene]
     for name, splats in model.body_splats.items():
@@ -66,7 +66,7 @@ def _joined(parts: list[Splats]) -> Splats:
             if part.harmonics is not None:
                 zero[:, : part.harmonics.shape[1]] = part.harmonics
         harmonics = np.concatenate(zeros)
-    # unknown normals are zeros in the file
+    # unknown normals are written as zeros
     normals = [np.zeros((len(part), 3)) if part.normals is None else part.normals for part in parts]
     some = any(part.normals is not None for part in parts)
     joined = [np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in fields]

@@ -1,4 +1,4 @@
-"""Scenes that cgwm makes itself, with MuJoCo and without OpenGL, as captures on disk."""
+"""Synthetic scenes, simulated with MuJoCo and rendered without OpenGL, as captures on disk."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def make_scene(
     video_size: tuple[int, int] = (480, 360),
     photos: int = 48,
 ) -> Path:
-    """Make a capture; the same arguments give the same bytes.
+    """Write the capture of a synthetic scene; the same arguments give the same bytes.
 
     Object, parameters and motion depend on the scene and the seed alone, not on sizes and counts.
 
     Args:
         name: One of `SCENES`.
-        out: Directory that takes the capture.
-        seed: Draws the object, its parameters, the motion, the cameras and the noise.
+        out: Directory of the capture.
+        seed: Seed of the object, its parameters, the motion, the cameras and the noise.
         renderer: One of `RENDERERS`.
         overwrite: Replace what is at `out`.
         photo_size: Width and height of the photos [px].
@@ -78,7 +78,7 @@ def make_scene(
 
 
 def plan_scene(name: str, seed: int = 0) -> ScenePlan:
-    """Draw a scene: the object, the true physics and every episode's true motion; nothing is rendered.
+    """Draw the object, the true physics and the true motion of every episode of a scene, without rendering.
 
     Args:
         name: One of `SCENES`.

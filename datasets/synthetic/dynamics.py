@@ -1,4 +1,4 @@
-"""The true motion: MuJoCo with a stiff, finely stepped contact, recorded at every step."""
+"""The true motion: MuJoCo with stiff contacts and small steps, recorded at every step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .objects import SolidObject
 
 Array = NDArray[np.float64]
 
-mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs, so a checker knows none of its names
+mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs, so that type checkers do not know its names
 MjModel: TypeAlias = Any
 """A `mujoco.MjModel`."""
 
@@ -30,13 +30,13 @@ _FINGERTIP_MASS = 1e4  # so heavy that contact does not deflect it from its comm
 
 @dataclass(frozen=True)
 class ContactTruth:
-    """Parameters of the true contact: a damped spring along the normal, Coulomb friction across it.
+    """Parameters of the true contact: a damped spring along the normal, and Coulomb friction.
 
     Args:
         friction: Friction coefficient between object and ground [1].
         friction_fingertip: The same between object and fingertip [1].
         natural_time: Inverse of the natural angular frequency of a contact [s].
-        damping_ratio: Damping ratio of a contact [1]; the smaller, the higher it bounces.
+        damping_ratio: Damping ratio of a contact [1]; a smaller one gives a higher bounce.
         impedance: MuJoCo's constraint impedance [1], the same at every depth.
     """
 
@@ -48,7 +48,7 @@ class ContactTruth:
 
     @property
     def solref(self) -> tuple[float, float]:
-        """MuJoCo's (timeconst, dampratio): timeconst · dampratio is the natural time."""
+        """MuJoCo's (timeconst, dampratio), where timeconst · dampratio is the natural time."""
         return self.natural_time / self.damping_ratio, self.damping_ratio
 
 
@@ -60,14 +60,14 @@ def draw_contact(rng: np.random.Generator) -> ContactTruth:
 
 @dataclass(frozen=True)
 class Motion:
-    """True motion of one episode, one row a step of 1 / STEPS_PER_S; row 0 may lie before time zero.
+    """True motion of one episode, one row for each step of 1 / STEPS_PER_S; row 0 may lie before time zero.
 
     Args:
         start: Time of the first row [s].
         qpos: MuJoCo positions: object position [m] and quat_wxyz, then the fingertip's position if there is one.
         qvel: MuJoCo velocities: object velocity of the body frame's origin [m/s], omega_body [rad/s], fingertip's.
-        first_contact: Time of the object's first contact with the fingertip, or where there is none with the ground
-            [s]; None if they never touch.
+        first_contact: Time of the object's first contact with the fingertip, or with the ground in scenes without a
+            fingertip [s]; None if they never touch.
     """
 
     start: float
@@ -85,15 +85,15 @@ class Motion:
 
 
 def build_model(solid: SolidObject, contact: ContactTruth, fingertip: bool, mat_half: float = 1.0) -> MjModel:
-    """Build the MuJoCo model: ground plane z = 0, the object with a free joint, and where asked a fingertip.
+    """Build the MuJoCo model: ground plane z = 0, the object with a free joint, and optionally a fingertip.
 
-    Contacts are explicit pairs, whose friction `CoulombFriction` looks after.
+    Contacts are explicit pairs, whose friction `CoulombFriction` sets in every step.
 
     Args:
         solid: The object.
         contact: Its contact parameters.
-        fingertip: Whether there is one, on three slide joints.
-        mat_half: Half the side of the textured mat [m]; rays beyond it hit nothing, bodies do.
+        fingertip: Whether there is a fingertip, on three slide joints.
+        mat_half: Half the side of the textured mat [m]; rays beyond it hit nothing; the collision plane is infinite.
     """
     assets, geoms, names = [], [], []
     for index, part in enumerate(solid.parts):
@@ -152,8 +152,8 @@ def simulate(
         qvel: Object velocity [m/s] and omega_body [rad/s] at `start`, shape (6,).
         start: Time of the initial state [s].
         end: Time of the last recorded state [s].
-        command: The fingertip's position [m] and velocity [m/s] at every step, each of shape (step, 3); needed where
-            the model has one. `first_contact` is then the object's with the fingertip.
+        command: The fingertip's position [m] and velocity [m/s] at every step, each of shape (step, 3); required if
+            the model has one. `first_contact` then refers to the fingertip.
     """
     data = mujoco.MjData(model)
     data.qpos[:7], data.qvel[:6] = qpos, qvel
@@ -167,16 +167,17 @@ def simulate(
         positions[step], velocities[step] = data.qpos, data.qvel
         mujoco.mj_step(model, data)
         friction.update(data)
-        # All contacts are with `partner`, but for those with the ground while there is a fingertip.
+        # In scenes with a fingertip, contacts with the ground do not count.
         if first_contact is None and data.ncon and partner in data.contact.geom:
             first_contact = start + step / STEPS_PER_S
     return Motion(start, positions, velocities, first_contact)
 
 
 def smooth_path(points: Array, speed: float, ramp: float, times: Array) -> tuple[Array, Array]:
-    """Run along straight legs from time zero on, with a smooth start and end, rounding the corners in time.
+    """Return positions and velocities along a polyline from time zero on, with smooth start, end and corners.
 
-    The velocity is the legs' piecewise constant velocity averaged over a window of `ramp`; so acceleration is bounded.
+    The velocity is the piecewise constant velocity of the legs, averaged over a window of `ramp`, so that the
+    acceleration is bounded.
 
     Args:
         points: Corners of the path [m], shape (corner, 3).
@@ -193,7 +194,7 @@ def smooth_path(points: Array, speed: float, ramp: float, times: Array) -> tuple
     knots = np.concatenate([[-1e3], arrivals, [1e3]])
     corners = np.concatenate([points[:1], points, points[-1:]])
 
-    # Exact integral of the piecewise linear path at its knots; between them it is quadratic.
+    # Exact integral of the piecewise linear path at its knots; between them the integral is quadratic.
     areas = np.concatenate([[np.zeros(3)], np.cumsum((corners[1:] + corners[:-1]) / 2 * np.diff(knots)[:, None], 0)])
 
     def position(at: Array) -> Array:
@@ -203,12 +204,12 @@ def smooth_path(points: Array, speed: float, ramp: float, times: Array) -> tuple
         index = np.searchsorted(knots, at).clip(1, len(knots) - 1) - 1
         return areas[index] + (corners[index] + position(at)) / 2 * (at - knots[index])[:, None]
 
-    # The window trails, so that the path starts at rest at time zero.
+    # The averaging window lies in the past, so that the path starts at rest at time zero.
     return (integral(times) - integral(times - ramp)) / ramp, (position(times) - position(times - ramp)) / ramp
 
 
 def lowest(solid: SolidObject, quat_wxyz: Array) -> float:
-    """Return how far the solid reaches below its body frame's origin at an orientation [m]."""
+    """Return the depth of the lowest point of the solid below its body frame's origin, for an orientation [m]."""
     return float(-(solid.vertices @ matrix_from_quat(quat_wxyz).T)[:, 2].min())
 
 

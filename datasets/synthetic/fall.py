@@ -21,9 +21,10 @@ _LOWEST_RELEASE_M = 0.01
 _TRIES = 600
 _CANDIDATES = 8
 _PREDICTABLE = 0.5
-"""A toss that repeats this well is taken at once, in units of 10 mm and 10 degrees; otherwise the best candidate."""
+"""A toss with a repeatability error below this is accepted at once, in units of 10 mm and 10 degrees; if there is none,
+the best candidate is used."""
 _MATERIALS = ((1.2, 1.1), (0.8, 0.9), (1.2, 0.9))
-"""What a fit may leave of friction and damping ratio, as factors: each restart has one."""
+"""Typical errors of fitted friction and damping ratio, as factors; one pair for each restart."""
 
 
 def plan_fall(seed: int) -> ScenePlan:
@@ -59,7 +60,7 @@ def _toss(
     split: str,
     others: list[Array],
 ) -> Motion:
-    """Toss until a toss stays in view, is unlike the others, and shows what its split needs."""
+    """Draw tosses until one stays in view, differs from the others, and meets the requirements of its split."""
     duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
     cameras = video_cameras(seed).values()
     useful: list[tuple[float, Motion]] = []
@@ -83,7 +84,7 @@ def _toss(
 
 
 def _release(rng: np.random.Generator, solid: SolidObject) -> tuple[Array, Array]:
-    """Draw a release, tossed a little upwards: pose and velocity of the body frame, by when it lands and how fast."""
+    """Draw the release of a toss (pose and velocity of the body frame) from its landing time and speed."""
     quat_wxyz = rng.standard_normal(4)
     quat_wxyz /= np.linalg.norm(quat_wxyz)
     heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.1, 0.3)
@@ -98,7 +99,7 @@ def _release(rng: np.random.Generator, solid: SolidObject) -> tuple[Array, Array
 
 
 def _instructive(motion: Motion) -> bool:
-    """Tell whether the first impact comes early and the object turns and travels after it."""
+    """Return whether the first impact is early and the object turns and travels after it."""
     if motion.first_contact is None or not 0.12 < motion.first_contact < 0.2:
         return False
     hit, end = motion.qpos[motion.row(motion.first_contact)], motion.qpos[-1]
@@ -113,12 +114,12 @@ def unpredictability(
     duration: float,
     enough: float,
 ) -> float:
-    """Return how far the true engine itself ends up when it starts from what a fit and a warm-up cannot tell apart.
+    """Return the error of the true engine itself when it starts from indistinguishable states and parameters.
 
-    A die that lands on an edge is no test of a model: two starts that no measurement distinguishes end on different
-    faces. Each restart is off by the accuracy of a state measured over 0.1 s and has another of `_MATERIALS`; the
-    result is the mean error over time and restarts, in units of 10 mm and 10 degrees. Once it must exceed `enough`
-    no more restarts are made.
+    A die that lands on an edge does not test a model: two starts that no measurement distinguishes end on different
+    faces. Each restart differs by the accuracy of a state measured over 0.1 s and by one of `_MATERIALS`; the result is
+    the mean error over time and restarts, in units of 10 mm and 10 degrees. Restarts end as soon as the result is
+    certain to exceed `enough`.
     """
     total = 0.0
     for friction, damping in _MATERIALS:
@@ -139,6 +140,6 @@ def unpredictability(
 
 
 def _settles(motion: Motion) -> bool:
-    """Tell whether the object is near rest at the end, after an impact no sooner than the warm-up's end."""
+    """Return whether the object is near rest at the end, and its first impact is not before the end of the warm-up."""
     speed, rate = np.linalg.norm(motion.qvel[-1, :3]), np.linalg.norm(motion.qvel[-1, 3:6])
     return bool(motion.first_contact is not None and motion.first_contact > 0.14 and speed < 0.02 and rate < 0.3)

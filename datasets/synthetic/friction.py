@@ -1,10 +1,11 @@
-"""Coulomb friction in MuJoCo: the regularised slip, set anew in every step so that it asks for what friction can give.
+"""Coulomb friction in MuJoCo: in every step the time constant of slip is set so that friction saturates at its limit.
 
-MuJoCo solves contact as a convex problem. Where friction cannot reach the deceleration that its time constant asks
-for, the contact is pushed apart by friction times the shortfall: a body that slides in an impact is lifted, and a
-hard, fast friction lifts it most. With the time constant chosen so that a sliding contact asks for little more than
-friction * normal force can give, sliding follows Coulomb's law and sticking stays stiff. Derived from the optimality
-conditions of MuJoCo's documentation, "Computation"; checked against analytic oblique impacts in the tests.
+MuJoCo solves contact as a convex problem. If friction cannot reach the deceleration that its time constant requests,
+the contact is pushed apart by the friction coefficient times the shortfall: a body that slides during an impact is
+lifted, most of all with a stiff friction. Here the time constant is chosen so that a sliding contact requests only
+slightly more than the available friction force, so that sliding follows Coulomb's law and sticking stays stiff. Derived
+from the optimality conditions in MuJoCo's documentation, "Computation"; checked against analytic oblique impacts in the
+tests.
 """
 
 from __future__ import annotations
@@ -22,20 +23,20 @@ MjData: TypeAlias = Any
 """A `mujoco.MjData`."""
 
 _EXCESS = 0.2
-"""How much more than friction can give a sliding contact asks for [1], so that it never asks for less."""
+"""Margin by which the request of a sliding contact exceeds the available friction [1], so that it is never smaller."""
 _SLOWEST_RATE, _FASTEST_RATE = 20.0, 2000.0
-"""Bounds of the rate at which slip is asked to decay [1/s]; the fastest is that of a contact that sticks."""
+"""Bounds of the requested decay rate of slip [1/s]; the upper one is used for sticking contacts."""
 
 _STUCK_M_S, _PAUSE_STEPS = 1e-3, 3
-"""While nothing slips faster than this, rates are kept for some steps: a body at rest takes most of the time."""
+"""While nothing slips faster than this, rates are kept for several steps: bodies at rest use most of the time."""
 
 
 class CoulombFriction:
     """Sets `pair_solreffriction` of a model after every step, from that step's contacts.
 
     Args:
-        model: Its contacts are explicit pairs of three dimensions; every pair has one geom of `body` in it.
-        body: Name of the free body whose contacts they are.
+        model: All contacts are explicit pairs of three dimensions, each with one geom of `body`.
+        body: Name of the free body.
     """
 
     def __init__(self, model: MjModel, body: str) -> None:
@@ -54,7 +55,7 @@ class CoulombFriction:
         if self._pause:
             self._pause -= 1
             return
-        self._model.pair_solreffriction[:, 0] = self._time_times_rate / _SLOWEST_RATE  # a new contact meets no jolt
+        self._model.pair_solreffriction[:, 0] = self._time_times_rate / _SLOWEST_RATE  # no jump in a new contact
         contact = data.contact
         active = np.flatnonzero(contact.efc_address >= 0)
         if not active.size:
@@ -70,7 +71,7 @@ class CoulombFriction:
         direction = (along[:, :, None] * frames[:, 1:]).sum(1)
         pressed, held = data.efc_force[first], -(data.efc_force[rows] * along).sum(1)
 
-        # slip is the second geom's velocity less the first one's; only `body` is free to answer a force
+        # slip: velocity of the second geom minus that of the first; only `body` is free
         geoms = contact.geom[active]
         sign = np.where(self._model.geom_bodyid[geoms[:, 1]] == self._body, 1.0, -1.0)
         rotation = data.xmat[self._body].reshape(3, 3)
@@ -82,7 +83,7 @@ class CoulombFriction:
         unopposed = sign * (acceleration * direction).sum(1) + mobility * held
 
         pairs = np.array([self._pairs[frozenset(pair)] for pair in geoms.tolist()])
-        friction = _friction_along(self._model.pair_friction[pairs, :2], along)  # may have been changed on the way
+        friction = _friction_along(self._model.pair_friction[pairs, :2], along)  # effects may have changed it
         wanted = (1 + _EXCESS) * mobility * friction * pressed - unopposed
         rate = np.where(pressed > 0, wanted / speed, 0.0).clip(_SLOWEST_RATE, _FASTEST_RATE)
         for pair in set(pairs.tolist()):
@@ -91,14 +92,14 @@ class CoulombFriction:
 
 
 def _friction_along(friction: Array, along: Array) -> Array:
-    """Return the friction (n,) along unit vectors (n, 2), of cones with the half axes (n, 2)."""
+    """Return the friction coefficient (n,) along unit vectors (n, 2), for elliptic cones with half axes (n, 2)."""
     if (friction[:, 0] == friction[:, 1]).all():
         return friction[:, 0]
-    return 1 / np.sqrt(((along / friction) ** 2).sum(1).clip(1e-6))  # no direction where nothing slips
+    return 1 / np.sqrt(((along / friction) ** 2).sum(1).clip(1e-6))  # without slip there is no direction
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross products of rows; a fifth of `np.cross`'s time for a few rows."""
+    """Return the cross products of rows, five times as fast as `np.cross` for a few rows."""
     return a[:, _NEXT] * b[:, _LAST] - a[:, _LAST] * b[:, _NEXT]
 
 

@@ -1,4 +1,4 @@
-"""Families of rigid test objects: extruded polygons, solid, with exact mass properties. Never a ball."""
+"""Families of rigid test objects: solid extruded polygons with exact mass properties, no balls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MASS_RANGE_KG = (0.1, 0.5)
 class SolidObject:
     """A solid of uniform density in its body frame, whose origin is the mean of the corners.
 
-    So the origin lies well inside, and for families without the symmetry it is not the centre of mass.
+    The origin therefore lies well inside, and differs from the centre of mass in asymmetric families.
 
     Args:
         family: One of `FAMILIES`.
@@ -45,10 +45,10 @@ class SolidObject:
 
 
 def make_object(seed: int) -> SolidObject:
-    """Draw an object; consecutive seeds go through the families.
+    """Draw an object; consecutive seeds cycle through the families.
 
     Args:
-        seed: Any integer >= 0; sets family, dimensions (7 to 14 cm over all) and mass.
+        seed: Any integer >= 0; determines family, dimensions (overall 7 to 14 cm) and mass.
     """
     rng = np.random.default_rng([seed, 1])
     family = FAMILIES[seed % len(FAMILIES)]
@@ -134,7 +134,7 @@ def extrude(outline: Array, depth: float) -> tuple[Array, NDArray[np.int64]]:
 
 
 def triangulate(outline: Array) -> NDArray[np.int64]:
-    """Cut a simple counter-clockwise polygon (corner, 2) into triangles (corner - 2, 3) by clipping ears."""
+    """Triangulate a simple counter-clockwise polygon (corner, 2) by ear clipping; return indices (corner - 2, 3)."""
     left = list(range(len(outline)))
     triangles = []
     while len(left) > 3:
@@ -191,7 +191,7 @@ def facet_normals(solid: SolidObject) -> Array:
 
 
 def resting_down(solid: SolidObject) -> Array:
-    """Return the body direction that points down in the most stable rest: facet under the lowest centre of mass.
+    """Return the body direction that points down in the most stable pose, which has the lowest centre of mass.
 
     Returns:
         Unit vector in the body frame, shape (3,).
@@ -209,7 +209,7 @@ def resting_down(solid: SolidObject) -> Array:
 
 
 def _stands(base: Array, normal: Array, com: Array) -> bool:
-    """Tell whether the centre of mass lies above the base's convex hull, at least 5 mm inside its rim."""
+    """Return whether the centre of mass lies above the convex hull of the base, at least 5 mm inside its edge."""
     from scipy.spatial import ConvexHull
 
     first = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])

@@ -1,4 +1,4 @@
-"""What a scene is before anything is drawn: the object, the true physics, and every episode's motion."""
+"""A scene before rendering: the object, the true physics, and the true motion of every episode."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .objects import SolidObject
 Array = NDArray[np.float64]
 
 EXPOSURE_LEAD_S = 1 / 120
-"""Motion is known from this long before time zero, since the first frame's exposure begins before it."""
+"""Motion begins this long before time zero, because the exposure of the first frame begins before it [s]."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class EpisodePlan:
         name: Its name in the capture.
         split: The split it belongs to.
         frame_count: Number of video frames.
-        motion: What truly happens.
+        motion: The true motion.
     """
 
     name: str
@@ -41,7 +41,7 @@ class ScenePlan:
 
     Args:
         name: Name of the scene.
-        seed: What it was drawn with.
+        seed: Seed of all random draws.
         solid: The object.
         contact: The true contact parameters.
         photo_qpos: Object position [m] and quat_wxyz at rest in the photos, shape (7,).
@@ -61,7 +61,7 @@ class ScenePlan:
 
 
 def stays_in_view(solid: SolidObject, motion: Motion, cameras: Iterable[Camera]) -> bool:
-    """Tell whether every corner of the object stays inside every image, 2 % of its size from the rim."""
+    """Return whether every corner of the object stays inside every image, 2 % of the image size from its edges."""
     for qpos in motion.qpos[:: STEPS_PER_S // 120]:
         corners = solid.vertices @ matrix_from_quat(qpos[3:7]).T + qpos[:3]
         for camera in cameras:
@@ -78,6 +78,6 @@ def turned_deg(quat_a: Array, quat_b: Array) -> float:
 
 
 def tilted_deg(quat_a: Array, quat_b: Array) -> float:
-    """Return the angle between where two orientations (w, x, y, z) put the vertical in the body [deg]."""
+    """Return the angle between the vertical directions, in the body frame, of two orientations (w, x, y, z) [deg]."""
     cosine = matrix_from_quat(quat_a)[2] @ matrix_from_quat(quat_b)[2]
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

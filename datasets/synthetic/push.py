@@ -56,7 +56,7 @@ def plan_push(seed: int) -> ScenePlan:
 
 
 def _push(rng: np.random.Generator, seed: int, model: MjModel, solid: SolidObject, down: Array, split: str) -> Motion:
-    """Push until a push moves and turns the object visibly, does not tip it, and ends at rest in view."""
+    """Draw pushes until one moves and turns the object visibly, does not tip it, and ends at rest in view."""
     duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
     cameras = video_cameras(seed).values()
     times = np.arange(round((_SETTLING_S + duration) * STEPS_PER_S) + 1) / STEPS_PER_S - _SETTLING_S
@@ -77,14 +77,14 @@ def _push(rng: np.random.Generator, seed: int, model: MjModel, solid: SolidObjec
 
 
 def _path(rng: np.random.Generator, solid: SolidObject, qpos: Array, direction: Array, bends: bool) -> Array:
-    """Draw a path of the fingertip at constant height: towards the object beside its centre of mass, and on.
+    """Draw a path of the fingertip at constant height: towards the object, off its centre of mass, and beyond.
 
     Args:
         rng: Source of randomness.
         solid: The object.
         qpos: Its position [m] and quat_wxyz, shape (7,).
-        direction: Of the first leg, horizontal unit vector, shape (2,).
-        bends: Whether the path turns, halfway, by 20 to 50 degrees.
+        direction: Direction of the first leg, horizontal unit vector, shape (2,).
+        bends: Whether the path turns by 20 to 50 degrees half-way.
 
     Returns:
         Corners [m], world frame, shape (2 or 3, 3).
@@ -107,14 +107,14 @@ def _path(rng: np.random.Generator, solid: SolidObject, qpos: Array, direction: 
 
 
 def _visible(motion: Motion) -> bool:
-    """Tell whether the object travels and turns."""
+    """Return whether the object travels and turns."""
     first, last = motion.qpos[motion.row(0.0)], motion.qpos[-1]
     travel = float(np.linalg.norm(last[:2] - first[:2]))
     return bool(travel > 0.03 and turned_deg(first[3:7], last[3:7]) > 12)
 
 
 def _upright(motion: Motion) -> bool:
-    """Tell whether the object stays on its facet and is at rest at the end."""
+    """Return whether the object stays on its facet and is at rest at the end."""
     first = motion.qpos[0, 3:7]
     tilt = max(tilted_deg(first, row[3:7]) for row in motion.qpos[::36])
     return bool(tilt < 4 and np.linalg.norm(motion.qvel[-1, :3]) < 0.01)

@@ -1,4 +1,4 @@
-"""A renderer that needs no OpenGL: MuJoCo's rays, procedural textures, one lamp with shadows."""
+"""Renderer without OpenGL: MuJoCo's ray casting, procedural textures, one lamp with shadows."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from .textures import Sheet
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Window = tuple[int, int, int, int]
-"""First row, first column, end row, end column [px] of a part of an image."""
-_SIDES = np.array([1.0, 0.731, 0.417])  # a direction along which no two sides of an object agree but by chance
-_GRAZING = 0.05  # below this cosine the lamp hardly shows on a smooth surface, in its shadow or not
+"""First row, first column, end row and end column [px] of a part of an image."""
+_SIDES = np.array([1.0, 0.731, 0.417])  # a generic direction: two sides of an object have different components along it
+_GRAZING = 0.05  # below this cosine the lamp contributes almost nothing on a smooth surface, in shadow or not
 
 
 class Material(Protocol):
@@ -32,14 +32,14 @@ class Material(Protocol):
         Args:
             points: On the surface, body frame [m], shape (point, 3).
             normals: Outward unit normals, body frame, shape (point, 3).
-            footprint: Width of what one ray stands for [m], shape (point,).
+            footprint: Width that one ray covers on the surface [m], shape (point,).
         """
         ...
 
 
 @dataclass(frozen=True)
 class Plain:
-    """One colour all over."""
+    """A uniform colour."""
 
     color: tuple[float, float, float]
 
@@ -65,7 +65,7 @@ class Faceted:
 
     Args:
         normals: Outward unit normals of the facets, body frame, shape (facet, 3).
-        sheets: One for each.
+        sheets: One for each facet.
     """
 
     normals: Array
@@ -91,13 +91,13 @@ class Faceted:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp far away, and the light of the room.
+    """A distant lamp and ambient light.
 
     Args:
-        position: World [m], shape (3,); so far away that its light is all but parallel.
+        position: World [m], shape (3,); so distant that its light is nearly parallel.
         diffuse: Brightness of a white surface that faces it [1].
-        ambient: Brightness of a white surface in the shadow that looks up [1].
-        underneath: The same for one that looks down [1].
+        ambient: Brightness of a white surface that faces up, in the shadow [1].
+        underneath: The same for a surface that faces down [1].
     """
 
     position: Array
@@ -108,7 +108,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays meet first, in the order of the rays.
+    """First hit of each ray, in the order of the rays.
 
     Args:
         geom: MuJoCo's geometry id, -1 for none, shape (ray,).
@@ -127,8 +127,8 @@ class Rendering:
 
     Args:
         color: Ideal colours, [0, 1] where well exposed, shape (height, width, 3).
-        label: What is seen through each pixel's centre, by the caster's labels, uint8 (height, width).
-        depth: Along the optical axis, through each pixel's centre [m], 0 where nothing is hit, (height, width).
+        label: Label of the surface at each pixel's centre, uint8 (height, width).
+        depth: Depth along the optical axis at each pixel's centre [m], 0 without a hit, shape (height, width).
     """
 
     color: Floats
@@ -137,16 +137,16 @@ class Rendering:
 
 
 class Raycaster:
-    """Draws the bodies of a MuJoCo model at the poses of its data.
+    """Renders the bodies of a MuJoCo model at the poses of its data.
 
     Args:
         model: Geometries in group 0 (the ground) and BODY_GROUP (what moves).
-        materials: By geometry id.
+        materials: Materials by geometry id.
         labels: Value in the masks by geometry id; absent: background.
         lamp: The light.
         backdrop: Colour where rays hit nothing, in [0, 1].
-        smooth: Geometry ids that together are one smooth surface of one body and one material: facets and parts are
-            not told apart there.
+        smooth: Geometry ids that together are one smooth surface of one body and one material: its facets and
+            parts are not distinguished.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Raycaster:
         self._surface_of = np.arange(model.ngeom + 1, dtype=np.int32)
         self._surface_of[one] = self.smooth
         self._surface_of[-1] = -1
-        # The last entry serves geometry -1.
+        # The last entry is for geometry -1.
         self.label_of = np.array([labels.get(geom, 0) for geom in range(model.ngeom)] + [0], np.uint8)
 
     def place(self, qpos: Array) -> None:
@@ -181,7 +181,7 @@ class Raycaster:
         Args:
             origin: World [m], shape (3,).
             directions: Unit vectors, world, shape (ray, 3).
-            bodies_only: Leave out the ground.
+            bodies_only: Whether to ignore the ground.
         """
         count = len(directions)
         geom, distance, normal = np.empty(count, np.int32), np.empty(count), np.empty((count, 3))
@@ -194,10 +194,10 @@ class Raycaster:
         return Hits(geom, distance, normal)
 
     def render(self, camera: Camera, window: Window | None = None, samples: int = 3) -> Rendering:
-        """Draw an image, or the window of it.
+        """Render an image, or a window of it.
 
-        One ray goes through each pixel's centre; where surface, side or shadow change between neighbours, samples x
-        samples rays are averaged instead (inside a surface the textures are band-limited already).
+        One ray is cast through each pixel's centre. If surface, side or shadow differ between neighbouring pixels,
+        samples x samples rays are averaged instead (textures are already band-limited within a surface).
         """
         top, left, bottom, right = window or whole(camera)
         shape = (bottom - top, right - left)
@@ -218,7 +218,7 @@ class Raycaster:
         return Rendering(colours.reshape(*shape, 3), self.label_of[hits.geom].reshape(shape), depth.reshape(shape))
 
     def _shade(self, camera: Camera, directions: Array, hits: Hits) -> tuple[Floats, Floats]:
-        """Return colours (ray, 3), and a number for each ray that tells surfaces, sides and shadow apart (ray,)."""
+        """Return colours (ray, 3), and an id for each combination of surface, side and shadow (ray,)."""
         origin, angle = camera.T_world_cam[:3, 3], 1 / camera.K[0, 0]
         colours = np.tile(self.backdrop, (len(directions), 1))
         code = np.full(len(directions), -1, np.float32)
@@ -229,7 +229,7 @@ class Raycaster:
             chosen = np.flatnonzero(surfaces == geom)
             distance, ray, normals = hits.distance[chosen], directions[chosen], hits.normal[chosen]
             points = origin + distance[:, None] * ray
-            # A slanted surface stretches the footprint one way only; the root is the middle of its two widths.
+            # A slanted surface stretches the footprint in one direction; the root is the geometric mean of both widths.
             slant = np.abs(np.einsum("ij,ij->i", ray, normals)).clip(0.06)
             footprint = (distance * angle / np.sqrt(slant)).astype(np.float32)
             body = self.model.geom_bodyid[geom]
@@ -244,9 +244,9 @@ class Raycaster:
         return colours, code
 
     def _light(self, points: Array, normals: Array, facing_only: bool) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return a white surface's brightness by Lambert's law, and whether the lamp reaches it, each (point,).
+        """Return the brightness of a white surface by Lambert's law, and whether the lamp reaches it, each (point,).
 
-        With `facing_only` no ray is cast for what faces away from the lamp; it counts as reached.
+        With `facing_only`, no ray is cast for points that face away from the lamp; they count as reached.
         """
         lamp = self.lamp
         ray = points - lamp.position
@@ -262,7 +262,7 @@ class Raycaster:
 
 
 def _changes(code: Floats) -> NDArray[np.bool_]:
-    """Tell which pixels (height, width) differ from one of their four neighbours."""
+    """Return a mask of the pixels (height, width) that differ from one of their four neighbours."""
     edge = np.zeros(code.shape, bool)
     down, right = np.abs(np.diff(code, axis=0)) > 1e-4, np.abs(np.diff(code, axis=1)) > 1e-4
     edge[1:] |= down
@@ -273,7 +273,7 @@ def _changes(code: Floats) -> NDArray[np.bool_]:
 
 
 def whole(camera: Camera) -> Window:
-    """Return the window that is the whole image."""
+    """Return the window that covers the whole image."""
     return 0, 0, camera.height, camera.width
 
 
@@ -298,7 +298,7 @@ def rays_through(camera: Camera, pixels: Array) -> tuple[Array, Array]:
 
 
 def window_around(camera: Camera, points: Array, margin: int = 2) -> Window | None:
-    """Return the smallest window that holds the convex hull of world points (point, 3), or None if out of view.
+    """Return the smallest window that contains the convex hull of world points (point, 3); None if it is out of view.
 
     Where a point lies behind the camera, or the lens distorts, the window is the whole image.
     """

@@ -1,4 +1,4 @@
-"""What stands around the object: the textured mat with its markers, the cameras, the lamp, the paints."""
+"""The surroundings of the object: the textured mat with its markers, the cameras, the lamp and the colours."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VIDEO_CAMERAS = ("left", "right")
 _MAT_PIXELS = 3200
 _FACET_SIDE, _FACET_PIXELS = 0.22, 550
 
-# The first colour is the base, the others are those of the specks; mats are dull, objects colourful.
+# The first colour is the base, the others are for specks; mats have muted colours, objects saturated ones.
 _MATS: tuple[tuple[Colour, ...], ...] = (
     ((0.56, 0.53, 0.48), (0.42, 0.40, 0.37), (0.68, 0.64, 0.57), (0.50, 0.42, 0.36), (0.60, 0.60, 0.58)),
     ((0.60, 0.50, 0.40), (0.47, 0.38, 0.29), (0.70, 0.60, 0.48), (0.54, 0.50, 0.45), (0.63, 0.48, 0.34)),
@@ -53,7 +53,7 @@ class PrintedMarker:
 
 
 def draw_markers(rng: np.random.Generator) -> tuple[PrintedMarker, ...]:
-    """Lay four markers of 60 to 68 mm around the object's place, each turned its own way."""
+    """Place four markers of 60 to 68 mm around the object, each with a random rotation."""
     markers = []
     for index in range(4):
         angle = np.pi / 4 + index * np.pi / 2 + rng.uniform(-0.15, 0.15)
@@ -66,7 +66,7 @@ def draw_markers(rng: np.random.Generator) -> tuple[PrintedMarker, ...]:
 
 
 def make_mat(rng: np.random.Generator, markers: tuple[PrintedMarker, ...]) -> Sheet:
-    """Paint the mat and print the markers on it; its u, v are the world's x, y."""
+    """Paint the mat and print the markers on it; u and v are the x and y axes of the world."""
     palette = _MATS[rng.integers(len(_MATS))]
     image = paint(rng, _MAT_PIXELS, 2 * MAT_HALF, palette, 13000, (0.0018, 0.016))
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{MARKER_DICTIONARY}"))
@@ -78,7 +78,7 @@ def make_mat(rng: np.random.Generator, markers: tuple[PrintedMarker, ...]) -> Sh
 
 
 def make_paint(rng: np.random.Generator, solid: SolidObject) -> Faceted:
-    """Paint every side of an object, each around its own tone of one palette, with specks half way to its colours."""
+    """Paint every side of an object: each gets a base tone from one palette, and specks half-way to its colours."""
     palette = _PAINTS[rng.integers(len(_PAINTS))]
     normals = facet_normals(solid)
     sheets = []
@@ -93,22 +93,22 @@ def make_paint(rng: np.random.Generator, solid: SolidObject) -> Faceted:
 
 
 def draw_lamp(rng: np.random.Generator) -> Lamp:
-    """Hang the lamp 20 m away, 45 to 60 degrees above the horizon."""
+    """Place the lamp 20 m away, 45 to 60 degrees above the horizon."""
     elevation, azimuth = rng.uniform(np.radians(45), np.radians(60)), rng.uniform(-np.pi, np.pi)
     flat = np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])
     return Lamp(20 * np.array([*flat, np.sin(elevation)]))
 
 
 def photo_cameras(count: int, size: tuple[int, int], rng: np.random.Generator) -> dict[str, Camera]:
-    """Place hand-held photos on three rings at about 15, 35 and 65 degrees elevation, every third one closer.
+    """Place the cameras of hand-held photos on rings at elevations of about 15, 35 and 65 degrees, every third closer.
 
     Args:
         count: Number of photos.
         size: Width and height [px]; the horizontal field of view does not depend on it.
-        rng: Source of the jitter of a hand.
+        rng: Source of the jitter of hand-held photos.
 
     Returns:
-        Cameras by the photo's path relative to images/.
+        Cameras, keyed by the path of the photo relative to images/.
     """
     low, middle = round(count * 0.375), round(count * 0.375)
     rings = ((15.0, low, 0.50), (35.0, middle, 0.48), (65.0, count - low - middle, 0.46))
@@ -126,10 +126,10 @@ def photo_cameras(count: int, size: tuple[int, int], rng: np.random.Generator) -
 
 
 def video_cameras(seed: int, size: tuple[int, int] = (480, 360)) -> dict[str, Camera]:
-    """Place the two static video cameras, about 80 degrees apart, some 0.86 m from the object's place.
+    """Place the two static video cameras, about 80 degrees apart and 0.86 m from the object.
 
     Args:
-        seed: Sets where exactly they stand.
+        seed: Seed of their exact positions.
         size: Width and height [px]; the horizontal field of view does not depend on it.
     """
     rng = np.random.default_rng([seed, 8])

@@ -1,4 +1,4 @@
-"""What a real camera adds to an image: exposure, white balance and noise (JPEG comes with writing)."""
+"""Camera model: exposure, white balance and noise (JPEG compression is applied on writing)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHOT_NOISE = 0.0003
 def expose(
     radiance: NDArray[np.float32], gain_rgb: tuple[float, float, float], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Turn ideal colours into what a sensor stores.
+    """Convert ideal colours to the 8-bit values of a sensor.
 
     The noise has variance READ_NOISE² + SHOT_NOISE · value, the usual affine model of sensor noise.
 
@@ -33,6 +33,6 @@ def expose(
 
 
 def draw_gain(rng: np.random.Generator, exposure: float) -> tuple[float, float, float]:
-    """Draw a camera's gain: an exposure, and a white balance that is off by about 2 % a channel."""
+    """Draw the gain of a camera: exposure, and a white balance with an error of about 2 % in each channel."""
     red, green, blue = np.round(exposure * (1 + 0.02 * rng.standard_normal(3)), 4)
     return float(red), float(green), float(blue)

@@ -1,4 +1,4 @@
-"""Procedural textures: seeded, rich in blobs and corners, and without detail finer than they can carry."""
+"""Procedural textures: seeded, rich in blobs and corners, and band-limited to their resolution."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 Colour = tuple[float, float, float]
 Floats = NDArray[np.float32]
-_REMAP_WIDTH = 8192  # cv2.remap takes no side above 32767, so points are laid out in rows
+_REMAP_WIDTH = 8192  # cv2.remap accepts sides up to 32767, so that points are arranged in rows
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A flat printed sheet with its mip levels, looked up by metric coordinates.
+    """A flat printed sheet with its mip levels, sampled at metric coordinates.
 
     Args:
         levels: Colours in [0, 255], uint8 (row, column, 3), each level half as fine as the one before.
@@ -33,8 +33,8 @@ class Sheet:
         """Return colours in [0, 1], shape (point, 3).
 
         Args:
-            uv: Coordinates on the sheet [m], shape (point, 2); beyond the rim the colour of the rim.
-            footprint: Width of what one ray stands for [m], shape (point,).
+            uv: Coordinates on the sheet [m], shape (point, 2); outside of the sheet the colour of its edge.
+            footprint: Width that one ray covers on the surface [m], shape (point,).
         """
         level = np.log2(np.maximum(footprint, 1e-9) / self.texel).clip(0, len(self.levels) - 1)
         lower = np.minimum(level.astype(np.int32), len(self.levels) - 2)
@@ -60,7 +60,7 @@ class Sheet:
 
 
 def make_sheet(image: NDArray[np.uint8], side: float) -> Sheet:
-    """Make a sheet of a square image and its side [m], with mip levels by area averaging."""
+    """Return the sheet of a square image with a given side [m], with mip levels by area averaging."""
     levels = [image]
     while len(levels[-1]) >= 16:
         size = len(levels[-1]) // 2
@@ -111,7 +111,7 @@ def paint(
 
 
 def _outlines(rng: np.random.Generator, radii_px: NDArray[np.float64], pixels: int) -> list[NDArray[np.int32]]:
-    """Draw ellipses and irregular polygons of given radii anywhere on the canvas, in OpenCV's fixed-point pixels."""
+    """Draw ellipses and irregular polygons of given radii at random places, in OpenCV's fixed-point pixels."""
     count = len(radii_px)
     centres, stretch = rng.uniform(0, pixels, (count, 1, 2)), rng.uniform(0.6, 1.0, (count, 1, 2))
     corners = np.where(rng.random(count) < 0.6, rng.integers(3, 7, count), 16)

@@ -1,4 +1,4 @@
-"""`truth.json`: what is truly so in a scene that was made. Calibration and fitting never read it."""
+"""`truth.json`: the true values of a synthetic scene. Calibration and fitting never read it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class TrueObject(FileModel):
 
     family: str
     mesh: str = TRUTH_MESH
-    """Its surface, body frame, metres; a file beside this one."""
+    """Its surface, body frame, metres; a file in the same folder."""
     mass_kg: float
     com_m: Vector3
     """Centre of mass, body frame [m]."""
@@ -70,14 +70,14 @@ class TruthFile(FileModel):
     cameras: CamerasFile
     """The true cameras of photos and videos."""
     gain_rgb: dict[str, Vector3]
-    """Exposure gain by channel, of the photos' camera ('photos') and of each video camera."""
+    """Exposure gain by channel, for the camera of the photos ('photos') and each video camera."""
     episodes: dict[str, TrueMotion]
 
 
 def read_truth(capture: Path) -> TruthFile:
-    """Read the truth of a made capture, given the capture's directory.
+    """Read the truth of a synthetic capture, given the directory of the capture.
 
     Raises:
-        InputDataError: If there is none or it is broken.
+        InputDataError: If the file is missing or invalid.
     """
     return read_json(Path(capture) / TRUTH_FILE, TruthFile)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..physics.world import World
 from ..trajectories.correlated_noise import WHITE, NoiseModel, estimate_noise_model, noise_model_warnings
-from ..trajectories.noise import flight_noise, slow_noise, without_outliers
+from ..trajectories.flight_noise import flight_noise, slow_noise, without_outliers
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
 from ..trajectories.track_noise import estimate_noise

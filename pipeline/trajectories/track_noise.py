@@ -1,4 +1,4 @@
-"""Noise of measured tracks, estimated from the tracks alone."""
+"""Noise of tracks estimated from windows over all of their frames, before flight and contact are separated."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Captures with hidden effects, by an independent truth: what `cgwm diagnose` is judged by, and `cgwm demo` walks on.
+"""Captures with hidden effects from an independent simulator, for the benchmark of `cgwm diagnose` and `cgwm demo`.
 
-Nothing here knows of `cgwm.pipeline`: MuJoCo moves the bodies, and the effects have their own formulas, which differ
-from cgwm's where a real one would.
+Nothing here imports `cgwm.pipeline`: MuJoCo simulates the bodies, and the effects are implemented independently, with
+formulas that differ from those of cgwm where those of real effects would.
 """
 
 from . import contact, flight, measured, unknown
@@ -13,7 +13,7 @@ from .record import ENGINES, make_capture
 from .registry import EFFECTS
 
 TRUTHS = (flight, contact, measured, unknown)
-"""The modules of the effects, which enter them in the registry."""
+"""Modules of the effects; importing one registers its effects."""
 
 __all__ = [
     "EFFECTS",

@@ -1,4 +1,4 @@
-"""A case: what is hidden in a capture, how it is thrown and how it is measured."""
+"""A case: the hidden effects of a capture, the motion, and the measurement."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from .things import Kind, Thing, draw_thing
 
 @dataclass(frozen=True)  # name, thing and effects are given by position in lists of cases
 class Case:
-    """Everything about a capture; two captures of equal cases are equal to the last bit.
+    """Complete description of a capture; equal cases give captures that are equal to the last bit.
 
     Args:
-        name: A stable name.
+        name: Stable name, from which random draws derive.
         thing: The body: "cube" (a box of about 10 cm) or "ball" (35 mm radius).
         effects: Names from `EFFECTS`; none for a null.
-        magnitude: Of all effects.
-        seed: Of the body, the effects' numbers, the throws and the noise.
-        law: The contact's law, 1 or 2 (see `mujoco_engine`); drake has one of its own.
+        magnitude: Magnitude of all effects.
+        seed: Seed of the body, the parameters of the effects, the throws and the noise.
+        law: Contact law, 1 or 2 (see `mujoco_engine`); ignored by drake.
         protocol: Kinds of motion.
         train: Number of training episodes.
         test: Number of test episodes.
         length_s: Length of an episode, in true time.
-        rate_hz: Of the measurement.
-        position_std_m: Noise of each coordinate.
-        rotation_std_rad: Noise about each body axis.
+        rate_hz: Rate of the measurement.
+        position_std_m: Standard deviation of the noise of each coordinate.
+        rotation_std_rad: Standard deviation of the noise about each body axis.
         mass_given: Whether the manifest has the mass.
-        inertia_given: Whether it has the inertia and the centre of mass of the homogeneous body.
-        noise_given: Whether it has the noise.
+        inertia_given: Whether the manifest has the inertia and the centre of mass of the homogeneous body.
+        noise_given: Whether the manifest has the noise.
         centroid_only: Whether tracks have no orientation.
         outliers: Share of the samples that are grossly wrong (2 to 10 cm, and 20 to 60 degrees).
         gaps: Number of gaps of 3 to 8 samples in every episode.
         uneven: Spread of the times, in sampling intervals (0.3: each time off by up to that).
-        lasting: Share of an error that the next frame still has.
+        lasting: Correlation of the errors of neighbouring frames.
         smoothed: Frames of the window in which parabolas smooth the tracks (Savitzky & Golay 1964), odd; 0 for none.
-        proportions: By what the body's half extents are multiplied.
-        friction: In place of the drawn one.
-        damping_ratio: The same, of the contact.
-        engine: The truth, one of `record.ENGINES`.
+        proportions: Factors of the body's half extents.
+        friction: Replaces the drawn friction.
+        damping_ratio: Replaces the drawn damping ratio of the contact.
+        engine: Simulator, one of `record.ENGINES`.
         filmed: Whether it is measured by two videos with masks, and has no tracks (`filmed.film_capture`).
     """
 
@@ -84,7 +84,7 @@ class Case:
             raise ValueError(f"times uneven by {self.uneven:g} intervals; at least 0, below 0.5")
 
     def rng(self, purpose: str) -> np.random.Generator:
-        """Return random numbers of their own for a purpose, so that one does not depend on how many another takes."""
+        """Return a random generator for one purpose, so that its draws do not depend on those for other purposes."""
         return np.random.default_rng([self.seed, *purpose.encode()])
 
     def drawn_thing(self) -> Thing:
@@ -96,6 +96,6 @@ class Case:
         return replace(drawn, half_extents_m=half, friction=friction, damping_ratio=damping)
 
     def drawn_effects(self) -> list[Hidden]:
-        """Return the effects with their true numbers."""
+        """Return the effects with their true parameter values."""
         thing = self.drawn_thing()
         return [draw_effect(name, thing, self.magnitude, self.rng(f"effect {name}")) for name in self.effects]

@@ -1,4 +1,4 @@
-"""Truths that act where the body touches the ground."""
+"""Hidden effects that act in contact with the ground."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _STRIBECK_SPEED_M_S = 0.4
 _ADHESION_GAP_M = 0.002
 _LEAST_FRICTION = 0.02
 _TOUCHING_M = 5e-5
-"""Below this height a point touches: MuJoCo lifts what slides by some micrometres, for a part of the time."""
+"""Height below which a point counts as touching: MuJoCo intermittently lifts sliding points by some micrometres [m]."""
 
 
 @hidden_effect("rolling_resistance", "contact", {"ball": 3e-4}, {"ball": 1.5e-3})
@@ -44,7 +44,7 @@ def torsional_friction(thing: Thing, size: float, rng: np.random.Generator) -> H
 
 @hidden_effect("viscous_friction", "contact", 0.35, 1.4)
 def viscous_friction(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Force -c_v v_t at the points that touch, shared equally; c_v [N s/m] is the magnitude [1/s] times the mass."""
+    """Force -c_v v_t, divided equally among the touching points; c_v [N s/m] is the magnitude [1/s] times the mass."""
     c_v = size * thing.mass_kg
 
     def wrench(now: Moment) -> Wrench:
@@ -90,9 +90,10 @@ def anisotropic_friction(thing: Thing, size: float, rng: np.random.Generator) ->
 
 @hidden_effect("friction_patch", "contact", 0.12, 0.3)
 def friction_patch(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A disc near the origin with another friction: higher, or where it is small lower too.
+    """A disc near the origin with another friction: higher, or, for a small effect, higher or lower.
 
-    Its radius is 0.2 m; 0.5 m with its edge near the origin for a ball, which soon rolls and then feels nothing of it.
+    Its radius is 0.2 m; for a ball 0.5 m with the edge near the origin, because a ball soon rolls, and rolling does not
+    depend on the friction.
     """
     change = size if size > 0.2 else size * sign(rng)
     radius, near, far = (0.5, 0.3, 0.5) if thing.kind == "ball" else (0.2, 0.05, 0.2)
@@ -109,7 +110,7 @@ def friction_patch(thing: Thing, size: float, rng: np.random.Generator) -> Hidde
 
 @hidden_effect("velocity_restitution", "contact", 0.1, 0.4)
 def velocity_restitution(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Restitution e / (1 + r v) of each point with the speed v [m/s] at which it comes down, r [s/m]."""
+    """Restitution e / (1 + r v) of each point, v its impact speed [m/s], r [s/m]."""
     bounce = restitution_of(thing.damping_ratio)
     held = np.zeros(0)
 
@@ -128,7 +129,7 @@ def velocity_restitution(thing: Thing, size: float, rng: np.random.Generator) ->
 
 @hidden_effect("adhesion", "contact", 3.0, 10.0)
 def adhesion(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A pull of F [N] (the magnitude [m/s2] times the mass) within a gap of 2 mm, falling linearly with the height."""
+    """A pull of F [N] (the magnitude [m/s2] times the mass) within a gap of 2 mm, which falls linearly with height."""
     pull = size * thing.mass_kg
 
     def wrench(now: Moment) -> Wrench:
@@ -146,7 +147,7 @@ def adhesion(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 
 def _held(now: Moment, length: float, spin: Array) -> float:
-    """Return the torque over the spin [N m s] of a friction of `length` [m]; too little to turn the spin round."""
+    """Return torque over spin [N m s] for a friction of `length` [m], limited so that the spin is not reversed."""
     speed = float(np.sqrt(spin @ spin))
     if not speed:
         return 0.0
@@ -155,7 +156,7 @@ def _held(now: Moment, length: float, spin: Array) -> float:
 
 
 def _at_points(now: Moment, forces: Array, share: Array) -> Wrench:
-    """Return the wrench of forces (n or 1, 3) [N] at the points, each times its share (n,)."""
+    """Return the wrench of forces (n or 1, 3) [N] at the points, each multiplied by its share (n,)."""
     force, torque = np.zeros(3), np.zeros(3)
     forces = np.broadcast_to(forces, now.arms_m.shape)
     for k in np.flatnonzero(share):

@@ -1,7 +1,7 @@
-"""A case filmed by two cameras: a capture with videos and masks and no tracks; its silhouettes are all that tells.
+"""A case filmed by two cameras: a capture with videos and masks but no tracks; only the silhouettes carry information.
 
-The pictures are plain on purpose: the known shape in one colour before a grey ground. What a fit needs of them are the
-masks, whose edges are accurate to a fraction of a pixel on average, as those of a good segmentation are.
+The images are deliberately plain: the known shape in one colour on a grey background. A fit uses only the masks, whose
+edges are on average accurate to a fraction of a pixel, like those of a good segmentation.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from .things import Array, Thing
 SIZE_PX = (320, 240)
 FOCAL_PX = 420.0
 AWAY_M, HEIGHT_M = 2.4, 1.0
-"""Of the cameras from the world's origin, about which all paths lie."""
+"""Distance of the cameras from the world's origin, near which all paths lie [m]."""
 SUPERSAMPLED = 4
-"""Number of sample points along and across a pixel, from which its coverage is counted."""
+"""Number of sample points along each side of a pixel, from which its coverage is computed."""
 _BODY, _GROUND, _NOISE = (60, 130, 190), 150, 4.0
 
 
 def film_capture(directory: Path, case: Case, truth: Path | None = None, overwrite: bool = False) -> Path:
-    """Write the capture of a case as videos with masks, and the truth beside it; return the file of the truth.
+    """Write the capture of a case as videos with masks, and the truth next to it; return the file of the truth.
 
     Args:
         directory: The capture to write.
-        case: What to make; its rate is the frame rate, and the noise of its tracks is not used.
-        truth: Where the truth goes, see `make_capture`.
+        case: The case; its rate is the frame rate, and the noise of its tracks is not used.
+        truth: File of the truth, see `make_capture`.
         overwrite: Replace both.
     """
     exact = replace(case, position_std_m=1e-9, rotation_std_rad=1e-9)
@@ -97,7 +97,7 @@ def silhouette(camera: Camera, points: Array) -> NDArray[np.uint8]:
     seen = (points - camera.T_world_cam[:3, 3]) @ camera.T_world_cam[:3, :3]
     pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
     edges = ConvexHull(pixels).equations
-    # the middle of pixel 0 lies at 0.5; a pixel counts where most of the points spread over it lie inside
+    # the centre of pixel 0 is at 0.5; a pixel is set if most of its sample points lie inside
     offsets = (np.arange(SUPERSAMPLED) + 0.5) / SUPERSAMPLED
     low = np.floor(pixels.min(0)).astype(int).clip(0)
     high = np.minimum(np.ceil(pixels.max(0)).astype(int), (camera.width, camera.height))

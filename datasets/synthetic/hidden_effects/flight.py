@@ -1,4 +1,4 @@
-"""Truths that act in flight: forces in the air, gravity, and how the mass lies."""
+"""Hidden effects that act in flight: forces of the air, gravity, and the mass distribution."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def linear_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("quadratic_drag", "flight", 0.1, 0.4)
 def quadratic_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Force of the air, k [1/m]: on a box by its sides, on a ball as usual; it has no torque."""
+    """Quadratic drag, k [1/m], without torque: on a box summed over its sides, on a ball along the velocity."""
     areas = np.prod(thing.half_extents_m) / thing.half_extents_m
 
     def wrench(now: Moment) -> Wrench:
@@ -51,7 +51,7 @@ def _air(thing: Thing, k: float, areas: np.ndarray, now: Moment, wind: np.ndarra
 
 @hidden_effect("wind", "flight", 2.0, 4.0)
 def wind(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Quadratic drag against air that flows at w [m/s] with any heading; k = 0.1 1/m, 0.2 where w is large."""
+    """Quadratic drag relative to air that moves at w [m/s] in a random direction; k = 0.1 1/m, for a large w 0.2."""
     areas = np.prod(thing.half_extents_m) / thing.half_extents_m
     air, k = size * horizontal(rng), 0.1 if size < 3 else 0.2
 
@@ -77,7 +77,7 @@ def magnus_lift(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("spin_damping", "flight", 0.2, 1.0)
 def spin_damping(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Torque -d I omega with the mean of the moments for I, d [1/s]."""
+    """Torque -d I omega, I the mean of the principal moments, d [1/s]."""
     inertia = float(thing.inertia_kg_m2.mean())
 
     def wrench(now: Moment) -> Wrench:
@@ -100,7 +100,7 @@ def constant_force(thing: Thing, size: float, rng: np.random.Generator) -> Hidde
 
 @hidden_effect("gravity_tilt", "flight", 0.7, 2.0)
 def gravity_tilt(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Gravity turned about a horizontal axis, by an angle [deg]."""
+    """Gravity rotated about a horizontal axis by an angle [deg]."""
     vector = np.radians(size) * horizontal(rng)
 
     def build(world: Mechanics) -> Mechanics:
@@ -158,7 +158,7 @@ def com_offset(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("inertia_shape", "flight", {"cube": 0.1}, {"cube": 0.3})
 def inertia_shape(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """The moments of the body times 1 + size, 1 and 1 - size, about axes turned by chance."""
+    """The principal moments of the body times 1 + size, 1 and 1 - size, about randomly rotated axes."""
     axes = turn(rng.uniform(0.3, 1.2) * direction(rng))
     factors = rng.permutation([1 + size, 1.0, 1 - size])
 

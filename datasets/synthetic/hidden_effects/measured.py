@@ -1,4 +1,4 @@
-"""Truths that act in the measurement: the motion is right, what is written down is not."""
+"""Hidden effects of the measurement: the motion is correct, its record is not."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .things import Array, Thing
 
 @hidden_effect("length_scale", "measurement", 0.01, 0.03)
 def length_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Positions times 1 + s, about the world's origin, s [1] of either sign; the shape in the manifest stays."""
+    """Positions scaled by 1 + s about the world's origin, s [1] of either sign; the shape in the manifest stays."""
     s = size * sign(rng)
 
     def observe(position: Array, rotation: Array) -> tuple[Array, Array]:
@@ -23,7 +23,7 @@ def length_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("frame_tilt", "measurement", 0.7, 2.0)
 def frame_tilt(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Poses turned about the world's origin and a horizontal axis, by an angle [deg]."""
+    """Poses rotated about a horizontal axis through the world's origin, by an angle [deg]."""
     vector = np.radians(size) * horizontal(rng)
     matrix = turn(vector)
 
@@ -38,14 +38,14 @@ def frame_tilt(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("clock_scale", "measurement", 0.01, 0.03)
 def clock_scale(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Times times 1 + s, s [1] of either sign."""
+    """Times multiplied by 1 + s, s [1] of either sign."""
     s = size * sign(rng)
     return Hidden(name="clock_scale", values={"s": s}, form="t_measured = (1 + s) t", clock=1 + s)
 
 
 @hidden_effect("marker_offset", "measurement", {"cube": 0.002, "ball": 0.001}, {"cube": 0.006, "ball": 0.004})
 def marker_offset(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """The tracked point beside the body frame's origin by d [m], body frame."""
+    """The tracked point displaced from the body frame's origin by d [m], body frame."""
     d = size * direction(rng)
 
     def observe(position: Array, rotation: Array) -> tuple[Array, Array]:

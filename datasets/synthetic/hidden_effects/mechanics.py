@@ -1,4 +1,4 @@
-"""The world in which a body moves, whatever engine moves it: what effects change, and what they look at."""
+"""Interface between hidden effects and a simulator: the quantities that effects change, and those that they read."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ STEP_S = 2e-4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mechanics:
-    """What the engine is told of the world before it starts; effects change it.
+    """Parameters of the world that the simulator receives before it starts; effects may change them.
 
     Args:
         thing: The body.
-        law: Of the contact: 1, 2 or 3.
+        law: Contact law: 1, 2 or 3.
         com_m: The centre of mass, body frame (3,).
         inertia_kg_m2: About the centre of mass, body axes (3, 3).
         gravity_m_s2: World axes (3,).
@@ -55,8 +55,8 @@ class Moment:
     """The state at one time, in world axes.
 
     time_s; com_m, velocity_m_s (of the centre of mass), omega_rad_s (3,); rotation body to world (3, 3); inertia_kg_m2
-    about the centre of mass (3, 3). Of the points that may touch: arms_m from the centre of mass (n, 3),
-    heights_m (n,), velocities_m_s (n, 3), pressed_n (n,): the ground's normal force in the step before.
+    about the centre of mass (3, 3). For the points that may touch: arms_m from the centre of mass (n, 3),
+    heights_m (n,), velocities_m_s (n, 3), pressed_n (n,): the ground's normal force in the previous step.
     """
 
     time_s: float
@@ -78,18 +78,18 @@ Wrench = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Hidden:
-    """One effect with its true numbers: any of the hooks, each of which does nothing where it is None.
+    """One effect with its true parameter values and its hooks; a hook that is None does nothing.
 
     Args:
-        name: Of the effect; that of `cgwm effects list` where it is one of them.
-        values: Its true numbers, as they go into the truth.
-        form: What the truth is, in words.
-        comes_with: Other effects of the library that the truth holds by its nature.
-        build: Changes the world before the start.
-        wrench: Force and torque at a moment.
+        name: Name of the effect, as in `cgwm effects list` if it is listed there.
+        values: True parameter values, as written into the truth.
+        form: Description of the true law.
+        comes_with: Other effects of the library that the true law implies.
+        build: Changes the world before the simulation.
+        wrench: Returns force and torque at a time.
         touch: Sets friction (n, 2) and damping ratio (n,) of the points for the next step, in place.
         clock: Measured time over true time [1].
-        observe: What is measured of positions (T, 3) and rotations body to world (T, 3, 3).
+        observe: Returns the measured positions (T, 3) and rotations body to world (T, 3, 3).
     """
 
     name: str
@@ -105,7 +105,7 @@ class Hidden:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first state: the body frame's origin and its velocity (world axes), quat_wxyz, omega in BODY axes."""
+    """An initial state: the body frame's origin and its velocity (world axes), quat_wxyz, omega in BODY axes."""
 
     position_m: Array
     quat_wxyz: Array
@@ -115,7 +115,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The true motion, one row a step: time_s (T,), position_m of the body frame's origin (T, 3), quat_wxyz (T, 4).
+    """The true motion at every step: time_s (T,), position_m of the body frame's origin (T, 3), quat_wxyz (T, 4).
 
     touching (T,): whether any point is in contact.
     """
@@ -127,14 +127,14 @@ class Motion:
 
 
 def build(mechanics: Mechanics, hidden: Sequence[Hidden]) -> Mechanics:
-    """Return the world with the effects that act before the start."""
+    """Return the world after the `build` hooks of the effects."""
     for effect in hidden:
         mechanics = effect.build(mechanics) if effect.build else mechanics
     return mechanics
 
 
 class Reader:
-    """Makes of an engine's state what effects look at."""
+    """Computes the state that effects read from the state of a simulator."""
 
     def __init__(self, mechanics: Mechanics) -> None:
         middles, self._radius = mechanics.thing.spheres

@@ -1,13 +1,13 @@
-"""MuJoCo as the truth: one body over a plane, with whatever hidden effects act on it.
+"""Simulation of the truth with MuJoCo: one body over a plane, with hidden effects.
 
-A box touches by eight small spheres in its corners, each a contact pair of its own. Contacts are stiff against a frame
-(2 to 6 ms). Friction is Coulomb's: MuJoCo's time constant of slip is set in every step by `CoulombFriction`, for with
-a constant one a glancing impact is lifted, by as much as a restitution of 0.8 where 0.45 was asked for.
+A box touches the ground with eight small spheres in its corners, each a separate contact pair. Contacts are short
+relative to a frame (2 to 6 ms). Friction is Coulomb's: `CoulombFriction` sets MuJoCo's time constant of slip in every
+step, because a constant one lifts the body in oblique impacts (restitution 0.8 instead of the specified 0.45).
 
 Law 1: hard contacts with MuJoCo's impedance nearly constant, elliptic cones. Law 2: contacts twice as long, whose
-impedance grows from 0.8 to 0.98 within 2 mm of depth, so that hard impacts bounce otherwise than soft ones, elliptic
-cones. Law 3: as law 2, with pyramidal cones and slip as MuJoCo has it by itself, lifts included; no ground does that,
-and no list of cases holds it: it serves to try what a wrong truth does.
+impedance grows from 0.8 to 0.98 within 2 mm of depth, so that the restitution depends on the impact speed, elliptic
+cones. Law 3: as law 2, with pyramidal cones and MuJoCo's default treatment of slip, including the lift. It is not
+physical and in no list of cases; it serves to study the effect of a wrong simulator.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _IMPEDANCE = {1: "0.95 0.99 0.001", 2: "0.8 0.98 0.002", 3: "0.8 0.98 0.002"}
 
 
 def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, length_s: float) -> Motion:
-    """Return the motion of a body from a first state on.
+    """Simulate a body from an initial state, and return its motion.
 
     Args:
-        mechanics: The world, effects that act before the start already in it (`build`).
+        mechanics: The world, to which the `build` hooks have been applied.
         hidden: The effects.
-        start: The first state.
+        start: The initial state.
         length_s: Length [s].
     """
     model = mujoco.MjModel.from_xml_string(_xml(mechanics))
@@ -71,7 +71,7 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
 
 
 def _pressed(model: Any, data: Any, count: int) -> Array:
-    """Return the normal forces (n,) [N] of the points in the step before."""
+    """Return the normal forces (n,) [N] of the points in the previous step."""
     pressed, force = np.zeros(count), np.empty(6)
     for k in range(data.ncon):
         mujoco.mj_contactForce(model, data, k, force)
@@ -80,7 +80,7 @@ def _pressed(model: Any, data: Any, count: int) -> Array:
 
 
 def facts(thing: Thing) -> dict[str, Any]:
-    """Return what the truth says of the engine."""
+    """Return the facts about the simulator that the truth file records."""
     return {"name": "mujoco", "version": mujoco.__version__, "comes_with": []}
 
 

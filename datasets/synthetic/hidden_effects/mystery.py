@@ -1,4 +1,4 @@
-"""The mystery of a seed: a case whose effect is drawn, and the truth of it in a sealed file."""
+"""A mystery: a case whose effect is drawn from a seed, with the truth in an encoded file."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ CHOICES: tuple[tuple[Kind, str], ...] = (
     ("ball", "length_scale"),
     ("ball", "marker_offset"),
 )
-"""Body and effect: six that act in flight, three in contact, three in the measurement."""
+"""Pairs of body and effect: six effects in flight, three in contact, three of the measurement."""
 NOTHING = 0.15
-"""Probability that nothing is hidden: then to find nothing is right."""
+"""Probability that nothing is hidden, so that `none_missing` is the correct verdict."""
 HOW_TO_OPEN = "The report tells it at its end. Otherwise: decode zlib_base64 by base64, then decompress it by zlib."
 
 
 def draw_mystery(seed: int) -> Case:
-    """Return the case of a seed: a body, and an effect or none; six episodes to learn from, four to predict.
+    """Return the case of a seed: a body with one effect or none; six episodes for training, four for testing.
 
     Raises:
         UsageError: If the seed is negative.
@@ -57,7 +57,7 @@ def draw_mystery(seed: int) -> Case:
 
 
 def make_mystery(capture: Path, sealed: Path, case: Case) -> None:
-    """Write the capture of a case, and what is hidden into a sealed file; nothing in the capture tells it."""
+    """Write the capture of a case, and its truth into an encoded file; nothing in the capture reveals it."""
     truth = make_capture(capture, case, sealed.with_name(f".{sealed.name}.open"))
     content = truth.read_bytes()
     truth.unlink()
@@ -67,10 +67,10 @@ def make_mystery(capture: Path, sealed: Path, case: Case) -> None:
 
 
 def open_sealed(path: Path) -> tuple[HiddenEffect, ...]:
-    """Return what is hidden.
+    """Read the truth from an encoded file.
 
     Raises:
-        InputDataError: If the file is no sealed one.
+        InputDataError: If the file is not such a file.
     """
     try:
         content: dict[str, Any] = json.loads(zlib.decompress(base64.b64decode(read_json(path, SealedFile).zlib_base64)))

@@ -1,4 +1,4 @@
-"""The list of all cases, for development and for the report: the same plan, with seeds that have nothing in common."""
+"""The lists of all cases for development and for reports: the same plan with disjoint seeds."""
 
 from __future__ import annotations
 
@@ -14,19 +14,26 @@ from .things import Kind
 
 Stage = Literal["development", "report", "report2", "report3", "report4", "report5", "report6", "report7", "report8"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
-"""Thresholds may be chosen by the first alone. The summary of `report` was seen when glides were added to `diagnose`,
-that of `report2` when impacts were, that of `report3` when rivals in glides were, and that of `report4` when what comes
-second in flight had to explain most of what is left, that of `report5` when one episode alone no longer named an effect
-in glides beside one of flight, and that of `report6` when tilted frames were no longer refused and friction against
-spinning had to beat maps (2026-11-22), that of `report7` when slight effects in flight needed more evidence, errors
-that last were told, and what acts in flight became a rival where nothing flies (2026-11-23), so that what came after is
-to be judged by `report8`."""
+"""Thresholds may be chosen on the first stage alone. Results on a report stage were known when `diagnose` was changed
+afterwards, so that each of these changes has to be judged on a later stage:
+
+- `report`: tests in sliding segments were added;
+- `report2`: tests in impacts of a ball were added;
+- `report3`: alternatives in sliding were compared;
+- `report4`: a second effect in flight had to explain most of the remaining excess;
+- `report5`: one episode alone no longer sufficed to name an effect in sliding in addition to one in flight;
+- `report6`: tilted frames were no longer refused, and torsional friction had to fit better than friction maps
+  (2026-11-22);
+- `report7`: slight effects in flight needed more evidence, correlated errors were modelled, and effects in flight
+  became alternatives in captures without flight (2026-11-23).
+
+The present version is judged on `report8`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
 """Effects that are in no library."""
 KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
-"""Effects of the library: all but `time_offset`, which takes a driven body."""
+"""Effects of the library: all except `time_offset`, which requires a driven body."""
 PAIRS: tuple[tuple[Kind, tuple[str, str]], ...] = (
     ("cube", ("linear_drag", "gravity_tilt")),
     ("cube", ("anisotropic_friction", "spin_damping")),
@@ -48,7 +55,7 @@ ROUGH: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     ("ball", ("gravity_tilt",)),
     ("ball", ("gust",)),
 )
-"""Effects that are hidden in rough measurements, too; those of the last four have centroids only."""
+"""Effects that are also hidden in rough measurements; the tracks of the last four have centroids only."""
 FILMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     ("ball", ("quadratic_drag",)),
     ("ball", ("gravity_tilt",)),
@@ -82,7 +89,7 @@ ODD: dict[str, tuple[Kind | None, dict[str, Any]]] = {
     "bouncy": (None, {"damping_ratio": 0.06}),
     "dead": (None, {"damping_ratio": 0.85}),
 }
-"""What is unlike the rest of the plan, by name: the body, None for both in turn, and what of the case is otherwise."""
+"""Variations, by name: the body (None: both in turn), and the fields of the case that differ from the plan."""
 ODD_EFFECTS = ("linear_drag", "gravity_tilt", "com_offset")
 SIZES: tuple[Size, ...] = ("small", "large")
 THINGS: tuple[Kind, ...] = ("cube", "ball")
@@ -92,14 +99,14 @@ NULLS = 200
 def cases(stage: Stage, repeats: int = 1, nulls: int = NULLS, noise: Noise = "spread") -> list[Case]:
     """Return the cases of a stage; the name of a case, and so its seed, does not depend on the other arguments.
 
-    Every effect of the library on the bodies on which it makes sense, small and large; nulls, half of them under each
+    Every effect of the library on the bodies on which it is meaningful, small and large; nulls, half of them with each
     contact law; pairs; and effects in no library, small and large. The contact law alternates.
 
     Args:
-        stage: Which seeds: those that thresholds may be chosen by, or those of the report.
+        stage: Set of seeds: the one on which thresholds may be chosen, or one of the reports.
         repeats: Number of seeds for each effect, pair and unknown.
         nulls: Number of nulls.
-        noise: "spread": 60, 100 or 148 Hz, 0.2 to 2 mm and 0.1 to 0.6 degrees by chance, the two growing together;
+        noise: "spread": 60, 100 or 148 Hz, 0.2 to 2 mm and 0.1 to 0.6 degrees at random, both increasing together;
             "study": 100 Hz, 0.5 mm and 0.3 degrees.
     """
     if stage not in STAGES:
@@ -118,7 +125,7 @@ def cases(stage: Stage, repeats: int = 1, nulls: int = NULLS, noise: Noise = "sp
 def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = "spread") -> list[Case]:
     """Return cases measured roughly: 2 % outliers, a gap in every episode, uneven times, no mass; see `cases`.
 
-    Large effects; of `ROUGH`'s last four and of every second null of a ball there are centroids only.
+    Large effects; the last four of `ROUGH` and every second null of a ball have centroids only.
     """
     found = [
         (planned_case(stage, noise, thing, names, "large", k, "/rough"), place >= len(ROUGH) - 4)
@@ -133,9 +140,9 @@ def rough_cases(stage: Stage, repeats: int = 1, nulls: int = 20, noise: Noise = 
 
 
 def odd_cases(stage: Stage, repeats: int = 1, nulls: int = 4) -> list[Case]:
-    """Return cases that are unlike the rest in one thing each, see `ODD`: nulls of each, and large effects of flight.
+    """Return cases that differ from the plan in one respect each, see `ODD`: nulls, and large effects of flight.
 
-    The body changes from one to the next; see `cases`.
+    The bodies alternate; see `cases`.
     """
     found = []
     for place, (name, (thing, otherwise)) in enumerate(ODD.items()):
@@ -149,7 +156,7 @@ def odd_cases(stage: Stage, repeats: int = 1, nulls: int = 4) -> list[Case]:
 
 
 def filmed_cases(stage: Stage) -> list[Case]:
-    """Return cases that are filmed: large effects, six throws of 0.5 s to learn from at 40 Hz; see `cases`."""
+    """Return filmed cases: large effects, six training throws of 0.5 s at 40 Hz; see `cases`."""
     found = [planned_case(stage, "study", thing, names, "large", 0, "/video") for thing, names in FILMED]
     film = {"rate_hz": FILM_HZ, "length_s": FILM_S, "protocol": "throws", "test": FILM_TEST}
     return [replace(case, filmed=True, **film) for case in found]
@@ -158,21 +165,21 @@ def filmed_cases(stage: Stage) -> list[Case]:
 def planned_case(
     stage: Stage, noise: Noise, thing: Kind, effects: tuple[str, ...], size: Size, k: int, list_: str = ""
 ) -> Case:
-    """Return one case of a list; its seed comes from its name, and so does not depend on what else is listed.
+    """Return one case of a list; its seed follows from its name alone, and does not depend on the other cases.
 
     Args:
-        stage: As of `cases`, like `noise`.
-        noise: How roughly it is measured.
+        stage: As in `cases`, like `noise`.
+        noise: Kind of measurement noise.
         thing: The body.
-        effects: What is hidden; none for a null.
-        size: Of the effects.
+        effects: Hidden effects; none for a null.
+        size: Magnitude of the effects.
         k: Number of the repetition.
-        list_: Name of a list beside the first, with a slash before it.
+        list_: Name of an additional list, with a leading slash; empty for the first one.
     """
     what = f"{'+'.join(effects)}/{size}" if effects else "null"
     name = f"{stage}{list_}/{thing}/{what}/{k}"
     code = crc32(name.encode())
-    # the last bit tells development from the rest, whatever the names
+    # the last bit separates development from the reports, whatever the names
     seed = 2 * (code // 2) + (stage != "development")
     law = 1 + (k if not effects else code // 2) % 2
     case = Case(name=name, thing=thing, effects=effects, magnitude=size, seed=seed, law=law)

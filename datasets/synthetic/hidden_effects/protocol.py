@@ -1,4 +1,4 @@
-"""How a body is thrown: first states drawn by the kind of motion."""
+"""Initial states of throws, drawn by kind of motion."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _TRAIN: tuple[Motion, ...] = ("throw", "slide", "drop", "throw", "roll", "throw"
 _TEST: tuple[Motion, ...] = ("throw", "slide", "drop", "roll")
 _ALONE: dict[Protocol, Motion] = {"throws": "throw", "slides": "slide", "drops": "drop", "rolls": "roll"}
 _GAP_M = 2e-4
-"""Height of the lowest point above the ground where a motion begins on it."""
+"""Initial height of the lowest point above the ground, for motions that begin on the ground [m]."""
 
 
 def motions(protocol: Protocol, train: int, test: int) -> list[Motion]:
-    """Return the kinds of motion of the training and then the test episodes; both splits begin their cycles anew."""
+    """Return the kinds of motion of the training and then the test episodes; the cycle restarts with each split."""
     alone = _ALONE.get(protocol)
     if alone is not None:
         return [alone for _ in range(train + test)]
@@ -30,12 +30,12 @@ def motions(protocol: Protocol, train: int, test: int) -> list[Motion]:
 
 
 def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
-    """Return a first state; paths pass within some centimetres of the world's origin, with any heading.
+    """Draw an initial state; paths pass within a few centimetres of the world's origin, in a random direction.
 
     throw: from 0.25 to 0.6 m at 1 to 2.5 m/s, up to 2 m/s upwards, spin of up to 15 rad/s about any axis.
     slide: flat on the ground at 0.8 to 2 m/s, a box turning at 1 to 5 rad/s about the vertical; a ball with spin
         of 5 to 20 rad/s about the vertical, and as much forwards or backwards.
-    drop: from 0.2 to 0.8 m, turned by chance, hardly moving.
+    drop: from 0.2 to 0.8 m, in a random orientation, almost at rest.
     roll: a ball that rolls at 0.4 to 1.3 m/s while it turns at 3 to 10 rad/s about the vertical, or a box that tumbles
         over its edges.
     """
@@ -67,7 +67,7 @@ def draw_start(thing: Thing, motion: Motion, rng: np.random.Generator) -> Start:
 
 
 def _depth(thing: Thing, rotation: Array) -> float:
-    """Return how far the body reaches below its middle [m]."""
+    """Return the depth of the lowest point of the body below its centre [m]."""
     middles, radius = thing.spheres
     return float(radius - (middles @ rotation.T)[:, 2].min())
 

@@ -1,4 +1,4 @@
-"""The hidden effects by name: on which bodies, how large, and how their true numbers are drawn."""
+"""Registry of the hidden effects: bodies, magnitudes, and the draw of their true parameter values."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ BOTH: tuple[Kind, ...] = ("cube", "ball")
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """An effect that can be hidden.
+    """An effect that can be hidden in a capture.
 
     Args:
-        name: That of `cgwm effects list`, or one of the generator's own where `acts` is "unknown".
-        acts: Where; "unknown": in flight, and in no library.
-        small: Its magnitude by body, in its unit; the bodies are those on which it makes sense.
-        large: The same.
-        draw: Draws the true numbers at a magnitude.
+        name: Name in `cgwm effects list`, or a separate one if `acts` is "unknown".
+        acts: Where it acts; "unknown": in flight, and in no library.
+        small: Small magnitude by body, in the unit of the effect; only bodies on which it is meaningful.
+        large: Large magnitude, likewise.
+        draw: Draws the true parameter values for a magnitude.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Entry:
 
     @property
     def things(self) -> tuple[Kind, ...]:
-        """The bodies on which it makes sense."""
+        """Bodies on which the effect is meaningful."""
         return tuple(self.small)
 
 
@@ -48,7 +48,7 @@ EFFECTS: dict[str, Entry] = {}
 def hidden_effect(
     name: str, acts: Acts, small: float | dict[Kind, float], large: float | dict[Kind, float]
 ) -> Callable[[Draw], Draw]:
-    """Return a decorator that enters an effect; one number counts for both bodies."""
+    """Return a decorator that registers an effect; a single magnitude applies to both bodies."""
 
     def by_thing(value: float | dict[Kind, float]) -> dict[Kind, float]:
         return dict(value) if isinstance(value, dict) else dict.fromkeys(BOTH, float(value))
@@ -61,10 +61,10 @@ def hidden_effect(
 
 
 def draw_effect(name: str, thing: Thing, size: Size, rng: np.random.Generator) -> Hidden:
-    """Return an effect with true numbers drawn for a body.
+    """Return an effect with true parameter values drawn for a body.
 
     Raises:
-        ValueError: If the effect makes no sense on that body.
+        ValueError: If the effect is not defined for that body.
     """
     entry = EFFECTS[name]
     if thing.kind not in entry.small:
@@ -73,17 +73,17 @@ def draw_effect(name: str, thing: Thing, size: Size, rng: np.random.Generator) -
 
 
 def horizontal(rng: np.random.Generator) -> Array:
-    """Return a horizontal unit vector of any heading."""
+    """Draw a horizontal unit vector, uniform in direction."""
     angle = rng.uniform(0, 2 * np.pi)
     return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def direction(rng: np.random.Generator) -> Array:
-    """Return a unit vector, uniform on the sphere."""
+    """Draw a unit vector, uniform on the sphere."""
     vector = rng.standard_normal(3)
     return vector / np.linalg.norm(vector)
 
 
 def sign(rng: np.random.Generator) -> float:
-    """Return 1 or -1."""
+    """Draw 1 or -1."""
     return float(rng.choice([-1.0, 1.0]))

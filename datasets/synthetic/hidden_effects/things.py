@@ -1,4 +1,4 @@
-"""The bodies that are thrown, and how they touch the ground: drawn from the seed of a case."""
+"""Bodies that are thrown, and their contact with the ground, drawn from the seed of a case."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Kind = Literal["cube", "ball"]
 
 BALL_RADIUS_M = 0.035
 _CORNER_M = 1e-4
-"""Radius of the spheres in a box's corners, by which MuJoCo has it touch the ground: each has its own friction."""
+"""Radius of the spheres in the corners of a box, its contact geometry in MuJoCo; each can have a different friction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -21,12 +21,12 @@ class Thing:
     """A homogeneous body and its contact with the ground.
 
     Args:
-        kind: What it is.
-        half_extents_m: Of the box, shape (3,); the radius three times for a ball.
+        kind: "cube" or "ball".
+        half_extents_m: Half extents of the box, shape (3,); for a ball three times the same number, its radius.
         mass_kg: Its mass.
         friction: Coulomb's coefficient [1].
         natural_time_s: Inverse of the natural angular frequency of a contact.
-        damping_ratio: Of a contact [1] (`restitution_of`).
+        damping_ratio: Damping ratio of a contact [1] (`restitution_of`).
     """
 
     kind: Kind
@@ -38,13 +38,13 @@ class Thing:
 
     @property
     def inertia_kg_m2(self) -> Array:
-        """The principal moments of the homogeneous body about its middle, body axes, shape (3,)."""
+        """Principal moments of the homogeneous body about its centre, body axes [kg m2], shape (3,)."""
         square = self.half_extents_m**2
         return self.mass_kg * (0.4 * square if self.kind == "ball" else (square.sum() - square) / 3)
 
     @property
     def spheres(self) -> tuple[Array, float]:
-        """The middles (n, 3) in the body frame and the radius [m] of the spheres that touch the ground."""
+        """Centres (n, 3) in the body frame and radius [m] of the spheres that touch the ground."""
         if self.kind == "ball":
             return np.zeros((1, 3)), float(self.half_extents_m[0])
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -52,12 +52,12 @@ class Thing:
 
     @property
     def size_m(self) -> float:
-        """Distance of the farthest point from the middle."""
+        """Distance of the farthest point from the centre [m]."""
         return float(self.half_extents_m[0] if self.kind == "ball" else np.linalg.norm(self.half_extents_m))
 
 
 def draw_thing(kind: Kind, law: int, rng: np.random.Generator) -> Thing:
-    """Return a body of a kind: a box of about 10 cm, 250 to 600 g, or a ball of 70 mm, 60 to 200 g.
+    """Draw a body of a kind: a box of about 10 cm, 250 to 600 g, or a ball of 70 mm, 60 to 200 g.
 
     Friction 0.2 to 0.4, restitution about 0.3 to 0.65; a contact takes 2 to 3 ms under law 1, 4 to 6 ms under law 2.
     """
@@ -76,7 +76,7 @@ def draw_thing(kind: Kind, law: int, rng: np.random.Generator) -> Thing:
 
 
 def restitution_of(damping_ratio: float | Array) -> Array:
-    """Return exp(-2 z arccos(z) / sqrt(1 - z^2)): of a damped spring that is let go where its force ends (derived)."""
+    """Return exp(-2 z arccos(z) / sqrt(1 - z^2)): restitution of a damped spring up to zero force (derived)."""
     z = np.asarray(damping_ratio)
     return np.asarray(np.exp(-2 * z * np.arccos(z) / np.sqrt(1 - z * z)))
 
@@ -86,5 +86,5 @@ _RESTITUTIONS = restitution_of(_RATIOS)
 
 
 def damping_ratio_of(restitution: float | Array) -> Array:
-    """Return the damping ratio that gives a restitution above 0.14, by interpolation."""
+    """Return the damping ratio for a restitution above 0.14, by interpolation."""
     return np.asarray(np.interp(restitution, _RESTITUTIONS[::-1], _RATIOS[::-1]))

@@ -1,4 +1,4 @@
-"""Truths that no library holds; all of them act in flight."""
+"""Hidden effects that are in no library; all of them act in flight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NONE = np.zeros(3)
 
 @hidden_effect("gust", "unknown", 3.0, 8.0)
 def gust(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A sideways push of 0.15 s at the same time of every episode, its peak in [m/s2], half a sine."""
+    """A horizontal push of 0.15 s at the same time of every episode: half a sine, peak [m/s2]."""
     push, begin, width = size * horizontal(rng), rng.uniform(0.1, 0.25), 0.15
 
     def wrench(now: Moment) -> Wrench:
@@ -27,7 +27,7 @@ def gust(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("shaking", "unknown", 1.0, 3.0)
 def shaking(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A sideways force that swings at 4 to 5 Hz, amplitude [m/s2]."""
+    """A horizontal force that oscillates at 4 to 5 Hz, amplitude [m/s2]."""
     push, frequency, phase = size * horizontal(rng), rng.uniform(4, 5), rng.uniform(0, 2 * np.pi)
 
     def wrench(now: Moment) -> Wrench:
@@ -51,7 +51,7 @@ def attractor(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
 
 @hidden_effect("quadratic_spin_drag", "unknown", 0.02, 0.06)
 def quadratic_spin_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """Torque -q I |omega| omega with the mean of the moments for I, q [1/rad]."""
+    """Torque -q I |omega| omega, I the mean of the principal moments, q [1/rad]."""
     inertia = float(thing.inertia_kg_m2.mean())
 
     def wrench(now: Moment) -> Wrench:
@@ -65,14 +65,14 @@ def quadratic_spin_drag(thing: Thing, size: float, rng: np.random.Generator) -> 
 
 @hidden_effect("heading_force", "unknown", 0.6, 2.0)
 def heading_force(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A sideways force across the horizontal path that turns with its heading: m f sin(2 (heading - angle))."""
+    """A horizontal force across the path that depends on its heading: m f sin(2 (heading - angle))."""
     angle = rng.uniform(0, np.pi)
 
     def wrench(now: Moment) -> Wrench:
         x, y, _ = now.velocity_m_s
         speed = np.hypot(x, y)
         heading = np.arctan2(y, x)
-        # fades at rest, where there is no heading
+        # fades out at rest, because the heading is then undefined
         pull = now.mass_kg * size * np.sin(2 * (heading - angle)) * min(speed / 0.2, 1.0)
         return pull * np.array([-np.sin(heading), np.cos(heading), 0.0]), NONE
 
@@ -86,7 +86,7 @@ def heading_force(thing: Thing, size: float, rng: np.random.Generator) -> Hidden
 
 @hidden_effect("gravity_step", "unknown", 0.6, 2.0)
 def gravity_step(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
-    """A vertical force m f of either sign, f [m/s2], from a time early in the flights on."""
+    """A vertical force m f of either sign, f [m/s2], that begins at a fixed time early in the flight."""
     f, begin = size * sign(rng), rng.uniform(0.2, 0.3)
 
     def wrench(now: Moment) -> Wrench:

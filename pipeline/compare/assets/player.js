@@ -15,7 +15,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
       const rows = [...table.tBodies[0].rows];
       const compare = (a, b) => {
         const x = key(a.cells[column]), y = key(b.cells[column]);
-        if (typeof x !== typeof y) return typeof x === "number" ? -1 : 1;  // what is no number stays below
+        if (typeof x !== typeof y) return typeof x === "number" ? -1 : 1;  // numbers first
         const order = typeof x === "number" ? x - y : x.localeCompare(y);
         return down ? -order : order;
       };
@@ -81,7 +81,7 @@ const hull = points => {  // Andrew's monotone chain
   return side(sorted).concat(side(sorted.reverse()));
 };
 let bounds = null;
-function frameOf() {  // what both views show: all that was measured, and predictions as far as they stay near
+function frameOf() {  // bounds of both views: all measurements, and predictions that stay near them
   const e = episode(), axes = e.axes, low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];
   const grow = (p, by) => axes.forEach((axis, i) => {
     const v = dot(axis, p); low[i] = Math.min(low[i], v - by); high[i] = Math.max(high[i], v + by);
@@ -161,7 +161,7 @@ function view(canvas, vertical) {
     const origin = point(p, k);
     if (!origin) return;
     const shape = data.bodies[name];
-    if (q[4 * k] === null) {  // the centroid alone is known
+    if (q[4 * k] === null) {  // only the centroid was measured
       const [x, y] = place(origin);
       g.strokeStyle = color; g.lineWidth = 2;
       g.beginPath(); g.moveTo(x - 5, y); g.lineTo(x + 5, y); g.moveTo(x, y - 5); g.lineTo(x, y + 5); g.stroke();
@@ -310,14 +310,14 @@ function film() {
     stamp(what === "predicted" ? v.models[j] : v.real, "source-over");
     if (what === "difference") {
       stamp(v.models[j], "difference");
-      g.globalCompositeOperation = "lighter";  // twice as bright, twice
+      g.globalCompositeOperation = "lighter";  // each of the two draws doubles the brightness
       g.drawImage(canvas, 0, 0); g.drawImage(canvas, 0, 0);
     }
     canvas.dataset.frame = k;
   }
 }
 
-// One clock for all of them
+// One clock for all views
 
 function prepare() {
   frameOf();
@@ -396,7 +396,7 @@ function scatter() {
   const w = 1060, h = 340, l = 62, r = 12, top = 26, b = 40;
   const xs = points.map(p => p.c[c]), x0 = Math.min(...xs), x1 = Math.max(...xs);
   const sizes = points.map(p => Math.abs(p.a[kind]) + p.s[kind]).sort((u, v) => u - v);
-  const most = sizes[Math.floor(0.95 * (sizes.length - 1))] * 1.1 || 1;  // the rest runs along the rim
+  const most = sizes[Math.floor(0.95 * (sizes.length - 1))] * 1.1 || 1;  // larger values are clipped to the edge
   const X = v => l + (w - l - r) * (v - x0) / (x1 - x0 || 1);
   const base = signed ? -most : 0;
   const Y = v => top + (h - top - b) * (1 - Math.max(0, Math.min(1, (v - base) / (most - base))));

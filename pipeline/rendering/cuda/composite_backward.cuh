@@ -1,7 +1,7 @@
 #define VALUES 8
 #define GROUPS ((5 + F + VALUES - 1) / VALUES)
 
-// Adds values over the lanes: each step halves the values and the lanes that hold them apart.
+// Sums values over the lanes of a warp: each step halves the number of values per lane and the distance of the lanes.
 __device__ float transposed_sum(float* values, int lane) {
 #pragma unroll
     for (int step = 0; step < 3; step++) {
@@ -39,7 +39,7 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
         int target = pixels[h].target;
         left[h] = shown ? 1.0f : 0.0f;
         by_depth[h] = shown ? grad_depth[target] : 0.0f;
-        // What lies behind a sphere, seen through it: starts at everything, and loses each sphere as it is passed.
+        // Colour of everything behind a sphere: starts at the whole pixel; each sphere that is passed is removed.
         rest[h] = shown ? out_depth[target] * by_depth[h] - grad_alpha[target] * out_left[target] : 0.0f;
 #pragma unroll
         for (int c = 0; c < F; c++) {

@@ -23,7 +23,7 @@ struct Pixel {  // inverse: 1 / (1 + x^2 + y^2)
     bool shown;
 };
 
-struct Patch {  // bounds of the 8 x 8 pixels of a warp in the unit of the spans
+struct Patch {  // bounds of the 8 x 8 pixels of a warp, in the unit of the spans
     float low_x, low_y, high_x, high_y;
 };
 
@@ -79,9 +79,9 @@ __device__ bool reaches(const float4& span, const Patch& patch) {
     return span.x <= patch.high_x && span.z >= patch.low_x && span.y <= patch.high_y && span.w >= patch.low_y;
 }
 
-// A sphere as the pixels see it. The squared distance from its centre p to the ray (x, y, 1), times 1 + x^2 + y^2, is
-// |p x (x, y, 1)|^2 = z^2 dx^2 + z^2 dy^2 + (py dx - px dy)^2 with dx = x - px / z and dy = y - py / z: a quadratic form
-// without terms that cancel, however small the sphere is beside a pixel.
+// A sphere in the form in which pixels evaluate it. The squared distance from its centre p to the ray (x, y, 1), times
+// 1 + x^2 + y^2, is |p x (x, y, 1)|^2 = z^2 dx^2 + z^2 dy^2 + (py dx - px dy)^2 with dx = x - px / z, dy = y - py / z:
+// a quadratic form without cancellation, however small the sphere is relative to a pixel.
 struct Seen {
     float4 form;   // px / z, py / z, and the factors of dx^2 and of dx dy in the exponent of 2
     float4 other;  // the factor of dy^2, the logarithm of the opacity to base 2, z
@@ -95,7 +95,7 @@ __device__ Seen seen_from(const float4& p, float log_opacity) {
 
 __device__ __forceinline__ float alpha_at(const Seen& seen, const Pixel& pixel) {
     float dx = pixel.x - seen.form.x, dy = pixel.y - seen.form.y;
-    // in this order the two pixels of a lane, which have one x without distortion, share what depends on dx alone
+    // in this order the two pixels of a lane, which have the same x without distortion, share the terms in dx alone
     float square = dy * (seen.other.x * dy + seen.form.w * dx) + seen.form.z * dx * dx;
     return exp2f(square * pixel.inverse + seen.other.y);
 }
@@ -106,12 +106,12 @@ struct Staged {  // up to 32 spheres that reach a patch
     float colors[32][CHANNELS];
 };
 
-struct Sources {  // where they come from, which only the derivative needs
+struct Sources {  // their rows in the input, needed only by the derivative
     float4 points[32];
     int places[32];
 };
 
-// Puts those of the next 32 spheres of a tile that reach the patch into shared memory, and returns how many they are.
+// Copies those of the next 32 spheres of a tile that reach the patch into shared memory, and returns their number.
 template <int CHANNELS>
 __device__ __forceinline__ int stage(const Lists& lists, const Patch& patch, int first, int end, int channel,
                                      Staged<CHANNELS>& staged, Sources* sources) {

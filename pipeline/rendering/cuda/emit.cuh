@@ -34,7 +34,7 @@ extern "C" __global__ void __launch_bounds__(128) emit(
     // The pairs of a warp's spheres are contiguous, so its lanes share them evenly, however many tiles a sphere covers.
     int lane = threadIdx.x & 31, last = min(__shfl_sync(FULL, end, 31), capacity);
     for (int first = __shfl_sync(FULL, place, 0); first < last; first += 32) {
-        int pair = first + lane, owner = 0;  // the lane of the first sphere that ends behind the pair
+        int pair = first + lane, owner = 0;  // the lane whose sphere owns the pair
 #pragma unroll
         for (int step = 16; step > 0; step >>= 1) {
             int other = __shfl_sync(FULL, end, owner + step - 1);

@@ -1,9 +1,9 @@
-// The minimum and maximum x / z of the rays that pass a centre within the reach, in the xz plane.
+// The minimum and maximum x / z of the rays that pass a centre at a distance of at most `reach`, in the xz plane.
 __device__ __forceinline__ float2 tangents(float x, float z, float reach) {
     float front = z * z - reach * reach;
     if (z <= reach || front <= 0.0f) return make_float2(-INFINITY_F, INFINITY_F);
     float root = reach * sqrtf(fmaxf(x * x + front, 0.0f));
-    // The product of the two is (x^2 - reach^2) / front, so that neither has to be a difference of nearly equal numbers.
+    // The product of the two is (x^2 - reach^2) / front; dividing it by the larger one gives the other accurately.
     float numerator = x * z + (x < 0.0f ? -root : root);
     float one = numerator / front, other = (x * x - reach * reach) / numerator;
     return make_float2(fminf(one, other), fmaxf(one, other));
@@ -31,7 +31,7 @@ extern "C" __global__ void __launch_bounds__(128) project(
     float z = V[8] * wx + V[9] * wy + V[10] * wz + V[11];
     float distance = sqrtf(x * x + y * y + z * z), log_opacity = logf(fmaxf(opacity, 1e-12f));
     float reach = min_alpha > 0.0f ? s * sqrtf(fmaxf(2.0f * (log_opacity - logf(min_alpha)), 0.0f)) : s * 1e4f;
-    reach = reach * 1.0001f + 1e-9f;  // rounding must not lose visible spheres
+    reach = reach * 1.0001f + 1e-9f;  // margin, so that rounding does not cull visible spheres
     float2 across = tangents(x, z, reach), down = tangents(y, z, reach);
 #if RAYS
     float4 span = make_float4(across.x - 1e-5f * (1.0f + fabsf(across.x)), down.x - 1e-5f * (1.0f + fabsf(down.x)),

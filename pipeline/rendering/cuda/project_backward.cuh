@@ -2,7 +2,7 @@
 #define SPHERES (THREADS / GROUP)
 #define WIDE ((5 + F + 7) / 8 * 8)
 
-// The sum over a block's groups of cameras of a value of each sphere; valid in the first group.
+// Sums a value of each sphere over the groups of cameras of a block; the result is valid in the first group.
 __device__ __forceinline__ float summed(float value, float* shared) {
     if (GROUP == 1) return value;
     shared[threadIdx.x] = value;

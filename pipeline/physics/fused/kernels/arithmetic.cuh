@@ -21,7 +21,7 @@ inline float root(float x) { return sqrtf(x); }
 inline void sine_cosine(float x, float& s, float& c) { s = sinf(x); c = cosf(x); }
 inline void sine_cosine(double x, double& s, double& c) { s = sin(x); c = cos(x); }
 #else
-// 2 units in the last place, where the exact ones cost a branch and ten times as much
+// accurate to 2 units in the last place; the exact functions branch and take ten times as long
 __device__ inline float reciprocal(float x) { return __fdividef(1.0f, x); }
 __device__ inline float inverse_root(float x) { return rsqrtf(x); }
 __device__ inline double inverse_root(double x) { return rsqrt(x); }
@@ -30,7 +30,7 @@ __device__ inline void sine_cosine(float x, float& s, float& c) { s = __sinf(x);
 __device__ inline void sine_cosine(double x, double& s, double& c) { sincos(x, &s, &c); }
 #endif
 
-// A value and its derivative in one direction: forward differentiation without a second program.
+// A value and its directional derivative (dual number): the same source computes values and forward derivatives.
 template <class T>
 struct Dual {
     T value, tangent;
@@ -116,7 +116,7 @@ __device__ inline Quat normalized(Quat q) {
 __device__ inline Quat quat_exp(Vec v) {
     Real angle2 = dot(v, v), cosine, sinc;
 #if SINGLE
-    if (plain(angle2) < Number(1)) {  // exact to single precision, and without a root
+    if (plain(angle2) < Number(1)) {  // exact to single precision, without a square root
         Real half2 = Number(0.25) * angle2;
         cosine = Real(1) + half2 * (Real(Number(-1.0 / 2)) + half2 * (Real(Number(1.0 / 24)) + half2 *
                  (Real(Number(-1.0 / 720)) + half2 * Number(1.0 / 40320))));
@@ -163,7 +163,7 @@ __device__ inline Sym turned(const Mat& R, const Sym& S) {  // R S R^T
     Sym T = {dot(R.x, x), dot(R.y, y), dot(R.z, z), dot(R.x, y), dot(R.x, z), dot(R.y, z)};
     return T;
 }
-// The solution x of S x = v, by minors.
+// Solves S x = v by cofactors.
 __device__ inline Vec solved(const Sym& S, Vec v) {
     Sym minors = {S.yy * S.zz - S.yz * S.yz, S.xx * S.zz - S.xz * S.xz, S.xx * S.yy - S.xy * S.xy,
                   S.xz * S.yz - S.xy * S.zz, S.xy * S.yz - S.xz * S.yy, S.xy * S.xz - S.yz * S.xx};
@@ -193,18 +193,19 @@ struct alignas(16) AlignedRow {
     Number a, b, c, d;
 };
 
-// Writes four numbers at once.
+// Writes four numbers in one store.
 __device__ inline void write_row(Number* to, Number a, Number b, Number c, Number d) {
     AlignedRow row = {a, b, c, d};
     *reinterpret_cast<AlignedRow*>(to) = row;
 }
 
-// The LANES neighbouring threads that share an environment; all of them hold the same state. A warp stays together
-// wherever its threads exchange something, whichever of its environments need it: apart, each exchange costs tenfold.
+// The LANES neighbouring threads that simulate one environment; all of them hold the same state. At every exchange
+// between threads the whole warp takes part, even if only some of its environments need it: in a divergent warp an
+// exchange takes ten times as long.
 struct Lanes {
     int lane;
-    bool idle;  // there is no such environment, and nothing to write
-    // Whether it holds for any environment of the warp; with one thread each, where nothing is exchanged, for this one.
+    bool idle;  // surplus lanes without an environment, which must not write
+    // Whether the condition holds in any environment of the warp; with LANES = 1, without exchanges, in this one.
     __device__ bool any(bool mine) const {
 #if LANES == 1
         return mine;

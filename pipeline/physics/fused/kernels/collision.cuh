@@ -1,5 +1,5 @@
-// Moves a free body over a step in which its velocity and angular momentum went to the given ones: positions follow
-// the mean velocity, the rotation what the mean angular momentum gives half-way through.
+// Moves a free body over one step, given velocity and angular momentum at its end: the position is advanced by the mean
+// velocity, the rotation by the angular velocity of the mean angular momentum at the midpoint.
 INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
     Real half_h = Number(0.5) * h;
     Quat half = normalized(multiply(body.quat, quat_exp(half_h * omega_start)));
@@ -13,7 +13,7 @@ INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocit
 
 #if EFFECTS
 #if SURFACE
-// Adds the pull of a sticky ground to a body's velocity and angular momentum.
+// Adds the impulse of the adhesion of the ground to a body's velocity and angular momentum.
 INLINE void stick(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec& velocity,
                   Vec& spin) {
     const Surface& s = env.law.surface;
@@ -33,7 +33,7 @@ INLINE void stick(const Problem& problem, const Environment& env, int b, const M
     sum = env.lanes.sum(sum);
     arms = env.lanes.sum(arms);
     most = -env.lanes.least(-most);
-    // the weights add up to that of the lowest sphere, so that more spheres do not pull more
+    // the weights are normalised to that of the lowest sphere: the force does not depend on the number of spheres
     Real pull = -(env.law.step_s * s.adhesion * most * reciprocal(at_least(sum, Number(1e-12))));
     velocity.z += env.constants[b].inverse_mass * pull * sum;
     spin.x += pull * arms.y;
@@ -42,7 +42,7 @@ INLINE void stick(const Problem& problem, const Environment& env, int b, const M
 #endif
 
 #if MAGNETS
-// Height of the lowest sphere of a body that the ground can touch, at least 0.
+// Height of the lowest sphere of a body that can touch the ground, at least 0.
 __device__ Real height_of(const Problem& problem, const Environment& env, int b, const Mat& rotation) {
     Real lowest = Real(Number(1e30));
     for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
@@ -80,7 +80,7 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
 #endif
 
 #if RECORD
-// Adds a contact's impulse and where it acted to its sums.
+// Adds the impulse of a contact, and its point of action, to the sums since the last frame.
 INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
 #if PAIRED
     Number along = plain(dot(c.impulse, c.normal)), across = size(c.impulse - Real(along) * c.normal);
@@ -111,7 +111,7 @@ INLINE bool near_ground(const Environment& env, int b, const Motion& m) {
 }
 
 #if PAIRED
-// Two unit vectors across a contact's normal, chosen in the world's frame.
+// Two unit tangents of a contact, orthogonal to its normal, chosen in the world frame.
 INLINE void tangents(const Environment& env, Vec normal, Vec& first, Vec& second) {
 #if TURNED
     Vec n = transposed(env.turn, normal);
@@ -134,8 +134,8 @@ struct Facing {
     Number sharp_gap;  // to the nearest sphere, without smoothing
 };
 
-// Finds how a slot of a pair of bodies faces the other body: first the spheres of b against the union of a, then those
-// of a against the union of b. Returns false where it is further than `limit`.
+// Finds gap, normal and point of one slot of a pair of bodies: first come the spheres of b against the union of a, then
+// those of a against the union of b. Returns false if the gap exceeds `limit`.
 __device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
                      Facing& facing) {
     bool second = k >= sphere_count(pair_b(p));
@@ -164,15 +164,15 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
     return true;
 }
 
-// Finds the contacts of two bodies, and shares the mass out among them; returns how many touch. With them are those
-// that just opened: their impulses of the step before act until the first sweep.
+// Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch. The list also
+// has contacts that just opened, because their impulses of the previous step act until the first iteration.
 __device__ int touch_pair(const Problem& problem, const Environment& env, int p, const Mat* rotations,
                           const Motion* motions, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), b = pair_b(p), first = count, touching = 0;
     const Constants &ca = env.constants[a], &cb = env.constants[b];
     const Motion &ma = motions[a], &mb = motions[b];
     Vec com_a = env.bodies[a].position, com_b = env.bodies[b].position;
-    // no point of a gap g nears faster than V + W g / 2, so what is further than h V / (1 - h W / 2) cannot touch
+    // points at a gap g approach at V + W g / 2 at most, so those beyond h V / (1 - h W / 2) cannot touch in this step
     Number spins = size(ma.omega) + size(mb.omega), h = plain(env.law.step_s);
     Number V = size(ma.velocity - mb.velocity) + size(ma.omega) * (ca.reach + Number(SMOOTHING_M)) +
                size(mb.omega) * (cb.reach + Number(SMOOTHING_M));
@@ -217,7 +217,7 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
     return touching;
 }
 
-// Lets each group of contacts move its share of a body that others touch too; `groups` counts them by body.
+// Divides the effective mass of a body by the number of groups of contacts on it; `groups` counts them by body.
 INLINE void split(Contact* list, int count, const int* groups) {
     for (int i = 0; i < count; i++) {
         Contact& c = list[i];
@@ -230,7 +230,7 @@ INLINE void split(Contact* list, int count, const int* groups) {
 }
 #endif
 
-// Forgets the impulses of the step before.
+// Discards the impulses of the previous step.
 INLINE void forget(Environment& env) {
     if (!env.warm) return;
     EACH_SLOT
@@ -238,7 +238,7 @@ INLINE void forget(Environment& env) {
     env.warm = false;
 }
 
-// Keeps the impulses of a step, from which the sweeps of the next one begin; one sweep begins from nothing.
+// Stores the impulses of a step as the start of the next one's iterations; a single iteration starts at zero.
 INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
     if (sweeps < 2) return;
 #if PAIRED
@@ -257,7 +257,8 @@ INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
     env.warm = count > 0;
 }
 
-// Finds the contacts of a body with the ground; they go to the list, or to their slot where that is the only pair.
+// Finds the contacts of a body with the ground. They are appended to the list; if this is the only pair, each is stored
+// in its own slot.
 INLINE void touch_plane(const Problem& problem, const Environment& env, int p, const Mat& rotation,
                         const Motion& motion, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), first = count;
@@ -372,7 +373,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #if SURFACE
     Real touching = Real(env.lanes.sum(Number(count)));
 #endif
-    // the impulses of the step before act first
+    // warm start: the impulses of the previous step
     int sweep = env.lanes.any(env.warm) ? -1 : 0;
     do {
         EACH_BODY

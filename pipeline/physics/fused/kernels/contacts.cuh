@@ -5,7 +5,7 @@ struct Law {
 #endif
 };
 
-struct Motion {  // free velocities of a body, and what a unit of impulse does to them; 0 where it is not free
+struct Motion {  // velocities of a body without contact, and inverse mass and inertia; 0 if it is not free
     Vec velocity, omega;
     Real inverse_mass;
     Sym inverse_inertia;  // world axes
@@ -15,10 +15,10 @@ struct Contact {  // world frame, impulse on body a
     Vec arm, impulse;
     Real target, stop_n, stop_t;
 #if SURFACE
-    Real friction, steady_x, steady_y;  // impulses that stay as they are
-    Vec turning;                        // angular impulse beyond the moment of the other
+    Real friction, steady_x, steady_y;  // steady: fixed impulses (viscosity)
+    Vec turning;                        // angular impulse of rolling and torsional friction
 #if ELLIPTIC
-    Ellipse ellipse;  // in the place of the friction
+    Ellipse ellipse;  // replaces the friction coefficient
 #endif
 #endif
 #if PAIRED
@@ -41,8 +41,9 @@ INLINE Real mobility_trace(const Motion& m, Vec arm) {
     return Number(3) * m.inverse_mass + trace(m.inverse_inertia) * dot(arm, arm) - dot(arm, m.inverse_inertia * arm);
 }
 
-// Sets the target of a contact, and for now its effective mass and tangential mobility in the place of the stops;
-// returns whether it touches. `weight` is how much it counts in the crowding.
+// Sets the target velocity of a contact and returns whether it touches. `stop_n` and `stop_t` temporarily hold its
+// effective mass and its tangential mobility, until `share_out` replaces them. `weight` is its weight among redundant
+// contacts.
 INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inverse_mass, Real mobility, Real& weight) {
     Real ahead = gap + law.step_s * speed;
     weight = Real(0);
@@ -67,7 +68,7 @@ INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inver
     return true;
 }
 
-// Shares the mass out among contacts whose weights times how far they do the same work add up to `total`.
+// Distributes the effective mass among redundant contacts; `total` is the sum of their weights times their redundancy.
 INLINE void share_out(Contact& c, Real total, Real weight) {
     const Real tiny = Real(Number(1e-9));
     Real share = (weight + tiny) * reciprocal((plain(total) > plain(weight) ? total : weight) + tiny);
@@ -75,7 +76,7 @@ INLINE void share_out(Contact& c, Real total, Real weight) {
     c.stop_n = share * c.stop_n;
 }
 
-// Returns the impulse of a contact after one projected sweep, under the relative velocity of its points.
+// Returns the impulse of a contact after one iteration of projected Gauss-Seidel, given the relative velocity.
 INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
 #if PAIRED
     Real speed = dot(relative, c.normal), before = dot(c.impulse, c.normal);
@@ -110,7 +111,8 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
 #endif
 }
 
-// Moments of the rows of contacts with one plane: a row is (1, arm_y, -arm_x) in the metric (1/m, inverse inertia).
+// Weighted moments of the Jacobian rows of contacts with one plane; a row is (1, arm_y, -arm_x), its metric (1/m,
+// inverse inertia).
 struct Moments {
     Real w, x, y, xx, xy, yy;
 };
@@ -135,7 +137,7 @@ INLINE Real crowd(const Moments& m, const Motion& a, const Contact& c) {
     return c.stop_n * (w * linear + u * u * m.xx + Number(2) * u * v * m.xy + v * v * m.yy);
 }
 
-// Prepares a contact with the ground, whose normal is z; `arm` is that of the sphere's centre.
+// Prepares a contact with the ground, whose normal is z; `arm` is the lever arm of the sphere's centre.
 INLINE bool touch_ground(Contact& c, const Law& law, const Motion& a, Vec arm, Real height, Real radius,
                          Real& weight) {
     const Sym& J = a.inverse_inertia;
@@ -147,8 +149,8 @@ INLINE bool touch_ground(Contact& c, const Law& law, const Motion& a, Vec arm, R
 }
 
 #if SURFACE
-// What the ground does to a contact beyond the law: its friction, and the drag of what lies between, of which all
-// contacts together, whose weights add up to `total`, take their shares.
+// Sets the effects of the surface on a ground contact: local friction, and viscous drag, which is distributed among all
+// contacts by weight; `total` is the sum of their weights.
 INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real weight, Real total) {
     const Surface& s = law.surface;
     Real u = a.velocity.x + a.omega.y * c.arm.z - a.omega.z * c.arm.y;
@@ -164,7 +166,7 @@ INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real w
     c.turning = none();
 }
 
-// The angular impulse of a contact after a sweep against rolling and spinning; `count` contacts stop the same spin.
+// Angular impulse of rolling and torsional friction after one iteration; `count` contacts act on the same spin.
 INLINE Vec turned_by(const Contact& c, const Law& law, const Motion& a, Real count) {
     const Sym& J = a.inverse_inertia;
     Real across = reciprocal((J.xx + J.yy) * count), about = reciprocal(J.zz * count);
@@ -199,7 +201,7 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     nearest = Number(1e30);
     for (int i = 0; i < spheres.count; i++) nearest = lesser(nearest, gap_to(spheres, i, point));
     if (nearest - width > limit) return false;
-    // t with sum over spheres of max(0, t - x)^2 = width^2: Newton from above, where the sum is convex and rising
+    // solve sum over spheres of max(0, t - x)^2 = width^2 for t: Newton from above, where the sum is convex and rising
     Number t = width;
     for (int round = 0; round < 40; round++) {
         Number squares = Number(0), sum = Number(0);
@@ -214,7 +216,7 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
         if (!(down > Number(SINGLE ? 1e-6 : 1e-13) * width)) break;
         t -= down;
     }
-    // with the spheres known that count, the closed form and its derivative
+    // once the set of active spheres is known: the closed form and its derivative
     Real first = Real(0), second = Real(0);
     Number count = Number(0);
     for (int i = 0; i < spheres.count; i++) {
@@ -250,7 +252,7 @@ INLINE Vec relative_velocity(const Contact& c, const Motion* bodies) {
     return velocity;
 }
 
-// Shares the mass out among the touching contacts of two bodies: those from `first` on in every lane's list.
+// Distributes the effective mass among the touching contacts of two bodies: those from `first` on in every lane's list.
 __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* weights, int first, int end,
                                const Motion* bodies) {
     Real totals[SLOTS];

@@ -42,7 +42,7 @@ struct Constants {
     Number reach;         // of its spheres from the centre of mass
 };
 
-struct Tally {  // contacts summed since the last frame
+struct Tally {  // sums over the contacts since the last frame
     Number impulse[3], weighted[3], weight, sliding;
 };
 
@@ -66,7 +66,8 @@ struct Environment {
     Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
     Real radii[SLOTS];
 #endif
-    // of this lane's contacts in the step before: with the ground in the kernel's frame, else along their axes
+    // impulses of this lane's contacts in the previous step: ground contacts in the kernel's frame, others along
+    // normal and tangents
     Vec before[SLOTS];
     bool warm;  // whether any of them is not zero
 #if RECORD
@@ -162,8 +163,8 @@ INLINE void load(const Problem& problem, Environment& env) {
 }
 
 #if CARRIED
-// Takes up where the last launch ended: each body's position, orientation, velocity and spin, then the impulses of this
-// lane's contacts and whether any is not zero. Every lane has its own copy, so that none waits for another.
+// Restores the state at the end of the last launch: position, orientation, velocity and spin of each body, the impulses
+// of this lane's contacts, and whether any is not zero. Every lane has a copy, so that lanes need no synchronisation.
 INLINE void resume(const Problem& problem, Environment& env) {
     const Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
     EACH_BODY
@@ -180,7 +181,7 @@ INLINE void resume(const Problem& problem, Environment& env) {
     env.warm = row[3 * SLOTS] > Number(0);
 }
 
-// Leaves for the next launch what `resume` reads.
+// Stores the state that `resume` reads in the next launch.
 INLINE void suspend(const Problem& problem, const Environment& env) {
     if (env.lanes.idle) return;
     Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
@@ -203,7 +204,7 @@ INLINE void suspend(const Problem& problem, const Environment& env) {
 #endif
 
 #if DRIVEN
-// The commanded motion of a driven body at a time that never falls.
+// The commanded motion of a driven body; times must not decrease from call to call.
 __device__ void drive(const Problem& problem, Environment& env, int b, Real time) {
     int number = drive_number(b), last = problem.drive_last[env.drive_last + number];
     long long start = env.drives + 14LL * problem.drive_starts[number];

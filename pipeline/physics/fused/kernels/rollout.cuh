@@ -88,7 +88,7 @@ INLINE void write_label(const Problem& problem, Environment& env, int frame, int
     t = zero;
 }
 
-// Writes what each contact passed on since the last frame, and the geometry now; and starts the sums anew.
+// Writes the impulse of each contact since the last frame and its present geometry, and resets the sums.
 INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
     if (env.lanes.idle) return;
     Mat rotations[BODIES];
@@ -137,7 +137,7 @@ INLINE void write(const Problem& problem, Environment& env, int frame) {
 #endif
 }
 
-// Rolls one environment out; called by all of its lanes.
+// Simulates one environment; called by all of its lanes.
 INLINE void roll(const Problem& problem, int index, Lanes lanes) {
     Environment env;
     env.index = index;

@@ -1,10 +1,10 @@
 #if SURFACE
 struct Surface {
-    Real stribeck, slow_speed;       // friction at slow slip, and how slow
-    Real even, mixed;                // friction by the direction
-    Real spots[9], spot_m;           // friction by the place: weights of B-splines, and their spacing
+    Real stribeck, slow_speed;       // additional friction at slow slip; velocity scale
+    Real even, mixed;                // friction by direction
+    Real spots[9], spot_m;           // friction by position: B-spline weights, knot spacing
     Real viscous, rolling, torsion;  // N s/m; m; m
-    Real restitution, time, ratio;   // how the damping ratio grows with the speed; of the contact
+    Real restitution, time, ratio;   // growth of the damping ratio with speed; contact time, ratio
     Real adhesion, reach;            // N; m
 };
 
@@ -16,7 +16,7 @@ INLINE Real spline(Real x) {
     return Number(0.5) * far * far;
 }
 
-// Friction of a contact at a place (x, y) with a slip (u, v), both along the axes of an upright ground.
+// Friction of a contact at (x, y) with slip velocity (u, v), both along the axes of the ground.
 INLINE Real friction_at(const Surface& s, Real friction, Real x, Real y, Real u, Real v) {
     Real speed = root(u * u + v * v + Real(Number(1e-24)));
     Real sum = friction + s.stribeck * exponential(-(speed * reciprocal(s.slow_speed)));
@@ -28,7 +28,8 @@ INLINE Real friction_at(const Surface& s, Real friction, Real x, Real y, Real u,
     return at_least(sum, Number(0));
 }
 
-// Stiffness and damping of a step where the damping ratio grows with the speed: `coefficients` of `physics/contact.py`.
+// Stiffness and damping of a step if the damping ratio grows with the speed, as in `coefficients` of
+// `physics/contact_law.py`.
 INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness, Real& damping) {
     Real fast = plain(speed) < Number(0) ? -speed : speed, ratio = s.ratio;
     Real grows = Real(Number(3.28)) + Number(1.16) * ratio;
@@ -49,7 +50,7 @@ INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness,
 }
 
 #if ELLIPTIC
-// The friction's matrix mean I + [[even, mixed], [mixed, -even]], as in `physics/ellipse.py`.
+// The friction matrix M = mean I + [[even, mixed], [mixed, -even]], as in `physics/friction_ellipse.py`.
 struct Ellipse {
     Real mean, even, mixed;
 };
@@ -71,7 +72,7 @@ INLINE Real share_of(Real size, Real limit) {
     return size * reciprocal(plain(limit) >= Number(1e-9) * plain(size) ? limit : Number(1e-9) * size);
 }
 
-// Moves an impulse to the nearest one with |M^-1 j| <= limit.
+// Projects an impulse onto the ellipse |M^-1 j| <= limit.
 INLINE void put_in(const Ellipse& e, Real limit, Real& x, Real& y) {
     const Real tiny = Real(Number(1e-24));
     Real square = e.even * e.even + e.mixed * e.mixed, twice = Number(2) * e.mean;
@@ -81,7 +82,7 @@ INLINE void put_in(const Ellipse& e, Real limit, Real& x, Real& y) {
     Real two_x = e.mean * turned_x + square * x, two_y = e.mean * turned_y + square * y;
     Real high = e.mean + root(square + tiny), u, v;
     Real t = at_least(share_of(root(one_x * one_x + one_y * one_y + tiny), limit) - high * high, Number(0));
-    bool close = false;  // its last step was so small that the next one changes nothing but rounding
+    bool close = false;  // the last step was so small that another one would change only rounding
     for (int round = 0;; round++) {
         Real inverse = reciprocal(t * t + Number(2) * half_trace * t + root_det * root_det), first = half_trace + t;
         u = inverse * (first * one_x - twice * two_x);
@@ -110,7 +111,7 @@ INLINE Number size_in(const Ellipse& e, Number x, Number y) {
 }
 #endif
 
-// A vector's factor that keeps its squared length below that of a limit.
+// The factor, at most 1, that limits a vector of the given squared length to a maximum length.
 INLINE Real shortened(Real square, Real limit) {
     return at_most(limit * inverse_root(square + Real(Number(1e-24))), Number(1));
 }

@@ -1,4 +1,4 @@
-"""Noise of the tracks, measured in flight without any motion model, and detection of wrong measurements."""
+"""Noise of the tracks measured in their flights, without a motion model, and detection of outliers."""
 
 from __future__ import annotations
 
