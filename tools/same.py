@@ -46,7 +46,7 @@ REFERENCE = "af3142a"
 
 MASKS: Sequence[tuple[str, str, str]] = (
     (r"\.json.*\.(seconds|seconds_by_step\.\w+|frames_per_s)$", r"[\d.e+-]+", "wall times"),
-    (r"(^|[.:])cgwm$", r"\d+(\.\d+)*\S*", "the version of cgwm itself"),
+    (r"\.(cgwm|creator)$", r"\d+(\.\d+)*\S*", "the version of cgwm itself"),
 )
 """Parts of values that may differ: a pattern of the place (file and key), one of the part of its text, the reason."""
 FOLDERS = (
@@ -63,7 +63,7 @@ REWORDED: Mapping[str, str] = {
     r"\.json.*\.(faults\.\d+|failures\.\d+\.text)$": "the faults that `validate` names",
     r"^diagnose\d\.stdout\.json\.sentence$": "the verdict of `diagnose`",
     r"^compare\.stdout\.json\.verdict$": "the verdict of `compare`",
-    r"^compare\.html text": "the paragraphs of the comparison page",
+    r"^compare\.html text in <p\b": "the paragraphs of the comparison page",
 }
 """Texts (a pattern of the place) whose words may differ, with the reason; their numbers may not."""
 DROPPED_TESTS: Mapping[str, str] = {
@@ -265,7 +265,10 @@ class Differences:
                 self.lines.append(f"rounding: {place}: {one!r} -> {other!r}{note}")
                 return
         self.failed += 1
-        self.lines.append(f"{place}: {str(one)[:160]!r} -> {str(other)[:160]!r}{note}")
+        texts = [str(one), str(other)]
+        equal = next((k for k, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), 0)
+        begin = max(equal - 80, 0)  # long texts are printed around their first difference
+        self.lines.append(f"{place}: {' -> '.join(repr(text[begin : begin + 160]) for text in texts)}{note}")
 
     def values(self, place: str, one: Any, other: Any) -> None:
         """Compare two JSON values."""
@@ -285,7 +288,7 @@ class Differences:
                 if re.search(pattern, place) and re.sub(part, "", str(one)) == re.sub(part, "", str(other)):
                     self.passed[f"masked: {reason}"] += 1
                     return
-            if isinstance(one, str):
+            if isinstance(one, str) and isinstance(other, str):
                 self.words(place, one, other)
             else:
                 self.add(place, one, other)
@@ -324,25 +327,26 @@ class Differences:
         elif one.suffix == ".py":
             self.words(f"{place} code", *map(code_of, texts))
         else:
-            self.lists(place, "line", *(text.splitlines() for text in texts))
+            self.lists(f"{place} line", *(text.splitlines() for text in texts))
 
     def pages(self, place: str, one: str, other: str) -> None:
         """Compare two HTML pages: tags with their attributes, texts, style sheets, scripts, and data as JSON."""
+        data = [re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.S) for page in (one, other)]
+        self.values(f"{place} data", *([json.loads(text) for text in texts] for texts in data))
         parts = [
             re.split(r"(<style.*?</style>|<script.*?</script>|<[^>]*>)", page, flags=re.S) for page in (one, other)
         ]
-        data = [re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.S) for page in (one, other)]
-        self.values(f"{place} data", *([json.loads(text) for text in texts] for texts in data))
-        self.lists(place, "text", *(texts[::2] for texts in parts))
-        tags = ([tag for tag in tags[1::2] if "application/json" not in tag] for tags in parts)
-        self.lists(place, "tag", *tags)
+        tags = [[tag for tag in part[1::2] if "application/json" not in tag] for part in parts]
+        self.lists(f"{place} tag", *tags)
+        for tag, a, b in zip(parts[0][1::2], parts[0][2::2], parts[1][2::2], strict=False):
+            self.words(f"{place} text in {tag[:40]}", a, b)
 
-    def lists(self, place: str, kind: str, one: Sequence[str], other: Sequence[str]) -> None:
-        """Compare two lists of texts: lines of a file, or texts of a page."""
+    def lists(self, place: str, one: Sequence[str], other: Sequence[str]) -> None:
+        """Compare two lists of texts."""
         if len(one) != len(other):
-            self.add(f"{place}, number of {kind}s", len(one), len(other))
+            self.add(f"{place}s, number", len(one), len(other))
         for k, (a, b) in enumerate(zip(one, other, strict=False)):
-            self.words(f"{place} {kind} {k + 1}", a, b)
+            self.words(f"{place} {k + 1}", a, b)
 
     def arrays(self, place: str, one: Path, other: Path) -> None:
         """Compare all arrays, types and attributes of two HDF5 files."""
@@ -353,8 +357,8 @@ class Differences:
         def plain(value: Any) -> Any:
             if isinstance(value, bytes):
                 value = value.decode()
-            if isinstance(value, str) and value[:1] in ("{", "["):
-                return json.loads(value)
+            if isinstance(value, str):
+                return json.loads(value) if value[:1] in ("{", "[") else value
             return value.tolist() if hasattr(value, "tolist") else value
 
         with h5py.File(one) as first, h5py.File(other) as second:
@@ -384,7 +388,7 @@ class Differences:
                         self.add(f"{where}, largest number and with the largest difference", scale, scale + gap)
 
     def names(
-        self, reference: Mapping[str, int], here: Mapping[str, int], kind: str, dropped: Mapping[str, str]
+        self, kind: str, reference: Mapping[str, int], here: Mapping[str, int], dropped: Mapping[str, str]
     ) -> None:
         """Compare how often names occur: none may occur less often, unless a pattern in `dropped` has it."""
         for name, count in reference.items():
@@ -488,12 +492,14 @@ def main() -> int:
         for name in sorted(names[0] & names[1]):
             found.files(name, reference / "out" / name, candidate / "out" / name)
         print(f"compared {len(names[0] & names[1])} files")
-    tests = [Counter(json.loads((folder / "tests.json").read_text())) for folder in (reference, candidate)]
-    checks = [checks_of(folder / "tree") for folder in (reference, candidate)]
-    functions = [dict.fromkeys((name.partition("[")[0] for name in names), 1) for names in tests]
-    found.names(*functions, "test function", {})
-    found.names(*tests, "test", DROPPED_TESTS)
-    found.names(*checks, "checks in", DROPPED_CHECKS)
+    tests, functions, checks = [], [], []
+    for folder in (reference, candidate):
+        tests.append(Counter(json.loads((folder / "tests.json").read_text())))
+        functions.append(dict.fromkeys((name.partition("[")[0] for name in tests[-1]), 1))
+        checks.append(checks_of(folder / "tree"))
+    found.names("test", tests[0], tests[1], DROPPED_TESTS)
+    found.names("test function", functions[0], functions[1], {})
+    found.names("checks in", checks[0], checks[1], DROPPED_CHECKS)
     for kind, counts in (("tests", tests), ("checks in the functions of tests", checks)):
         print(f"{kind}: {counts[0].total()} -> {counts[1].total()}")
     found.wheel(candidate / "tree", next((candidate / "wheel").glob("*.whl")))
