@@ -1,11 +1,20 @@
 """Compare what this tree computes with what a reference commit computes: `make same`.
 
-For a change that is to move, rename or split code and to alter no number. Both trees are built as wheels and installed
-into folders of their own, the commands run on the same small captures from an empty folder where neither source tree
-can be imported, and everything that they write is compared: JSON key by key, HDF5 array by array, other files by byte.
-What may differ is named in `MASKS`. Tests are counted, too: none may vanish but those in `DROPPED_TESTS`.
+For a change that moves, renames or splits code and changes no number. Both trees are built as wheels and installed
+into separate folders. The same commands run on the same small captures, on the CPU, in an empty folder where neither
+source tree can be imported. Everything that they write is compared:
 
-Reference outputs are kept in `build/same/` and made anew when the reference or an installed package changes.
+- JSON key by key and HDF5 array by array, exactly;
+- text files and HTML pages line by line and element by element, exactly, style sheets and scripts included;
+- other files by byte.
+
+`MASKS` and `FOLDERS` name the parts of values that may differ, `REWORDED` the texts whose words may: their numbers are
+compared. The report counts what each of these let pass. Three checks need no outputs: no test of the reference may be
+missing except `DROPPED_TESTS`; no function of the tests may have lost a check; and the wheel of this tree has exactly
+the files of its packages.
+
+Outputs are kept in `build/same/`. Those of the reference are made again when the reference or an installed package
+changes; `--again` compares the kept outputs of the last run without running anything.
 """
 
 from __future__ import annotations
@@ -14,7 +23,6 @@ import argparse
 import ast
 import hashlib
 import json
-import math
 import os
 import re
 import shutil
@@ -22,8 +30,11 @@ import subprocess
 import sys
 import tarfile
 import time
+import tomllib
+import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -34,24 +45,27 @@ REFERENCE = "af3142a"
 """Commit whose outputs count."""
 
 MASKS: Sequence[tuple[str, str, str]] = (
-    (r"(^|\.)(cgwm|version|versions|packages|software)(\.|$)", ".*", "versions of packages"),
-    (
-        r"(^|\.)(created|date|finished|started|host|command|argv|parent|out|model|capture|source|path|directory)$",
-        ".*",
-        "paths, times and the command line of the run",
-    ),
-    (
-        r"(^|\.)(\w*seconds\w*|frames_per_s|\w*_(s_taken|wall_s|elapsed_s)|timing_s|stages_s)(\.|$)",
-        ".*",
-        "wall times",
-    ),
-    (r"(^|\.)inputs(\.|$)", ".*", "hashes by path of the files that were read"),
-    (r"(^|\.)(model_json|provenance|settings)(\.|$)", ".*", "text that repeats the masked fields"),
-    (r"(^|\.)\w*sha256$", ".*", "hashes of files that contain masked fields"),
+    (r"\.json.*\.(seconds|seconds_by_step\.\w+|frames_per_s)$", r"[\d.e+-]+", "wall times"),
+    (r"\.(cgwm|creator)$", r"\d+(\.\d+)*\S*", "the version of cgwm itself"),
 )
-"""What may differ: a pattern of the key's path, one of the value, and the reason."""
-WORDS = r"(^|\.)(warnings|notes|what|where|words|messages?|why|text|summary|reason|refused|description|next)(\.|$)"
-"""Keys whose text may be worded anew; the numbers in it are compared still."""
+"""Parts of values that may differ: a pattern of the place (file and key), one of the part of its text, the reason."""
+FOLDERS = (
+    r"((/[\w.+-]+)*/build/same/|(\.\./)+)(reference-\w+/|candidate/)?(?=(in|out|site)/)",
+    "the folder in which a tree ran: the rest of the path is compared",
+)
+"""Part that may differ in every text, and the reason."""
+NUMBER = r"[-+−]?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+REWORDED: Mapping[str, str] = {
+    r"^mine\.py": "the template of `effects new`: comments, and parameters by keyword",
+    r"^effects-new\.stdout\.txt": "the next step that `effects new` names",
+    r"^effects-\w+\.stdout\.json.*\.(summary|reveals|source)$": "the descriptions of effects",
+    r"\.json.*\.warnings\.\d+$": "the warnings of fits",
+    r"\.json.*\.(faults\.\d+|failures\.\d+\.text)$": "the faults that `validate` names",
+    r"^diagnose\d\.stdout\.json\.sentence$": "the verdict of `diagnose`",
+    r"^compare\.stdout\.json\.verdict$": "the verdict of `compare`",
+    r"^compare\.html text in <p\b": "the paragraphs of the comparison page",
+}
+"""Texts (a pattern of the place) whose words may differ, with the reason; their numbers may not."""
 DROPPED_TESTS: Mapping[str, str] = {
     r"^test_(all_is_complete|docstring_examples_run)\[cgwm\.": "named by the module, which has moved",
     r"^test_the_commands_exist\[": "named by a line of the README, which became pages",
@@ -59,14 +73,8 @@ DROPPED_TESTS: Mapping[str, str] = {
     r"\[(.*-)?(triton|cuda)(-.*)?\]$": "the GPU renderer has one kind of kernels",
 }
 """Tests (a pattern of their names) that this tree need not have, with the reason."""
-DROPPED_ASSERTS = 0
-"""Number of assert statements that went with those tests."""
-
-REWORDED: Mapping[str, str] = {
-    "mine.py": "the template of `effects new`: comments, and a parameter by keyword",
-    "effects-new.stdout.txt": "its next step",
-}
-"""Files of words that were reworded; they are not compared."""
+DROPPED_CHECKS: Mapping[str, str] = {}
+"""Functions of the tests that may have fewer checks than in the reference, with the reason."""
 
 INPUTS = """
 import sys
@@ -103,6 +111,15 @@ PHOTOS = (
     "--set sg-gs.max_collision_spheres=60 --set sg-gs.image_size=96 --set sg-gs.exposure=false"
 )
 HIDDEN = 6
+ENVIRONMENT: Mapping[str, str] = {
+    "CUDA_VISIBLE_DEVICES": "",  # the CPU's results repeat to the byte
+    "PYTHONSAFEPATH": "1",
+    "PYTHONDONTWRITEBYTECODE": "1",
+    "OMP_NUM_THREADS": "1",
+    "COLUMNS": "200",
+    "NO_COLOR": "1",
+}
+"""Environment variables of every command."""
 COMMANDS: Sequence[tuple[str, str]] = (
     ("fit-tracks", f"fit {{in}}/tracked --stage phys-geo --from {{in}}/tracked-model {FAST} --out m-tracks --json"),
     (
@@ -160,18 +177,11 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 def installed(tree: Path, site: Path) -> dict[str, str]:
     """Install a tree into a folder as a wheel, and return the environment in which only that one is found."""
-    wheels = site.with_name(site.name + "-wheel")
+    wheels = site.with_name("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
-    run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", wheels, tree], cwd=tree)
-    run([*pip, "install", "--no-deps", "--target", site, *wheels.glob("*.whl")])
-    environment = os.environ | {
-        "PYTHONPATH": str(site),
-        "PYTHONSAFEPATH": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "OMP_NUM_THREADS": "1",
-        "COLUMNS": "200",
-        "NO_COLOR": "1",
-    }
+    run([*pip, "wheel", "--no-index", "--no-deps", "--no-build-isolation", "-w", wheels, tree], cwd=tree)
+    run([*pip, "install", "--no-index", "--no-deps", "--target", site, *wheels.glob("*.whl")])
+    environment = os.environ | ENVIRONMENT | {"PYTHONPATH": str(site)}
     code = "import cgwm, cgwm.pipeline; print(cgwm.__file__); print(cgwm.pipeline.__path__[0])"
     places = run([sys.executable, "-c", code], env=environment, cwd=wheels).stdout.split()
     if not all(Path(place).is_relative_to(site) for place in places):
@@ -198,7 +208,8 @@ def outputs(environment: Mapping[str, str], inputs: Path, folder: Path) -> None:
         (folder / f"{name}.code.txt").write_text(f"{done.returncode}\n")
         if done.returncode:
             (folder / f"{name}.stderr.log").write_text(done.stderr)
-        print(f"  {name}: exit code {done.returncode}, {time.monotonic() - begin:.1f} s", flush=True)
+        side = folder.parent.name.partition("-")[0]
+        print(f"  {side} {name}: exit code {done.returncode}, {time.monotonic() - begin:.1f} s", flush=True)
     (folder / "options.txt").write_text("\n".join(option_lines(environment, folder)) + "\n")
 
 
@@ -215,76 +226,129 @@ def option_lines(environment: Mapping[str, str], folder: Path) -> list[str]:
     return run([sys.executable, "-c", code], env=dict(environment), cwd=folder).stdout.splitlines()
 
 
-def tests_of(tree: Path, environment: Mapping[str, str]) -> tuple[Counter[str], int]:
-    """Return the tests of a tree by function and parameters, without their files, and the number of asserts."""
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "--collect-only", "-q", "-m", "evidence or not evidence", "tests"],
-        cwd=tree, env=dict(environment) | {"PYTHONSAFEPATH": "1"}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    names = [line.split("::", 1)[1] for line in done.stdout.splitlines() if "::" in line]
-    if done.returncode or not names:
-        sys.exit(f"tests of {tree} were not collected:\n{done.stdout[-3000:]}{done.stderr[-3000:]}")
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (tree / "tests").rglob("*.py")]
-    return Counter(names), sum(isinstance(node, ast.Assert) for one in trees for node in ast.walk(one))
+def tests_of(tree: Path, environment: Mapping[str, str]) -> list[str]:
+    """Return the tests of a tree by function and parameters, without their files."""
+    words = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-m", "evidence or not evidence", "tests"]
+    lines = run(words, cwd=tree, env=dict(environment)).stdout.splitlines()
+    return [line.split("::", 1)[1] for line in lines if "::" in line]
+
+
+def checks_of(tree: Path) -> Counter[str]:
+    """Return the number of assert statements and calls of checks (`raises`, `assert_*`) by function of the tests."""
+    found: Counter[str] = Counter()
+    for path in (tree / "tests").rglob("*.py"):
+        for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(function, ast.FunctionDef):
+                for node in ast.walk(function):
+                    name = ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
+                    check = isinstance(node, ast.Assert) or name in ("raises", "warns") or name.startswith("assert_")
+                    found[function.name] += check
+    return found
 
 
 class Differences:
-    """What differs between two outputs: lines to print, and how many exceed the rounding that is allowed."""
+    """Differences of two runs: lines to print, what was let pass with its reason, and the number that fail."""
 
     def __init__(self, rounding: float) -> None:
-        self.rounding, self.lines, self.masked, self.failed = rounding, [], Counter(), 0
+        self.rounding, self.lines, self.failed = rounding, [], 0
+        reasons = [f"masked: {reason}" for *_, reason in (*MASKS, FOLDERS)]
+        reasons += [f"reworded: {reason}" for reason in REWORDED.values()]
+        self.passed = Counter(dict.fromkeys(reasons, 0))
 
-    def add(self, where: str, one: object, other: object) -> None:
-        """Note a difference; numbers within the rounding are named and pass."""
+    def add(self, place: str, one: Any, other: Any) -> None:
+        """Add a difference; numbers within the rounding are printed and pass."""
         note = ""
-        if isinstance(one, int | float) and isinstance(other, int | float) and not isinstance(one, bool):
+        if _is_number(one) and _is_number(other):
             relative = abs(one - other) / max(abs(one), abs(other), 1e-300)
             note = f" (relative {relative:.2e})"
-            if relative <= self.rounding:
-                self.lines.append(f"rounding: {where}: {one!r} -> {other!r}{note}")
+            if relative < self.rounding:
+                self.lines.append(f"rounding: {place}: {one!r} -> {other!r}{note}")
                 return
         self.failed += 1
-        self.lines.append(f"{where}: {str(one)[:160]!r} -> {str(other)[:160]!r}{note}")
+        texts = [str(one), str(other)]
+        equal = next((k for k, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), 0)
+        begin = max(equal - 80, 0)  # long texts are printed around their first difference
+        self.lines.append(f"{place}: {' -> '.join(repr(text[begin : begin + 160]) for text in texts)}{note}")
 
-    def values(self, where: str, key: str, one: Any, other: Any) -> None:
+    def values(self, place: str, one: Any, other: Any) -> None:
         """Compare two JSON values."""
-        for pattern, value, reason in MASKS:
-            if re.search(pattern, key) and not isinstance(one, dict | list) and re.fullmatch(value, str(one), re.S):
-                self.masked[reason] += one != other
-                return
         if isinstance(one, dict) and isinstance(other, dict):
             for name in sorted({*one, *other}):
                 if name in one and name in other:
-                    self.values(where, f"{key}.{name}", one[name], other[name])
+                    self.values(f"{place}.{name}", one[name], other[name])
                 else:
-                    self.add(f"{where} {key}.{name}", one.get(name, "absent"), other.get(name, "absent"))
+                    self.add(f"{place}.{name}", one.get(name, "absent"), other.get(name, "absent"))
         elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
             for k, (a, b) in enumerate(zip(one, other, strict=True)):
-                self.values(where, f"{key}.{k}", a, b)
-        elif isinstance(one, str) and isinstance(other, str) and (re.search(WORDS, key) or " " in one.strip()):
-            numbers = [re.findall(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?", text) for text in (one, other)]
-            if numbers[0] != numbers[1] and "/" not in one:
-                self.add(f"{where} {key} (numbers in the text)", one, other)
-        elif one != other and not (one is other or (_is_nan(one) and _is_nan(other))):
-            self.add(f"{where} {key}", one, other)
+                self.values(f"{place}.{k}", a, b)
+        elif type(one) is not type(other):
+            self.add(place, one, other)
+        elif repr(one) != repr(other):  # NaN equals NaN, and 0 differs from -0
+            for pattern, part, reason in MASKS:
+                if re.search(pattern, place) and re.sub(part, "", str(one)) == re.sub(part, "", str(other)):
+                    self.passed[f"masked: {reason}"] += 1
+                    return
+            if isinstance(one, str) and isinstance(other, str):
+                self.words(place, one, other)
+            else:
+                self.add(place, one, other)
 
-    def files(self, one: Path, other: Path, where: str) -> None:
+    def words(self, place: str, one: str, other: str) -> None:
+        """Compare two texts but for the folders in their paths, and for their words where `REWORDED` has the place."""
+        if one == other:
+            return
+        one, other = (re.sub(FOLDERS[0], "", text) for text in (one, other))
+        if one == other:
+            self.passed[f"masked: {FOLDERS[1]}"] += 1
+            return
+        reason = next((reason for pattern, reason in REWORDED.items() if re.search(pattern, place)), None)
+        if reason is None:
+            self.add(place, one, other)
+        elif re.findall(NUMBER, one) != re.findall(NUMBER, other):
+            self.add(f"{place} (numbers in a reworded text)", one, other)
+        else:
+            self.passed[f"reworded: {reason}"] += 1
+
+    def files(self, place: str, one: Path, other: Path) -> None:
         """Compare two files by what their kind says."""
+        if one.suffix == ".h5":
+            self.arrays(place, one, other)
+            return
+        if one.read_bytes() == other.read_bytes():
+            return
+        if one.suffix not in (".json", ".html", ".py", ".txt", ".xml", ".log"):
+            self.add(place, f"{one.stat().st_size} bytes", f"{other.stat().st_size} bytes, other content")
+            return
+        texts = [path.read_text(encoding="utf-8") for path in (one, other)]
         if one.suffix == ".json":
-            self.values(where, "", json.loads(one.read_text()), json.loads(other.read_text()))
-        elif one.suffix == ".h5":
-            self.arrays(one, other, where)
-        elif one.suffix in (".html", ".log"):
-            self.masked["pages and messages: their words are not compared"] += one.read_bytes() != other.read_bytes()
-        elif one.suffix in (".txt", ".xml", ".toml"):
-            texts = [re.sub(r"(/[\w.+-]+)+", "PATH", path.read_text()) for path in (one, other)]
-            if texts[0] != texts[1]:
-                pairs = list(zip(texts[0].splitlines(), texts[1].splitlines(), strict=False))
-                self.add(where, *next((p for p in pairs if p[0] != p[1]), (len(texts[0]), str(len(texts[1])))))
-        elif one.read_bytes() != other.read_bytes():
-            self.add(where, f"{one.stat().st_size} bytes", f"{other.stat().st_size} bytes, other content")
+            self.values(place, *map(json.loads, texts))
+        elif one.suffix == ".html":
+            self.pages(place, *texts)
+        elif one.suffix == ".py":
+            self.words(f"{place} code", *map(code_of, texts))
+        else:
+            self.lists(f"{place} line", *(text.splitlines() for text in texts))
 
-    def arrays(self, one: Path, other: Path, where: str) -> None:
+    def pages(self, place: str, one: str, other: str) -> None:
+        """Compare two HTML pages: tags with their attributes, texts, style sheets, scripts, and data as JSON."""
+        data = [re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.S) for page in (one, other)]
+        self.values(f"{place} data", *([json.loads(text) for text in texts] for texts in data))
+        parts = [
+            re.split(r"(<style.*?</style>|<script.*?</script>|<[^>]*>)", page, flags=re.S) for page in (one, other)
+        ]
+        tags = [[tag for tag in part[1::2] if "application/json" not in tag] for part in parts]
+        self.lists(f"{place} tag", *tags)
+        for tag, a, b in zip(parts[0][1::2], parts[0][2::2], parts[1][2::2], strict=False):
+            self.words(f"{place} text in {tag[:40]}", a, b)
+
+    def lists(self, place: str, one: Sequence[str], other: Sequence[str]) -> None:
+        """Compare two lists of texts."""
+        if len(one) != len(other):
+            self.add(f"{place}s, number", len(one), len(other))
+        for k, (a, b) in enumerate(zip(one, other, strict=False)):
+            self.words(f"{place} {k + 1}", a, b)
+
+    def arrays(self, place: str, one: Path, other: Path) -> None:
         """Compare all arrays, types and attributes of two HDF5 files."""
         import h5py
         import hdf5plugin  # noqa: F401  reads zstd
@@ -293,8 +357,8 @@ class Differences:
         def plain(value: Any) -> Any:
             if isinstance(value, bytes):
                 value = value.decode()
-            if isinstance(value, str) and value[:1] in "{[":
-                return json.loads(value)
+            if isinstance(value, str):
+                return json.loads(value) if value[:1] in ("{", "[") else value
             return value.tolist() if hasattr(value, "tolist") else value
 
         with h5py.File(one) as first, h5py.File(other) as second:
@@ -302,30 +366,68 @@ class Differences:
             for file, found in zip((first, second), names, strict=True):
                 file.visit(found.append)
             if names[0] != names[1]:
-                self.add(where, sorted({*names[0]} - {*names[1]}), sorted({*names[1]} - {*names[0]}))
+                self.add(place, sorted({*names[0]} - {*names[1]}), sorted({*names[1]} - {*names[0]}))
                 return
             for name in ["/", *names[0]]:
-                a, b = first[name], second[name]
+                a, b, where = first[name], second[name], f"{place}:{name}"
                 attributes = [{key: plain(node.attrs[key]) for key in node.attrs} for node in (a, b)]
-                self.values(f"{where}:{name}", "", *attributes)
-                if isinstance(a, h5py.Dataset) and isinstance(b, h5py.Dataset):
-                    if a.dtype != b.dtype or a.shape != b.shape:
-                        self.add(f"{where}:{name}", f"{a.dtype} {a.shape}", f"{b.dtype} {b.shape}")
-                    elif a.dtype.kind in "fiub":
-                        x, y = np.asarray(a[()]), np.asarray(b[()])
-                        if x.tobytes() != y.tobytes():
-                            gap = float(np.abs(np.asarray(x, float) - np.asarray(y, float)).max())
-                            scale = max(float(np.abs(np.asarray(x, float)).max()), 1e-300)
-                            self.add(f"{where}:{name}", scale, scale + gap)
-                    elif a.dtype.kind == "O":
-                        values = [[plain(v) for v in np.ravel(node[()])] for node in (a, b)]
-                        self.values(f"{where}:{name}", name.replace("/", "."), *values)
-                    elif a[()].tobytes() != b[()].tobytes():
-                        self.add(f"{where}:{name}", "array", "other content")
+                self.values(where, *attributes)
+                if not (isinstance(a, h5py.Dataset) and isinstance(b, h5py.Dataset)):
+                    if type(a) is not type(b):
+                        self.add(where, type(a).__name__, type(b).__name__)
+                elif a.dtype != b.dtype or a.shape != b.shape:
+                    self.add(where, f"{a.dtype} {a.shape}", f"{b.dtype} {b.shape}")
+                elif a.dtype.kind == "O":
+                    self.values(where, *([plain(value) for value in np.ravel(node[()])] for node in (a, b)))
+                elif (x := np.asarray(a[()])).tobytes() != (y := np.asarray(b[()])).tobytes():
+                    if a.dtype.kind not in "fiub":
+                        self.add(where, "array", "other content")
+                    else:
+                        gap = float(np.abs(x.astype(float) - y.astype(float)).max())
+                        scale = max(float(np.abs(x.astype(float)).max()), 1e-300)
+                        self.add(f"{where}, largest number and with the largest difference", scale, scale + gap)
+
+    def names(
+        self, kind: str, reference: Mapping[str, int], here: Mapping[str, int], dropped: Mapping[str, str]
+    ) -> None:
+        """Compare how often names occur: none may occur less often, unless a pattern in `dropped` has it."""
+        for name, count in reference.items():
+            if here.get(name, 0) < count:
+                reason = next((reason for pattern, reason in dropped.items() if re.search(pattern, name)), None)
+                if reason is None:
+                    self.add(f"{kind} {name}", f"{count}", f"{here.get(name, 0)}")
+                else:
+                    self.passed[f"dropped {kind}: {reason}"] += 1
+
+    def wheel(self, tree: Path, wheel: Path) -> None:
+        """Compare the files of a wheel with those of the packages' folders in the source tree: each once, no others."""
+        folders = tomllib.loads((tree / "pyproject.toml").read_text())["tool"]["setuptools"]["package-dir"]
+        source = {
+            f"{package.replace('.', '/')}/{path.relative_to(tree / folder).as_posix()}": path.read_bytes()
+            for package, folder in folders.items()
+            for path in (tree / folder).rglob("*")
+            if path.is_file() and path.suffix != ".pyc"
+        }
+        with zipfile.ZipFile(wheel) as archive:
+            packed = {name: archive.read(name) for name in archive.namelist() if ".dist-info/" not in name}
+        for name in sorted(source.keys() | packed.keys()):
+            if source.get(name) != packed.get(name):
+                sizes = [f"{len(files[name])} bytes" if name in files else "absent" for files in (source, packed)]
+                self.add(f"wheel {name} (source, wheel)", *sizes)
+        print(f"wheel: {len(packed)} files, {sum(not name.endswith('.py') for name in packed)} of them data")
 
 
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)
+def code_of(text: str) -> str:
+    """Return Python code without comments and docstrings."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            node.body = node.body[1:] or [ast.Pass()]
+    return ast.unparse(tree)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def files_in(folder: Path) -> Iterator[str]:
@@ -336,8 +438,35 @@ def files_in(folder: Path) -> Iterator[str]:
 def key_of(commit: str) -> str:
     """Return what reference outputs depend on: the commit, this script's commands, and the installed packages."""
     packages = run([sys.executable, "-m", "pip", "--disable-pip-version-check", "freeze", "--exclude-editable"]).stdout
-    text = "\n".join([commit, INPUTS, repr(COMMANDS), packages])
+    text = "\n".join([commit, INPUTS, repr(COMMANDS), repr(ENVIRONMENT), packages])
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def prepared(commit: str | None, folder: Path) -> dict[str, str]:
+    """Install a commit into a new folder, list its tests there, and return the environment of its commands."""
+    shutil.rmtree(folder, ignore_errors=True)
+    tree = tree_of(commit, folder / "tree")
+    environment = installed(tree, folder / "site")
+    (folder / "tests.json").write_text(json.dumps(tests_of(tree, environment)))
+    return environment
+
+
+def make(commit: str, reference: Path, other: str | None, candidate: Path, *, only_tests: bool) -> None:
+    """Write the outputs and tests of the reference, unless they are there, and of the candidate into their folders."""
+    inputs, work = reference / "in", []
+    if not (reference / "done").exists():
+        environment = prepared(commit, reference)
+        inputs.mkdir()
+        run([sys.executable, "-c", INPUTS, inputs, reference / "tree" / "tests"], env=environment, cwd=reference)
+        work.append((reference, environment))
+    environment = prepared(other, candidate)
+    if not only_tests:
+        work.append((candidate, environment))
+    with ThreadPoolExecutor() as pool:
+        for _ in pool.map(lambda one: outputs(one[1], inputs, one[0] / "out"), work):
+            pass
+    for folder in (reference, candidate):
+        (folder / "done").touch()
 
 
 def main() -> int:
@@ -346,48 +475,39 @@ def main() -> int:
     parser.add_argument("--reference", default=REFERENCE, help="commit whose outputs count")
     parser.add_argument("--candidate", help="commit to compare (default: the working tree)")
     parser.add_argument("--rounding", type=float, default=0.0, help="relative difference of numbers that passes, named")
-    parser.add_argument("--only-tests", action="store_true", help="compare the tests alone")
+    parser.add_argument("--only-tests", action="store_true", help="compare the tests and the wheel alone")
+    parser.add_argument("--again", action="store_true", help="compare the kept outputs of the last run; run nothing")
     chosen = parser.parse_args()
     commit = run(["git", "rev-parse", chosen.reference], cwd=ROOT).stdout.strip()
-    reference = BUILD / f"reference-{key_of(commit)}"
-    if not (reference / "done").exists():
-        shutil.rmtree(reference, ignore_errors=True)
-        print(f"making the reference outputs of {commit[:7]}")
-        tree = tree_of(commit, reference / "tree")
-        environment = installed(tree, reference / "site")
-        (reference / "in").mkdir()
-        run([sys.executable, "-c", INPUTS, reference / "in", tree / "tests"], env=environment, cwd=reference)
-        outputs(environment, reference / "in", reference / "out")
-        names, asserts = tests_of(tree, environment)
-        (reference / "tests.json").write_text(json.dumps([dict(names), asserts]))
-        (reference / "done").touch()
-    candidate = BUILD / "candidate"
-    shutil.rmtree(candidate, ignore_errors=True)
-    print(f"running {chosen.candidate or 'the working tree'}")
-    tree = tree_of(chosen.candidate, candidate / "tree")
-    environment = installed(tree, candidate / "site")
+    reference, candidate = BUILD / f"reference-{key_of(commit)}", BUILD / "candidate"
+    if not chosen.again:
+        make(commit, reference, chosen.candidate, candidate, only_tests=chosen.only_tests)
+    elif not all((folder / "done").exists() for folder in (reference, candidate)):
+        parser.error("--again: no finished run is kept in build/same")
     found = Differences(chosen.rounding)
-    if not chosen.only_tests:
-        outputs(environment, reference / "in", candidate / "out")
+    if (candidate / "out").exists():
         names = [set(files_in(folder / "out")) for folder in (reference, candidate)]
         for name in sorted(names[0] ^ names[1]):
             found.add(name, name in names[0], name in names[1])
-        for name in sorted((names[0] & names[1]) - set(REWORDED)):
-            found.files(reference / "out" / name, candidate / "out" / name, name)
+        for name in sorted(names[0] & names[1]):
+            found.files(name, reference / "out" / name, candidate / "out" / name)
         print(f"compared {len(names[0] & names[1])} files")
-    expected, asserts = json.loads((reference / "tests.json").read_text())
-    here, here_asserts = tests_of(tree, environment)
-    lost = {name: n for name, n in (Counter(expected) - here).items()}
-    for name in lost:
-        if not any(re.search(pattern, name) for pattern in DROPPED_TESTS):
-            found.add(f"test {name}", "there", "gone")
-    if here_asserts < asserts - DROPPED_ASSERTS:
-        found.add("assert statements in tests", asserts, here_asserts - 0.5)
-    print(f"tests: {sum(expected.values())} -> {sum(here.values())}, asserts: {asserts} -> {here_asserts}")
-    for reason, count in found.masked.items():
-        print(f"masked: {count} differ: {reason}")
-    print(*found.lines, sep="\n")
-    print("different: " + str(found.failed) if found.failed else "equal")
+    tests, functions, checks = [], [], []
+    for folder in (reference, candidate):
+        tests.append(Counter(json.loads((folder / "tests.json").read_text())))
+        functions.append(dict.fromkeys((name.partition("[")[0] for name in tests[-1]), 1))
+        checks.append(checks_of(folder / "tree"))
+    found.names("test", tests[0], tests[1], DROPPED_TESTS)
+    found.names("test function", functions[0], functions[1], {})
+    found.names("checks in", checks[0], checks[1], DROPPED_CHECKS)
+    for kind, counts in (("tests", tests), ("checks in the functions of tests", checks)):
+        print(f"{kind}: {counts[0].total()} -> {counts[1].total()}")
+    found.wheel(candidate / "tree", next((candidate / "wheel").glob("*.whl")))
+    for reason, count in found.passed.items():
+        print(f"{count} pass, {reason}")
+    for line in found.lines:
+        print(line)
+    print(f"different: {found.failed}" if found.failed else "equal")
     return 1 if found.failed else 0
 
 
