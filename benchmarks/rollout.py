@@ -77,7 +77,7 @@ def world_of(device: str, dtype: torch.dtype, sweeps: int = 10) -> World:
         ground_offset=tensor(0.0),
         contact=law,
         step_s=STEP_S,
-        sweeps=sweeps,
+        iterations=sweeps,
     )
 
 

@@ -48,7 +48,7 @@ def flight_slot(
     prepared, world = ready(body, effects, seed, count=5, duration_s=0.4, ground=False)
     assert prepared.flight is not None
     chosen = LIBRARY if library is None else library
-    return select_next(prepared.flight, world, chosen, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
+    return select_next(prepared.flight, world, chosen, prepared.groups, prepared.has_orientation)  # pyright: ignore[reportArgumentType]
 
 
 def names(slot: SelectionStep) -> set[str]:
@@ -72,17 +72,17 @@ def test_phases_follow_the_motion_of_a_ball() -> None:
     episodes = tosses(world, 2, count=3, duration_s=1.2)
     prepared = prepare(world, episodes)
     contact = prepared.contact(world)
-    found = phases_of([name for name, _ in episodes], prepared.whole, prepared.clear, contact)
+    found = phases_of([name for name, _ in episodes], prepared.observations, prepared.airborne, contact)
     for one in found:
         assert set(one.phase) <= {"flight", "impact", "sliding", "rolling", "sticking", "rest"}
-        assert (one.phase[one.clear] == "flight").all()
+        assert (one.phase[one.airborne] == "flight").all()
         assert one.phase[0] == "flight" and "impact" in one.phase
         assert "rolling" in one.phase[-10:] or "sliding" in one.phase[-10:]
 
 
 def test_without_ground_all_is_flight() -> None:
     prepared, _ = ready("cube", {}, ground=False, count=3)
-    assert prepared.clear.all() and not prepared.contact_items
+    assert prepared.airborne.all() and not prepared.contact_items
 
 
 def test_segments_recover_states_and_the_noise() -> None:
@@ -90,7 +90,7 @@ def test_segments_recover_states_and_the_noise() -> None:
     episodes = tosses(world, 4, count=6, duration_s=0.9)
     prepared = prepare(world, episodes)
     assert prepared.noise == pytest.approx(NOISE, rel=0.12)
-    whole = prepared.whole
+    whole = prepared.observations
     for fitted in (prepared.flight, prepared.contact(world)):
         assert fitted is not None
         chi2 = fitted.residuals([], NOTHING, False)[0].square().sum((1, 2))
@@ -161,7 +161,7 @@ def test_the_constants_of_a_large_effect_are_those_of_where_it_ends() -> None:
     library = [Candidate(name, load_effect(name)) for name in ("ground_magnet", "gravity_scale")]
     prepared, world = ready("ball", {"ground_magnet": {"A": 10.0, "l": 0.1}}, 3, duration_s=0.6)
     assert prepared.flight is not None
-    slot = select_next(prepared.flight, world, library, prepared.groups, prepared.turned)  # pyright: ignore[reportArgumentType]
+    slot = select_next(prepared.flight, world, library, prepared.groups, prepared.has_orientation)  # pyright: ignore[reportArgumentType]
     assert slot.best.name == "ground_magnet" and slot.best.constants == {"l": 0.1}
     assert slot.best.numbers is not None
     estimate, error = slot.best.numbers["A"]
@@ -254,7 +254,7 @@ def test_an_effect_may_have_a_value_for_each_episode() -> None:
 def test_the_residual_wrench_tells_what_organises_it_and_which_law() -> None:
     prepared, world = ready("ball", {"linear_drag": {"c": 0.6}}, 8, count=6, duration_s=0.5, ground=False)
     assert prepared.flight is not None
-    windows = wrench_windows(world, prepared.whole, prepared.flight.items, prepared.noise)  # pyright: ignore[reportArgumentType]
+    windows = wrench_windows(world, prepared.observations, prepared.flight.items, prepared.noise)  # pyright: ignore[reportArgumentType]
     assert windows is not None
     law = residual_law(windows)
     assert [t.name for t in law.terms] == ["-u"]
@@ -263,7 +263,7 @@ def test_the_residual_wrench_tells_what_organises_it_and_which_law() -> None:
     assert low <= 1.0 <= high and best == pytest.approx(1.0, abs=0.5)
     assert law.left_chi2 < 1.6
     tilted, world = ready("ball", {"gravity_tilt": {"tilt_x": 0.06}}, 8, count=6, duration_s=0.5, ground=False)
-    windows = wrench_windows(world, tilted.whole, tilted.flight.items, tilted.noise)  # pyright: ignore
+    windows = wrench_windows(world, tilted.observations, tilted.flight.items, tilted.noise)  # pyright: ignore
     assert covariates_of(windows)[0].coordinate == "constant"  # pyright: ignore[reportArgumentType]
 
 
@@ -344,7 +344,7 @@ def test_a_body_that_slides_above_the_ground_does_not_fly() -> None:
     ]
     prepared = prepare(world, raised)
     assert any("the body is not in free fall" in words for words in prepared.warnings)
-    flying = prepared.clear.float().mean(1)
+    flying = prepared.airborne.float().mean(1)
     assert float(flying.max()) < 0.75  # they rest on the ground at their ends
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose.contact_search import GLIDE_SCORE, selected_in_sliding
+from cgwm.pipeline.diagnose.contact_search import SLIDING_SCORE, selected_in_sliding
 from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingEvidence, sliding_evidence, with_effect
 from cgwm.pipeline.diagnose.detection_limits import DetectionLimit, detection_limits
 from cgwm.pipeline.diagnose.effect_selection import Evidence
@@ -55,12 +55,12 @@ def test_a_glide_ends_at_an_impact() -> None:
     on = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
     off = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.3, 0.4), lift_m_s=(0.0, 0.0))
     slid, bounced = (prepare(world, episodes) for episodes in (on, off))
-    glides = find_sliding_segments(world, slid.whole, slid.clear, slid.noise)
+    glides = find_sliding_segments(world, slid.observations, slid.airborne, slid.noise)
     assert {item.episode for item in glides} == {0, 1}
     covered = sum(item.last - item.first for item in glides)
-    assert covered >= 0.9 * 2 * (len(slid.whole.times_s[0]) - 1)
-    height = bounced.whole.position_m[:, :, 0, 2] - 0.04
-    for item in find_sliding_segments(world, bounced.whole, bounced.clear, bounced.noise):
+    assert covered >= 0.9 * 2 * (len(slid.observations.times_s[0]) - 1)
+    height = bounced.observations.position_m[:, :, 0, 2] - 0.04
+    for item in find_sliding_segments(world, bounced.observations, bounced.airborne, bounced.noise):
         assert float(height[item.episode, item.first : item.last + 1].max()) < 0.01
 
 
@@ -68,15 +68,15 @@ def test_hidden_frames_shorten_no_glide() -> None:
     world = world_with("ball")
     episodes = tosses(world, 1, count=2, duration_s=0.6, height_m=(0.04, 0.04), lift_m_s=(0.0, 0.0))
     seen = prepare(world, episodes)
-    whole = seen.whole
-    hidden = {name: getattr(whole, name).clone() for name in ("seen", "turned")}
+    whole = seen.observations
+    hidden = {name: getattr(whole, name).clone() for name in ("seen", "has_orientation")}
     for mask in hidden.values():
         mask[:, :6] = 0  # in a hand
         mask[0, 20] = 0  # lost once
     parts = [
-        (item.episode, item.first, item.last) for item in find_sliding_segments(world, whole, seen.clear, seen.noise)
+        (item.episode, item.first, item.last) for item in find_sliding_segments(world, whole, seen.airborne, seen.noise)
     ]
-    later = find_sliding_segments(world, replace(whole, **hidden), seen.clear, seen.noise)
+    later = find_sliding_segments(world, replace(whole, **hidden), seen.airborne, seen.noise)
     assert max(last for _, _, last in parts) == max(item.last for item in later) == len(whole.times_s[0]) - 1
     assert min(item.first for item in later) == 6
     covered = sum(item.last - item.first for item in later)
@@ -156,9 +156,9 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22}, thrown=2)
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
-    found = sliding_evidence(prepared, world, library, GLIDE_SCORE, StartedSliding.of(prepared, world, prepared.flight))
+    found = sliding_evidence(prepared, world, library, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight))
     assert found[0].evidence.name == name
-    assert found[0].score > GLIDE_SCORE
+    assert found[0].score > SLIDING_SCORE
     assert found[0].score > 3 * found[1].score
     assert found[0].evidence.numbers is not None
     (key, value) = next(iter(values.items()))
@@ -172,7 +172,7 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
 def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY) -> dict[str, DetectionLimit]:
     started = StartedSliding.of(prepared, world, prepared.flight)
     blind_to = ("velocity_restitution",)
-    found = detection_limits(started, world, library, (GLIDE_SCORE, 400.0), prepared.turned, blind_to)
+    found = detection_limits(started, world, library, (SLIDING_SCORE, 400.0), prepared.has_orientation, blind_to)
     return {one.candidate.effect.name: one for one in found}
 
 
@@ -190,7 +190,7 @@ def test_from_the_limit_on_an_effect_is_named() -> None:
             ranked = sliding_evidence(
                 prepared, world, LIBRARY, 20.0, StartedSliding.of(prepared, world, prepared.flight)
             )
-            named = bool(ranked) and ranked[0].evidence.name == name and ranked[0].score > GLIDE_SCORE
+            named = bool(ranked) and ranked[0].evidence.name == name and ranked[0].score > SLIDING_SCORE
             assert named == seen, (name, times, limit, [(one.evidence.name, one.score) for one in ranked])
 
 
@@ -205,8 +205,8 @@ def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
 
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
-    found = sliding_evidence(prepared, world, LIBRARY, GLIDE_SCORE, StartedSliding.of(prepared, world, prepared.flight))
-    assert not found or found[0].score < GLIDE_SCORE
+    found = sliding_evidence(prepared, world, LIBRARY, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight))
+    assert not found or found[0].score < SLIDING_SCORE
 
 
 def test_what_glides_tell_is_the_verdict() -> None:
@@ -247,7 +247,7 @@ def test_a_box_that_turns_over_an_edge_does_not_glide() -> None:
         level[:, 2] += 0.05 * (np.abs(np.cos(tilt)) + np.abs(np.sin(tilt))) - height
         track = Track(times, level, quat / np.linalg.norm(quat, axis=1, keepdims=True))
         prepared = prepare(world, [(name, {world.bodies[0].name: track})])
-        glides = find_sliding_segments(world, prepared.whole, prepared.clear, prepared.noise)
+        glides = find_sliding_segments(world, prepared.observations, prepared.airborne, prepared.noise)
         found[name] = sum(item.last - item.first for item in glides)
         assert all(name == "flat" or item.last <= 32 or item.first >= 58 for item in glides)
     assert found["flat"] > 90 and 40 < found["over"] < 70
@@ -259,7 +259,7 @@ def test_what_unknown_loads_turn_is_no_evidence() -> None:
     prepared = prepare(world, episodes)
     soft = soft_world(world)
     frames = [Segment(k, 0, 50) for k in range(2)]
-    glides = Segments.of("contact", soft, prepared.whole, frames, prepared.noise)
+    glides = Segments.of("contact", soft, prepared.observations, frames, prepared.noise)
     rows = glides.residuals([FRICTION], torch.zeros(2, 1, dtype=torch.float64), jacobian=False)[0]
     weak, full = without_loads(glides, rows), rows
     up = quat_to_matrix(glides.observations.quat_wxyz[:, :, 0]).transpose(-1, -2) @ soft.ground_normal

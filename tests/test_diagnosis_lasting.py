@@ -80,7 +80,7 @@ def test_innovations_are_what_the_inverse_of_the_covariance_says() -> None:
 @pytest.mark.parametrize("body", ["cube", "ball"])
 def test_errors_that_last_are_measured(body: str) -> None:
     prepared, _ = ready(body, {}, lasting(0.7, 3))
-    for one, std, true in zip(prepared.memory, prepared.noise, NOISE, strict=True):
+    for one, std, true in zip(prepared.noise_model, prepared.noise, NOISE, strict=True):
         # what is new in each frame is told well; how much lasts is not, and rather too much of it is taken
         kept = np.exp(-0.01 / one.time_s)
         fresh = (one.size * std / true) ** 2 * (1 - one.share * kept**2)
@@ -95,33 +95,33 @@ def test_errors_that_last_are_measured(body: str) -> None:
 )
 def test_errors_that_do_not_last_are_not_taken_for_such(body: str, effects: dict) -> None:
     prepared, _ = ready(body, effects, None)
-    assert prepared.memory == WHITE
-    assert prepared.flight is not None and prepared.flight.memory == WHITE
+    assert prepared.noise_model == WHITE
+    assert prepared.flight is not None and prepared.flight.noise_model == WHITE
 
 
 def test_rounding_does_not_last() -> None:
     world = world_with("ball", {"linear_drag": {"c": 0.3}})
     exact = tosses(world, 1, count=4, duration_s=0.5, noise=(1e-14, 1e-14))
     prepared = prepare(world_with("ball"), exact, NOISE)
-    assert prepared.memory == WHITE and prepared.noise == NOISE
+    assert prepared.noise_model == WHITE and prepared.noise == NOISE
 
 
 def test_few_frames_tell_nothing() -> None:
     prepared, _ = ready("ball", {}, lasting(0.9, 3))
-    assert estimate_noise_model(prepared.whole, [prepared.flight.items[0]]) == (WHITE, (None, None))  # pyright: ignore
-    assert estimate_noise_model(prepared.whole, []) == (WHITE, (None, None))
+    assert estimate_noise_model(prepared.observations, [prepared.flight.items[0]]) == (WHITE, (None, None))  # pyright: ignore
+    assert estimate_noise_model(prepared.observations, []) == (WHITE, (None, None))
 
 
 @pytest.mark.parametrize("change", [lasting(0.8, 5), smoothed], ids=["lasting", "smoothed"])
 def test_they_are_no_effect_and_hide_none(change: Callable[[Track], Track]) -> None:
     prepared, world = ready("ball", {}, change)
-    assert prepared.memory != WHITE
+    assert prepared.noise_model != WHITE
     assert find(prepared, world, LIBRARY).verdict == "none_missing"  # pyright: ignore[reportArgumentType]
-    blind = replace(prepared, memory=NoiseModel())
+    blind = replace(prepared, noise_model=NoiseModel())
     assert prepared.flight is not None
     items = prepared.flight.items
     slow = [p.segments("flight", world, items) for p in (prepared, blind)]  # pyright: ignore[reportArgumentType]
-    assert slow[0].memory != WHITE and slow[1].memory == WHITE
+    assert slow[0].noise_model != WHITE and slow[1].noise_model == WHITE
     prepared, world = ready("ball", {"linear_drag": {"c": 0.6}}, change)
     found = find(prepared, world, LIBRARY)  # pyright: ignore[reportArgumentType]
     assert [one.evidence.name for one in found.chosen] == ["linear_drag"]
@@ -130,20 +130,20 @@ def test_they_are_no_effect_and_hide_none(change: Callable[[Track], Track]) -> N
 def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
     sharp, _ = ready("ball", {}, None)
     smeared, _ = ready("ball", {}, smoothed)
-    seen = sharp.whole.seen.amax(-1) > 0
+    seen = sharp.observations.seen.amax(-1) > 0
     for episode in range(len(sharp.names)):
-        contact = np.flatnonzero((~sharp.clear & seen)[episode].numpy())
+        contact = np.flatnonzero((~sharp.airborne & seen)[episode].numpy())
         near = {int(k) + d for k in contact for d in range(-SMEARED, SMEARED + 1)}
-        flies = set(np.flatnonzero(smeared.clear[episode].numpy()).tolist())
+        flies = set(np.flatnonzero(smeared.airborne[episode].numpy()).tolist())
         # what smoothing lifts above the ground may move the contact by a frame
         assert len(flies & near) <= 2 * max(1, len(contact))
-        assert contact.size == 0 or len(flies) < int(sharp.clear[episode].sum())
+        assert contact.size == 0 or len(flies) < int(sharp.airborne[episode].sum())
 
 
 def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cgwm.pipeline.segments.prepare.SMEARED", 200)
     prepared, _ = ready("ball", {}, lasting(0.8, 5))
-    assert prepared.memory != WHITE and prepared.least_force_m_s2 > 0
+    assert prepared.noise_model != WHITE and prepared.least_force_m_s2 > 0
     touched = {item.episode for item in prepared.contact_items}
     assert prepared.flight is None or not touched & {item.episode for item in prepared.flight.items}
 
@@ -151,5 +151,5 @@ def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -
 def test_a_box_without_orientation_has_no_contact_though_errors_last() -> None:
     change = lasting(0.8, 5)
     prepared, _ = ready("cube", {}, lambda track: replace(change(track), quat_wxyz=None))
-    assert prepared.memory != WHITE and not prepared.turned
+    assert prepared.noise_model != WHITE and not prepared.has_orientation
     assert prepared.contact_items == ()

@@ -41,7 +41,7 @@ def test_glides_give_an_effect_with_the_friction_where_a_search_starts() -> None
         assert inside(parameter, truth[name][number]) and parameter.state == "fitted"
         assert parameter.std_error is not None and parameter.std_error < 0.1 * truth[name][number]
     assert {p.name for p in found.parameters} == {p.name for p in effect_parameters(nothing)}
-    assert found.along["friction"] == pytest.approx(0.3, rel=0.05)
+    assert found.contact_start["friction"] == pytest.approx(0.3, rel=0.05)
     placed = {a.effect.name: a.values for a in found.world.effects}
     assert float(placed["rolling_resistance"]["c_r"]) == found.parameters[0].estimate
 
@@ -87,7 +87,7 @@ def test_impacts_of_a_ball_give_a_restitution_that_falls_with_the_speed() -> Non
     (only,) = found.parameters
     assert only.name == "velocity_restitution.r" and inside(only, 0.3) and only.estimate > 0.1
     assert found.record["costs"][1] < found.record["costs"][0]
-    assert found.along["damping_ratio"] == pytest.approx(0.4, rel=0.3)
+    assert found.contact_start["damping_ratio"] == pytest.approx(0.4, rel=0.3)
 
 
 def test_what_no_episode_shows_keeps_the_width_of_its_prior() -> None:

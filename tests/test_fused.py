@@ -236,7 +236,7 @@ def test_no_ground_one_frame_and_a_single_fixed_body(fused: Fused) -> None:
 def test_a_fast_spin_and_one_sweep(fused: Fused) -> None:
     state = tossed()
     state = replace(state, omega_body_rad_s=state.omega_body_rad_s * 50)
-    world = replace(world_of(box_body()), sweeps=1)
+    world = replace(world_of(box_body()), iterations=1)
     agree(simulate(world, state, times(0.05)), fused(world, state, times(0.05)), 1e-9)
 
 

@@ -48,7 +48,7 @@ def test_a_throw_that_begins_in_a_hand_is_named_and_left_out() -> None:
     at = round(prepared.released_s["002"] * 148.0)
     assert HELD_FRAMES - 4 <= at <= HELD_FRAMES
     assert any("episode '002' begins in a hand" in text for text in prepared.warnings)
-    assert prepared.flight is not None and not bool(prepared.whole.seen[2, :at].any())
+    assert prepared.flight is not None and not bool(prepared.observations.seen[2, :at].any())
     firsts = {item.episode: item.first for item in reversed(prepared.flight.items)}
     assert firsts == {k: at if k == 2 else 0 for k in range(6)}
 
@@ -110,5 +110,5 @@ def test_a_hand_hides_neither_another_one_nor_a_wrong_frame() -> None:
     episodes[4] = ("004", {body: replace(track, quat_wxyz=wrong)})
     prepared = prepare(world, episodes)
     assert list(prepared.released_s) == ["002"] and prepared.outliers == 1
-    assert not bool(prepared.whole.turned[4, 20]) and bool(prepared.whole.turned[4, 19])
+    assert not bool(prepared.observations.has_orientation[4, 20]) and bool(prepared.observations.has_orientation[4, 19])
     assert np.allclose(prepared.noise, NOISE, rtol=0.15)

@@ -139,7 +139,7 @@ def observed(training: Training, found: PoseTrack) -> Found:
     window = (float(times[0]) - 1e-9, float(times[-1]) + 1e-9)
     observations = Observations.of(world, [(TRAIN_EPISODE, tracks | training.drives)], [window])
     seen = found.found.cpu().to(observations.seen)[None, :, None].expand_as(observations.seen)
-    observations = replace(observations, seen=seen.clone(), turned=seen.clone())
+    observations = replace(observations, seen=seen.clone(), has_orientation=seen.clone())
     observations = replace(observations, state=first_state(world, observations))  # of what was seen alone
     noise = pose_noise([found])
     span = float(times[START_FRAMES - 1] - times[0])

@@ -65,7 +65,7 @@ def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list
     points: list[WrenchPoint] = []
     episodes = prepared.names
     flown = () if prepared.flight is None else prepared.flight.items
-    flight = wrench_windows(world, fit.whole, flown, prepared.noise, prepared.memory)
+    flight = wrench_windows(world, fit.observations, flown, prepared.noise, prepared.noise_model)
     if flight is not None:
         std = np.sqrt(np.diagonal(flight.covariance, axis1=1, axis2=2))
         std = np.where(std < KNOWN_STD, std, np.nan)

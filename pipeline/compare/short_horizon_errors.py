@@ -75,7 +75,7 @@ class ShortErrors:
 class ShortFit:
     """Short predictions of one model."""
 
-    whole: Observations
+    observations: Observations
     """The full episodes, without outliers."""
     contact: Segments | None
     """The fitted segments with contact; None if no segment has contact."""
@@ -94,7 +94,11 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
     """
     whole = whole_episodes(world, episodes)
     columns = [list(bodies).index(world.bodies[k].name) for k in whole.free]
-    whole = replace(whole, seen=prepared.whole.seen[..., columns], turned=prepared.whole.turned[..., columns])
+    whole = replace(
+        whole,
+        seen=prepared.observations.seen[..., columns],
+        has_orientation=prepared.observations.has_orientation[..., columns],
+    )
     noise, contact = prepared.noise, None
     flight = None
     if prepared.flight is not None:
@@ -102,7 +106,7 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
     if prepared.contact_items:
         contact = fit_states(Segments.of("contact", world, whole, prepared.contact_items, noise), thorough=True)
     names = [name for name, _ in episodes]
-    phases = phases_of(names, whole, prepared.clear, contact)
+    phases = phases_of(names, whole, prepared.airborne, contact)
     free = tuple(world.bodies[k].name for k in whole.free)
     found = {
         one.episode: ShortErrors(
@@ -124,7 +128,7 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
     for one in phases:
         places = np.array([PHASES.index(name) for name in one.phase.tolist()], np.int64)
         covered = np.isfinite(found[one.episode].span_s[:, 0])
-        found[one.episode].phase[:] = _placed(places, covered, one.clear)
+        found[one.episode].phase[:] = _placed(places, covered, one.airborne)
         found[one.episode].cause[:] = _causes(found[one.episode])
     return ShortFit(whole, contact, found)
 
@@ -144,7 +148,7 @@ def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: 
     )
     seen = segments.observations
     mask = torch.cat(
-        (seen.seen[..., None] * seen.measured_axes[:, None], seen.turned[..., None].expand(-1, -1, -1, 3)), -1
+        (seen.seen[..., None] * seen.measured_axes[:, None], seen.has_orientation[..., None].expand(-1, -1, -1, 3)), -1
     )
     measured = mask.numpy() > 0
     for item, segment in enumerate(segments.items):
@@ -161,7 +165,7 @@ def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: 
         one.span_s[at] = times[0], times[-1]
 
 
-def _placed(places: NDArray[np.int64], covered: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _placed(places: NDArray[np.int64], covered: NDArray[np.bool_], airborne: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the phase (T,) of each frame, -1 where it is unknown.
 
     Only the first segments of a long rest are fitted; later frames in contact count as rest, too.
@@ -169,7 +173,7 @@ def _placed(places: NDArray[np.int64], covered: NDArray[np.bool_], clear: NDArra
     found = np.where(covered, places, -1)
     rest = PHASES.index("rest")
     for k in range(1, len(found)):
-        if not covered[k] and not clear[k] and found[k - 1] == rest:
+        if not covered[k] and not airborne[k] and found[k - 1] == rest:
             found[k] = rest
     return found
 

@@ -26,28 +26,28 @@ from .contact_tests.sliding import SlidingEvidence, sliding_evidence, with_effec
 from .detection_limits import DetectionLimit, detection_limits
 from .effect_selection import Evidence, SelectionStep
 
-GLIDE_SCORE, GLIDE_EXPLAINED = 220.0, 0.5
+SLIDING_SCORE, SLIDING_EXPLAINED = 220.0, 0.5
 """Thresholds of the sliding test: minimum score, and minimum share of the excess of chi2 over the noise that the effect
 explains. They hold for an effect of one parameter where no effect was selected in flight."""
-FEW_NUMBERS, GLIDE_SCORE_FLEXIBLE = 1, 400.0
-"""Maximum number of parameters for which `GLIDE_SCORE` applies, and the minimum score of effects with more parameters,
+FEW_NUMBERS, SLIDING_SCORE_FLEXIBLE = 1, 400.0
+"""Maximum number of parameters for which `SLIDING_SCORE` applies, and the minimum score of effects with more parameters,
 or of any effect after one was selected in flight: these fit more by chance."""
-GLIDE_SURE, GLIDE_SHARE_SURE = 80.0, 0.78
+SLIDING_SURE, SLIDING_SHARE_SURE = 80.0, 0.78
 """Lower minimum score in the sliding test for an effect that explains at least this share of the excess. On the
 development cases absent effects reached a score of 165 at a share of 0.69, any share up to a score of 50, and
 (directional friction with a drag in wind) a score of 179 at a share of 0.94. For this last reason the lower score does
 not apply to effects of several parameters after one was selected in flight."""
 MANY_NUMBERS = 4
-"""Maximum number of parameters for which `GLIDE_SURE` applies. A friction map has more and fits almost anything."""
-GLIDE_LEAST = 0.3
+"""Maximum number of parameters for which `SLIDING_SURE` applies. A friction map has more and fits almost anything."""
+SLIDING_LEAST = 0.3
 """Minimum size in the sliding test: an effect is not selected if all its parameters are below this share of their usual
 sizes. Simulators differ by as much."""
-GLIDE_OTHERS = 80.0
+SLIDING_OTHERS = 80.0
 """Minimum fall of chi2 without the episode that contributes most, required where an effect was selected in flight,
 because the law of that effect may be slightly wrong along a single slide. On balls in wind, false directional friction
 had scores of 823 and 1044, of which 33 and 18 came from the other episodes; true effects had 114 to 34,000, except for
 one at 26, which is no longer detected."""
-GLIDE_LEAD, GLIDE_SHARE = 12.0, 0.1
+SLIDING_LEAD, SLIDING_SHARE = 12.0, 0.1
 """Another effect counts as equal in the sliding test if its score is lower by less than the first value, or by less
 than this share of the best score."""
 MISLED, RIVAL_SHARE = 165.0, 0.5
@@ -55,7 +55,7 @@ MISLED, RIVAL_SHARE = 165.0, 0.5
 absent effect reached, and if it explains at least this share of what the best one explains. Friction that falls with
 the speed, that grows, and that changes with the place are nearly the same along a single slide."""
 BRAKED_OTHERWISE = ("torsional_friction",)
-"""Effects that are not selected where a friction map fits equally well and the score is below `GLIDE_SCORE_FLEXIBLE`.
+"""Effects that are not selected where a friction map fits equally well and the score is below `SLIDING_SCORE_FLEXIBLE`.
 The simulators disagree about the spin of a sliding body: of four such detections three were false (scores 101 to 260),
 and the fourth came with a drag."""
 CONTACT_SCORE, CONTACT_T = 22.0, 1.0
@@ -134,7 +134,7 @@ def with_contact(
         chosen = [Chosen(step.best, step.equals, "flight") for step in steps if step.flagged]
         return ContactFindings(chosen=chosen, evidence=[], world=after_flight)
     started = StartedSliding.of(prepared, data.world, flight)
-    sliding = sliding_evidence(prepared, data.world, candidates, GLIDE_SURE, started)
+    sliding = sliding_evidence(prepared, data.world, candidates, SLIDING_SURE, started)
     found = _by_sliding(data, sliding, explained)
     if found is not None:
         return found
@@ -146,14 +146,14 @@ def with_contact(
     found = _by_friction_consistency(data, friction)
     if found is not None:
         return found
-    evidence = contact_evidence(data.segments, data.world, candidates, prepared.groups, prepared.turned)
+    evidence = contact_evidence(data.segments, data.world, candidates, prepared.groups, prepared.has_orientation)
     found = _by_segments(data, evidence, sliding)
     if found is not None:
         return found
     # effects that only impacts show are left out where impacts were measured
     asked = [c for c in candidates if not impacts or c.effect.name not in IN_IMPACTS_ALONE]
-    scores = (GLIDE_SCORE, GLIDE_SCORE_FLEXIBLE)
-    limits = detection_limits(started, data.world, asked, scores, prepared.turned, IN_IMPACTS_ALONE)
+    scores = (SLIDING_SCORE, SLIDING_SCORE_FLEXIBLE)
+    limits = detection_limits(started, data.world, asked, scores, prepared.has_orientation, IN_IMPACTS_ALONE)
     final = replace(data.after_flight, contact=data.world.contact)
     return ContactFindings(
         chosen=data.chosen, evidence=evidence, world=final, chi2=data.chi2, segments=data.segments, limits=tuple(limits)
@@ -277,13 +277,13 @@ def selected_in_sliding(evidence: Sequence[SlidingEvidence], explained: bool, fl
     fit = [one for one in evidence if one.evidence.test.admissible]
     if not fit or not _selected_effects_in_sliding(fit[0], flown):
         return []
-    if not explained and fit[0].share < GLIDE_SHARE_SURE:
+    if not explained and fit[0].share < SLIDING_SHARE_SURE:
         return []  # what is unexplained in flight also acts during sliding
-    alike = fit[0].score - max(GLIDE_LEAD, GLIDE_SHARE * fit[0].score)
+    alike = fit[0].score - max(SLIDING_LEAD, SLIDING_SHARE * fit[0].score)
     rival, share = fit[0].score - MISLED, RIVAL_SHARE * fit[0].share
     equals = [one for one in fit if one.score > alike or (one.score > rival and one.share > share)]
     mapped = any(len(one.evidence.candidate.effect.parameters) > MANY_NUMBERS for one in equals)
-    if mapped and fit[0].evidence.name in BRAKED_OTHERWISE and fit[0].score < GLIDE_SCORE_FLEXIBLE:
+    if mapped and fit[0].evidence.name in BRAKED_OTHERWISE and fit[0].score < SLIDING_SCORE_FLEXIBLE:
         return []
     return equals
 
@@ -291,14 +291,14 @@ def selected_in_sliding(evidence: Sequence[SlidingEvidence], explained: bool, fl
 def _selected_effects_in_sliding(one: SlidingEvidence, flown: bool) -> bool:
     """Return whether an effect is large enough, and its evidence strong enough, to be selected in sliding segments."""
     parameters, estimates = one.evidence.candidate.effect.parameters, one.evidence.estimates
-    if all(abs(estimates[p.name][0]) < GLIDE_LEAST * p.scale for p in parameters):
+    if all(abs(estimates[p.name][0]) < SLIDING_LEAST * p.scale for p in parameters):
         return False
-    if flown and one.others < GLIDE_OTHERS:
+    if flown and one.others < SLIDING_OTHERS:
         return False
     flexible = len(parameters) > FEW_NUMBERS
-    least = GLIDE_SCORE_FLEXIBLE if flexible or flown else GLIDE_SCORE
-    enough = one.score > least and one.share > GLIDE_EXPLAINED
-    sure = one.score > GLIDE_SURE and one.share > GLIDE_SHARE_SURE and len(parameters) <= MANY_NUMBERS
+    least = SLIDING_SCORE_FLEXIBLE if flexible or flown else SLIDING_SCORE
+    enough = one.score > least and one.share > SLIDING_EXPLAINED
+    sure = one.score > SLIDING_SURE and one.share > SLIDING_SHARE_SURE and len(parameters) <= MANY_NUMBERS
     return enough or (sure and not (flexible and flown))
 
 

@@ -59,7 +59,10 @@ def held_out_loss(segments: Segments, world: World) -> float:
     fitted, late = _continued(at, parameters, values)
     away = fitted.residuals(parameters, values, jacobian=False)[0].unflatten(1, (late.shape[1], -1))
     loss = 0.0
-    for measured, columns in ((segments.observations.seen, slice(0, 3)), (segments.observations.turned, slice(3, 6))):
+    for measured, columns in (
+        (segments.observations.seen, slice(0, 3)),
+        (segments.observations.has_orientation, slice(3, 6)),
+    ):
         weight = measured * late
         loss += float((away[..., columns].norm(dim=-1) * weight).sum() / weight.sum().clamp_min(1.0))
     return loss
@@ -93,7 +96,8 @@ def _continued(segments: Segments, parameters: Sequence[Parameter], values: Tens
     known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])
     early = (torch.arange(observed.times_s.shape[1]) < known[:, None])[..., None].to(observed.seen)
     start = replace(
-        segments, observations=replace(observed, seen=observed.seen * early, turned=observed.turned * early)
+        segments,
+        observations=replace(observed, seen=observed.seen * early, has_orientation=observed.has_orientation * early),
     )
     fitted = fit_states(start, parameters, values, ITERATIONS, search=False)
     return replace(fitted, observations=replace(observed, state=fitted.observations.state)), 1 - early

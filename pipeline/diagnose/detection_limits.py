@@ -98,7 +98,7 @@ def _lowest_limits(
     best: dict[int, _VariantLimit] = {}
     for part in batches(variants):
         start = [(started.base.segments, started.base.values[0])] * len(part)
-        fits = fit_sliding(started.segments.world, part, start, started.told, iterations=1)
+        fits = fit_sliding(started.segments.world, part, start, started.flight_parameters, iterations=1)
         for variant, fit in zip(part, fits, strict=True):
             one = _variant_limit(variant, fit, SAFE * math.sqrt(least_chi2[len(variant.parameters) > 1]))
             if variant.place not in best or one.times < best[variant.place].times:
@@ -126,7 +126,7 @@ def _misfits(started: StartedSliding, limits: Sequence[_VariantLimit]) -> list[f
     if not limits:
         return []
     extended, own = with_variants(started.segments.world, [one.variant for one in limits], "contact")
-    known = nuisance_parameters(started.segments.world, started.told)
+    known = nuisance_parameters(started.segments.world, started.flight_parameters)
     parameters = [*known, *own]
     values = base_values(extended, parameters)
     values[: len(known)] = started.base.values[0, : len(known)]

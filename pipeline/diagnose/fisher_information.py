@@ -83,8 +83,8 @@ def information_of_data(
 
 def experiment_states(prepared: Prepared, world: World, throws: Sequence[Experiment]) -> State:
     """Return the start states (B) of experiments, above the median of the measured positions."""
-    middle = prepared.whole.position_m[prepared.whole.seen > 0].median(0).values
-    return states_of(world, world.free[0], throws, middle, prepared.whole.state)
+    middle = prepared.observations.position_m[prepared.observations.seen > 0].median(0).values
+    return states_of(world, world.free[0], throws, middle, prepared.observations.state)
 
 
 def information_of_experiments(
@@ -114,12 +114,15 @@ def information_of_experiments(
     fine = [k for k in range(len(throws)) if bool(torch.isfinite(true.position_m[k]).all())]
     body = world.free[0]
     episodes = [
-        (f"{k}", {world.bodies[body].name: _track(measured, k, body, times, throws[k].duration_s, prepared.turned)})
+        (
+            f"{k}",
+            {world.bodies[body].name: _track(measured, k, body, times, throws[k].duration_s, prepared.has_orientation)},
+        )
         for k in fine
     ]
     whole = whole_episodes(world, episodes)
     flight, contact, _ = cut_episodes(world, whole, prepared.noise)
-    if not prepared.turned and not is_round(world.bodies[body]):
+    if not prepared.has_orientation and not is_round(world.bodies[body]):
         contact = []
     total = np.zeros((len(fine), len(layout.names), len(layout.names)))
     parts: list[tuple[Kind, list[Segment], float]] = [
@@ -128,7 +131,9 @@ def information_of_experiments(
     ]
     for kind, items, share in parts:
         if items:
-            segments = _at_truth(Segments.of(kind, world, whole, items, prepared.noise, prepared.memory), true, fine)
+            segments = _at_truth(
+                Segments.of(kind, world, whole, items, prepared.noise, prepared.noise_model), true, fine
+            )
             found = _embedded(segments, world, variants, layout)
             np.add.at(total, np.array([item.episode for item in items]), share * found)
     place = {k: n for n, k in enumerate(fine)}
@@ -159,7 +164,7 @@ def _embedded(segments: Segments, world: World, variants: Sequence[Variant], lay
 def _times(prepared: Prepared, duration_s: float) -> tuple[Tensor, float]:
     """Return the frame times [s] of an experiment and the factor that scales its information to the data."""
     items: Sequence[Segment] = prepared.contact_items if prepared.flight is None else prepared.flight.items
-    times = prepared.whole.times_s
+    times = prepared.observations.times_s
     step = float(torch.cat([times[i.episode, i.first : i.last + 1].diff() for i in items]).median())
     used = max(step, LEAST_STEP_S)
     return used * torch.arange(round(duration_s / used) + 1).to(times), used / step

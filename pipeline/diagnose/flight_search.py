@@ -67,7 +67,7 @@ def _forward_selection(
     losses: list[float] = []
     current = world
     while len(steps) < MOST_EFFECTS:
-        step = select_next(flight, current, candidates, prepared.groups, prepared.turned, scatter)
+        step = select_next(flight, current, candidates, prepared.groups, prepared.has_orientation, scatter)
         refitted = step.best.refitted if step.flagged else None
         if refitted is None:
             steps = steps or [step]
@@ -101,7 +101,7 @@ def _reselected(
         if len(without.effects) < len(current.effects) - 1:
             continue  # another effect acts through this one
         states = fit_states(flight.in_world(without))
-        step = select_next(states, without, candidates, prepared.groups, prepared.turned, scatter)
+        step = select_next(states, without, candidates, prepared.groups, prepared.has_orientation, scatter)
         refitted = step.best.refitted if step.flagged else None
         if refitted is not None:
             chosen[place] = step

@@ -129,9 +129,9 @@ def report(
             todo="record at 60 Hz or more, or name another split.",
         )
     findings = find(prepared, world, library)
-    _, refused = admissible(world, library, prepared.turned)
-    clear = prepared.clear & (prepared.whole.seen.amax(-1) > 0)
-    seen = int((prepared.whole.seen.amax(-1) > 0).sum())
+    _, refused = admissible(world, library, prepared.has_orientation)
+    clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
+    seen = int((prepared.observations.seen.amax(-1) > 0).sum())
     warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings)]
     law = _law(prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
@@ -217,7 +217,7 @@ def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
     if prepared.flight is None:
         return None
     world = findings.base if findings.verdict == "unexplained" else findings.world
-    windows = wrench_windows(world, prepared.whole, prepared.flight.items, prepared.noise, prepared.memory)
+    windows = wrench_windows(world, prepared.observations, prepared.flight.items, prepared.noise, prepared.noise_model)
     if windows is None:
         return None
     law = residual_law(windows)

@@ -220,7 +220,7 @@ class _Batch:
             position_m=seen.position_m[item, :count].numpy(),
             quat_wxyz=seen.quat_wxyz[item, :count].numpy(),
             seen=seen.seen[item, :count].numpy() > 0,
-            turned=seen.turned[item, :count].numpy() > 0,
+            turned=seen.has_orientation[item, :count].numpy() > 0,
             grid_s=grid,
             rows=rows,
             motions={MODEL: model},

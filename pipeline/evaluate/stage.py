@@ -153,7 +153,7 @@ def _worlds_with_random_effects(
     """Return the world with the random effects known from the fit, and the one with those fitted to all episodes."""
     names = [name for name, _ in episodes]
     known = with_known_groups(world, model.file, names, capture.groups)
-    unknown = [name for name in names if len(known.own.get(name, {})) < len(group_parameters(world))]
+    unknown = [name for name in names if len(known.own_values.get(name, {})) < len(group_parameters(world))]
     if brief or not unknown:
         return known, known
     warnings.append(

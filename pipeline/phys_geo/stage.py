@@ -154,7 +154,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
                 {e.name: load_effect(e.name).name for e in file.effects},
                 found.parameters,
                 found.constants,
-                {} if found.effects is None else found.effects.own,
+                {} if found.effects is None else found.effects.own_values,
                 {} if found.effects is None else found.effects.spread,
             ),
             "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},

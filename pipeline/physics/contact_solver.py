@@ -239,7 +239,7 @@ class Contacts:
                     root = body.rotation @ take(inertia.root, items)
                     sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
             groups.append(ContactGroup.of(touch, axes, tuple(sides)))
-        return solve_impulses(groups, self.world.sweeps, warm)
+        return solve_impulses(groups, self.world.iterations, warm)
 
     def _warm(
         self,
@@ -249,7 +249,9 @@ class Contacts:
         batch: int,
     ) -> list[Tensor | None]:
         """Return the impulses of the previous step along the axes (n, C, 3) [N s] for each pair; None for zero."""
-        old = {pair.pair: pair for pair in before} if self.world.sweeps > 1 else {}  # one iteration is the closed form
+        old = (
+            {pair.pair: pair for pair in before} if self.world.iterations > 1 else {}
+        )  # one iteration is the closed form
         warm: list[Tensor | None] = []
         for number, points, _, _ in found:
             if number in old:

@@ -68,7 +68,7 @@ class World:
     """The contact law and its coefficients."""
     step_s: float = 0.001
     """Largest time step [s]."""
-    sweeps: int = 10
+    iterations: int = 10
     """Projected Jacobi iterations over all contacts of a step; 1 is the closed form alone."""
     effects: tuple[ActiveEffect, ...] = ()
     """Effects in addition to gravity and contact."""
@@ -78,7 +78,7 @@ class World:
     """Device on which `engine.rollout` computes before it returns results to the device of the tensors; None for that
     of the tensors.
     """
-    own: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    own_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Group- or episode-specific values of effects' parameters: by episode, then by `effect.parameter`."""
 
     @property
@@ -155,7 +155,7 @@ class World:
             ground_offset=tensor(ground.offset_m) if ground else None,
             contact=law,
             step_s=file.solver.step_s,
-            sweeps=file.solver.sweeps,
+            iterations=file.solver.sweeps,
             effects=tuple(_active(effect, str(model.root), tensor(0.0)) for effect in file.effects),
         )
 

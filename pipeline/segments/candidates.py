@@ -121,7 +121,7 @@ def without_effect(world: World, name: str) -> World:
 def base_parameters(world: World, kind: Kind) -> list[Parameter]:
     """Return the nuisance parameters of a model: those of its effects, and in contact those of the contact law."""
     # group-specific parameters stay as fitted: a refit here does not know their prior
-    own = [p for p in effect_parameters(world) if p.shared == "all" or not world.own]
+    own = [p for p in effect_parameters(world) if p.shared == "all" or not world.own_values]
     if kind == "flight":
         acting = {a.effect.name for a in world.effects if a.effect.phase != "contact"}
         return [p for p in own if p.name.partition(".")[0] in acting]

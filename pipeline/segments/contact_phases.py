@@ -47,7 +47,7 @@ class EpisodePhases:
     """Frame times, shape (T,) [s]."""
     phase: NDArray[np.str_]
     """One of `PHASES` for each frame, shape (T,)."""
-    clear: NDArray[np.bool_]
+    airborne: NDArray[np.bool_]
     """Airborne frames: surely without contact, shape (T,)."""
 
 
@@ -120,14 +120,14 @@ def _round_share(world: World, body_a: Tensor, normal: Tensor) -> Tensor:
 
 
 def phases_of(
-    episodes: Sequence[str], whole: Observations, clear: Tensor, contact: Segments | None
+    episodes: Sequence[str], whole: Observations, airborne: Tensor, contact: Segments | None
 ) -> list[EpisodePhases]:
     """Return the phases of whole episodes.
 
     Args:
         episodes: Their names.
         whole: The episodes (E).
-        clear: Airborne frames (E, T).
+        airborne: Airborne frames (E, T).
         contact: The fitted contact segments; None where there are none.
     """
     places = torch.arange(1, whole.times_s.shape[1] + 1)
@@ -136,9 +136,9 @@ def phases_of(
     if contact is not None:
         for segment, phases in zip(contact.items, contact_phases(contact), strict=True):
             for frame, phase in zip(range(segment.first, segment.last + 1), phases, strict=True):
-                if not bool(clear[segment.episode, frame]):
+                if not bool(airborne[segment.episode, frame]):
                     names[segment.episode][frame] = phase
     return [
-        EpisodePhases(name, whole.times_s[k, :n].numpy(), names[k], clear[k, :n].numpy())
+        EpisodePhases(name, whole.times_s[k, :n].numpy(), names[k], airborne[k, :n].numpy())
         for k, (name, n) in enumerate(zip(episodes, lengths, strict=True))
     ]

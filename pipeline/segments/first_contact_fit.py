@@ -71,11 +71,11 @@ class EffectEstimate:
     """Constants of effects, `effect.constant` by name."""
     ground: FittedParameter | None = None
     """Ground shift in this world, where ends of episodes determined its height; else None."""
-    own: dict[str, dict[str, float]] = field(default_factory=dict)
+    own_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """By group or episode, values of the parameters `effect.parameter` that differ between groups."""
     spread: dict[str, float] = field(default_factory=dict)
     """Standard deviation of these between groups, by parameter."""
-    along: dict[str, float] = field(default_factory=dict)
+    contact_start: dict[str, float] = field(default_factory=dict)
     """Contact parameters that were fitted too, where a search for them may start."""
 
 

@@ -44,7 +44,7 @@ def with_known_groups(world: World, file: ModelFile, episodes: Sequence[str], gr
     Other episodes use the mean over the groups of the fit.
     """
     own = {name: _known(world, file, name, groups) for name in episodes}
-    return replace(world, own={name: values for name, values in own.items() if values})
+    return replace(world, own_values={name: values for name, values in own.items() if values})
 
 
 def _known(world: World, file: ModelFile, episode: str, groups: Mapping[str, str]) -> dict[str, float]:

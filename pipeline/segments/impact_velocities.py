@@ -105,9 +105,9 @@ def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
 
 def _measurable(prepared: Prepared, world: World) -> bool:
     """Return whether the scene is a single ball above a ground with measured orientation."""
-    whole = prepared.whole
+    whole = prepared.observations
     alone = len(whole.free) == 1 and len(world.bodies) == 1 and world.ground_normal is not None
-    return alone and prepared.turned and is_round(world.bodies[whole.free[0]])
+    return alone and prepared.has_orientation and is_round(world.bodies[whole.free[0]])
 
 
 def _neighbours(chains: Sequence[Sequence[Segment]]) -> list[tuple[int, int]]:
@@ -127,7 +127,7 @@ def _chains(prepared: Prepared, world: World, flights: Segments) -> list[list[Se
         world: For the ground and gravity.
         flights: The flight segments that chains start from.
     """
-    whole, body = prepared.whole, world.bodies[prepared.whole.free[0]]
+    whole, body = prepared.observations, world.bodies[prepared.observations.free[0]]
     heights = heights_of(world, body, whole, 0).amin(-1).numpy()
     fall = float(-(world.gravity[0] @ GroundPlane.of(world).normal))
     chains = []

@@ -87,7 +87,7 @@ def _check_mass(body: Body, where: str) -> None:
 def _check_depth(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
     """Refuse bodies that lie deep under the ground, unless the ground is only tilted."""
     whole = whole_episodes(world, episodes)
-    if world.ground_normal is None or not bool(whole.turned.any()):
+    if world.ground_normal is None or not bool(whole.has_orientation.any()):
         return
     size = min(size_of(world.bodies[k]) for k in world.free)
     seen = whole.seen.amax(-1) > 0
@@ -133,7 +133,7 @@ def check_observability(world: World, prepared: Prepared, where: str) -> None:
     Raises:
         InputDataError: What is wrong, and what to record or check.
     """
-    whole, sigma = prepared.whole, prepared.noise[0]
+    whole, sigma = prepared.observations, prepared.noise[0]
     size = min(size_of(world.bodies[k]) for k in world.free)
     gravity, seen = float(world.gravity.norm()) or 9.81, prepared.least_force_m_s2
     if seen > LEAST_SEEN * gravity and sigma > SHARE_OF_SIZE * size:
@@ -163,12 +163,12 @@ def check_observability(world: World, prepared: Prepared, where: str) -> None:
 
 def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
     """Refuse episodes in which the body is above the ground and not in free fall in many frames."""
-    whole = prepared.whole
-    if world.ground_normal is None or not prepared.turned or not bool(prepared.carried.any()):
+    whole = prepared.observations
+    if world.ground_normal is None or not prepared.has_orientation or not bool(prepared.supported.any()):
         return
     gap = clearance(world, whole)
     size = min(size_of(world.bodies[k]) for k in world.free)
-    high = prepared.carried & (gap > MOST_OFF * size)
+    high = prepared.supported & (gap > MOST_OFF * size)
     share = float(high.sum()) / max(float((whole.seen.amax(-1) > 0).sum()), 1.0)
     if share > MOST_CARRIED:
         raise InputDataError(
@@ -188,8 +188,8 @@ def _travel(whole: Observations) -> float:
 
 def _turns(whole: Observations, sigma: float) -> bool:
     """Return whether any orientation changes by more than the noise [rad]."""
-    known = (whole.turned[..., None] * whole.quat_wxyz).abs()
-    spread = known.amax(1) - torch.where(whole.turned[..., None] > 0, known, torch.inf).amin(1)
+    known = (whole.has_orientation[..., None] * whole.quat_wxyz).abs()
+    spread = known.amax(1) - torch.where(whole.has_orientation[..., None] > 0, known, torch.inf).amin(1)
     return bool((torch.nan_to_num(spread, neginf=0.0) > 2 * ALIKE_SIGMAS * sigma).any())
 
 

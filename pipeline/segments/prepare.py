@@ -43,11 +43,11 @@ class Prepared:
     """Names of the episodes (E)."""
     groups: tuple[int, ...]
     """Session of each episode (E)."""
-    whole: Observations
+    observations: Observations
     """All frames of all episodes (E)."""
-    clear: Tensor
+    airborne: Tensor
     """Airborne frames (E, T)."""
-    carried: Tensor
+    supported: Tensor
     """Supported frames (E, T): the body is above the ground and not in free fall."""
     noise: tuple[float, float]
     """Standard deviations of the tracks (position [m], rotation [rad])."""
@@ -60,14 +60,14 @@ class Prepared:
     """The contact segments."""
     outliers: int
     """Number of frames left out as wrong measurements."""
-    turned: bool
+    has_orientation: bool
     """Whether orientations were measured."""
     warnings: tuple[str, ...]
     """Sentences for the user."""
     released_s: Mapping[str, float] = field(default_factory=dict)
     """Time [s] from which an episode that begins in a hand flies freely, by name; earlier frames count as not
     measured."""
-    memory: NoiseModel = WHITE
+    noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
 
     @property
@@ -79,13 +79,13 @@ class Prepared:
         """
         information = 0.0
         for item in () if self.flight is None else self.flight.items:
-            times = self.whole.times_s[item.episode, item.first : item.last + 1]
+            times = self.observations.times_s[item.episode, item.first : item.last + 1]
             information += len(times) * float(times[-1] - times[0]) ** 4 / (720 * self.noise[0] ** 2)
         return SURE / math.sqrt(information) if information > 0 else math.inf
 
     def segments(self, kind: Kind, world: World, items: Sequence[Segment]) -> Segments:
         """Return segments of these episodes, with first guesses of their states."""
-        return Segments.of(kind, world, self.whole, items, self.noise, self.memory)
+        return Segments.of(kind, world, self.observations, items, self.noise, self.noise_model)
 
     def contact(self, world: World) -> Segments | None:
         """Return the contact segments with states fitted by a world; None where there are none."""
@@ -97,7 +97,7 @@ class Prepared:
         """Return the flights cut into equal pieces of at most a length [s], states fitted; None without flights."""
         if self.flight is None:
             return None
-        items = [piece for item in self.flight.items for piece in _cut(item, self.whole, longest_s)]
+        items = [piece for item in self.flight.items for piece in _cut(item, self.observations, longest_s)]
         return fit_states(self.segments("flight", world, items))
 
 
@@ -126,23 +126,23 @@ def prepare(
     if not turned and not all(is_round(world.bodies[k]) for k in world.free):
         state.contact = []
         state.warnings.append("no orientation was measured and the body is not a ball: contacts cannot be examined.")
-    released = {episodes[k][0]: float(state.whole.times_s[k, first]) for k, first in state.held.items()}
-    starts = {episodes[k][0]: float(state.whole.times_s[k, 0]) for k in state.held}
+    released = {episodes[k][0]: float(state.observations.times_s[k, first]) for k, first in state.held.items()}
+    starts = {episodes[k][0]: float(state.observations.times_s[k, 0]) for k in state.held}
     return Prepared(
         names=tuple(name for name, _ in episodes),
         groups=tuple(groups or [0] * len(episodes)),
-        whole=state.whole,
-        clear=state.clear,
-        carried=state.supported,
+        observations=state.observations,
+        airborne=state.airborne,
+        supported=state.supported,
         noise=state.noise,
-        slow=1.0 if state.memory.position.share else slow_noise(state.whole, state.flight),
+        slow=1.0 if state.noise_model.position.share else slow_noise(state.observations, state.flight),
         flight=state.fitted,
         contact_items=tuple(state.contact),
         outliers=state.outliers,
-        turned=turned,
+        has_orientation=turned,
         warnings=(*state.warnings, *release_warnings(released, starts)),
         released_s=released,
-        memory=state.memory,
+        noise_model=state.noise_model,
     )
 
 
@@ -156,7 +156,7 @@ class _State:
     """Standard deviations that the user states (position [m], rotation [rad])."""
     noise: tuple[float, float]
     """Standard deviations in use (position [m], rotation [rad])."""
-    whole: Observations
+    observations: Observations
     """All frames of all episodes (E)."""
     oriented: bool
     """Whether any orientation was measured."""
@@ -164,7 +164,7 @@ class _State:
     """Flight segments of the last segmentation."""
     contact: list[Segment] = field(default_factory=list)
     """Contact segments of the last segmentation."""
-    clear: Tensor
+    airborne: Tensor
     """Airborne frames (E, T)."""
     supported: Tensor
     """Frames (E, T) above the ground in which the body is not in free fall."""
@@ -174,7 +174,7 @@ class _State:
     """Number of frames removed as wrong measurements."""
     held: dict[int, int] = field(default_factory=dict)
     """First free frame of the episodes, by index, that begin in a hand."""
-    memory: NoiseModel = WHITE
+    noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
     fitted: Segments | None = None
     """The flights with fitted states; None where there are none."""
@@ -196,27 +196,29 @@ class _State:
             world=world,
             given=given,
             noise=(given[0] or rough[0], given[1] or rough[1]),
-            whole=whole,
-            oriented=bool(whole.turned.any()),
-            clear=nothing,
+            observations=whole,
+            oriented=bool(whole.has_orientation.any()),
+            airborne=nothing,
             supported=nothing,
             touched=nothing,
         )
 
     def segment(self, touched: Tensor | None = None) -> None:
         """Cut the episodes into flight and contact segments, with frames (E, T) that are known not to be flight."""
-        self.flight, self.contact, self.clear = cut_episodes(self.world, self.whole, self.noise, touched)
+        self.flight, self.contact, self.airborne = cut_episodes(self.world, self.observations, self.noise, touched)
 
     def measure_noise(self, flight: Sequence[Segment], warnings: list[str]) -> None:
         """Measure the noise in flight, and choose between it and the given one."""
-        self.noise = _agreed(self.given, flight_noise(self.whole, flight), self.noise, warnings)
+        self.noise = _agreed(self.given, flight_noise(self.observations, flight), self.noise, warnings)
 
     def fit_flights(self) -> None:
         """Fit the states of the flights by the model's world."""
         if not self.flight:
             self.fitted = None
             return
-        self.fitted = fit_states(Segments.of("flight", self.world, self.whole, self.flight, self.noise, self.memory))
+        self.fitted = fit_states(
+            Segments.of("flight", self.world, self.observations, self.flight, self.noise, self.noise_model)
+        )
 
 
 def _mark_supported_frames(state: _State) -> None:
@@ -225,7 +227,7 @@ def _mark_supported_frames(state: _State) -> None:
     # without anything that could support the body, drag alone may keep it from falling
     alone = world.ground_normal is None and len(world.bodies) == 1
     if not alone:
-        state.supported = supported_frames(world, state.whole, state.flight, state.noise)
+        state.supported = supported_frames(world, state.observations, state.flight, state.noise)
     if bool(state.supported.any()):
         state.segment(state.supported)
         state.warnings.append(
@@ -237,7 +239,7 @@ def _mark_supported_frames(state: _State) -> None:
 
 def _remove_outliers(state: _State) -> None:
     """Mark wrong measurements in flight as not seen, and cut and measure again without them."""
-    state.whole, state.outliers, touched = without_outliers(state.whole, state.flight, state.noise)
+    state.observations, state.outliers, touched = without_outliers(state.observations, state.flight, state.noise)
     state.touched = touched | state.supported
     if state.outliers or bool(state.touched.any()):
         state.segment(state.touched)
@@ -248,13 +250,13 @@ def _remove_outliers(state: _State) -> None:
 def _remove_held_starts(state: _State) -> None:
     """Fit the flights, and leave out first frames in which a hand still touches the body, until none is found."""
     state.fit_flights()
-    while state.fitted is not None and (found := held_starts(state.fitted, state.whole)):
+    while state.fitted is not None and (found := held_starts(state.fitted, state.observations)):
         # frames in the hand inflated the noise, which then hid other wrong frames
         state.held |= found
-        state.whole = without_held(state.whole, state.held)
-        state.measure_noise(cut_episodes(state.world, state.whole, state.noise, state.touched)[0], [])
-        flight = cut_episodes(state.world, state.whole, state.noise, state.touched)[0]
-        state.whole, more, again = without_outliers(state.whole, flight, state.noise)
+        state.observations = without_held(state.observations, state.held)
+        state.measure_noise(cut_episodes(state.world, state.observations, state.noise, state.touched)[0], [])
+        flight = cut_episodes(state.world, state.observations, state.noise, state.touched)[0]
+        state.observations, more, again = without_outliers(state.observations, flight, state.noise)
         state.outliers, state.touched = state.outliers + more, state.touched | again
         state.segment(state.touched)
         state.fit_flights()
@@ -264,14 +266,14 @@ def _remove_held_starts(state: _State) -> None:
 
 def _model_correlated_noise(state: _State) -> None:
     """Estimate how errors are correlated in time; where they are, cut and fit again with that noise model."""
-    state.memory, correlated = estimate_noise_model(state.whole, state.flight)
-    if state.memory == WHITE:
+    state.noise_model, correlated = estimate_noise_model(state.observations, state.flight)
+    if state.noise_model == WHITE:
         return
     position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))
     state.noise = position, rotation
-    state.segment(state.touched | _smeared(state.whole, ~state.clear))
+    state.segment(state.touched | _smeared(state.observations, ~state.airborne))
     state.fit_flights()
-    state.warnings.append(noise_model_warnings(state.memory))
+    state.warnings.append(noise_model_warnings(state.noise_model))
 
 
 def _smeared(whole: Observations, contact: Tensor) -> Tensor:

@@ -279,7 +279,7 @@ def _result(
         name: {p.name: own[group_of(p.shared, name, groups)][p.name] for p in parameters if p.shared != "all"}
         for name in dict.fromkeys(episodes)
     }
-    moved = replace(apply_parameters(world, parameters, values[None]), own=dict(world.own) | by_episode)
+    moved = replace(apply_parameters(world, parameters, values[None]), own_values=dict(world.own_values) | by_episode)
     record = {
         "windows": len(episodes),
         "costs": solution.costs,
@@ -300,7 +300,7 @@ def _result(
         parameters=tuple(reported.rows),
         record=record,
         correlations=tuple(blocks),
-        own=own,
+        own_values=own,
         spread=reported.spread,
     )
 
@@ -318,7 +318,7 @@ def with_fitted_groups(
     """
     own = group_parameters(world)
     known = with_known_groups(world, file, [name for name, _ in episodes], groups)
-    unknown = [(name, tracks) for name, tracks in episodes if len(known.own.get(name, {})) < len(own)]
+    unknown = [(name, tracks) for name, tracks in episodes if len(known.own_values.get(name, {})) < len(own)]
     if not own or not unknown:
         return known
     centre = {f"{a.effect.name}.{name}": float(value) for a in world.effects for name, value in a.values.items()}
@@ -327,4 +327,4 @@ def with_fitted_groups(
     flying = bool(flight_frames(known, whole)[whole.seen.amax(-1) > 0].all())
     ties = GroupPrior({p.name: centre[p.name] for p in own}, spread)
     found = fit_random_effects(known, unknown, groups, [(p, centre[p.name]) for p in own], (), noise, flying, 0.0, ties)
-    return replace(known, own=dict(found.world.own))
+    return replace(known, own_values=dict(found.world.own_values))

@@ -94,10 +94,10 @@ def find_releases(
 
 def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
     """Return the episodes with the frames before each release (`held`, by episode) marked as not measured."""
-    seen, turned = whole.seen.clone(), whole.turned.clone()
+    seen, turned = whole.seen.clone(), whole.has_orientation.clone()
     for episode, first in held.items():
         seen[episode, :first], turned[episode, :first] = 0.0, 0.0
-    return replace(whole, seen=seen, turned=turned)
+    return replace(whole, seen=seen, has_orientation=turned)
 
 
 def after_release(
@@ -127,12 +127,12 @@ def release_warnings(released_s: Mapping[str, float], starts_s: Mapping[str, flo
 
 def _fitted(flight: Segments, whole: Observations, items: Sequence[Segment]) -> Segments:
     """Return segments of the same kind as given flights, with fitted states."""
-    return fit_states(Segments.of("flight", flight.world, whole, items, flight.noise, flight.memory))
+    return fit_states(Segments.of("flight", flight.world, whole, items, flight.noise, flight.noise_model))
 
 
 def _rotation_chi2(flight: Segments) -> Tensor:
     """Return the reduced chi-square (B,) of the rotations of flights; NaN where too few were measured."""
     rows, _ = flight.residuals((), torch.zeros(0).to(flight.world.gravity), jacobian=False)
     square = torch.nan_to_num(rows[..., 3:], posinf=0.0, neginf=0.0).square().sum((1, 2))
-    dof = 3 * (flight.observations.turned.sum(1) - 2).clamp_min(0).sum(-1)
+    dof = 3 * (flight.observations.has_orientation.sum(1) - 2).clamp_min(0).sum(-1)
     return torch.where(dof > 0, square / dof.clamp_min(1.0), torch.nan)

@@ -51,7 +51,7 @@ class Segments:
     """Frames of the segments, padded, with the best known state of each."""
     noise: tuple[float, float]
     """Standard deviations of the tracks (position [m], rotation [rad])."""
-    memory: NoiseModel = WHITE
+    noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
 
     @staticmethod
@@ -71,7 +71,7 @@ class Segments:
             items=tuple(items),
             observations=cut,
             noise=noise,
-            memory=memory,
+            noise_model=memory,
         )
         return found.with_state(line_state(found, START_FRAMES[1]))
 
@@ -87,7 +87,7 @@ class Segments:
         A coordinate that is the same in all frames was not measured.
         """
         seen = self.observations
-        moved, turned = seen.seen.sum(1), seen.turned.sum(1)
+        moved, turned = seen.seen.sum(1), seen.has_orientation.sum(1)
         axes = seen.measured_axes.sum(-1)
         free = axes * (moved - 2).clamp_min(0) + 3 * (turned - 2).clamp_min(0)
         return free.sum(-1)
@@ -152,14 +152,14 @@ class Segments:
             )
             shared = values if values.ndim == 1 else values[places]
             rows, slopes = problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian)
-            fresh = None if slopes is None else _innovations(some, slopes, self.memory)
-            parts.append((_innovations(some, rows, self.memory), fresh))
+            fresh = None if slopes is None else _innovations(some, slopes, self.noise_model)
+            parts.append((_innovations(some, rows, self.noise_model), fresh))
         rows = torch.cat([r for r, _ in parts])
         return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
 
     def innovations(self, rows: Tensor) -> Tensor:
         """Return rows (B, T nf, 6, ...) as innovations: less what the correlated errors of earlier frames predict."""
-        return _innovations(self.observations, rows, self.memory)
+        return _innovations(self.observations, rows, self.noise_model)
 
     def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
         """Return derivatives (B, T nf, 6, P) of the residuals by parameters alone, by one-sided differences.
@@ -212,7 +212,7 @@ def _innovations(seen: Observations, rows: Tensor, memory: NoiseModel) -> Tensor
     times = seen.times_s.repeat_interleave(bodies, 0)
     parts = [
         part if noise.share == 0 else innovations(part, times, mask.movedim(2, 1).flatten(0, 1), noise)
-        for part, mask, noise in zip(by_body.split(3, 2), (seen.seen, seen.turned), memory, strict=True)
+        for part, mask, noise in zip(by_body.split(3, 2), (seen.seen, seen.has_orientation), memory, strict=True)
     ]
     return torch.cat(parts, 2).unflatten(0, (-1, bodies)).movedim(1, 2).flatten(1, 2)
 
@@ -248,14 +248,16 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
     times = whole.times_s[rows[:, None], place]
     step = (times[:, -1] - times[:, 0]) / (lengths - 1)
     times = times + step[:, None] * (offset - lengths[:, None] + 1).clamp_min(0)
-    picked = {key: getattr(whole, key)[rows[:, None], place] for key in ("position_m", "quat_wxyz", "seen", "turned")}
-    picked |= {key: picked[key] * inside[..., None] for key in ("seen", "turned")}
+    picked = {
+        key: getattr(whole, key)[rows[:, None], place] for key in ("position_m", "quat_wxyz", "seen", "has_orientation")
+    }
+    picked |= {key: picked[key] * inside[..., None] for key in ("seen", "has_orientation")}
     drives = {name: drive.select(rows) for name, drive in whole.drives.items()}
     state = whole.state.at(rows)
     names = tuple(whole.names[item.episode] for item in items)
     picked["measured_axes"] = whole.measured_axes[rows]
-    own = {name: value[rows] for name, value in whole.own.items()}
-    return replace(whole, names=names, times_s=times, drives=drives, state=state, own=own, **picked)
+    own = {name: value[rows] for name, value in whole.own_values.items()}
+    return replace(whole, names=names, times_s=times, drives=drives, state=state, own_values=own, **picked)
 
 
 def line_state(segments: Segments, frames: int) -> State:
@@ -266,7 +268,7 @@ def line_state(segments: Segments, frames: int) -> State:
     t = (seen.times_s - seen.times_s[:, :1])[:, :frames]
     fall = 0.5 * t.square()[..., None] * world.gravity[:, None] if segments.kind == "flight" else torch.zeros(1)
     for column, body in enumerate(seen.free):
-        moved, turned = seen.seen[:, :frames, column], seen.turned[:, :frames, column]
+        moved, turned = seen.seen[:, :frames, column], seen.has_orientation[:, :frames, column]
         fields[0][:, body], fields[2][:, body] = _line(t, seen.position_m[:, :frames, column] - fall, moved)
         at = turned.argmax(1)  # the first measured orientation
         item = torch.arange(len(at))

@@ -46,7 +46,7 @@ class StartedSliding:
     """Median logarithm of the friction over well-determined segments."""
     base: SlidingFit
     """Fit of the model without a candidate, with one friction for all."""
-    told: tuple[Parameter, ...]
+    flight_parameters: tuple[Parameter, ...]
     """Parameters of effects that act in flight, with their standard errors from the flights as priors. They act during
     sliding too, and are not known exactly: an error of half a thousandth of a radian in a tilt is a millimetre in a
     slide of half a second."""
@@ -60,9 +60,9 @@ class StartedSliding:
             world: The model's world.
             flight: Flights with fitted states; None where there are none.
         """
-        if not isinstance(world.contact, ContactLaw) or not prepared.turned:
+        if not isinstance(world.contact, ContactLaw) or not prepared.has_orientation:
             return None
-        items = find_sliding_segments(world, prepared.whole, prepared.clear, prepared.noise)
+        items = find_sliding_segments(world, prepared.observations, prepared.airborne, prepared.noise)
         if not items:
             return None
         soft = soft_world(world)

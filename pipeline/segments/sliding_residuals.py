@@ -44,8 +44,8 @@ def soft_world(world: World) -> World:
         damping_ratio=torch.ones_like(law.damping_ratio),
     )
     offset = GroundPlane.of(world).offset + gravity * TIME_S**2
-    sweeps = min(world.sweeps, SWEEPS)
-    return replace(world, contact=soft, ground_offset=offset, step_s=0.5 * TIME_S, sweeps=sweeps)
+    sweeps = min(world.iterations, SWEEPS)
+    return replace(world, contact=soft, ground_offset=offset, step_s=0.5 * TIME_S, iterations=sweeps)
 
 
 def chi2_by_segment(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ def without_loads(segments: Segments, rows: Tensor) -> Tensor:
     if is_round(body):
         return rows
     normal = GroundPlane.of(world).normal
-    turned = seen.turned[:, :, 0, None] / segments.noise[1]
+    turned = seen.has_orientation[:, :, 0, None] / segments.noise[1]
     times = (seen.times_s - seen.times_s[:, :1])[..., None]
     share = times / times.amax(1, keepdim=True).clamp_min(1e-9)
     axis = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal

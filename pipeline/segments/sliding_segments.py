@@ -74,7 +74,7 @@ def grounded_states(segments: Segments, state: State) -> State:
     seen, world = segments.observations, segments.world
     (normal, offset), index = GroundPlane.of(world), seen.free[0]
     fields = [value.clone() for value in vars(state).values()]
-    weight = seen.turned[:, :, 0, None]
+    weight = seen.has_orientation[:, :, 0, None]
     up = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
     up = torch.nn.functional.normalize((up * weight).sum(1), dim=-1)
     now = quat_to_matrix(fields[1][:, index]).transpose(-1, -2) @ normal
@@ -97,7 +97,7 @@ def _impacts(
     """Return the seen frames within one frame of a jump of the speed along the normal, or of the tilting."""
     body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
     height = (whole.position_m[episode, seen, 0] @ normal)[:, None].numpy()
-    quat, turned = whole.quat_wxyz[episode, seen, 0], whole.turned[episode, seen, 0].numpy() > 0
+    quat, turned = whole.quat_wxyz[episode, seen, 0], whole.has_orientation[episode, seen, 0].numpy() > 0
     level = tangent_axes(normal)[1:]
     jumps = np.zeros(len(seen), np.bool_)
     for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
@@ -120,7 +120,7 @@ def _impacts(
 def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float) -> NDArray[np.bool_]:
     """Return the seen frames at which the body does not stay on one of its sides."""
     normal = GroundPlane.of(world).normal
-    turned = whole.turned[episode, seen, 0].numpy() > 0
+    turned = whole.has_orientation[episode, seen, 0].numpy() > 0
     up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ normal).numpy()
     tilts = np.zeros(len(seen), np.bool_)
     for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):

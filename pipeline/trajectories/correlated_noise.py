@@ -230,7 +230,7 @@ def _likelihood(windows: Sequence[_Windows], noise: CorrelatedNoise) -> tuple[fl
 
 def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[_Windows]:
     """Return the windows of all flights, grouped by length and degree."""
-    mask = (whole.seen, whole.turned)[kind]
+    mask = (whole.seen, whole.has_orientation)[kind]
     found: dict[tuple[int, int, int], list[tuple[Array, Array, Array]]] = {}
     for segment in flight:
         for column in range(len(whole.free)):
@@ -258,7 +258,7 @@ def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind
     """Return the number of frames of the windows of a flight, and the degree of its polynomials."""
     if len(frames) < LEAST_DEGREE + 1 + LEAST:
         return 0, LEAST_DEGREE
-    times, known = whole.times_s[episode, frames], frames[whole.turned[episode, frames, column] > 0]
+    times, known = whole.times_s[episode, frames], frames[whole.has_orientation[episode, frames, column] > 0]
     spin = 0.0
     if len(known) > 1:
         quat = whole.quat_wxyz[episode, known, column]
@@ -322,7 +322,11 @@ class WindowErrors:
         weight = (1 / (1 + solution.chi2 / ROBUST_SCALE**2)).unflatten(1, (-1, len(batch.free)))
         r = rows.unflatten(1, (-1, len(batch.free)))
         known = torch.cat(
-            (batch.seen[..., None] * batch.measured_axes[:, None], batch.turned[..., None].expand(-1, -1, -1, 3)), -1
+            (
+                batch.seen[..., None] * batch.measured_axes[:, None],
+                batch.has_orientation[..., None].expand(-1, -1, -1, 3),
+            ),
+            -1,
         )
         count = (weight[..., None] * known).sum(1)
         count = (count - 2 * (known.sum(1) > 0)).clamp_min(0.0).sum((1, 2))

@@ -60,7 +60,7 @@ def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
     slow, all_orders = [], []
     for segment in flight:
         for column in range(len(whole.free)):
-            if bool(whole.turned[segment.episode, :, column].any()):
+            if bool(whole.has_orientation[segment.episode, :, column].any()):
                 continue
             for chosen in _frames(whole, segment, column, 0):
                 if len(chosen) <= SLOW_DEGREE + 1:
@@ -88,7 +88,7 @@ def without_outliers(
     Returns:
         The episodes; the number of wrong measurements; frames (E, T) of flight in which something touched the body.
     """
-    seen, turned = whole.seen.clone(), whole.turned.clone()
+    seen, turned = whole.seen.clone(), whole.has_orientation.clone()
     kinked = torch.zeros_like(seen[..., 0], dtype=torch.bool)
     wrong: set[tuple[int, int, int, int]] = set()
     for kind in (0, 1):
@@ -108,7 +108,7 @@ def without_outliers(
         if not bool(kinked[episode, frame]):
             (seen, turned)[kind][episode, frame, column] = 0.0
             count += 1
-    return replace(whole, seen=seen, turned=turned), count, kinked
+    return replace(whole, seen=seen, has_orientation=turned), count, kinked
 
 
 def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: float) -> float:
@@ -124,7 +124,7 @@ def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: fl
     square, product, count = 0.0, 0.0, 0
     for segment in flight:
         for column in range(len(whole.free)):
-            if not bool(whole.turned[segment.episode, :, column].any()):
+            if not bool(whole.has_orientation[segment.episode, :, column].any()):
                 continue  # long windows see all of a centroid's errors, see `slow_noise`
             for frames in _frames(whole, segment, column, kind):
                 if len(frames) < WINDOW:
@@ -166,7 +166,7 @@ def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarr
 
 def _windows(whole: Observations, flight: Sequence[Segment], kind: int, step: int = 2):
     """Yield segment, body, frames and standardised residuals (n, 1 to 3) [m or rad] of a cubic, window by window."""
-    mask = (whole.seen, whole.turned)[kind]
+    mask = (whole.seen, whole.has_orientation)[kind]
     for segment in flight:
         for column in range(len(whole.free)):
             frames = torch.arange(segment.first, segment.last + 1)
@@ -179,13 +179,13 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int, step: in
 
 def _frames(whole: Observations, segment: Segment, column: int, kind: int) -> list[Tensor]:
     """Return the frames of half-overlapping windows of a flight: long ones where no orientation was measured."""
-    mask = (whole.seen, whole.turned)[kind]
+    mask = (whole.seen, whole.has_orientation)[kind]
     frames = torch.arange(segment.first, segment.last + 1)
     frames = frames[mask[segment.episode, frames, column] > 0]
     if len(frames) <= DEGREE + 2:
         return []
     length = WINDOW
-    if not bool(whole.turned[segment.episode, :, column].any()):
+    if not bool(whole.has_orientation[segment.episode, :, column].any()):
         step = float(whole.times_s[segment.episode, frames].diff().median())
         length = max(WINDOW, round(LONG_S / step))
     return [frames[start : start + length] for start in range(0, max(len(frames) - length, 0) + 1, length // 2)]

@@ -85,7 +85,7 @@ def estimate_states(
         position_m=observations.position_m[:, :last],
         quat_wxyz=observations.quat_wxyz[:, :last],
         seen=observations.seen[:, :last] * keep,
-        turned=observations.turned[:, :last] * keep,
+        has_orientation=observations.has_orientation[:, :last] * keep,
     )
     like = world.gravity
     states = torch.zeros(len(observations.names), 12 * len(observations.free)).to(like)
@@ -113,7 +113,7 @@ def _information(world: World, warm: Observations, noise: tuple[float, float]) -
     touching = clearance(world, warm)[:, 0] <= FLIGHT_MARGIN_M
     for item in touching.nonzero()[:, 0].tolist():
         for column in range(bodies):
-            at = torch.nonzero(warm.seen[item, :, column] * warm.turned[item, :, column])[:START_FRAMES, 0]
+            at = torch.nonzero(warm.seen[item, :, column] * warm.has_orientation[item, :, column])[:START_FRAMES, 0]
             if len(at) < 3:
                 continue
             t = warm.times_s[item, at] - warm.times_s[item, 0]

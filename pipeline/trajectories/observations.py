@@ -42,7 +42,7 @@ class Observations:
     """Orientations of the free bodies' frames, body to world, shape (B, T, nf, 4)."""
     seen: Tensor
     """1 where the position was measured, 0 elsewhere, shape (B, T, nf)."""
-    turned: Tensor
+    has_orientation: Tensor
     """1 where the orientation was measured, 0 elsewhere, shape (B, T, nf)."""
     drives: dict[str, Drive]
     """Commands by kinematic body."""
@@ -52,16 +52,16 @@ class Observations:
     """Indices of the free bodies (nf)."""
     measured_axes: Tensor
     """1 for measured coordinates, which are those that change anywhere in the track, shape (B, nf, 3)."""
-    own: dict[str, Tensor] = field(default_factory=dict)
+    own_values: dict[str, Tensor] = field(default_factory=dict)
     """Group-specific values (B,) of effects' parameters, by `effect.parameter`."""
 
     def with_own(self, world: World) -> Observations:
         """Return the items with the group-specific parameters that a world has for their episodes."""
-        return replace(self, own=_own(world, self.names))
+        return replace(self, own_values=_own(world, self.names))
 
     def world(self, world: World, repeats: int = 1) -> World:
         """Return a world with the items' group-specific parameters, for the batch repeated `repeats` times."""
-        return with_own(world, self.own, repeats)
+        return with_own(world, self.own_values, repeats)
 
     @property
     def frames(self) -> Tensor:
@@ -93,32 +93,36 @@ class Observations:
             position_m=position,
             quat_wxyz=quat,
             seen=seen,
-            turned=turned,
+            has_orientation=turned,
             drives=drives,
             state=_resting(world, len(rows)),
             free=free,
             measured_axes=torch.as_tensor(np.stack([row.axes for row in rows])).to(like),
-            own=_own(world, [row.name for row in rows]),
+            own_values=_own(world, [row.name for row in rows]),
         )
         return replace(partial, state=first_state(world, partial))
 
     def select(self, items: Sequence[int]) -> Observations:
         """Return some items of the batch."""
         index = torch.as_tensor(list(items))
-        picked = {key: getattr(self, key)[index] for key in ("times_s", "position_m", "quat_wxyz", "seen", "turned")}
+        picked = {
+            key: getattr(self, key)[index] for key in ("times_s", "position_m", "quat_wxyz", "seen", "has_orientation")
+        }
         drives = {name: drive.select(index) for name, drive in self.drives.items()}
         names = tuple(self.names[i] for i in items)
         picked["measured_axes"] = self.measured_axes[index]
-        own = {name: value[index] for name, value in self.own.items()}
-        return replace(self, names=names, drives=drives, state=self.state.at(index), own=own, **picked)
+        own = {name: value[index] for name, value in self.own_values.items()}
+        return replace(self, names=names, drives=drives, state=self.state.at(index), own_values=own, **picked)
 
 
 def _own(world: World, names: Sequence[str]) -> dict[str, Tensor]:
     """Return group-specific values (B,) of episodes by parameter; the world's common value where there is none."""
-    numbers = sorted({number for values in world.own.values() for number in values})
+    numbers = sorted({number for values in world.own_values.values() for number in values})
     common = {f"{a.effect.name}.{key}": float(value[0]) for a in world.effects for key, value in a.values.items()}
     return {
-        number: torch.tensor([world.own.get(name, {}).get(number, common[number]) for name in names]).to(world.gravity)
+        number: torch.tensor([world.own_values.get(name, {}).get(number, common[number]) for name in names]).to(
+            world.gravity
+        )
         for number in numbers
         if number in common
     }
@@ -195,7 +199,7 @@ def first_state(world: World, observations: Observations) -> State:
                 continue
             t = observations.times_s[item, at] - observations.times_s[item, 0]
             position[item, body], velocity[item, body] = straight_line(t, observations.position_m[item, at, column])
-            if bool(observations.turned[item, at, column].all()):
+            if bool(observations.has_orientation[item, at, column].all()):
                 measured = observations.quat_wxyz[item, at, column]
                 turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
                 quat[item, body], omega[item, body] = measured[0], straight_line(t, turn)[1]

@@ -120,7 +120,7 @@ class TrajectoryResiduals:
         rotation = quat_log(quat_multiply(measured, rollout.quat_wxyz[:, :, free]))
         weights = [
             (mask.flatten(1)[..., None] / std).repeat(repeats, 1, 1)
-            for mask, std in ((seen.seen, self.position_std_m), (seen.turned, self.rotation_std_rad))
+            for mask, std in ((seen.seen, self.position_std_m), (seen.has_orientation, self.rotation_std_rad))
         ]
         rows = torch.cat((position.flatten(1, 2) * weights[0], rotation.flatten(1, 2) * weights[1]), -1)
         return rows.flatten(1)

@@ -139,7 +139,7 @@ def without_rest(whole: Observations, items: Sequence[Segment], noise: tuple[flo
         still = True
         for values, mask, sigma in (
             (whole.position_m[item.episode, frames], whole.seen[item.episode, frames], noise[0]),
-            (_turns(whole, item), whole.turned[item.episode, frames], noise[1]),
+            (_turns(whole, item), whole.has_orientation[item.episode, frames], noise[1]),
         ):
             half = len(values) // 2
             parts = [
@@ -254,7 +254,7 @@ def heights_of(world: World, body: Body, observations: Observations, column: int
     along = quat_to_matrix(observations.quat_wxyz[:, :, column]).transpose(-1, -2) @ normal
     own = origin[..., None] + along @ body.centers[0, chosen].T - body.radii[0, chosen]
     ball = (origin - size_of(body))[..., None]
-    return torch.where(observations.turned[:, :, column, None] > 0, own, torch.minimum(own, ball))
+    return torch.where(observations.has_orientation[:, :, column, None] > 0, own, torch.minimum(own, ball))
 
 
 def _apart(gaps: Tensor, margin: float) -> Tensor:

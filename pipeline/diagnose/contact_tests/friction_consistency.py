@@ -95,7 +95,7 @@ def friction_consistency_evidence(
     """
     if started is None or is_round(world.bodies[world.free[0]]):
         return []
-    sliding, own, known = started.segments, started.friction, started.told
+    sliding, own, known = started.segments, started.friction, started.flight_parameters
     struck = [k for k, item in enumerate(contact.items) if not _within(item, sliding.items)]
     if len(struck) < FEWEST:
         return []
@@ -107,7 +107,7 @@ def friction_consistency_evidence(
     alone = fit_sliding(soft_world, [], [(sliding, own[None])], known)[0]
     degrees = float(sliding.dof.sum())
     impacts = replace(impacts, spread=max(1.0, alone.cost / degrees))
-    kept, _ = admissible(world, candidates, prepared.turned)
+    kept, _ = admissible(world, candidates, prepared.has_orientation)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
     # chi2 of the sliding segments falls no further below its mean by chance
     surplus = alone.cost - degrees + SURPLUS_SIGMAS * math.sqrt(2 * degrees)

@@ -74,7 +74,7 @@ def impact_evidence(prepared: Prepared, world: World, candidates: Sequence[Candi
     impacts = measured_impacts(prepared, world)
     if impacts is None or len(impacts) < LEAST:
         return []
-    kept, _ = admissible(world, candidates, prepared.turned)
+    kept, _ = admissible(world, candidates, prepared.has_orientation)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
     base = ImpactBase.of(world, impacts)
     found = []

@@ -77,12 +77,12 @@ def sliding_evidence(
         least: Minimum score of interest.
         started: The sliding segments and their fit without candidates; None without any.
     """
-    kept, _ = admissible(world, candidates, prepared.turned)
+    kept, _ = admissible(world, candidates, prepared.has_orientation)
     asked = {"contact", "flight"} if prepared.least_force_m_s2 > FLIGHT_TELLS_M_S2 else {"contact"}
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase in asked]
     if started is None or not variants:
         return []
-    known, base = started.told, started.base
+    known, base = started.flight_parameters, started.base
     soft_world = started.segments.world
     degrees = float(started.segments.dof.sum())
     if base.cost - (degrees - SURPLUS_SIGMAS * math.sqrt(2 * degrees)) < least:
@@ -103,7 +103,7 @@ def _fits(variants: Sequence[Variant], started: StartedSliding, least: float) ->
         started: The sliding segments and their fit without the variants.
         least: The smallest gain of chi2 for which a fit is continued.
     """
-    soft_world, base, known = started.segments.world, started.base, started.told
+    soft_world, base, known = started.segments.world, started.base, started.flight_parameters
     start = (base.segments, base.values[0])
     found: dict[int, tuple[Variant, SlidingFit]] = {}
     for part in batches(variants):

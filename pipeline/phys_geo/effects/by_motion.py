@@ -107,7 +107,7 @@ class SlidingStart:
             world: World with the effects, and possibly others.
             names: Names of the effects.
         """
-        known, base = self.started.told, self.started.base
+        known, base = self.started.flight_parameters, self.started.base
         neutral = replace(base.segments.world, effects=at_neutral(world, names).effects)
         parameters = nuisance_parameters(neutral, known)
         start = base.values[0, :2]  # friction and height; the effects are neutral
@@ -135,7 +135,7 @@ class SlidingStart:
             excess,
             record,
         )
-        return replace(estimate, along={FRICTION.name: friction})
+        return replace(estimate, contact_start={FRICTION.name: friction})
 
 
 @dataclass(frozen=True)
@@ -195,4 +195,4 @@ class ImpactStart:
             record,
         )
         damping = DAMPING_RATIO.decode(torch.as_tensor(found.values)[BASE.index(DAMPING_RATIO)])
-        return replace(estimate, along={DAMPING_RATIO.name: float(damping)})
+        return replace(estimate, contact_start={DAMPING_RATIO.name: float(damping)})

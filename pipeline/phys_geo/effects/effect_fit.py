@@ -110,7 +110,7 @@ class _Progress:
         return _Progress(
             found.world,
             [name for name in self.missing if name not in identified],
-            [(p, found.along.get(p.name, value)) for p, value in self.along],
+            [(p, found.contact_start.get(p.name, value)) for p, value in self.along],
             self.parts | {where: replace(found, constants=kept)},
         )
 
@@ -138,7 +138,7 @@ def _joined(parts: Mapping[str, EffectEstimate]) -> EffectEstimate:
         record=last.record | {where: part.record for where, part in before},
         correlations=tuple(block for part in parts.values() for block in part.correlations),
         constants={name: value for part in parts.values() for name, value in part.constants.items()},
-        along={name: value for part in parts.values() for name, value in part.along.items()},
+        contact_start={name: value for part in parts.values() for name, value in part.contact_start.items()},
     )
 
 

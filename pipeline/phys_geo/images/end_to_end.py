@@ -207,7 +207,7 @@ class ImageObjective:
         against = replace(seen, position_m=rollout.position_m[:, :, free], quat_wxyz=rollout.quat_wxyz[:, :, free])
         rows = _difference(against, seen)
         variance = torch.tensor([sigma**2 for sigma in self.tracks.noise for _ in range(3)], dtype=torch.float64)
-        measured = torch.stack([seen.seen] * 3 + [seen.turned] * 3, -1)
+        measured = torch.stack([seen.seen] * 3 + [seen.has_orientation] * 3, -1)
         chi2 = (measured * rows.square() / variance).sum(-1)
         loss, weight = robust_loss(chi2, TRACK_ROBUST_SCALE)
         count = 6 * seen.seen.sum().clamp_min(1)

@@ -196,7 +196,7 @@ def _completed(track: Track, times_s: np.ndarray) -> Track:
 
 def _measured_only(world: World, observations: Observations, filmed: Sequence[FilmedEpisode]) -> Observations:
     """Return the observations with placeholders marked as not seen."""
-    seen, turned = observations.seen.clone(), observations.turned.clone()
+    seen, turned = observations.seen.clone(), observations.has_orientation.clone()
     for item, episode in enumerate(filmed):
         for column, index in enumerate(world.free):
             track = episode.tracks.get(world.bodies[index].name)
@@ -204,7 +204,7 @@ def _measured_only(world: World, observations: Observations, filmed: Sequence[Fi
             away = np.ones(len(grid), bool) if track is None else np.abs(grid[:, None] - track.time_s).min(1) > 1e-6
             seen[item, torch.as_tensor(away), column] = 0.0
             turned[item, torch.as_tensor(away), column] = 0.0
-    return replace(observations, seen=seen, turned=turned)
+    return replace(observations, seen=seen, has_orientation=turned)
 
 
 def _whole_track(world: World, observations: Observations) -> Observations:

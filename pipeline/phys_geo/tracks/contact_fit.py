@@ -201,7 +201,7 @@ def _fitted_before(
         at = world_for("flight", world, data.noise[0]) if data.airborne else world
         effects = fit_effects(at, data.episodes, [] if data.airborne else start, data.noise, groups)
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
-        start = [(p, effects.along.get(p.name, value)) for p, value in start]
+        start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
         if effects.ground is not None:  # bodies at rest identify it better than the ends of rollouts
             start = [(p, value) for p, value in start if p in CONTACT_PARAMETERS]
     return _Ready(world=world, start=start, mass=mass, effects=effects)

@@ -243,7 +243,7 @@ class Shooting:
         shift = poses.position_m[:, :, free] - seen.position_m.repeat(repeats, 1, 1, 1)
         measured = quat_conjugate(seen.quat_wxyz.repeat(repeats, 1, 1, 1))
         turn = quat_log(quat_multiply(measured, poses.quat_wxyz[:, :, free]))
-        weights = [mask / std for mask, std in zip((seen.seen, seen.turned), self.noise, strict=True)]
+        weights = [mask / std for mask, std in zip((seen.seen, seen.has_orientation), self.noise, strict=True)]
         rows = torch.cat(
             [v * w.repeat(repeats, 1, 1)[..., None] for v, w in zip((shift, turn), weights, strict=True)], -1
         )

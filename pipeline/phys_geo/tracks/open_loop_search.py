@@ -152,7 +152,7 @@ def open_loop_errors(
         free = list(observations.free)
         shift = rollout.position_m[:, :, free] - observations.position_m.repeat(repeats, 1, 1, 1)
         angle = geodesic_angle(rollout.quat_wxyz[:, :, free], observations.quat_wxyz.repeat(repeats, 1, 1, 1))
-        turned = observations.turned.repeat(repeats, 1, 1)
+        turned = observations.has_orientation.repeat(repeats, 1, 1)
         error = (shift.square().sum(-1) + (turned * angle * size).square()).sqrt()
         weight = after.repeat(repeats, 1, 1)
         return ((error * weight).sum((1, 2)) / frames.repeat(repeats)).view(repeats, -1).numpy()

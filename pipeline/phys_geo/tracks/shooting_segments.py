@@ -54,7 +54,7 @@ class TiedSegments:
         items = [k for k, _, _ in pieces]
         windows = [(float(whole.times_s[k, a]) - 1e-9, float(whole.times_s[k, b]) + 1e-9) for k, a, b in pieces]
         segments = Observations.of(world, [episodes[k] for k in items], windows)
-        following, end, seen, turned = [], [], segments.seen.clone(), segments.turned.clone()
+        following, end, seen, turned = [], [], segments.seen.clone(), segments.has_orientation.clone()
         for row, k in enumerate(items):
             last = row + 1 == len(items) or pieces[row + 1][:2] != (k, pieces[row][2])
             following.append(-1 if last else row + 1)
@@ -64,7 +64,7 @@ class TiedSegments:
         ahead = segments.state
         state = _moving(world, whole, items, [first for _, first, _ in pieces], ahead)
         return TiedSegments(
-            segments=replace(segments, seen=seen, turned=turned, state=state),
+            segments=replace(segments, seen=seen, has_orientation=turned, state=state),
             following=torch.tensor(following),
             end=torch.tensor(end),
             ahead=ahead,

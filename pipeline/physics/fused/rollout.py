@@ -108,7 +108,7 @@ def roll(
     strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
     pointers = [x for pair in zip(values, tangents, strict=True) for x in pair]
     pointers += [packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last]
-    run(structure, (*pointers, frames, frame_tangents, labels, None), (batch, count, world.sweeps, *strides))
+    run(structure, (*pointers, frames, frame_tangents, labels, None), (batch, count, world.iterations, *strides))
     if frame_tangents is not None:
         frames = forward_ad.make_dual(frames, frame_tangents)
     return read_frames(world, times_s, packed, frames, labels)

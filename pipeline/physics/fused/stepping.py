@@ -79,7 +79,7 @@ class FusedStepper:
         pointers += (packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last)
         pointers += (resident.frames, None, None, resident.carried)
         # without strides: all arrays are of one environment
-        self._run(packed.structure, pointers, (1, 2, self._world.sweeps, 0, 0, 0, 0))
+        self._run(packed.structure, pointers, (1, 2, self._world.iterations, 0, 0, 0, 0))
         last = read_frames(self._world, self._times, packed, resident.frames, None)
         return State(*(getattr(last, name)[:, -1] for name in State.__dataclass_fields__))
 
