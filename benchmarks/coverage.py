@@ -37,6 +37,7 @@ from cgwm.pipeline.physics import Body, ContactLaw, World
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State
 from cgwm.pipeline.runtime.device import resolve_device
+from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import FittedParameter, PhysConfig, SplatConfig
 from numpy.typing import NDArray
 from store import Store, timed
@@ -97,7 +98,7 @@ def own_motion(plan: ScenePlan, toss: EpisodePlan) -> Motion:
 def tracked(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[FittedParameter, ...]:
     """Return what a fit to the toss's measured track finds, on the object's true corners."""
     world = replace(world_of(plan.solid), rolls_on=resolve_device(device).type)
-    noise = (POSITION_STD, float(ROTATION_STD))
+    noise = Noise(POSITION_STD, float(ROTATION_STD))
     return fit_physics(world, [(toss.name, measure_tracks(plan, toss))], PhysConfig(seed=plan.seed), noise).parameters
 
 

@@ -14,6 +14,7 @@ from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.observation_model import measure
+from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import (
     CAPTURE_FORMAT,
     Body,
@@ -30,7 +31,7 @@ from cgwm.schemas.capture import SphereShape
 from cgwm.schemas.model import BodyModel
 from worlds import F64, ball_body, box_body, law, world_of
 
-NOISE = (5e-4, 5e-3)
+NOISE = Noise(5e-4, 5e-3)
 Effects = Mapping[str, Mapping[str, float]]
 
 

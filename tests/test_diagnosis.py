@@ -27,6 +27,7 @@ from cgwm.pipeline.segments.segment_states import fit_states
 from cgwm.pipeline.segments.segments import FLIGHT_STEP_S, Segments
 from cgwm.pipeline.trajectories.flight_noise import flight_noise, without_outliers
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
+from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import InputDataError
 from diagnosis_data import NOISE, tosses, world_with, write_capture
 from scipy.stats import kstest
@@ -58,7 +59,9 @@ def names(slot: SelectionStep) -> set[str]:
 def test_a_bounce_between_two_frames_is_no_flight() -> None:
     world = world_with("ball")
     for rate in (60.0, 100.0, 300.0):
-        episodes = tosses(world, 5, count=6, duration_s=0.8, rate_hz=rate, noise=(1e-5, 1e-4), height_m=(0.15, 0.4))
+        episodes = tosses(
+            world, 5, count=6, duration_s=0.8, rate_hz=rate, noise=Noise(1e-5, 1e-4), height_m=(0.15, 0.4)
+        )
         whole = whole_episodes(world, episodes)
         flight, _, _ = cut_episodes(world, whole, (1e-5, 1e-4))
         assert len(flight) >= 6
@@ -371,7 +374,7 @@ def test_steps_in_flight_are_short_enough_for_fine_measurements() -> None:
     """Through a noise of 0.05 mm the error of a drag in steps of 2.5 ms looked like buoyancy or another scale."""
     truth, world = world_with("cube", {"linear_drag": {"c": 0.6}}, ground=False), world_with("cube", ground=False)
     truth = replace(truth, step_s=2e-4)
-    noise = (3e-5, 3e-4)
+    noise = Noise(3e-5, 3e-4)
     prepared = prepare(world, tosses(truth, 1, count=5, duration_s=0.5, noise=noise))
     assert prepared.flight is not None and prepared.flight.world.step_s < 0.0005
     slots, found, _ = flight_search.flight_search(prepared, world, LIBRARY, 1.0)

@@ -24,6 +24,7 @@ from cgwm.pipeline.segments.sliding_fit import StartedSliding
 from cgwm.pipeline.segments.sliding_residuals import soft_world, without_loads
 from cgwm.pipeline.segments.sliding_segments import find_sliding_segments
 from cgwm.pipeline.trajectories.segmentation import Segment
+from cgwm.pipeline.trajectories.track_noise import Noise
 from diagnosis_data import Effects, tosses, world_with
 
 LIBRARY = [
@@ -156,7 +157,9 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22}, thrown=2)
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
-    found = sliding_evidence(prepared, world, library, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight))
+    found = sliding_evidence(
+        prepared, world, library, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight)
+    )
     assert found[0].evidence.name == name
     assert found[0].score > SLIDING_SCORE
     assert found[0].score > 3 * found[1].score
@@ -196,7 +199,7 @@ def test_from_the_limit_on_an_effect_is_named() -> None:
 
 def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
     prepared, world = rolls()
-    worse = replace(prepared, noise=(3 * prepared.noise[0], 3 * prepared.noise[1]))
+    worse = replace(prepared, noise=Noise(3 * prepared.noise[0], 3 * prepared.noise[1]))
     near, far = limits(prepared, world)["rolling_resistance"], limits(worse, world)["rolling_resistance"]
     assert far.sizes["c_r"] == pytest.approx(3 * near.sizes["c_r"], rel=0.5)
     tossed = prepare(world, tosses(world, 1, count=2, duration_s=0.3, height_m=(0.6, 0.7)))
@@ -205,7 +208,9 @@ def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
 
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
-    found = sliding_evidence(prepared, world, LIBRARY, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight))
+    found = sliding_evidence(
+        prepared, world, LIBRARY, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight)
+    )
     assert not found or found[0].score < SLIDING_SCORE
 
 

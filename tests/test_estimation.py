@@ -20,12 +20,12 @@ from cgwm.pipeline.physics import restitution, simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
 from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
-from cgwm.pipeline.trajectories.track_noise import estimate_noise
+from cgwm.pipeline.trajectories.track_noise import Noise, estimate_noise
 from cgwm.schemas import PhysConfig
 from scipy.spatial.transform import Rotation
 from worlds import F64, box_body, law, state_of, times, world_of
 
-NOISE = (0.0005, 0.005)
+NOISE = Noise(0.0005, 0.005)
 
 
 def toss(seed: int, contact=None, duration_s: float = 0.4, height: float = 0.09) -> Track:

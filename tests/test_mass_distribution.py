@@ -15,6 +15,7 @@ from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
 from cgwm.pipeline.synthesize.parameters import draw_parameters
+from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import (
     Body,
     BoxShape,
@@ -29,7 +30,7 @@ from cgwm.schemas import (
 from scipy.spatial.transform import Rotation
 from worlds import batch, box_body, law, state_of, times, world_of
 
-NOISE = (0.0003, 0.003)
+NOISE = Noise(0.0003, 0.003)
 STEP_S = 0.002
 COM_M = (0.003, -0.002, 0.006)
 MOMENTS = (1.4, 1.2, 1.8)

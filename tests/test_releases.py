@@ -15,10 +15,11 @@ from cgwm.pipeline.physics import World
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.release_detection import after_release, find_releases
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
+from cgwm.pipeline.trajectories.track_noise import Noise
 from diagnosis_data import tosses, world_with
 from worlds import F64
 
-NOISE = (2e-5, 4e-4)
+NOISE = Noise(2e-5, 4e-4)
 HELD_FRAMES = 8
 HAND_RAD_S2 = 40.0
 

@@ -15,10 +15,11 @@ from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.residuals import TrajectoryResiduals, state_prior
+from cgwm.pipeline.trajectories.track_noise import Noise
 from scipy.spatial.transform import Rotation
 from worlds import F64, box_body, law, state_of, times, world_of
 
-NOISE = (5e-5, 5e-4)
+NOISE = Noise(5e-5, 5e-4)
 NAMES = list(CONTACT_PARAMETERS)
 TRUTH = torch.tensor([p.encode(v) for p, v in zip(NAMES, (0.25, 0.004, 0.3), strict=True)], dtype=F64)
 PRIOR = ShootingPrior(
@@ -33,7 +34,7 @@ def box_world(contact=None) -> World:
     return world_of(box_body(), contact=contact, step_s=0.0015)
 
 
-def noisy(position: torch.Tensor, quat: torch.Tensor, times_s: torch.Tensor, noise: tuple[float, float]) -> Track:
+def noisy(position: torch.Tensor, quat: torch.Tensor, times_s: torch.Tensor, noise: Noise) -> Track:
     rng = np.random.default_rng(0)
     turned = Rotation.from_quat(quat.numpy(), scalar_first=True)
     turned = turned * Rotation.from_rotvec(noise[1] * rng.standard_normal(position.shape))
@@ -111,8 +112,8 @@ def covered_box(per_side: int = 6) -> World:
     return world_of(replace(box_body(), centers=centers, radii=radii), step_s=0.002)
 
 
-@pytest.mark.parametrize("noise", [(5e-4, 5e-3), (3e-3, 3e-2)])
-def test_a_body_that_rests_on_many_spheres_starts_at_rest(noise: tuple[float, float]) -> None:
+@pytest.mark.parametrize("noise", [Noise(5e-4, 5e-3), Noise(3e-3, 3e-2)])
+def test_a_body_that_rests_on_many_spheres_starts_at_rest(noise: Noise) -> None:
     world, count = covered_box(), 6
     rest = torch.tensor([0.0, 0.0, 0.0299], dtype=F64).repeat(count, 1)
     quat = torch.tensor([1.0, 0, 0, 0], dtype=F64).repeat(count, 1)
@@ -130,7 +131,7 @@ def test_a_body_that_rests_on_many_spheres_starts_at_rest(noise: tuple[float, fl
 
 def test_a_body_that_is_struck_while_it_is_watched_keeps_the_velocity_that_it_had() -> None:
     """Frames that lie on no straight line say nothing of the velocity at the first one."""
-    world, noise = covered_box(), (2e-4, 2e-3)
+    world, noise = covered_box(), Noise(2e-4, 2e-3)
     start = state_of(((0, 0, 0.0325), (1.0, 0.02, 0.05, 0.0), (0.5, 0.0, -0.8), (0.0, 0.0, 0.0)))
     grid = torch.arange(7, dtype=F64) / 120
     rollout = simulate(world, start, grid)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,15 @@ class Track:
         optional = (self.quat_wxyz, self.velocity_m_s, self.omega_body_rad_s)
         kept = (None if value is None else value[keep] for value in optional)
         return Track(self.time_s[keep], self.position_m[keep], *kept)
+
+
+class Episode(NamedTuple):
+    """The tracks of one recorded motion."""
+
+    name: str
+    """Name of the episode."""
+    tracks: dict[str, Track]
+    """Tracks by body."""
 
 
 def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Track], int]:

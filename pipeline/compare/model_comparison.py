@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...datasets.models.model import Model
 from ...schemas import PHASES, CovariateShare, ModelComparison, Phase, PhaseFigures, WorstMoment
 from ..evaluate.stage import Evaluation
+from ..trajectories.track_noise import Noise
 from .residual_wrenches import WrenchPoint
 from .short_horizon_errors import FREEDOMS, ShortErrors
 
@@ -34,7 +35,7 @@ class ComparedModel:
     """The model."""
     evaluation: Evaluation
     """The open-loop evaluation."""
-    noise: tuple[float, float]
+    noise: Noise
     """Standard deviations of the measurement that scale short predictions (position [m], rotation [rad])."""
     short: Mapping[str, ShortErrors] = field(default_factory=dict)
     """Short predictions by episode."""
@@ -78,7 +79,7 @@ class ComparedModel:
         return None if figures is None else figures.reduced_chi2
 
 
-def _figures(short: Sequence[ShortErrors], phase: Phase | None, noise: tuple[float, float]) -> PhaseFigures | None:
+def _figures(short: Sequence[ShortErrors], phase: Phase | None, noise: Noise) -> PhaseFigures | None:
     """Return the figures of one phase, or of all phases; None if it has no frame.
 
     Flight includes only segments without contact, because the misfit of a contact segment spreads to its frames in
@@ -106,8 +107,8 @@ def _figures(short: Sequence[ShortErrors], phase: Phase | None, noise: tuple[flo
     return PhaseFigures(
         frames=len(rows),
         reduced_chi2=float(square.sum()) / total if total >= LEAST_FREEDOM else None,
-        position_rms_m=float(np.sqrt(np.nansum(mean[:3]))) * noise[0],
-        rotation_rms_deg=float(np.degrees(np.sqrt(mean[3:].sum()) * noise[1])) if turned else None,
+        position_rms_m=float(np.sqrt(np.nansum(mean[:3]))) * noise.position_m,
+        rotation_rms_deg=float(np.degrees(np.sqrt(mean[3:].sum()) * noise.rotation_rad)) if turned else None,
         sigmas={name: float(np.sqrt(mean[k])) for k, name in enumerate(FREEDOMS) if np.isfinite(mean[k])},
     )
 

@@ -25,7 +25,7 @@ from ..trajectories.residuals import state_prior
 from ..trajectories.segmentation import whole_episodes
 
 if TYPE_CHECKING:
-    from ..evaluate.prediction import Episode
+    from ...datasets.capture.tracks import Episode
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...datasets.capture.capture import Capture
+from ...datasets.capture.tracks import Episode
 from ...datasets.io.atomic import new_file, refuse_existing, sha256
 from ...datasets.io.progress import note, progress
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
-from ..evaluate.prediction import Episode
 from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
 from ..physics.world import World
 from ..runtime.device import resolve_device
@@ -106,7 +106,7 @@ def compare_models(
     shared = [name for name in names if all(any(e.errors.episode == name for e in ev.episodes) for ev in evaluations)]
     if not shared:
         raise InputDataError("no episode can be predicted by all models.", todo="run 'cgwm eval' with each model.")
-    episodes: list[Episode] = [(name, capture.tracks(name)) for name in shared]
+    episodes: list[Episode] = [Episode(name, capture.tracks(name)) for name in shared]
     first, given = World.from_model(models[0][1]), capture.manifest.measurement
     prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
     bodies = [first.bodies[k].name for k in first.free]
@@ -121,7 +121,7 @@ def compare_models(
         models=figures,
         best=best.model,
         pairs=tuple(_pairs(compared)),
-        measurement_std={"position_m": prepared.noise[0], "rotation_rad": prepared.noise[1]},
+        measurement_std={"position_m": prepared.noise.position_m, "rotation_rad": prepared.noise.rotation_rad},
         warnings=(
             *_fitted_to_them(compared, capture, shared),
             *_left_out(names, shared),

@@ -30,7 +30,8 @@ SLIDING_SCORE, SLIDING_EXPLAINED = 220.0, 0.5
 """Thresholds of the sliding test: minimum score, and minimum share of the excess of chi2 over the noise that the effect
 explains. They hold for an effect of one parameter where no effect was selected in flight."""
 FEW_NUMBERS, SLIDING_SCORE_FLEXIBLE = 1, 400.0
-"""Maximum number of parameters for which `SLIDING_SCORE` applies, and the minimum score of effects with more parameters,
+"""Maximum number of parameters for which `SLIDING_SCORE` applies, and the minimum score of effects with more
+parameters,
 or of any effect after one was selected in flight: these fit more by chance."""
 SLIDING_SURE, SLIDING_SHARE_SURE = 80.0, 0.78
 """Lower minimum score in the sliding test for an effect that explains at least this share of the excess. On the

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...datasets.capture.capture import Capture
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode
 from ...datasets.models.model import POSE_TRACKS, Model
 from ...schemas import InputDataError
 from ..trajectories.observations import track_episodes
@@ -22,7 +22,7 @@ MAX_EPISODES = 40
 class DiagnosedEpisodes:
     """Episodes with their noise."""
 
-    episodes: tuple[tuple[str, dict[str, Track]], ...]
+    episodes: tuple[Episode, ...]
     """Name and tracks by body of each episode."""
     noise: tuple[float | None, float | None]
     """Standard deviation of position [m] and rotation [rad]; None where it is unknown."""
@@ -53,7 +53,7 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
             "neighbouring frames are correlated, and a systematic error, as of a wrong shape, can look like physics.",
         )
     moving = {body.name for body in model.file.bodies if body.motion != "fixed"}
-    episodes = [(name, tracks) for name, tracks in found if moving <= set(tracks)]
+    episodes = [episode for episode in found if moving <= set(episode.tracks)]
     if len(episodes) < MIN_EPISODES:
         raise InputDataError(
             f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all moving bodies.",
@@ -64,7 +64,7 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
     return DiagnosedEpisodes(tuple(episodes[k] for k in chosen), known, warnings)
 
 
-def _filmed(model: Model, capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
+def _filmed(model: Model, capture: Capture, split: str) -> list[Episode]:
     """Return the episodes with the poses that the model's fit estimated, and the tracks of the kinematic bodies."""
     names = [name for name in capture.episodes(split) if name in model.tracks]
     if not names:
@@ -74,7 +74,7 @@ def _filmed(model: Model, capture: Capture, split: str) -> list[tuple[str, dict[
             f"tracks/<episode>.csv in the capture, or {POSE_TRACKS}/<episode>.csv in the model.",
             f"run 'cgwm fit {capture.root} --supervise images --out MODEL', which looks for the poses.",
         )
-    return [(name, model.tracks[name] | capture.tracks(name)) for name in names]
+    return [Episode(name, model.tracks[name] | capture.tracks(name)) for name in names]
 
 
 def _filmed_noise(model: Model, names: list[str]) -> tuple[float | None, float | None]:

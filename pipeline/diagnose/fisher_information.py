@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode, Track
 from ..physics.engine import rollout as rolled_out
 from ..physics.observation_model import as_measured, true_times
 from ..physics.parameters import PRIOR_SCALES
@@ -114,7 +114,7 @@ def information_of_experiments(
     fine = [k for k in range(len(throws)) if bool(torch.isfinite(true.position_m[k]).all())]
     body = world.free[0]
     episodes = [
-        (
+        Episode(
             f"{k}",
             {world.bodies[body].name: _track(measured, k, body, times, throws[k].duration_s, prepared.has_orientation)},
         )

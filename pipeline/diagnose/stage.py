@@ -147,7 +147,7 @@ def report(
         residual_law=law,
         episodes=len(prepared.names),
         phases={"flight": int(clear.sum()), "contact": seen - int(clear.sum())},
-        noise={"position_m": prepared.noise[0], "rotation_rad": prepared.noise[1]},
+        noise={"position_m": prepared.noise.position_m, "rotation_rad": prepared.noise.rotation_rad},
         flight_before=_flight_test(findings.before),
         flight_after=_flight_test(findings.after),
         contact_chi2=findings.contact_chi2,

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode
 from ..geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
 from ..physics.observation_model import measure
 from ..physics.rollout import Rollout, require_finite
@@ -18,9 +18,9 @@ from ..physics.world import World
 from ..trajectories.initial_state import estimate_states, warmup_frames
 from ..trajectories.observations import Observations
 from ..trajectories.state_uncertainty import StartUncertainty
+from ..trajectories.track_noise import Noise
 
 Array = NDArray[np.float64]
-Episode = tuple[str, dict[str, Track]]
 
 MODEL, FROZEN, BALLISTIC = "model", "frozen", "ballistic"
 BASELINES = (FROZEN, BALLISTIC)
@@ -109,7 +109,7 @@ class EpisodePrediction:
 def predict(
     world: World,
     episodes: Sequence[Episode],
-    noise: tuple[float, float],
+    noise: Noise,
     warmup_s: float,
     video_times_s: Sequence[Array],
     on_step: Callable[[int], object] = lambda _: None,
@@ -167,7 +167,7 @@ class _Batch:
     """Covariance of the initial states, by episode."""
 
     @staticmethod
-    def of(world: World, episodes: Sequence[Episode], noise: tuple[float, float], warmup_s: float) -> _Batch:
+    def of(world: World, episodes: Sequence[Episode], noise: Noise, warmup_s: float) -> _Batch:
         everything = [(-np.inf, np.inf)] * len(episodes)
         observations = Observations.of(world, episodes, everything)
         warm = warmup_frames(world, observations, warmup_s)
@@ -181,7 +181,7 @@ class _Batch:
     def uncertainty(self) -> StartUncertainty:
         return StartUncertainty(self.world, self.observations, self.covariance, self.weight())
 
-    def state_fitted(self, items: list[int], noise: tuple[float, float], world: World) -> dict[int, float]:
+    def state_fitted(self, items: list[int], noise: Noise, world: World) -> dict[int, float]:
         """Return the state-fitted residual [m] of items of the batch, by item."""
         if not items:
             return {}

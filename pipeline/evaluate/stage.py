@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...datasets.capture.cameras import require_metric
 from ...datasets.capture.capture import Capture
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode, Track
 from ...datasets.io.kinds import kind_of
 from ...datasets.io.progress import progress
 from ...datasets.models.model import Model, read_model
@@ -28,13 +28,13 @@ from ..runtime.device import resolve_device
 from ..runtime.resources import enough_memory, one_torch_thread
 from ..segments.group_parameters import group_parameters, with_known_groups
 from ..segments.random_effects import with_fitted_groups
-from ..trajectories.track_noise import estimate_noise
+from ..trajectories.track_noise import Noise, estimate_noise
 from .image_errors import VideoComparison, VideoErrors
-from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, Episode, EpisodePrediction, predict
+from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, EpisodePrediction, predict
 
 Array = NDArray[np.float64]
 
-DATASET_NOISE = (1e-4, 1e-3)
+DATASET_NOISE = Noise(1e-4, 1e-3)
 """Assumed noise of the poses of a dataset, which are exact (position [m], rotation [rad])."""
 
 
@@ -113,7 +113,7 @@ def evaluate_model(
     """
     check_bodies(model, capture.body_names, str(capture.root))
     world = World.from_model(model)
-    episodes, warnings = _usable(model, [(name, capture.tracks(name)) for name in capture.episodes(split)])
+    episodes, warnings = _usable(model, [Episode(name, capture.tracks(name)) for name in capture.episodes(split)])
     if not episodes:
         raise InputDataError(
             f"{capture.root}: no episode of split '{split}' can be evaluated. {' '.join(warnings)}".rstrip(),
@@ -146,7 +146,7 @@ def _worlds_with_random_effects(
     model: Model,
     capture: Capture,
     episodes: Sequence[Episode],
-    noise: tuple[float, float],
+    noise: Noise,
     warnings: list[str],
     brief: bool,
 ) -> tuple[World, World]:
@@ -174,7 +174,7 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
         world = World.from_model(model)
         # A dataset stores true states, not measured ones.
         world = replace(world, effects=tuple(a for a in world.effects if a.effect.phase != "measurement"))
-        found = [(info.demo, _stored_tracks(reader, number)) for number, info in enumerate(reader.rollouts)]
+        found = [Episode(info.demo, _stored_tracks(reader, number)) for number, info in enumerate(reader.rollouts)]
     finally:
         reader.close()
     episodes, warnings = _usable(model, found)
@@ -225,20 +225,20 @@ def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], l
         if lacking:
             warnings.append(f"episode '{name}' is left out: no track of {_listed(lacking)}.")
         else:
-            usable.append((name, tracks))
+            usable.append(Episode(name, tracks))
     return usable, warnings
 
 
-def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> tuple[float, float]:
+def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> Noise:
     """Return the measurement noise (position [m], rotation [rad]): from the model, the manifest or an estimate."""
     known, given = model.file.measurement_std, capture.manifest.measurement
     position = known.get("position_m") or given.position_std_m
     rotation = known.get("rotation_rad") or given.rotation_std_rad
     if position and rotation:
-        return position, rotation
+        return Noise(position, rotation)
     free = [body.name for body in model.file.bodies if body.motion == "free"]
     estimated = estimate_noise([tracks[name] for _, tracks in episodes for name in free])
-    return position or estimated[0], rotation or estimated[1]
+    return Noise(position or estimated.position_m, rotation or estimated.rotation_rad)
 
 
 @one_torch_thread()
@@ -246,7 +246,7 @@ def _predict(
     model: Model,
     world: World,
     episodes: Sequence[Episode],
-    noise: tuple[float, float],
+    noise: Noise,
     warmup_s: float,
     video_times: Sequence[Array],
     state_fits: int = STATE_FIT_EPISODES,

@@ -157,7 +157,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
                 {} if found.effects is None else found.effects.own_values,
                 {} if found.effects is None else found.effects.spread,
             ),
-            "measurement_std": {"position_m": found.noise[0], "rotation_rad": found.noise[1]},
+            "measurement_std": {"position_m": found.noise.position_m, "rotation_rad": found.noise.rotation_rad},
             "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
         }
     )

@@ -69,7 +69,7 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
     steps = seen.times_s.diff(dim=1)
     normal = (record.impulse_n_s * record.normal).sum(-1)  # (B, T, C)
     speeds = _surface_speeds(world, rollout.velocity_m_s, rollout.omega_body_rad_s)
-    limit = REST_M_S + contact.noise[0] / steps.median() * 0.5
+    limit = REST_M_S + contact.noise.position_m / steps.median() * 0.5
     weight = world.gravity[0].norm() * torch.cat((steps[:, :1], steps), 1)
     mass = min(float(world.bodies[k].mass[0]) for k in world.free)
     total, slides = normal.sum(-1), (normal * record.sliding).sum(-1)

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode
 from ...schemas import Correlation, FittedParameter
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..optimization.uncertainty import (
@@ -34,6 +34,7 @@ from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors
 from ..trajectories.initial_state import flight_frames
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
+from ..trajectories.track_noise import Noise
 
 Array = NDArray[np.float64]
 
@@ -81,10 +82,10 @@ class EffectEstimate:
 
 def fit_first_contacts(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     wanted: Sequence[tuple[Parameter, float]],
     along: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
     whole_flight: bool = False,
     after_s: float = AFTER_S,
 ) -> EffectEstimate:
@@ -163,8 +164,8 @@ def _prior(parameters: Sequence[Parameter], wanted: int, like: Tensor) -> tuple[
 
 
 def windows_of(
-    world: World, episodes: Sequence[tuple[str, dict[str, Track]]], lead_frames: int | None, after_s: float
-) -> tuple[list[tuple[str, dict[str, Track]]], list[tuple[float, float]], list[float]]:
+    world: World, episodes: Sequence[Episode], lead_frames: int | None, after_s: float
+) -> tuple[list[Episode], list[tuple[float, float]], list[float]]:
     """Return episodes (at most `MAX_WINDOWS`, evenly spread), windows about their first contacts, and these [s].
 
     Args:

@@ -134,7 +134,7 @@ def _chains(prepared: Prepared, world: World, flights: Segments) -> list[list[Se
     for episode in range(len(whole.names)):
         seeds = sorted((i.first, i.last) for i in flights.items if i.episode == episode)
         seen = np.flatnonzero(whole.seen[episode, :, 0].numpy() > 0)
-        hops = _Hops(whole.times_s[episode].numpy()[seen], heights[episode][seen], fall, prepared.noise[0])
+        hops = _Hops(whole.times_s[episode].numpy()[seen], heights[episode][seen], fall, prepared.noise.position_m)
         done = -1
         for first, last in seeds:
             a, b = np.searchsorted(seen, [first, last])

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode
 from ...schemas import InputDataError
 from ..physics.world import Body, World
 from ..trajectories.initial_state import clearance
@@ -49,7 +49,7 @@ _BELONG_TOGETHER = (
 """What would be usable and what to do, where tracks and geometry do not agree."""
 
 
-def check_units_and_geometry(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
+def check_units_and_geometry(world: World, episodes: Sequence[Episode], where: str) -> None:
     """Refuse times in another unit, bodies deep under the ground, and masses that no body of that shape has.
 
     Raises:
@@ -84,7 +84,7 @@ def _check_mass(body: Body, where: str) -> None:
         )
 
 
-def _check_depth(world: World, episodes: Sequence[tuple[str, dict[str, Track]]], where: str) -> None:
+def _check_depth(world: World, episodes: Sequence[Episode], where: str) -> None:
     """Refuse bodies that lie deep under the ground, unless the ground is only tilted."""
     whole = whole_episodes(world, episodes)
     if world.ground_normal is None or not bool(whole.has_orientation.any()):
@@ -133,7 +133,7 @@ def check_observability(world: World, prepared: Prepared, where: str) -> None:
     Raises:
         InputDataError: What is wrong, and what to record or check.
     """
-    whole, sigma = prepared.observations, prepared.noise[0]
+    whole, sigma = prepared.observations, prepared.noise.position_m
     size = min(size_of(world.bodies[k]) for k in world.free)
     gravity, seen = float(world.gravity.norm()) or 9.81, prepared.least_force_m_s2
     if seen > LEAST_SEEN * gravity and sigma > SHARE_OF_SIZE * size:
@@ -145,7 +145,7 @@ def check_observability(world: World, prepared: Prepared, where: str) -> None:
             "record longer flights, more of them, or with less noise; check the unit of the positions.",
         )
     spread, alike = _travel(whole), _apart(whole)
-    if spread < ALIKE_SIGMAS * sigma and not _turns(whole, prepared.noise[1]):
+    if spread < ALIKE_SIGMAS * sigma and not _turns(whole, prepared.noise.rotation_rad):
         raise InputDataError(
             f"{where}: nothing moves by more than {1e3 * spread:.2g} mm, with a noise of {1e3 * sigma:.2g} mm.",
             "motions: throws, drops, pushes, slides.",

@@ -11,19 +11,20 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ...datasets.capture.tracks import Episode
 from ..physics.world import World
 from ..trajectories.correlated_noise import WHITE, NoiseModel, estimate_noise_model, noise_model_warnings
 from ..trajectories.flight_noise import flight_noise, slow_noise, without_outliers
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
-from ..trajectories.track_noise import estimate_noise
+from ..trajectories.track_noise import Noise, estimate_noise
 from .contact_phases import is_round
 from .release_detection import held_starts, release_warnings, without_held
 from .segment_states import fit_states
 from .segments import Kind, Segments
 
 if TYPE_CHECKING:
-    from ...datasets.capture.tracks import Track
+    pass
 
 NOISE_DISAGREES = 1.3
 """Ratio of given to measured noise (or its inverse) at and above which the two disagree."""
@@ -49,7 +50,7 @@ class Prepared:
     """Airborne frames (E, T)."""
     supported: Tensor
     """Supported frames (E, T): the body is above the ground and not in free fall."""
-    noise: tuple[float, float]
+    noise: Noise
     """Standard deviations of the tracks (position [m], rotation [rad])."""
     slow: float
     """Factor by which the variance of slow errors of a centroid exceeds that of all errors; 1 where the noise model
@@ -80,7 +81,7 @@ class Prepared:
         information = 0.0
         for item in () if self.flight is None else self.flight.items:
             times = self.observations.times_s[item.episode, item.first : item.last + 1]
-            information += len(times) * float(times[-1] - times[0]) ** 4 / (720 * self.noise[0] ** 2)
+            information += len(times) * float(times[-1] - times[0]) ** 4 / (720 * self.noise.position_m**2)
         return SURE / math.sqrt(information) if information > 0 else math.inf
 
     def segments(self, kind: Kind, world: World, items: Sequence[Segment]) -> Segments:
@@ -103,7 +104,7 @@ class Prepared:
 
 def prepare(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     given: tuple[float | None, float | None] = (None, None),
     groups: Sequence[int] | None = None,
 ) -> Prepared:
@@ -154,7 +155,7 @@ class _State:
     """The model's world."""
     given: tuple[float | None, float | None]
     """Standard deviations that the user states (position [m], rotation [rad])."""
-    noise: tuple[float, float]
+    noise: Noise
     """Standard deviations in use (position [m], rotation [rad])."""
     observations: Observations
     """All frames of all episodes (E)."""
@@ -184,7 +185,7 @@ class _State:
     @staticmethod
     def of(
         world: World,
-        episodes: Sequence[tuple[str, dict[str, Track]]],
+        episodes: Sequence[Episode],
         given: tuple[float | None, float | None],
     ) -> _State:
         """Return the whole episodes with a rough estimate of their noise, not yet cut."""
@@ -195,7 +196,7 @@ class _State:
         return _State(
             world=world,
             given=given,
-            noise=(given[0] or rough[0], given[1] or rough[1]),
+            noise=Noise(given[0] or rough[0], given[1] or rough[1]),
             observations=whole,
             oriented=bool(whole.has_orientation.any()),
             airborne=nothing,
@@ -270,7 +271,7 @@ def _model_correlated_noise(state: _State) -> None:
     if state.noise_model == WHITE:
         return
     position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))
-    state.noise = position, rotation
+    state.noise = Noise(position, rotation)
     state.segment(state.touched | _smeared(state.observations, ~state.airborne))
     state.fit_flights()
     state.warnings.append(noise_model_warnings(state.noise_model))
@@ -286,9 +287,9 @@ def _smeared(whole: Observations, contact: Tensor) -> Tensor:
 def _agreed(
     given: tuple[float | None, float | None],
     found: tuple[float | None, float | None],
-    rough: tuple[float, float],
+    rough: Noise,
     warnings: list[str],
-) -> tuple[float, float]:
+) -> Noise:
     """Return the noise to use: the given one, or the measured one where that is larger by `NOISE_DISAGREES`.
 
     Args:
@@ -315,7 +316,7 @@ def _agreed(
             chosen.append(seen)
         else:
             chosen.append(said or seen or otherwise)
-    return chosen[0], chosen[1]
+    return Noise(*chosen)
 
 
 def _cut(item: Segment, whole: Observations, longest_s: float) -> list[Segment]:

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode
 from ...schemas import FittedParameter, ModelFile
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..optimization.uncertainty import correlation_of, student_quantile
@@ -31,7 +31,7 @@ from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors
 from ..trajectories.initial_state import flight_frames
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
-from ..trajectories.track_noise import MAD_TO_STD
+from ..trajectories.track_noise import MAD_TO_STD, Noise
 from .first_contact_fit import ITERATIONS, MODEL_ERROR, EffectEstimate, described, windows_of
 from .group_parameters import group_of, group_parameters, with_known_groups
 from .mixed_model import Array, GroupLayout, GroupPosterior, GroupPrior, posterior
@@ -48,11 +48,11 @@ first frames."""
 
 def fit_random_effects(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     groups: Mapping[str, str],
     wanted: Sequence[tuple[Parameter, float]],
     along: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
     flying: bool,
     after_s: float,
     ties: GroupPrior | None = None,
@@ -174,8 +174,8 @@ def _usual(rows: Tensor, ends: NDArray[np.bool_]) -> Tensor:
 
 def _batch(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
-    noise: tuple[float, float],
+    episodes: Sequence[Episode],
+    noise: Noise,
     flying: bool,
     after_s: float,
 ) -> tuple[Observations, NDArray[np.bool_], tuple[Tensor, Tensor]]:
@@ -307,10 +307,10 @@ def _result(
 
 def with_fitted_groups(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     file: ModelFile,
     groups: Mapping[str, str],
-    noise: tuple[float, float],
+    noise: Noise,
 ) -> World:
     """Return the world in which every episode has group-specific parameters: known from the fit, else fitted.
 
@@ -318,7 +318,7 @@ def with_fitted_groups(
     """
     own = group_parameters(world)
     known = with_known_groups(world, file, [name for name, _ in episodes], groups)
-    unknown = [(name, tracks) for name, tracks in episodes if len(known.own_values.get(name, {})) < len(own)]
+    unknown = [episode for episode in episodes if len(known.own_values.get(episode.name, {})) < len(own)]
     if not own or not unknown:
         return known
     centre = {f"{a.effect.name}.{name}": float(value) for a in world.effects for name, value in a.values.items()}

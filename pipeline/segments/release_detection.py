@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ...datasets.capture.tracks import Episode
+from ...pipeline.trajectories.track_noise import Noise
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
 from ..trajectories.track_noise import estimate_noise
@@ -23,7 +25,6 @@ from .segment_states import fit_states
 from .segments import Segments
 
 if TYPE_CHECKING:
-    from ...datasets.capture.tracks import Track
     from ..physics.world import World
 
 HELD_CHI2 = 3.0
@@ -68,7 +69,7 @@ def held_starts(flight: Segments, whole: Observations) -> dict[int, int]:
 
 
 def find_releases(
-    world: World, episodes: Sequence[tuple[str, dict[str, Track]]], noise: tuple[float | None, float | None]
+    world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]
 ) -> tuple[dict[str, float], list[str]]:
     """Return release times [s] of episodes that begin in a hand, by name, and warnings about them.
 
@@ -82,7 +83,7 @@ def find_releases(
     if all(track.quat_wxyz is None for track in found):
         return {}, []
     rough = estimate_noise(found)
-    std = (noise[0] or rough[0], noise[1] or rough[1])
+    std = Noise(noise[0] or rough[0], noise[1] or rough[1])
     whole = whole_episodes(world, episodes)
     items, _, _ = cut_episodes(world, whole, std)
     if not items:
@@ -100,12 +101,10 @@ def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
     return replace(whole, seen=seen, has_orientation=turned)
 
 
-def after_release(
-    episodes: Iterable[tuple[str, dict[str, Track]]], released_s: Mapping[str, float]
-) -> list[tuple[str, dict[str, Track]]]:
+def after_release(episodes: Iterable[Episode], released_s: Mapping[str, float]) -> list[Episode]:
     """Return the episodes cut to start at their release times [s], where they have one."""
     return [
-        (name, {body: track.window(released_s.get(name)) for body, track in tracks.items()})
+        Episode(name, {body: track.window(released_s.get(name)) for body, track in tracks.items()})
         for name, tracks in episodes
     ]
 

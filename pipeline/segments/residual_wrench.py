@@ -19,6 +19,7 @@ from ..physics.world import World
 from ..trajectories.correlated_noise import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment
+from ..trajectories.track_noise import Noise
 from .segment_fit import linearised
 from .segment_states import fit_states
 from .segments import Segments
@@ -115,7 +116,7 @@ def wrench_windows(
     world: World,
     whole: Observations,
     flight: Sequence[Segment],
-    noise: tuple[float, float],
+    noise: Noise,
     memory: NoiseModel = WHITE,
 ) -> ResidualWrenches | None:
     """Return the residual wrenches of half-overlapping windows of flights, states fitted; None without windows."""

@@ -21,6 +21,7 @@ from ..trajectories.correlated_noise import WHITE, NoiseModel, innovations
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, retract
 from ..trajectories.segmentation import Segment
+from ..trajectories.track_noise import Noise
 
 Kind = Literal["flight", "contact"]
 
@@ -49,7 +50,7 @@ class Segments:
     """Episode and frames of each segment (B)."""
     observations: Observations
     """Frames of the segments, padded, with the best known state of each."""
-    noise: tuple[float, float]
+    noise: Noise
     """Standard deviations of the tracks (position [m], rotation [rad])."""
     noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
@@ -60,14 +61,14 @@ class Segments:
         world: World,
         whole: Observations,
         items: Sequence[Segment],
-        noise: tuple[float, float],
+        noise: Noise,
         memory: NoiseModel = WHITE,
     ) -> Segments:
         """Cut whole episodes; the states are first guesses, see :func:`fit_states`."""
         cut = _windows(whole, items)
         found = Segments(
             kind=kind,
-            world=world_for(kind, world, noise[0]),
+            world=world_for(kind, world, noise.position_m),
             items=tuple(items),
             observations=cut,
             noise=noise,
@@ -103,7 +104,7 @@ class Segments:
 
     def in_world(self, world: World) -> Segments:
         """Return the segments in another world, with the step that their kind needs."""
-        return replace(self, world=world_for(self.kind, world, self.noise[0]))
+        return replace(self, world=world_for(self.kind, world, self.noise.position_m))
 
     def in_states(self, states: Sequence[State]) -> Segments:
         """Return the segments once in each of several states (B), as one batch."""

@@ -66,7 +66,7 @@ def without_loads(segments: Segments, rows: Tensor) -> Tensor:
     if is_round(body):
         return rows
     normal = GroundPlane.of(world).normal
-    turned = seen.has_orientation[:, :, 0, None] / segments.noise[1]
+    turned = seen.has_orientation[:, :, 0, None] / segments.noise.rotation_rad
     times = (seen.times_s - seen.times_s[:, :1])[..., None]
     share = times / times.amax(1, keepdim=True).clamp_min(1e-9)
     axis = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal

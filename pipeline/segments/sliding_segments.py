@@ -20,6 +20,7 @@ from ..physics.impulse_solver import tangent_axes
 from ..physics.world import State, World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import GAP, GroundPlane, Segment, heights_of, size_of, without_rest
+from ..trajectories.track_noise import Noise
 from .contact_phases import is_round
 from .segments import Segments
 
@@ -39,9 +40,7 @@ JUMP_M_S, JUMP_SIGMAS = 0.12, 4.0
 """Jump of the velocity [m/s] of any point of the body that is an impact, or this many sigmas where that is more."""
 
 
-def find_sliding_segments(
-    world: World, whole: Observations, clear: Tensor, noise: tuple[float, float]
-) -> list[Segment]:
+def find_sliding_segments(world: World, whole: Observations, clear: Tensor, noise: Noise) -> list[Segment]:
     """Return the sliding segments of whole episodes; none without a ground or with several bodies.
 
     Args:
@@ -53,7 +52,7 @@ def find_sliding_segments(
     if world.ground_normal is None or len(whole.free) != 1 or len(world.bodies) != 1:
         return []
     body = world.bodies[whole.free[0]]
-    margin = NEAR_M + NEAR_SIGMAS * float(np.hypot(noise[0], noise[1] * size_of(body)))
+    margin = NEAR_M + NEAR_SIGMAS * float(np.hypot(noise.position_m, noise.rotation_rad * size_of(body)))
     lowest = heights_of(world, body, whole, 0).amin(-1)
     on = (lowest < margin) & ~clear & (whole.seen[:, :, 0] > 0)
     found = []
@@ -63,7 +62,7 @@ def find_sliding_segments(
             continue
         steady = on[episode, seen].numpy() & ~_impacts(world, whole, episode, seen, noise)
         if not is_round(body):
-            steady &= ~_tilting(world, whole, episode, seen, noise[1])
+            steady &= ~_tilting(world, whole, episode, seen, noise.rotation_rad)
         parts = _parts(times[seen].numpy(), steady)
         found += [Segment(episode, int(seen[first]), int(seen[last])) for first, last in parts]
     return without_rest(whole, found, noise)
@@ -91,9 +90,7 @@ def grounded_states(segments: Segments, state: State) -> State:
     return State(*fields)
 
 
-def _impacts(
-    world: World, whole: Observations, episode: int, seen: Tensor, noise: tuple[float, float]
-) -> NDArray[np.bool_]:
+def _impacts(world: World, whole: Observations, episode: int, seen: Tensor, noise: Noise) -> NDArray[np.bool_]:
     """Return the seen frames within one frame of a jump of the speed along the normal, or of the tilting."""
     body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
     height = (whole.position_m[episode, seen, 0] @ normal)[:, None].numpy()
@@ -105,12 +102,12 @@ def _impacts(
             continue
         inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], 1))[3]
         spread = float(np.linalg.norm(inverse))
-        jumps[k] = np.abs(inverse @ height[frames]).max() > max(JUMP_M_S, JUMP_SIGMAS * noise[0] * spread)
+        jumps[k] = np.abs(inverse @ height[frames]).max() > max(JUMP_M_S, JUMP_SIGMAS * noise.position_m * spread)
         if is_round(body) or not turned[frames].all():
             continue  # an impact of a ball never changes its spin alone
         turns = quat_log(quat_multiply(quat[frames], quat_conjugate(quat[k : k + 1])))  # world axes
         tilting = np.linalg.norm(inverse @ (turns @ level.T).numpy())
-        jumps[k] |= tilting > max(JUMP_M_S / size_of(body), JUMP_SIGMAS * noise[1] * spread)
+        jumps[k] |= tilting > max(JUMP_M_S / size_of(body), JUMP_SIGMAS * noise.rotation_rad * spread)
     wide = jumps.copy()
     wide[1:] |= jumps[:-1]
     wide[:-1] |= jumps[1:]

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from .observations import Observations
 from .segmentation import Segment
-from .track_noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, moves
+from .track_noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, Noise, moves
 
 WINDOW = 9
 """Frames of a window that a cubic follows in free flight: 0.09 s at 100 Hz, within 0.1 mm for 6 mm at 20 rad/s."""
@@ -76,9 +76,7 @@ def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
     return max(1.0, float(np.median(slow) / max(np.median(all_orders), FLOOR_M**2))) if len(slow) >= 10 else 1.0
 
 
-def without_outliers(
-    whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]
-) -> tuple[Observations, int, Tensor]:
+def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Noise) -> tuple[Observations, int, Tensor]:
     """Remove wrong measurements in flight, and find flight frames in which something touched the body.
 
     A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen. Where the other

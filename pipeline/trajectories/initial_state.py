@@ -13,6 +13,7 @@ from ..physics.smooth_distance import union_distance
 from ..physics.world import World
 from .observations import START_FRAMES, Observations, straight_line
 from .residuals import STATE_SIZE, TrajectoryResiduals, retract, state_prior
+from .track_noise import Noise
 
 MIN_FRAMES = 4
 """Minimum number of frames of the warm-up."""
@@ -70,7 +71,7 @@ def warmup_frames(world: World, observations: Observations, warmup_s: float) -> 
 
 
 def estimate_states(
-    world: World, observations: Observations, frames: Tensor, noise: tuple[float, float], iterations: int = 12
+    world: World, observations: Observations, frames: Tensor, noise: Noise, iterations: int = 12
 ) -> tuple[Observations, Solution]:
     """Fit the states at the first frames to the chosen frames (B, T), by the model itself.
 
@@ -102,7 +103,7 @@ def estimate_states(
     return replace(observations, state=retract(observations.state, solution.states, observations.free)), solution
 
 
-def _information(world: World, warm: Observations, noise: tuple[float, float]) -> Tensor:
+def _information(world: World, warm: Observations, noise: Noise) -> Tensor:
     """Return the information (B, S) of the prior on state changes, tighter for a body in contact that moves evenly.
 
     Contact removes a velocity at once, so that later frames do not determine it: the fit would use it to follow the
@@ -119,7 +120,7 @@ def _information(world: World, warm: Observations, noise: tuple[float, float]) -
             t = warm.times_s[item, at] - warm.times_s[item, 0]
             measured = warm.quat_wxyz[item, at, column]
             turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
-            rows = torch.stack([warm.position_m[item, at, column] / noise[0], turn / noise[1]])
+            rows = torch.stack([warm.position_m[item, at, column] / noise.position_m, turn / noise.rotation_rad])
             lines = [straight_line(t, values) for values in rows]
             away = torch.stack([v - (a + t[:, None] * b) for v, (a, b) in zip(rows, lines, strict=True)])
             if float(away.square().sum()) < LINE_MISFIT * 6 * (len(at) - 2):

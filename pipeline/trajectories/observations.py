@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...datasets.capture.capture import Capture
-from ...datasets.capture.tracks import Track
+from ...datasets.capture.tracks import Episode, Track
 from ...schemas import InputDataError
 from ..geometry.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
 from ..physics.kinematic import Drive
@@ -69,9 +69,7 @@ class Observations:
         return (self.seen.amax(-1) > 0).sum(-1)
 
     @staticmethod
-    def of(
-        world: World, episodes: Sequence[tuple[str, dict[str, Track]]], windows: Sequence[tuple[float, float]]
-    ) -> Observations:
+    def of(world: World, episodes: Sequence[Episode], windows: Sequence[tuple[float, float]]) -> Observations:
         """Collect one window (start, end) [s] from each of the given episodes, which may repeat."""
         rows = [_Row.of(world, name, tracks, window) for (name, tracks), window in zip(episodes, windows, strict=True)]
         longest = max(len(row.times) for row in rows)
@@ -228,15 +226,15 @@ def _resting(world: World, batch: int) -> State:
     return State(position, quat, zero, zero)
 
 
-def track_episodes(capture: Capture, split: str) -> list[tuple[str, dict[str, Track]]]:
+def track_episodes(capture: Capture, split: str) -> list[Episode]:
     """Return the episodes of a split that have tracks of a free body.
 
     Raises:
         InputDataError: If none has.
     """
     free = {body.name for body in capture.manifest.bodies if body.motion == "free"}
-    episodes = [(name, capture.tracks(name)) for name in capture.episodes(split)]
-    usable = [(name, tracks) for name, tracks in episodes if free & set(tracks)]
+    episodes = [Episode(name, capture.tracks(name)) for name in capture.episodes(split)]
+    usable = [episode for episode in episodes if free & set(episode.tracks)]
     if not usable:
         raise InputDataError(
             f"{capture.root}: none of the {len(episodes)} episodes of split '{split}' has a track of a free body.",

@@ -15,13 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...datasets.capture.tracks import Episode
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
 from ..physics.world import Body, World
 from .initial_state import FLIGHT_MARGIN_M, clearance
 from .observations import Observations
+from .track_noise import Noise
 
 if TYPE_CHECKING:
-    from ...datasets.capture.tracks import Track
+    pass
 
 FLIGHT_S = 0.60
 """Maximum length [s] of a flight segment; longer flights are cut into equal parts."""
@@ -64,13 +66,13 @@ class Segment:
     """Last frame, included."""
 
 
-def whole_episodes(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> Observations:
+def whole_episodes(world: World, episodes: Sequence[Episode]) -> Observations:
     """Return all frames of all episodes as one batch."""
     return Observations.of(world, episodes, [(-torch.inf, torch.inf)] * len(episodes))
 
 
 def cut_episodes(
-    world: World, whole: Observations, noise: tuple[float, float], touched: Tensor | None = None
+    world: World, whole: Observations, noise: Noise, touched: Tensor | None = None
 ) -> tuple[list[Segment], list[Segment], Tensor]:
     """Cut whole episodes into flight and contact segments.
 
@@ -131,15 +133,15 @@ def _cut_stretch(
     return flight, contact
 
 
-def without_rest(whole: Observations, items: Sequence[Segment], noise: tuple[float, float]) -> list[Segment]:
+def without_rest(whole: Observations, items: Sequence[Segment], noise: Noise) -> list[Segment]:
     """Return the segments without those in which nothing moves, except the first in a row: more add no information."""
     kept, resting = [], {}
     for item in items:
         frames = slice(item.first, item.last + 1)
         still = True
         for values, mask, sigma in (
-            (whole.position_m[item.episode, frames], whole.seen[item.episode, frames], noise[0]),
-            (_turns(whole, item), whole.has_orientation[item.episode, frames], noise[1]),
+            (whole.position_m[item.episode, frames], whole.seen[item.episode, frames], noise.position_m),
+            (_turns(whole, item), whole.has_orientation[item.episode, frames], noise.rotation_rad),
         ):
             half = len(values) // 2
             parts = [
@@ -201,7 +203,7 @@ def size_of(body: Body) -> float:
     return float((body.centers[0].square().sum(-1).sqrt() + body.radii[0]).max())
 
 
-def clear_frames(world: World, observations: Observations, noise: tuple[float, float]) -> Tensor:
+def clear_frames(world: World, observations: Observations, noise: Noise) -> Tensor:
     """Return the airborne frames (B, T): surely without contact, also between two frames.
 
     Args:
@@ -213,16 +215,18 @@ def clear_frames(world: World, observations: Observations, noise: tuple[float, f
     if world.ground_normal is not None and world.ground_offset is not None:
         for column, index in enumerate(observations.free):
             heights = heights_of(world, world.bodies[index], observations, column)
-            margin = FLIGHT_MARGIN_M + NOISE_SIGMAS * float(np.hypot(noise[0], noise[1] * size_of(world.bodies[index])))
+            margin = FLIGHT_MARGIN_M + NOISE_SIGMAS * float(
+                np.hypot(noise.position_m, noise.rotation_rad * size_of(world.bodies[index]))
+            )
             clear &= _apart(heights, margin)
     others = clearance(replace(world, ground_normal=None), observations)
     if bool(torch.isfinite(others).any()):
-        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise[0])
+        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise.position_m)
     for a in range(len(observations.free)):
         for b in range(a):
             reach = size_of(world.bodies[observations.free[a]]) + size_of(world.bodies[observations.free[b]])
             gap = (observations.position_m[:, :, a] - observations.position_m[:, :, b]).norm(dim=-1) - reach
-            clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise[0])
+            clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise.position_m)
     return clear
 
 
@@ -265,9 +269,7 @@ def _apart(gaps: Tensor, margin: float) -> Tensor:
     return (gaps > margin + MOVE_SHARE * move).all(-1)
 
 
-def supported_frames(
-    world: World, whole: Observations, flight: Sequence[Segment], noise: tuple[float, float]
-) -> Tensor:
+def supported_frames(world: World, whole: Observations, flight: Sequence[Segment], noise: Noise) -> Tensor:
     """Return the supported frames (E, T) of flight segments: a body's acceleration is far from gravity.
 
     A ground at another height than stated, a marker away from the body's middle or a hand make a body slide or rest
@@ -294,7 +296,7 @@ def supported_frames(
             along = (whole.position_m[item.episode, frames, column][seen] @ gravity / strength).numpy()
             powers = np.vander(t - t.mean(), 3)
             solution = np.linalg.lstsq(powers, along, rcond=None)[0]
-            error = 2 * noise[0] * float(np.sqrt(np.linalg.inv(powers.T @ powers)[0, 0]))
+            error = 2 * noise.position_m * float(np.sqrt(np.linalg.inv(powers.T @ powers)[0, 0]))
             off = abs(2 * float(solution[0]) - strength)
             if off > MOST_LIFT * strength and off > SURE_SIGMAS * error:
                 found[item.episode, frames] = True

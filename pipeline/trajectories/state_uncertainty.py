@@ -17,6 +17,7 @@ from ..optimization.levenberg_marquardt import robust_loss
 from ..physics.world import World
 from .observations import Observations
 from .residuals import STATE_SIZE, TrajectoryResiduals
+from .track_noise import Noise
 
 MAX_STEP = (0.005, 0.05, 0.1, 0.5)
 """Largest differences in position [m], rotation [rad], velocity [m/s], omega [rad/s], where nothing was measured."""
@@ -59,7 +60,7 @@ class StartUncertainty:
         rows = self._rows(torch.cat((torch.zeros_like(changes[:, :1]), changes), 1))[..., :3]
         return self._distance(rows[:, 1:] - rows[:, :1]).mean(1)
 
-    def fit(self, noise: tuple[float, float], iterations: int) -> Tensor:
+    def fit(self, noise: Noise, iterations: int) -> Tensor:
         """Return the mean distance (B,) [m] to the measured track after fitting the state to all of it.
 
         Gauss-Newton steps with Cauchy weights in the coordinates in which the start's covariance is the identity, with
@@ -88,7 +89,7 @@ class StartUncertainty:
             distance = distances[item, choice][:, None]
         return distance[:, 0]
 
-    def _steps(self, rows: Tensor, jacobian: Tensor, noise: tuple[float, float]) -> Tensor:
+    def _steps(self, rows: Tensor, jacobian: Tensor, noise: Noise) -> Tensor:
         """Return the damped steps (B, dampings, S) of residuals (B, F, 6) and differences (B, S, F, 6)."""
         counted = self.weight.flatten(1)[..., None].expand(-1, -1, 6)
         scale = torch.cat([_spread(rows[..., k : k + 3], noise[k // 3]) for k in (0, 3)], -1)[:, None] / counted

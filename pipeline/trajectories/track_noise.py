@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +23,16 @@ FLOOR_M, FLOOR_RAD = 1e-5, 1e-4
 """Minimum noise of position [m] and rotation [rad]: noiseless tracks would get infinite weights."""
 
 
-def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> tuple[float, float]:
+class Noise(NamedTuple):
+    """Standard deviations of tracked poses."""
+
+    position_m: float
+    """Of each coordinate of the position [m]."""
+    rotation_rad: float
+    """Of the rotation about each axis [rad]."""
+
+
+def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
     """Return the standard deviations of position [m] and rotation [rad] for each axis.
 
     Each window of consecutive frames is fitted by a parabola in position and in rotation vector (a tumbling body turns
@@ -48,7 +57,7 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> tuple[float
             if track.quat_wxyz is not None:
                 turn = Rotation.from_quat(track.quat_wxyz[rows], scalar_first=True)
                 rotations.append(_residual(t, (turn[WINDOW // 2].inv() * turn).as_rotvec(), degree).ravel())
-    return max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD)
+    return Noise(max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD))
 
 
 def moves(position_m: np.ndarray) -> np.ndarray:

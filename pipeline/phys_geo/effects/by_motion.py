@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode
 from ...optimization.uncertainty import correlation_of, few_covariance
 from ...physics.contact_law import ContactLaw
 from ...physics.effects import Effect
@@ -27,6 +27,7 @@ from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import linearised, refit
 from ...segments.sliding_descent import information_by_segment
 from ...segments.sliding_fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
+from ...trajectories.track_noise import Noise
 from .identified_effects import at_neutral, identified_effects
 
 ITERATIONS = 25
@@ -35,9 +36,9 @@ ITERATIONS = 25
 
 def fit_effect_flights(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     wanted: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
 ) -> EffectEstimate | None:
     """Fit effects to the flights of episodes, each with its own initial state, as `cgwm diagnose` does.
 

@@ -8,18 +8,19 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode
 from ...physics.effects import ActiveEffect
 from ...physics.parameters import GROUND_SHIFT, Parameter, effect_parameters
 from ...physics.world import World
 from ...segments.first_contact_fit import AFTER_S, CONTACT_S, EffectEstimate, fit_first_contacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.random_effects import fit_random_effects
+from ...trajectories.track_noise import Noise
 from .by_motion import ImpactStart, SlidingStart, fit_effect_flights
 
 Start = list[tuple[Parameter, float]]
 """Parameters of effects, and their start."""
-Episodes = Sequence[tuple[str, dict[str, Track]]]
+Episodes = Sequence[Episode]
 """Name and tracks by body of each episode."""
 
 
@@ -27,7 +28,7 @@ def fit_effects(
     world: World,
     episodes: Episodes,
     along: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
     groups: Mapping[str, str] | None = None,
 ) -> EffectEstimate:
     """Fit the world's effects to flights, sliding segments and impacts, and the remaining ones around first contacts.
@@ -76,7 +77,7 @@ class _Progress:
     parts: dict[str, EffectEstimate]
     """Estimates by the key of the kind of motion in `fit.json`."""
 
-    def with_flights(self, episodes: Episodes, names: Sequence[str], noise: tuple[float, float]) -> _Progress:
+    def with_flights(self, episodes: Episodes, names: Sequence[str], noise: Noise) -> _Progress:
         """Add the effects that act in flight, if flights identify all of them."""
         flown = _best(self.world, names, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise))
         if flown is None:
@@ -85,7 +86,7 @@ class _Progress:
         missing = [name for name in self.missing if name not in names]
         return replace(self, world=flown.world, missing=missing, parts=self.parts | {"in_flight": flown})
 
-    def with_contacts(self, episodes: Episodes, contact: Sequence[str], noise: tuple[float, float]) -> _Progress:
+    def with_contacts(self, episodes: Episodes, contact: Sequence[str], noise: Noise) -> _Progress:
         """Add the effects that sliding segments identify, then those that impacts identify."""
         prepared = prepare(_without(self.world, contact), episodes, noise)
         progress = self
@@ -114,7 +115,7 @@ class _Progress:
             self.parts | {where: replace(found, constants=kept)},
         )
 
-    def with_first_contacts(self, episodes: Episodes, noise: tuple[float, float], after_s: float) -> _Progress:
+    def with_first_contacts(self, episodes: Episodes, noise: Noise, after_s: float) -> _Progress:
         """Add the effects that are still missing, from windows around first contacts."""
         found = _best_of(
             self.world,
@@ -146,7 +147,7 @@ def _with_segment_parameters(
     world: World,
     episodes: Episodes,
     along: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
     groups: Mapping[str, str],
     touching: bool,
 ) -> EffectEstimate:

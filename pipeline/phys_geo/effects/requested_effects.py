@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode
 from ....schemas import EffectModel, FittedParameter, InputDataError, PhysConfig, UsageError
 from ...physics.effects import load_effect
 from ...physics.effects.registry import split_units
@@ -82,7 +82,7 @@ def _without_prefix(prefix: str, values: Mapping[str, float]) -> dict[str, float
 
 def fit_with_effects(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     config: PhysConfig,
     noise: tuple[float | None, float | None],
     warm_started: bool = False,
@@ -100,7 +100,7 @@ def fit_with_effects(
     return replace(found, warnings=(*found.warnings, *warnings))
 
 
-def _require_needs(world: World, episodes: Sequence[tuple[str, dict[str, Track]]]) -> None:
+def _require_needs(world: World, episodes: Sequence[Episode]) -> None:
     """Refuse effects that need what the world or the episodes do not have."""
     free = {body.name for body in world.bodies if body.free}
     turned = any(

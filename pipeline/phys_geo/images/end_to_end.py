@@ -23,6 +23,7 @@ from ...physics.rollout import Rollout
 from ...physics.world import World
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import STATE_SIZE, STATE_STEPS, retract
+from ...trajectories.track_noise import Noise
 from .contact_spheres import ContactSpheres
 from .image_loss import ImageLoss
 
@@ -52,7 +53,7 @@ class TrackTerm:
 
     observations: Observations
     """Observations on the time grid of the images."""
-    noise: tuple[float, float]
+    noise: Noise
     """Standard deviation of the tracks' errors: position [m], rotation [rad]."""
 
 

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from ....datasets.capture.cameras import require_metric
 from ....datasets.capture.capture import Capture
+from ....datasets.capture.tracks import Episode
 from ....datasets.models.model import Model
 from ....datasets.shapes.meshes import Mesh
 from ....datasets.shapes.ply import Splats
@@ -32,6 +33,7 @@ from ...physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, e
 from ...physics.world import World
 from ...runtime.checkpoint import Checkpoint
 from ...runtime.device import resolve_device
+from ...trajectories.track_noise import Noise
 from ..effects.requested_effects import fit_with_effects
 from ..tracks.contact_result import ContactEstimate, PhysicsFit, physics_fit
 from .end_to_end import ImageObjective, Refined, refine_end_to_end
@@ -86,10 +88,10 @@ def fit_physics_from_images(
     episodes = _load_episodes(world, model, capture, names, config, tracks_too, checkpoint, outlines)
     clock.lap("pose_tracks")
     noise = tracks_noise(capture, episodes)
-    known = noise[0] or 0.0, noise[1] or 0.0
+    known = Noise(noise[0] or 0.0, noise[1] or 0.0)
     doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
     _require_shared_effects(world)
-    start = fit_with_effects(world, [(episode.name, episode.tracks) for episode in episodes], config, noise)
+    start = fit_with_effects(world, [Episode(episode.name, episode.tracks) for episode in episodes], config, noise)
     clock.lap("dynamics")
 
     estimate = _estimate_from_tracks(start.effects.world if start.effects is not None else world, start)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode, Track
 from ....schemas import PhysConfig
 from ...optimization.levenberg_marquardt import minimise
 from ...physics.observation_model import measure
@@ -18,6 +18,7 @@ from ...physics.world import State, World
 from ...trajectories.initial_state import estimate_states, warmup_frames
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import TrajectoryResiduals, retract, state_prior
+from ...trajectories.track_noise import Noise
 from ..tracks.contact_result import ContactEstimate, PhysicsFit
 from .contact_spheres import ContactSpheres, dense_times
 from .end_to_end import ImageObjective, TrackTerm
@@ -126,14 +127,13 @@ def _observed(world: World, filmed: Sequence[FilmedEpisode]) -> Observations:
     rows, windows = [], []
     for episode in filmed:
         times = episode.times_s
-        rows.append((episode.name, {name: _completed(track, times) for name, track in episode.tracks.items()}))
+        completed = {name: _completed(track, times) for name, track in episode.tracks.items()}
+        rows.append(Episode(episode.name, completed))
         windows.append((float(times[0]) - 1e-9, float(times[-1]) + 1e-9))
     return _measured_only(world, Observations.of(world, rows, windows), filmed)
 
 
-def _warm_started(
-    world: World, observations: Observations, warmup_s: float, noise: tuple[float, float]
-) -> Observations:
+def _warm_started(world: World, observations: Observations, warmup_s: float, noise: Noise) -> Observations:
     """Return the observations with initial states from their warm-up."""
     warm = warmup_frames(world, observations, warmup_s)
     observations, _ = estimate_states(world, observations, warm, noise)

@@ -24,6 +24,7 @@ from torch import Tensor
 from ....datasets.io.progress import progress
 from ....schemas import NotConvergedError
 from ...geometry.rotation import geodesic_angle, quat_conjugate, quat_exp, quat_log, quat_multiply
+from ...trajectories.track_noise import Noise
 from .image_loss import ImageLoss, PoseQuality
 from .pose_search import Poses, descend, descend_all, distinct, located, search
 
@@ -80,13 +81,13 @@ class PoseTrack:
         return self.covariance[self.found].diagonal(dim1=1, dim2=2).unflatten(1, (-1, 2, 3))
 
 
-def pose_noise(tracks: Sequence[PoseTrack]) -> tuple[float, float]:
+def pose_noise(tracks: Sequence[PoseTrack]) -> Noise:
     """Return the noise of found poses by axis (position [m], rotation [rad]).
 
     The variance is the median over the instants of all tracks, averaged over axes and free bodies.
     """
     std = torch.cat([track.variance for track in tracks]).median(0).values.mean((0, 2)).sqrt()
-    return float(std[0]), float(std[1])
+    return Noise(float(std[0]), float(std[1]))
 
 
 def track_state(track: PoseTrack) -> dict[str, object]:

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.capture.capture import Capture
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode, Track
 from ....schemas import InputDataError
 from ...physics.checks import overlaps
 from ...physics.world import World
 from ...trajectories.observations import Observations
+from ...trajectories.track_noise import Noise
 from ..tracks.contact_fit import MAX_SPAN_S
 from .video_frames import Footage, Video, load_footage
 
@@ -39,7 +40,6 @@ REFUSED_SHARE = 0.1
 """Additional depth above which a start is refused, as a share of the free body's radius; the contact would throw the
 body."""
 
-Noise = tuple[float, float]
 """Standard deviations of a track: position [m], rotation [rad]."""
 
 
@@ -160,8 +160,8 @@ def _moves(world: World, tracks: Mapping[str, Track], noise: Noise) -> bool:
         if track is None:
             continue
         size = float((body.centers[0] - body.com[0]).norm(dim=-1).mean() + body.radii[0].mean())
-        far = min(STILL_SIGMA * math.sqrt(3) * noise[0], MOVED_SHARE * size)
-        turned = min(STILL_SIGMA * math.sqrt(3) * noise[1], MOVED_RAD)
+        far = min(STILL_SIGMA * math.sqrt(3) * noise.position_m, MOVED_SHARE * size)
+        turned = min(STILL_SIGMA * math.sqrt(3) * noise.rotation_rad, MOVED_RAD)
         if _largest_shift(track) > far or _largest_turn(track) > turned:
             return True
     return False
@@ -183,7 +183,7 @@ def _overlap(world: World, name: str, tracks: Mapping[str, Track], noise: Noise)
     """Return warnings about bodies that start inside an obstacle, and refuse a body deep inside one."""
     free = [tracks[world.bodies[i].name] for i in world.free if world.bodies[i].name in tracks]
     times = np.unique(np.concatenate([track.time_s for track in free]))
-    first = Observations.of(world, [(name, dict(tracks))], [(float(times[0]) - 1e-9, float(times[1]) + 1e-9)])
+    first = Observations.of(world, [Episode(name, dict(tracks))], [(float(times[0]) - 1e-9, float(times[1]) + 1e-9)])
     state = first.state
     for index, body in enumerate(world.bodies):
         if body.name in first.drives:
@@ -192,7 +192,7 @@ def _overlap(world: World, name: str, tracks: Mapping[str, Track], noise: Noise)
     reach = {b.name: float(((b.centers[0] - b.com[0]).norm(dim=-1) + b.radii[0]).max()) for b in world.bodies}
     texts = []
     for overlap in overlaps(world, state):
-        depth, allowed = float(overlap.depth_m[0]), DEEP_M + DEEP_SIGMA * noise[0]
+        depth, allowed = float(overlap.depth_m[0]), DEEP_M + DEEP_SIGMA * noise.position_m
         if depth <= allowed:
             continue
         found = f"{name}: in the first frame body '{overlap.body}' is {1e3 * depth:.1f} mm deep inside {overlap.other}"
@@ -202,7 +202,7 @@ def _overlap(world: World, name: str, tracks: Mapping[str, Track], noise: Noise)
         raise InputDataError(
             f"{found}, which is impossible for rigid bodies: the ground, the scale, the shape or the poses are wrong, "
             "or an object that is not in the capture pressed the body there.",
-            f"up to {1e3 * allowed:.1f} mm (with the poses' noise of {1e3 * noise[0]:.1f} mm).",
+            f"up to {1e3 * allowed:.1f} mm (with the poses' noise of {1e3 * noise.position_m:.1f} mm).",
             "check [world] ground's offset_m and normal, the metric scale of the cameras (cgwm validate), the size of "
             "the shape, and a driven body's track; or begin a little later ([episodes] start_s).",
         )

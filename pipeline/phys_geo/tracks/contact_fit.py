@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode, Track
 from ....schemas import InputDataError, PhysConfig
 from ...optimization.importance_sampling import episode_covariance
 from ...physics.parameters import (
@@ -39,7 +39,7 @@ from ...segments.first_contact_fit import EffectEstimate, bound_warnings
 from ...segments.segments import world_for
 from ...trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from ...trajectories.observations import Observations
-from ...trajectories.track_noise import estimate_noise
+from ...trajectories.track_noise import Noise, estimate_noise
 from ..effects.effect_fit import fit_effects
 from .contact_result import ContactEstimate, FitRecord, PhysicsFit, absolute_ground, physics_fit
 from .contact_shooting import ShootingEpisodes, shoot_contact
@@ -63,7 +63,7 @@ NEVER_TOUCHES = (
 @one_torch_thread()
 def fit_physics(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     config: PhysConfig,
     noise: tuple[float | None, float | None] = (None, None),
     warm_started: bool = False,
@@ -120,23 +120,21 @@ def _require_short_steps(step_s: float) -> None:
 class _FitData:
     """Episodes of a fit, their noise, and whether they contain contact."""
 
-    episodes: Sequence[tuple[str, dict[str, Track]]]
+    episodes: Sequence[Episode]
     """Name and tracks by body of each training episode."""
-    searched: Sequence[tuple[str, dict[str, Track]]]
+    searched: Sequence[Episode]
     """Episodes of the search: at most `MAX_EPISODES`, evenly spread."""
     spans: Sequence[tuple[float, float]]
     """Start and end of the part of each searched episode that is fitted [s]."""
-    noise_estimated: tuple[float, float]
+    noise_estimated: Noise
     """Noise estimated from the tracks: position [m], rotation [rad]."""
-    noise: tuple[float, float]
+    noise: Noise
     """Noise that the fit assumes, given or estimated: position [m], rotation [rad]."""
     airborne: bool
     """Whether the only free body touches nothing in any of the frames."""
 
     @staticmethod
-    def of(
-        world: World, episodes: Sequence[tuple[str, dict[str, Track]]], noise: tuple[float | None, float | None]
-    ) -> _FitData:
+    def of(world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]) -> _FitData:
         """Choose the episodes of the search, and estimate the noise where it is not given."""
         free_tracks = [
             tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
@@ -154,7 +152,7 @@ class _FitData:
             searched=searched,
             spans=spans,
             noise_estimated=estimated,
-            noise=(noise[0] or estimated[0], noise[1] or estimated[1]),
+            noise=Noise(noise[0] or estimated[0], noise[1] or estimated[1]),
             airborne=airborne,
         )
 
@@ -198,7 +196,7 @@ def _fitted_before(
         world = mass.world
     if effect_parameters(world):
         # flight needs no contact and no short steps
-        at = world_for("flight", world, data.noise[0]) if data.airborne else world
+        at = world_for("flight", world, data.noise.position_m) if data.airborne else world
         effects = fit_effects(at, data.episodes, [] if data.airborne else start, data.noise, groups)
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
@@ -231,7 +229,7 @@ def _contact_estimate(
     return estimate, replace(record, shooting=shooting)
 
 
-def _never_touching(ready: _Ready, batch: SearchBatch, noise: tuple[float, float], record: FitRecord) -> PhysicsFit:
+def _never_touching(ready: _Ready, batch: SearchBatch, noise: Noise, record: FitRecord) -> PhysicsFit:
     """Return a fit with the contact parameters at their priors; a search would only return the scatter of its draws."""
     names = ready.parameters
     middle = np.array([p.encode(p.prior[0]) for p in names])

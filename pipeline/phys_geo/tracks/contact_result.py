@@ -18,6 +18,7 @@ from ...physics.contact_law import restitution
 from ...physics.parameters import GROUND_SHIFT, Parameter
 from ...physics.world import State, World
 from ...segments.first_contact_fit import EffectEstimate, bound_warnings, described
+from ...trajectories.track_noise import Noise
 from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
 
 
@@ -79,7 +80,7 @@ class FitRecord:
     """Number of training episodes."""
     search_episodes: int
     """Number of episodes in the search."""
-    noise_estimated: tuple[float, float]
+    noise_estimated: Noise
     """Noise estimated from the tracks: position [m], rotation [rad]."""
     mass_distribution: dict[str, Any] | None = None
     """Record of the fit of the mass distribution, where there was one."""
@@ -122,7 +123,7 @@ class PhysicsFit:
     """Fitted and derived parameters, with intervals, for `model.json`."""
     ground_offset_m: float | None
     """Fitted height of the ground [m]; None where it was not fitted."""
-    noise: tuple[float, float]
+    noise: Noise
     """Standard deviation of the tracks' errors: position [m], rotation [rad]."""
     record: FitRecord
     """Course of the fit, for `fit.json`."""
@@ -144,7 +145,7 @@ class PhysicsFit:
     """Correlations of the contact parameters, then of those of effects and of the mass distribution."""
 
 
-def physics_fit(world: World, estimate: ContactEstimate, noise: tuple[float, float], record: FitRecord) -> PhysicsFit:
+def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: FitRecord) -> PhysicsFit:
     """Return the stage's result from an estimate of the contact parameters.
 
     Args:

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode
 from ....datasets.io.progress import progress
 from ....schemas import PhysConfig
 from ...optimization.importance_sampling import SearchResult
 from ...physics.parameters import GROUND_SHIFT, Parameter
 from ...physics.world import World
+from ...trajectories.track_noise import Noise
 from .contact_result import ContactEstimate, ShootingRecord
 from .multiple_shooting import Shooting, ShootingFit, ShootingPrior
 from .open_loop_search import SEVERAL_EPISODES, SearchBatch, open_loop_errors
@@ -40,7 +41,7 @@ built-in scenes fall 0 to 5 (MuJoCo's contact); data that the model explains hav
 class ShootingEpisodes:
     """Episodes for multiple shooting."""
 
-    episodes: Sequence[tuple[str, dict[str, Track]]]
+    episodes: Sequence[Episode]
     """Name and tracks by body of each episode."""
     spans: Sequence[tuple[float, float]]
     """Start and end of the part of each episode that is fitted [s]."""
@@ -54,7 +55,7 @@ def shoot_contact(
     search: SearchResult,
     names: Sequence[Parameter],
     ground_known: bool,
-    noise: tuple[float, float],
+    noise: Noise,
     config: PhysConfig,
 ) -> tuple[ContactEstimate, ShootingRecord]:
     """Fit the contact parameters by multiple shooting, and keep the search's estimate if shooting predicts worse.
@@ -128,7 +129,7 @@ def _descended(
     parameters: Sequence[Parameter],
     starts: Sequence[np.ndarray],
     prior: ShootingPrior,
-    noise: tuple[float, float],
+    noise: Noise,
     config: PhysConfig,
 ) -> list[ShootingFit]:
     """Return the ends of the continued descents, the lowest cost first."""

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ....datasets.capture.tracks import Track
+from ....datasets.capture.tracks import Episode, Track
 from ....schemas import InputDataError
 from ...physics.parameters import Parameter, mass_distribution
 from ...physics.world import World
 from ...segments.first_contact_fit import EffectEstimate, fit_first_contacts
+from ...trajectories.track_noise import Noise
 
 LEAST_EPISODES = 8
 """Minimum number of episodes; with fewer the mass distribution cannot be separated from the scatter of the impacts."""
@@ -20,9 +21,9 @@ LEAST_EPISODES = 8
 
 def fit_mass_distribution(
     world: World,
-    episodes: Sequence[tuple[str, dict[str, Track]]],
+    episodes: Sequence[Episode],
     contact: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
 ) -> EffectEstimate:
     """Fit centre of mass and second moments of every free body, together with the contact parameters.
 

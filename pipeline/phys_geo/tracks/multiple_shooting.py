@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...optimization.levenberg_marquardt import bound_stops, robust_loss
 from ...physics.engine import rollout as rolled_out
@@ -27,10 +28,11 @@ from ...physics.rollout import Rollout
 from ...physics.world import State, World
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import retract, state_prior
+from ...trajectories.track_noise import Noise
 from .shooting_segments import TiedSegments
 
 if TYPE_CHECKING:
-    from ....datasets.capture.tracks import Track
+    pass
 
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """Standard deviation of a tie over flight: position [m], rotation [rad], velocity [m/s], angular velocity [rad/s]."""
@@ -113,9 +115,9 @@ class Shooting:
     def of(
         world: World,
         parameters: Sequence[Parameter],
-        episodes: Sequence[tuple[str, dict[str, Track]]],
+        episodes: Sequence[Episode],
         spans: Sequence[tuple[float, float]],
-        noise: tuple[float, float],
+        noise: Noise,
         prior: ShootingPrior,
         contacts_only: bool = False,
     ) -> Shooting:

@@ -18,6 +18,7 @@ from ...physics.observation_model import measure
 from ...physics.parameters import Parameter, apply_parameters
 from ...physics.world import World
 from ...trajectories.observations import Observations
+from ...trajectories.track_noise import Noise
 
 ERRORS_PER_EPISODE = 3.0
 """Number of independent errors in one episode's open-loop error; `docs/results.md` has the resulting coverage of the
@@ -50,7 +51,7 @@ def search_contact(
     world: World,
     batch: SearchBatch,
     start: Sequence[tuple[Parameter, float]],
-    noise: tuple[float, float],
+    noise: Noise,
     config: PhysConfig,
     warm_started: bool,
 ) -> SearchResult:
@@ -108,10 +109,10 @@ def _population(episodes: int) -> int:
     return min(max(rollouts // episodes, POPULATION[0]), POPULATION[1])
 
 
-def _noise_floor(world: World, observations: Observations, noise: tuple[float, float]) -> float:
+def _noise_floor(world: World, observations: Observations, noise: Noise) -> float:
     """Return the displacement of a surface point [m] that the noise of the tracks alone produces."""
     size = float(torch.stack([_surface_radius(world, index) for index in observations.free]).mean())
-    return math.sqrt(3 * noise[0] ** 2 + 3 * (size * noise[1]) ** 2)
+    return math.sqrt(3 * noise.position_m**2 + 3 * (size * noise.rotation_rad) ** 2)
 
 
 def open_loop_errors(

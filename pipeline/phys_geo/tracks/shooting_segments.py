@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...physics.world import State, World
 from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance
 from ...trajectories.observations import Observations
+from ...trajectories.track_noise import Noise
 
 if TYPE_CHECKING:
-    from ....datasets.capture.tracks import Track
+    pass
 
 SEGMENT_S = 0.03
 """Minimum duration of a segment [s]; segments begin and end at frames."""
@@ -43,9 +45,9 @@ class TiedSegments:
     @staticmethod
     def of(
         world: World,
-        episodes: Sequence[tuple[str, dict[str, Track]]],
+        episodes: Sequence[Episode],
         spans: Sequence[tuple[float, float]],
-        noise: tuple[float, float],
+        noise: Noise,
         contacts_only: bool,
     ) -> TiedSegments:
         """Cut the span [s] of each episode into segments; see `Shooting.of`."""
@@ -71,7 +73,7 @@ class TiedSegments:
         )
 
 
-def _pieces(world: World, whole: Observations, noise: tuple[float, float], contacts_only: bool) -> list[_Piece]:
+def _pieces(world: World, whole: Observations, noise: Noise, contacts_only: bool) -> list[_Piece]:
     """Return the segments of episodes; with `contacts_only` those near contact, and the first of each episode."""
     cuts = [_cuts(times[:count]) for times, count in zip(whole.times_s, whole.frames.tolist(), strict=True)]
     pieces = [(k, a, b) for k, places in enumerate(cuts) for a, b in itertools.pairwise(places)]
@@ -92,14 +94,14 @@ def _cuts(times_s: Tensor) -> list[int]:
     return [*places, len(times_s) - 1] if places[-1] != len(times_s) - 1 else places
 
 
-def _informative(world: World, whole: Observations, pieces: Sequence[_Piece], noise: tuple[float, float]) -> list[bool]:
+def _informative(world: World, whole: Observations, pieces: Sequence[_Piece], noise: Noise) -> list[bool]:
     """Return which segments (episode, first and last frame) are informative: in contact and moving, or next to such."""
     flying = clearance(world, whole) > FLIGHT_MARGIN_M
     moved = whole.position_m.new_zeros(len(pieces))
     for row, (k, a, b) in enumerate(pieces):
-        shift = (whole.position_m[k, b] - whole.position_m[k, a]).abs().amax() / noise[0]
+        shift = (whole.position_m[k, b] - whole.position_m[k, a]).abs().amax() / noise.position_m
         turn = quat_log(quat_multiply(quat_conjugate(whole.quat_wxyz[k, a]), whole.quat_wxyz[k, b]))
-        moved[row] = torch.maximum(shift, turn.abs().amax() / noise[1])
+        moved[row] = torch.maximum(shift, turn.abs().amax() / noise.rotation_rad)
     touches = [not bool(flying[k, a : b + 1].all()) for k, a, b in pieces]
     moving = [touch and bool(way > RESTING_SIGMAS) for touch, way in zip(touches, moved, strict=True)]
     padded = [False, *moving, False]
