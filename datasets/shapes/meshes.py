@@ -163,16 +163,25 @@ def _read_obj(data: bytes) -> Mesh:
                 raise ValueError(f"line {number}: a vertex of {len(words) - 1} coordinate(s)")
             vertices.append([float(word) for word in words[1:4]])
         elif words[0] == "f":
-            # Indices count from 1, negative ones from the vertex read last.
-            listed = [int(word.split("/")[0]) for word in words[1:]]
-            corners = [k - 1 if k > 0 else len(vertices) + k for k in listed]
-            if len(corners) < 3 or not all(0 <= k < len(vertices) for k in corners):
-                fault = f"line {number}: a face of {len(corners)} corners, after {len(vertices)} vertices"
-                if absent := [k for k, corner in zip(listed, corners, strict=True) if not 0 <= corner < len(vertices)]:
-                    fault += f" (a face names vertex {max(absent, key=abs)} of {len(vertices)})"
-                raise ValueError(fault)
+            corners = _face_corners(words[1:], len(vertices), number)
             faces += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
     return Mesh(np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3))
+
+
+def _face_corners(words: list[str], count: int, number: int) -> list[int]:
+    """Return the vertices of a face, from 0, on line `number` of an .obj with `count` vertices so far.
+
+    Indices count from 1, negative ones from the vertex read last.
+    """
+    listed = [int(word.split("/")[0]) for word in words]
+    corners = [k - 1 if k > 0 else count + k for k in listed]
+    absent = [k for k, corner in zip(listed, corners, strict=True) if not 0 <= corner < count]
+    if len(corners) < 3 or absent:
+        fault = f"line {number}: a face of {len(corners)} corners, after {count} vertices"
+        if absent:
+            fault += f" (a face names vertex {max(absent, key=abs)} of {count})"
+        raise ValueError(fault)
+    return corners
 
 
 def _read_stl(data: bytes) -> Mesh:
