@@ -66,6 +66,11 @@ REWORDED: Mapping[str, str] = {
     r"^compare\.html text in <p\b": "the paragraphs of the comparison page",
 }
 """Texts (a pattern of the place) whose words may differ, with the reason; their numbers may not."""
+ROUNDED: Sequence[tuple[str, float, str]] = (
+    (r"\.h5:data/demo_\d+/bodies/contact_torque,", 1e-15, "rotation matrices of scipy: torques of contacts"),
+    (r"^(ds/dataset\.json\.shards\.0|synthesize\.stdout\.json)\.sha256$", 0.0, "the hash of the shard with them"),
+)
+"""Where a library replaced code: a pattern of the place, the relative difference that passes, and the reason."""
 DROPPED_TESTS: Mapping[str, str] = {
     r"^test_(all_is_complete|docstring_examples_run)\[cgwm\.": "named by the module, which has moved",
     r"^test_the_commands_exist\[": "named by a line of the README, which became pages",
@@ -253,11 +258,16 @@ class Differences:
         self.rounding, self.lines, self.failed = rounding, [], 0
         reasons = [f"masked: {reason}" for *_, reason in (*MASKS, FOLDERS)]
         reasons += [f"reworded: {reason}" for reason in REWORDED.values()]
+        reasons += [f"rounded: {reason}" for *_, reason in ROUNDED]
         self.passed = Counter(dict.fromkeys(reasons, 0))
 
     def add(self, place: str, one: Any, other: Any) -> None:
         """Add a difference; numbers within the rounding are printed and pass."""
         note = ""
+        for pattern, limit, reason in ROUNDED:
+            if re.search(pattern, place) and (limit == 0.0 or abs(one - other) <= limit * abs(one)):
+                self.passed[f"rounded: {reason}"] += 1
+                return
         if _is_number(one) and _is_number(other):
             relative = abs(one - other) / max(abs(one), abs(other), 1e-300)
             note = f" (relative {relative:.2e})"
@@ -336,7 +346,7 @@ class Differences:
         parts = [
             re.split(r"(<style.*?</style>|<script.*?</script>|<[^>]*>)", page, flags=re.S) for page in (one, other)
         ]
-        tags = [[tag for tag in part[1::2] if "application/json" not in tag] for part in parts]
+        tags = [[_without_comments(tag) for tag in part[1::2] if "application/json" not in tag] for part in parts]
         self.lists(f"{place} tag", *tags)
         for tag, a, b in zip(parts[0][1::2], parts[0][2::2], parts[1][2::2], strict=False):
             self.words(f"{place} text in {tag[:40]}", a, b)
@@ -467,6 +477,11 @@ def make(commit: str, reference: Path, other: str | None, candidate: Path, *, on
             pass
     for folder in (reference, candidate):
         (folder / "done").touch()
+
+
+def _without_comments(tag: str) -> str:
+    """Return an element without the comments of a script at the ends of its lines."""
+    return re.sub(r"(?m)\s+// .*$", "", tag) if tag.startswith("<script") else tag
 
 
 def main() -> int:

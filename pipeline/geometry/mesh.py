@@ -31,13 +31,17 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def mesh_mass_properties(mesh: Mesh) -> MassProperties:
-    """Return the exact mass properties of a closed mesh.
-
-    Raises:
-        InputDataError: If it encloses no volume.
-    """
-    solid = meshes.solid_properties(mesh)
-    return MassProperties(solid.volume_m3, solid.com_m, solid.inertia_per_kg)
+    """Return the exact mass properties of a closed mesh, by signed tetrahedra from the origin (divergence theorem)."""
+    # `datasets.shapes.meshes.solid_properties` integrates about the vertices' mean instead: the better choice far from
+    # the origin, but it changes the last digits, and a fit through impacts turns these into a per mille of friction
+    triangles = mesh.corners()
+    volumes = np.linalg.det(triangles) / 6
+    volume = volumes.sum()
+    com = (volumes[:, None] * triangles.sum(1)).sum(0) / (4 * volume)
+    sums = triangles.sum(1)
+    outer = np.einsum("f,fci,fcj->ij", volumes, triangles, triangles) + np.einsum("f,fi,fj->ij", volumes, sums, sums)
+    second = outer / (20 * volume) - np.outer(com, com)
+    return MassProperties(float(volume), com, np.trace(second) * np.eye(3) - second)
 
 
 def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
