@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from .execution import running
 from .options import AnyDevice, Debug, Json, Overwrite, Quiet
-from .run import running
 
 if TYPE_CHECKING:
     from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit, MysteryResult

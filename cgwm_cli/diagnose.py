@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .execution import running
 from .options import AnyDevice, Debug, Json, Overwrite, Quiet
-from .run import running
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

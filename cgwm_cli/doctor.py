@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from .execution import running
 from .options import Debug, Json, Quiet
-from .run import running
 
 if TYPE_CHECKING:
     from ..schemas import DoctorReport

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .execution import running
 from .options import AnyDevice, Debug, Json, Quiet
-from .run import running
 
 if TYPE_CHECKING:
     from ..schemas import ErrorSummary, EvalResult

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from .execution import running
 from .options import Debug, Json, Overwrite, Quiet
-from .run import running
 from .usage import refuse_foreign
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from .execution import running
 from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
-from .run import running
 
 if TYPE_CHECKING:
     from ..schemas import FittedParameter, ModelFile

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from .run import run_command
+from .execution import run_command
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

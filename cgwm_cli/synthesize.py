@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .execution import running, typed
 from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
-from .run import running, typed
 
 if TYPE_CHECKING:
     from ..schemas import DatasetSummary, ShardsSummary

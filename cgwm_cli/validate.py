@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .execution import running
 from .options import Debug, Json, Quiet, Seed
-from .run import running
 
 if TYPE_CHECKING:
     from ..schemas import ValidationReport

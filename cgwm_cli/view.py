@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .execution import running, until_interrupted
 from .options import Debug, Json, Quiet
-from .run import running, until_interrupted
 
 if TYPE_CHECKING:
     from ..schemas import ViewReport

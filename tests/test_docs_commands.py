@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from cgwm.cli import main
 from cgwm.cli.app import app
-from cgwm.cli.run import with_values
+from cgwm.cli.execution import with_values
 from cgwm.cli.settings import StageSettings
 from cgwm.datasets.capture.tracks import read_tracks
 from cgwm.pipeline.diagnose.experiments import read_experiments

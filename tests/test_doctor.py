@@ -107,7 +107,7 @@ def test_a_device_whose_kernels_cannot_run_is_named_once(caplog: pytest.LogCaptu
 def test_a_warning_reaches_stderr_that_is_no_terminal() -> None:
     code = """
 import logging, sys, typer
-from cgwm.cli.run import running
+from cgwm.cli.execution import running
 with running(quiet="quiet" in sys.argv):
     logging.getLogger("of.a.library").warning("nobody reads this")
     logging.getLogger("cgwm").warning("it is slow because of %s", "this")

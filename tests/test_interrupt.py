@@ -164,7 +164,7 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
 
 INTERRUPTED_WITHIN = """
 import signal, sys, time
-from cgwm.cli.run import run_command
+from cgwm.cli.execution import run_command
 
 def app(*arguments, **options):
     try:

@@ -28,7 +28,7 @@ from cgwm.pipeline.physics.parameters import (
     effect_parameters,
     mass_distribution,
 )
-from cgwm.pipeline.segments.first_contact_fit import bound_warnings, described
+from cgwm.pipeline.segments.fitted_parameters import bound_warnings, fitted_parameter
 from cgwm.schemas import InputDataError, read_json
 from cgwm.schemas.model import FitFile, ModelFile
 from tiny_capture import (
@@ -264,9 +264,9 @@ def test_bounds_of_effects_and_of_the_mass_have_a_meaning_too() -> None:
     names = [*effect_parameters(replace(world_of(box_body()), effects=(active,))), *mass_distribution("box", 0.05)]
     for parameter in names:
         for coordinate in parameter.limits:
-            (text,) = bound_warnings(names, [described(parameter, coordinate, 1e-9)])
+            (text,) = bound_warnings(names, [fitted_parameter(parameter, coordinate, 1e-9)])
             assert parameter.name in text and "the motion asks" not in text
-    (text,) = bound_warnings(names[:1], [described(names[0], 0.0, 1e-9)])
+    (text,) = bound_warnings(names[:1], [fitted_parameter(names[0], 0.0, 1e-9)])
     assert "leave it out" in text
 
 

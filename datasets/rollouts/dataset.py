@@ -17,8 +17,8 @@ from typing import Any
 
 from ...schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError, read_json
 from ..io.atomic import move_into_place, new_directory, new_file, scratch_file, sha256
+from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
-from ..io.room import enough_room
 from .index import index_fault
 from .shards import gathered, shard_fault, shard_name, tidied, write_entry
 

@@ -35,6 +35,7 @@ from ..trajectories.initial_state import flight_frames
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
 from ..trajectories.track_noise import Noise
+from .fitted_parameters import fitted_parameter
 
 Array = NDArray[np.float64]
 
@@ -52,8 +53,6 @@ MAX_WINDOWS = 100
 """Maximum number of windows, which determines second moments of mass within 2 %."""
 ITERATIONS = 16
 """Maximum number of steps of a fit."""
-UNOBSERVABLE_SHARE = 0.8
-"""Ratio of the standard error to the prior's width above which a parameter is called not observable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +131,7 @@ def fit_first_contacts(
     return EffectEstimate(
         world=placed(world, found, coordinates),
         parameters=tuple(
-            described(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)
+            fitted_parameter(p, float(z), float(s)) for p, z, s in zip(found, coordinates, std_errors, strict=True)
         ),
         record=record,
         correlations=(correlation_of([p.name for p in found], covariance[:count, :count]),),
@@ -192,50 +191,3 @@ def placed(world: World, names: Sequence[Parameter], coordinates: Tensor) -> Wor
     moved = apply_parameters(world, names, values)
     bodies = [replace(b, com=b.com.clone(), inertia=b.inertia.clone()) for b in moved.bodies]
     return replace(moved, bodies=tuple(bodies))
-
-
-def described(parameter: Parameter, coordinate: float, std: float, reach: float = REACH) -> FittedParameter:
-    """Return a parameter as `model.json` has it, from its estimate and standard error in fitted coordinates.
-
-    Args:
-        parameter: The parameter.
-        coordinate: Its estimate.
-        std: Its standard error.
-        reach: Half of the interval, in standard errors.
-    """
-    low, high = parameter.limits
-    estimate, *interval = (
-        float(parameter.decode(torch.tensor(z, dtype=torch.float64)))
-        for z in (coordinate, *(min(max(coordinate + k * reach * std, low), high) for k in (-1, 1)))
-    )
-    estimate = min(max(estimate, parameter.bounds[0]), parameter.bounds[1])  # rounding may lead past a bound
-    state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
-    if std > UNOBSERVABLE_SHARE * parameter.prior[1]:
-        state = "not_observable"
-    factor = "factor of the second moment of mass given or derived before; " if ".moment_" in parameter.name else ""
-    return FittedParameter(
-        name=parameter.name,
-        unit=parameter.unit,
-        estimate=estimate,
-        std_error=std * (estimate if parameter.logarithmic else 1.0),
-        interval_95=(interval[0], interval[1]),
-        bounds=parameter.bounds,
-        state=state,
-        note=f"{factor}{parameter.reveals} would reveal it",
-    )
-
-
-def bound_warnings(parameters: Sequence[Parameter], fitted: Sequence[FittedParameter]) -> list[str]:
-    """Return a warning for each parameter that ended on a bound, with what that means."""
-    meaning = {parameter.name: parameter.at_bounds for parameter in parameters}
-    texts = []
-    for found in fitted:
-        if found.state != "on_bound" or found.bounds is None:
-            continue
-        upper = found.estimate - found.bounds[0] > found.bounds[1] - found.estimate
-        side, unit = ("upper" if upper else "lower"), "" if found.unit == "1" else f" {found.unit}"
-        texts.append(
-            f"{found.name} ended on its {side} bound ({found.estimate:.3g}{unit}), which is not an estimate: "
-            f"{meaning[found.name.partition('[')[0]][upper]}."
-        )
-    return texts

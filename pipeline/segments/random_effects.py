@@ -32,7 +32,8 @@ from ..trajectories.initial_state import flight_frames
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
 from ..trajectories.track_noise import MAD_TO_STD, Noise
-from .first_contact_fit import ITERATIONS, MODEL_ERROR, EffectEstimate, described, windows_of
+from .first_contact_fit import ITERATIONS, MODEL_ERROR, EffectEstimate, windows_of
+from .fitted_parameters import fitted_parameter
 from .group_parameters import group_of, group_parameters, with_known_groups
 from .mixed_model import Array, GroupLayout, GroupPosterior, GroupPrior, posterior
 from .segments import PARAMETER_STEP
@@ -132,7 +133,7 @@ def _with_ground_shift(result: EffectEstimate, layout: GroupLayout, found: Group
         return result
     at = int(layout.places(layout.parameters.index(GROUND_SHIFT))[0])
     z, std = float(found.values[at]), float(np.sqrt(found.covariance[at, at]))
-    ground = described(GROUND_SHIFT, z, std, student_quantile(0.975, found.dof))
+    ground = fitted_parameter(GROUND_SHIFT, z, std, student_quantile(0.975, found.dof))
     moved = replace(world, ground_offset=world.ground_offset + ground.estimate)
     record = result.record | {"ground_shift_m": ground.estimate}
     return replace(result, world=moved, ground=ground, record=record)
@@ -212,7 +213,7 @@ class _Reported:
 
     def add_shared(self, p: Parameter, z: Array, std: Array, reach: float) -> None:
         """Add a parameter with one value for all."""
-        self.rows.append(described(p, float(z[0]), float(std[0]), reach))
+        self.rows.append(fitted_parameter(p, float(z[0]), float(std[0]), reach))
         self.centres.append(float(z[0]))
 
     def add_groups(
@@ -232,14 +233,14 @@ class _Reported:
         centre = float(np.clip(mean, *p.limits))
         self.spread[p.name] = tau
         error = float(np.sqrt((tau**2 + (std**2).mean()) / count))
-        row = described(p, centre, error, student_quantile(0.975, max(count - 1, 1)))
+        row = fitted_parameter(p, centre, error, student_quantile(0.975, max(count - 1, 1)))
         note = f"mean over {count} {p.shared}s, which differ by {tau:.3g} {p.unit} (standard deviation)"
         self.rows.append(row.model_copy(update={"note": note}))
         self.centres.append(centre)
         for group, value, error in zip(groups, z, std, strict=True):
             self.own.setdefault(group, {})[p.name] = float(p.decode(torch.tensor(value)))
             if p.shared == "group":
-                one = described(p, float(value), float(error), reach)
+                one = fitted_parameter(p, float(value), float(error), reach)
                 update = {"name": f"{p.name}[{group}]", "note": f"of {group} alone"}
                 self.rows.append(one.model_copy(update=update))
 

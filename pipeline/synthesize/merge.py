@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...datasets.io.atomic import new_directory, new_file, sha256
+from ...datasets.io.free_space import enough_room
 from ...datasets.io.progress import progress
-from ...datasets.io.room import enough_room
 from ...datasets.rollouts.dataset import (
     MANIFEST,
     MODEL_FOLDER,

@@ -20,7 +20,8 @@ from ...physics.effects import Effect
 from ...physics.parameters import DAMPING_RATIO, FRICTION, Parameter
 from ...physics.world import World
 from ...segments.candidates import base_values
-from ...segments.first_contact_fit import UNOBSERVABLE_SHARE, EffectEstimate, described, placed
+from ...segments.first_contact_fit import EffectEstimate, placed
+from ...segments.fitted_parameters import UNOBSERVABLE_SHARE, fitted_parameter
 from ...segments.impact_fit import BASE, LEAST, ImpactBase, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
@@ -70,7 +71,9 @@ def fit_effect_flights(
     std = np.sqrt(np.diag(covariance))
     if any(s > UNOBSERVABLE_SHARE * p.prior[1] for s, p in zip(std, names, strict=True)):
         return None
-    parameters = tuple(described(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True))
+    parameters = tuple(
+        fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True)
+    )
     record = {"flights": len(prepared.flight.items), "costs": [found.cost], "chi2": excess}
     correlation = correlation_of([p.name for p in names], covariance)
     return EffectEstimate(

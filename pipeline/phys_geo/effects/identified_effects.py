@@ -13,7 +13,8 @@ from ...optimization.uncertainty import correlation_of, few_covariance
 from ...physics.effects import ActiveEffect
 from ...physics.parameters import Parameter
 from ...physics.world import World
-from ...segments.first_contact_fit import UNOBSERVABLE_SHARE, EffectEstimate, described, placed
+from ...segments.first_contact_fit import EffectEstimate, placed
+from ...segments.fitted_parameters import UNOBSERVABLE_SHARE, fitted_parameter
 
 
 def at_neutral(world: World, names: Sequence[str]) -> World:
@@ -62,7 +63,9 @@ def identified_effects(
     theirs = [parameters[k] for k in kept]
     return EffectEstimate(
         world=placed(world, theirs, values[kept]),
-        parameters=tuple(described(p, float(values[k]), float(std[k])) for p, k in zip(theirs, kept, strict=True)),
+        parameters=tuple(
+            fitted_parameter(p, float(values[k]), float(std[k])) for p, k in zip(theirs, kept, strict=True)
+        ),
         record=record,
         correlations=(correlation_of([p.name for p in theirs], covariance[np.ix_(kept, kept)]),),
     )

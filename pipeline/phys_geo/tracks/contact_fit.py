@@ -35,7 +35,8 @@ from ...physics.parameters import (
 )
 from ...physics.world import World
 from ...runtime.resources import one_torch_thread
-from ...segments.first_contact_fit import EffectEstimate, bound_warnings
+from ...segments.first_contact_fit import EffectEstimate
+from ...segments.fitted_parameters import bound_warnings
 from ...segments.segments import world_for
 from ...trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from ...trajectories.observations import Observations

@@ -17,7 +17,8 @@ from ...optimization.uncertainty import correlation_of
 from ...physics.contact_law import restitution
 from ...physics.parameters import GROUND_SHIFT, Parameter
 from ...physics.world import State, World
-from ...segments.first_contact_fit import EffectEstimate, bound_warnings, described
+from ...segments.first_contact_fit import EffectEstimate
+from ...segments.fitted_parameters import bound_warnings, fitted_parameter
 from ...trajectories.track_noise import Noise
 from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
 
@@ -217,7 +218,7 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
     """Return a fitted parameter with its interval and prior."""
     centre, width = parameter.prior
     prior = f"normal{' in its logarithm' if parameter.logarithmic else ''} about {centre:g}, std {width:g}"
-    return described(parameter, coordinate, std).model_copy(update={"prior": prior})
+    return fitted_parameter(parameter, coordinate, std).model_copy(update={"prior": prior})
 
 
 def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:
