@@ -29,6 +29,7 @@ from cgwm.pipeline.physics.parameters import (
     mass_distribution,
 )
 from cgwm.pipeline.segments.fitted_parameters import bound_warnings, fitted_parameter
+from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import InputDataError, read_json
 from cgwm.schemas.model import FitFile, ModelFile
 from tiny_capture import (
@@ -179,7 +180,7 @@ def test_a_start_in_the_fingertip() -> None:
         finger = np.tile([x, 0.06, 0.06], (3, 1))
         return {"box": Track(times, np.cumsum(np.full((3, 3), 0.02), 0), quat), "tip": Track(times, finger, quat)}
 
-    noise = (5e-4, 5e-3)
+    noise = Noise(5e-4, 5e-3)
     assert examine_tracks(world, [("a", at(0.09), noise)]) == []
     (text,) = examine_tracks(world, [("a", at(0.075), noise)])
     assert re.search(r"a: in the first frame body 'box' is 5\.0 mm deep inside body 'tip'", text)
@@ -195,16 +196,16 @@ def test_poses_that_only_scatter_are_no_motion() -> None:
     quat = np.tile([1.0, 0, 0, 0], (15, 1))
     times = np.arange(15) / 30
 
-    def scattered(speed: float) -> list[tuple[str, dict[str, Track], tuple[float, float]]]:
+    def scattered(speed: float) -> list[tuple[str, dict[str, Track], Noise]]:
         path = np.array([0.0, 0.0, 0.05]) + 1e-3 * rng.standard_normal((15, 3)) + speed * times[:, None] * [1, 0, 0]
-        return [("a", {"box": Track(times, path, quat)}, (1e-3, 1e-2))]
+        return [("a", {"box": Track(times, path, quat)}, Noise(1e-3, 1e-2))]
 
     with pytest.raises(InputDataError, match=r"no free body moves(.|\n)*film the motion"):
         examine_tracks(world, scattered(0.0))
     assert examine_tracks(world, scattered(0.1)) == []
     # poses of coarse pictures may be uncertain, and the motion plain all the same
     ((name, tracks, _),) = scattered(0.1)
-    assert examine_tracks(world, [(name, tracks, (1e-3, 1.0))]) == []
+    assert examine_tracks(world, [(name, tracks, Noise(1e-3, 1.0))]) == []
 
 
 def test_a_time_offset_of_a_camera_gives_its_instants(root: Path) -> None:
@@ -238,7 +239,7 @@ def test_a_fit_that_ends_at_a_bound_says_what_it_means(parameter, low: str, high
     names = [*CONTACT_PARAMETERS, GROUND_SHIFT]
     world = world_of(box_body())
     inside = np.array([p.encode(p.prior[0]) for p in names])
-    record = FitRecord(episodes=9, search_episodes=9, noise_estimated=(1e-3, 1e-2))
+    record = FitRecord(episodes=9, search_episodes=9, noise_estimated=Noise(1e-3, 1e-2))
 
     def fit(best: np.ndarray) -> PhysicsFit:
         estimate = ContactEstimate(parameters=names, values=best, covariance=1e-8 * np.eye(4))
