@@ -59,13 +59,12 @@ def names(slot: SelectionStep) -> set[str]:
 def test_a_bounce_between_two_frames_is_no_flight() -> None:
     world = world_with("ball")
     for rate in (60.0, 100.0, 300.0):
-        episodes = tosses(
-            world, 5, count=6, duration_s=0.8, rate_hz=rate, noise=Noise(1e-5, 1e-4), height_m=(0.15, 0.4)
-        )
+        noise = Noise(1e-5, 1e-4)
+        episodes = tosses(world, 5, count=6, duration_s=0.8, rate_hz=rate, noise=noise, height_m=(0.15, 0.4))
         whole = whole_episodes(world, episodes)
-        flight, _, _ = cut_episodes(world, whole, (1e-5, 1e-4))
+        flight, _, _ = cut_episodes(world, whole, noise)
         assert len(flight) >= 6
-        fitted = fit_states(Segments.of("flight", world, whole, flight, (1e-4, 1e-3)))
+        fitted = fit_states(Segments.of("flight", world, whole, flight, Noise(1e-4, 1e-3)))
         # a bounce in a flight leaves millimetres; without one the model is exact
         assert float(fitted.residuals([], NOTHING, False)[0].abs().max()) < 1.0
 
