@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import running
-from .options import AnyDevice, Debug, Json, Overwrite, Quiet
+from .options import AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,12 +29,14 @@ def compare(
     ] = 0.1,
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Compare models on measured motion: where and when each fails, as figures and as an HTML page."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        trust(trust_effects)
         from ..pipeline.compare import compare as work
         from ..schemas import UsageError
 

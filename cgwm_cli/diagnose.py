@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import running
-from .options import AnyDevice, Debug, Json, Overwrite, Quiet
+from .options import AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -61,12 +61,14 @@ def diagnose(
     ] = None,
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Find the missing physical or measurement effect, and those that these data cannot distinguish from it."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        trust(trust_effects)
         from ..pipeline.diagnose import diagnose as work
 
         wanted = [name.strip() for name in candidates.split(",") if name.strip()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .execution import running
-from .options import AnyDevice, Debug, Json, Quiet
+from .options import AnyDevice, Debug, Json, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from ..schemas import ErrorSummary, EvalResult
@@ -24,12 +24,14 @@ def evaluate(
         float, typer.Option("--warmup-s", help="Length of the start that the model may see [s].")
     ] = 0.1,
     device: AnyDevice = "auto",
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Evaluate a model against measurements: open-loop errors of position, rotation and image."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        trust(trust_effects)
         from ..pipeline.evaluate import evaluate as work
         from ..schemas import UsageError
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from .execution import running
-from .options import Debug, Json, Overwrite, Quiet
+from .options import Debug, Json, Overwrite, Quiet, TrustEffects, trust
 from .usage import refuse_foreign
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ def export(
         typer.Option("--duration", min=0.02, help="mjcf: length of that motion [s] (1).", show_default=False),
     ] = None,
     overwrite: Overwrite = False,
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -93,6 +94,7 @@ def export(
     given = {"split": split, "cameras": cameras, "every": every, "task": task, "rollout": rollout, "mask": mask}
     given |= {"sh_degree": sh_degree, "capture": capture, "seed": seed, "duration_s": duration}
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        trust(trust_effects)
         from ..pipeline.export import export as work
         from ..pipeline.export.stage import OPTIONS, ExportOptions
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from .execution import running
-from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
+from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings, TrustEffects, trust
 
 if TYPE_CHECKING:
     from ..schemas import FittedParameter, ModelFile
@@ -70,12 +70,14 @@ def fit(
     overwrite: Overwrite = False,
     config: ConfigFile = None,
     set_: Settings = None,
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Fit a world model to a capture: shape and appearance (sg-gs), then physics (phys-geo)."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        trust(trust_effects)
         from ..pipeline.fit import fit as work
         from ..schemas import PhysConfig, SplatConfig
         from .settings import StageSettings

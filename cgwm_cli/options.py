@@ -24,7 +24,16 @@ Device = Annotated[
     typer.Option("--device", show_default="auto", help="auto takes a CUDA device if one is available."),
 ]
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace an output that exists, once the new one is complete.")
+    bool, typer.Option("--overwrite", help="Replace an output that cgwm wrote, once the new one is complete.")
+]
+TrustEffects = Annotated[
+    str,
+    typer.Option(
+        "--trust-effects",
+        metavar="FILE|SHA256|MODEL,...",
+        help="Python files of custom effects that may be run: the file, its SHA-256, or the model that brings it.",
+        show_default=False,
+    ),
 ]
 ConfigFile = Annotated[
     Path | None,
@@ -34,3 +43,12 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="STAGE.KEY=VALUE", help="One setting; may be repeated. Overrides --config."),
 ]
+
+
+def trust(named: str) -> None:
+    """Consent to what `--trust-effects` names; without it nothing is imported."""
+    names = [name.strip() for name in named.split(",") if name.strip()]
+    if names:
+        from ..pipeline.physics.effects.trust import trust_effects
+
+        trust_effects(names)

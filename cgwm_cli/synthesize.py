@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import running, typed
-from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings
+from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings, TrustEffects, trust
 
 if TYPE_CHECKING:
     from ..schemas import DatasetSummary, ShardsSummary
@@ -65,12 +65,14 @@ def synthesize(
     overwrite: Overwrite = False,
     config: ConfigFile = None,
     set_: Settings = None,
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Make labelled rollouts of a model, in HDF5: images, depth, masks, poses, contacts, parameters."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
+        trust(trust_effects)
         from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
         from .settings import StageSettings
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import running, until_interrupted
-from .options import Debug, Json, Quiet
+from .options import Debug, Json, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from ..schemas import ViewReport
@@ -24,6 +24,7 @@ def view(
         str, typer.Option("--host", help="Address to listen on; with 0.0.0.0 everyone on the network can connect.")
     ] = "127.0.0.1",
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
+    trust_effects: TrustEffects = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -31,6 +32,7 @@ def view(
     """Show the rollouts of a dataset, or a model and its simulated motion, in the browser until Ctrl-C."""
     with contextlib.ExitStack() as ends:
         with running(json=json, quiet=quiet, debug=debug) as emit:
+            trust(trust_effects)
             from ..pipeline.view import open_view
             from ..schemas import ViewReport
 

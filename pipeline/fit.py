@@ -17,7 +17,8 @@ from ..datasets.capture.capture import Capture
 from ..datasets.capture.colmap_model import find_colmap_model
 from ..datasets.capture.geometry_maps import KINDS
 from ..datasets.capture.sparse_points import POINTS_NAME
-from ..datasets.io.atomic import refuse_existing, sha256
+from ..datasets.io.atomic import sha256
+from ..datasets.io.outputs import reads, refuse_output
 from ..datasets.models.model import Model, read_model, write_model
 from ..schemas import (
     Body,
@@ -36,6 +37,7 @@ from ..schemas import (
 from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
 from .phys_geo.stage import fit_motion
+from .physics.effects.trust import keep_trust
 from .physics.world import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
 from .runtime.device import resolve_device
@@ -48,6 +50,7 @@ ASSUMED_DENSITY_KG_M3 = 500.0
 """Density assumed for a body without a given mass; free motion and contact with the ground do not depend on it."""
 
 
+@reads("capture")
 def fit(
     capture: Path,
     out: Path,
@@ -105,13 +108,14 @@ def fit(
     file = model.file.model_copy(update={"provenance": provenance})
     fit_file = FitFile(stages=stages, warnings=file.warnings)
     written = write_model(out, replace(model, file=file, fit=fit_file), overwrite)
+    keep_trust(effect.name for effect in model.file.effects)
     checkpoint.remove()
     return written.file
 
 
 def _refuse_early(out: Path, stage: Stage, config: PhysConfig, overwrite: bool) -> None:
     """Refuse what cannot succeed, before hours of work."""
-    refuse_existing(out, overwrite)
+    refuse_output(out, "model", overwrite)
     with_effects((), config.effects)
     if config.effects and stage == "sg-gs":
         raise UsageError(

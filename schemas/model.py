@@ -93,8 +93,10 @@ class EffectModel(FileModel):
     """An effect in the model, with the values of its parameters and constants."""
 
     name: str
-    """A built-in effect, `path/to/file.py:ClassName`, or the name of an entry point of the group `cgwm.effects`; with
-    `@group` or `@episode` behind it each session, or episode, has numbers of its own."""
+    """A built-in effect, `effects/FILE.py:ClassName` for a file in the model's directory, or the name of an entry point
+    of the group `cgwm.effects`; with `@group` or `@episode` behind it each session, or episode, has specific values."""
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """SHA-256 of the file; none for effects without one."""
     parameters: dict[str, float] = {}
     """Where each unit has its own: the mean over units, which serves one that the fit has not seen."""
     own: dict[str, dict[str, float]] = {}

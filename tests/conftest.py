@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import os
+import tempfile
 from collections.abc import Iterator
 
 import pytest
@@ -8,6 +9,8 @@ import pytest
 # Tests start commands in processes of their own, from the repository's root. Without this Python puts that directory
 # first on the path, and finds the folder cgwm/ there instead of the installed package.
 os.environ["PYTHONSAFEPATH"] = "1"
+# What a user consents to is kept in the home directory: not that of the user who runs the tests.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cgwm-tests-")
 
 
 @pytest.fixture(scope="module")

@@ -139,13 +139,22 @@ def is_unsafe(call: ast.Call, name: str) -> bool:
     )
 
 
+RUNS_EFFECTS = "pipeline/physics/effects/registry.py"
+"""The only module that runs a file: that of a custom effect, after consent (test_trust)."""
+
+
 def test_nothing_is_unpickled_executed_or_fetched() -> None:
     forbidden = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal", "requests", "httpx"}
     forbidden |= {"urllib.request", "http.client", "ftplib"}
     wrong = []
     for path in FILES:
         wrong += [place(path, line) for line, name in imports(path) if name in forbidden]
-        wrong += [f"{place(path, call.lineno)} calls {name}" for call, name in calls(path) if is_unsafe(call, name)]
+        allowed = {"exec", "compile"} if place(path, 0).startswith(RUNS_EFFECTS) else set()
+        wrong += [
+            f"{place(path, call.lineno)} calls {name}"
+            for call, name in calls(path)
+            if is_unsafe(call, name) and name not in allowed
+        ]
     assert wrong == []
 
 

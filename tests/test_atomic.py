@@ -10,16 +10,17 @@ from pathlib import Path
 
 import pytest
 from cgwm.datasets import new_directory, new_file, sha256
+from cgwm.datasets.io.outputs import RECORD, signed
 from cgwm.schemas import UsageError
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir() if path.name != RECORD)
 
 
 def test_directory_appears_at_the_end(tmp_path: Path) -> None:
     out = tmp_path / "made" / "on" / "the" / "way" / "out"
-    with new_directory(out) as directory:
+    with new_directory(out, "model") as directory:
         (directory / "a").write_text("1")
         assert directory.parent == out.parent and not out.exists()
         assert re.fullmatch(rf"\.out\.partial-{os.getpid()}-[0-9a-f]{{8}}-[0-9a-f]{{8}}", directory.name)
@@ -28,10 +29,10 @@ def test_directory_appears_at_the_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
 def test_nothing_stays_after_an_exception(tmp_path: Path, error: type[BaseException]) -> None:
-    with pytest.raises(error), new_directory(tmp_path / "out") as directory:
+    with pytest.raises(error), new_directory(tmp_path / "out", "model") as directory:
         (directory / "a").write_text("1")
         raise error
-    with pytest.raises(error), new_file(tmp_path / "out.json") as file:
+    with pytest.raises(error), new_file(tmp_path / "out.json", "effect") as file:
         file.write_text("1")
         raise error
     assert names(tmp_path) == []
@@ -41,7 +42,7 @@ def test_existing_output_is_refused_before_work(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "file").write_text("old")
     for make, name in ((new_directory, "out"), (new_file, "file")):
-        with pytest.raises(UsageError) as caught, make(tmp_path / name):
+        with pytest.raises(UsageError) as caught, make(tmp_path / name, "model" if name == "out" else "effect"):
             raise AssertionError("not reached")
         assert str(caught.value) == f"{tmp_path / name} exists.\nNext: choose another name or pass --overwrite."
         assert caught.value.exit_code == 2
@@ -49,11 +50,11 @@ def test_existing_output_is_refused_before_work(tmp_path: Path) -> None:
 
 
 def test_output_that_appears_meanwhile_is_not_replaced(tmp_path: Path) -> None:
-    with pytest.raises(UsageError), new_directory(tmp_path / "out") as directory:
+    with pytest.raises(UsageError), new_directory(tmp_path / "out", "model") as directory:
         (directory / "mine").touch()
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / "theirs").touch()
-    with pytest.raises(UsageError), new_file(tmp_path / "file") as file:
+    with pytest.raises(UsageError), new_file(tmp_path / "file", "effect") as file:
         file.write_text("mine")
         (tmp_path / "file").write_text("theirs")
     assert names(tmp_path / "out") == ["theirs"] and (tmp_path / "file").read_text() == "theirs"
@@ -62,20 +63,20 @@ def test_output_that_appears_meanwhile_is_not_replaced(tmp_path: Path) -> None:
 
 def test_overwrite_keeps_the_old_until_the_new_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    out.mkdir()
-    (out / "old").touch()
-    with pytest.raises(ValueError), new_directory(out, overwrite=True):
+    with new_directory(out, "model") as directory:
+        (directory / "old").touch()
+    with pytest.raises(ValueError), new_directory(out, "model", overwrite=True):
         assert names(out) == ["old"]
         raise ValueError
     assert names(out) == ["old"] and names(tmp_path) == ["out"]
-    with new_directory(out, overwrite=True) as directory:
+    with new_directory(out, "model", overwrite=True) as directory:
         (directory / "new").touch()
     assert names(out) == ["new"] and names(tmp_path) == ["out"]
-    with new_file(tmp_path / "file", overwrite=True) as file:
-        file.write_text("1")
-    with new_file(tmp_path / "file", overwrite=True) as file:
-        file.write_text("2")
-    assert (tmp_path / "file").read_text() == "2"
+    with new_file(tmp_path / "file", "effect", overwrite=True) as file:
+        file.write_text(signed("1\n"))
+    with new_file(tmp_path / "file", "effect", overwrite=True) as file:
+        file.write_text(signed("2\n"))
+    assert (tmp_path / "file").read_text() == signed("2\n")
 
 
 def test_overwrite_does_not_remove_a_home_or_a_work_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +90,7 @@ def test_overwrite_does_not_remove_a_home_or_a_work_tree(tmp_path: Path, monkeyp
         ("people", "is, or contains, the home or working directory"),
         ("work", "is, or contains, the home or working directory"),
     ):
-        with pytest.raises(UsageError) as caught, new_directory(tmp_path / name, overwrite=True):
+        with pytest.raises(UsageError) as caught, new_directory(tmp_path / name, "model", overwrite=True):
             raise AssertionError("not reached")
         expected = f"{tmp_path / name} {reason}; --overwrite does not remove it.\nNext: choose another name."
         assert str(caught.value) == expected
@@ -98,7 +99,7 @@ def test_overwrite_does_not_remove_a_home_or_a_work_tree(tmp_path: Path, monkeyp
 _KILLED = """
 import sys, time
 from cgwm.datasets import new_directory, new_file
-with new_directory(sys.argv[1]) as directory, new_file(sys.argv[2]) as file:
+with new_directory(sys.argv[1], "model") as directory, new_file(sys.argv[2], "effect") as file:
     (directory / "half").write_text("x")
     file.write_text("x")
     print("writing", flush=True)
@@ -110,10 +111,10 @@ def test_a_killed_process_leaves_no_output_and_is_tidied_up_after(tmp_path: Path
     out, file = tmp_path / "out", tmp_path / "file.json"
     process = subprocess.Popen([sys.executable, "-c", _KILLED, str(out), str(file)], stdout=subprocess.PIPE, text=True)
     assert process.stdout and process.stdout.readline() == "writing\n"
-    with new_directory(tmp_path / "out2"):
+    with new_directory(tmp_path / "out2", "model"):
         pass
     process.send_signal(signal.SIGSTOP)
-    with new_directory(tmp_path / "other"):
+    with new_directory(tmp_path / "other", "model"):
         pass
     process.kill()
     process.wait()
@@ -121,7 +122,7 @@ def test_a_killed_process_leaves_no_output_and_is_tidied_up_after(tmp_path: Path
     assert "out" not in left and "file.json" not in left
     partial = [name for name in left if ".partial-" in name]
     assert len(partial) == 2 and all(name.startswith(".") for name in partial)
-    with new_directory(out), new_file(file) as temporary:
+    with new_directory(out, "model"), new_file(file, "effect") as temporary:
         temporary.write_text("whole")
     assert names(tmp_path) == ["file.json", "other", "out", "out2"]
 
@@ -133,7 +134,7 @@ def test_what_a_living_process_or_another_machine_writes_stays(tmp_path: Path) -
     dead = tmp_path / ".out.partial-999999999-11111111"
     for folder in (living, elsewhere, other_output, dead):
         folder.mkdir()
-    with new_directory(tmp_path / "out"):
+    with new_directory(tmp_path / "out", "model"):
         pass
     assert living.exists() and elsewhere.exists() and other_output.exists() and not dead.exists()
 
@@ -142,7 +143,7 @@ def test_a_replaced_directory_comes_back_if_its_replacement_never_arrived(tmp_pa
     aside = tmp_path / ".out.replaced-999999999-11111111"
     aside.mkdir()
     (aside / "old").touch()
-    with pytest.raises(UsageError), new_directory(tmp_path / "out"):
+    with pytest.raises(UsageError), new_directory(tmp_path / "out", "model"):
         raise AssertionError("not reached")
     assert names(tmp_path / "out") == ["old"]
 

@@ -22,7 +22,7 @@ from cgwm.pipeline.evaluate import evaluate
 from cgwm.pipeline.evaluate.prediction import Motion
 from cgwm.pipeline.physics import State, World, simulate
 from cgwm.pipeline.segments.prepare import prepare
-from cgwm.schemas import PHASES, CompareResult, EffectModel, InputDataError, UsageError
+from cgwm.schemas import PHASES, CompareResult, EffectModel, UsageError
 from pages import Tags, clicked
 from small_model import HALF, small_model
 from thrown_cube import FRAMES, NOISE_M, RATE_HZ, add_video, measured, quick, truth, with_friction, write_capture
@@ -317,7 +317,7 @@ def test_an_existing_page_is_told_before_the_work(folder: Path, tmp_path: Path) 
     (tmp_path / "page.html").write_text("mine")
     with pytest.raises(UsageError, match="exists"):
         compare([folder / "nothing"], folder / "capture", out=tmp_path / "page.html")
-    with pytest.raises(InputDataError, match="nothing"):
+    with pytest.raises(UsageError, match="no page of cgwm, or was changed; --overwrite does not remove it"):
         compare([folder / "nothing"], folder / "capture", out=tmp_path / "page.html", overwrite=True)
     assert (tmp_path / "page.html").read_text() == "mine"
 

@@ -142,7 +142,7 @@ def test_a_class_that_wants_arguments_is_refused(own: Path) -> None:
 
 def test_the_built_in_effects_are_the_files_of_the_folder() -> None:
     folder = Path(module.__file__).parent
-    others = {"__init__", "catalogue", "effect", "registry", "residual_wrench", "template"}
+    others = {"__init__", "catalogue", "effect", "registry", "residual_wrench", "template", "trust"}
     assert sorted(path.stem for path in folder.glob("*.py") if path.stem not in others) == sorted(BUILT_IN)
 
 
@@ -153,7 +153,7 @@ def test_one_effect_is_imported_without_the_others() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     names = {name.rpartition(".")[2] for name in quoted(done.stdout)}
-    assert names == {"effect", "registry", "wind"}
+    assert names == {"effect", "registry", "trust", "wind"}
 
 
 def quoted(text: str) -> list[str]:
@@ -229,8 +229,16 @@ def test_the_template_overwrites_nothing(tmp_path: Path) -> None:
         new_effect(path)
     assert str(error.value) == f"{path} exists.\nNext: choose another name or pass --overwrite."
     assert path.read_text() == "mine"
-    new_effect(path, overwrite=True)
-    assert "class MyEffect(Effect):" in path.read_text()
+    with pytest.raises(UsageError, match="no effect template of cgwm, or was changed"):
+        new_effect(path, overwrite=True)
+    assert path.read_text() == "mine"
+    new_effect(tmp_path / "new.py")
+    assert "class MyEffect(Effect):" in (tmp_path / "new.py").read_text()
+    new_effect(tmp_path / "new.py", overwrite=True)
+    with (tmp_path / "new.py").open("a") as file:
+        file.write("# mine\n")
+    with pytest.raises(UsageError, match="was changed"):
+        new_effect(tmp_path / "new.py", overwrite=True)
     with pytest.raises(UsageError) as error:
         new_effect(tmp_path / "mine.txt")
     assert str(error.value) == f"{tmp_path}/mine.txt: an effect is a Python file.\nAllowed: a name that ends with .py."

@@ -1,6 +1,7 @@
 """Exports: each file says what the model or the dataset says, in its format's own frames, units and orders."""
 
 import json
+import shutil
 import struct
 import sys
 from collections.abc import Callable, Iterator
@@ -570,10 +571,15 @@ def test_the_wrong_kind_is_named(dataset: Path, model: Path, tmp_path: Path, for
 def test_what_exists_stays(dataset: Path, model: Path, tmp_path: Path, format_: ExportFormat) -> None:
     out = tmp_path / ("out.glb" if format_ == "glb" else "out")
     thing = dataset if format_ in DATASET_FORMATS else model
-    out.write_text("mine") if format_ == "glb" else out.mkdir()
+    out.write_text("mine") if format_ == "glb" else (out / "mine").mkdir(parents=True)
+    if format_ != "glb":
+        (out / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(UsageError, match="exists"):
         export(thing, format_, out)
-    export(thing, format_, out, ExportOptions(every=10), overwrite=True)
+    with pytest.raises(UsageError, match="--overwrite does not remove it"):
+        export(thing, format_, out, overwrite=True)
+    out.unlink() if format_ == "glb" else shutil.rmtree(out)
+    export(thing, format_, out, ExportOptions(every=10))
     first = sha256(out)
     export(thing, format_, out, ExportOptions(every=10), overwrite=True)
     assert sha256(out) == first  # the same bytes again

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets import Model, kind_of, read_model, write_model
+from cgwm.datasets.io.outputs import RECORD
 from cgwm.schemas import BodyModel, FitFile, FittedParameter, Ground, InputDataError, ModelFile, Provenance, UsageError
 from test_ply import splats
 
@@ -59,7 +60,7 @@ def test_equal_models_are_equal_bytes_and_a_read_model_writes_itself(tmp_path: P
     write_model(tmp_path / "a", model())
     write_model(tmp_path / "b", read_model(tmp_path / "a"))
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
-    assert files == ["cube.collision.ply", "cube.ply", "fit.json", "model.json", "scene-2.ply", "scene.ply"]
+    assert files == [RECORD, "cube.collision.ply", "cube.ply", "fit.json", "model.json", "scene-2.ply", "scene.ply"]
     for name in ("model.json", "fit.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 

@@ -71,7 +71,7 @@ def make_capture(
     item = load_item(obj)
     plan, rejected = plan_capture(item, obj, material, task, seed, tests)
     print(f"{obj} {material} {task}: draws left out: {rejected or 'none'}", flush=True)
-    with new_directory(Path(folder), overwrite) as directory:
+    with new_directory(Path(folder), "capture", overwrite) as directory:
         stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL)
         record(stage, directory)
         cameras = read_truth(directory).cameras

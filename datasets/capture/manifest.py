@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from ...schemas import CaptureManifest
-from ..io.atomic import new_file
+from ..io.atomic import new_file, replaced_file
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def write_manifest(path: Path | str, manifest: CaptureManifest, overwrite: bool = False) -> None:
     """Write a manifest as TOML; default values are omitted, except those of the world."""
-    with new_file(path, overwrite) as temporary:
+    with replaced_file(path) if overwrite else new_file(path, "manifest") as temporary:
         temporary.write_text(manifest_toml(manifest), encoding="utf-8")
 
 

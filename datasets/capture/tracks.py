@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import QUATERNION_NORM_TOLERANCE, InputDataError, did_you_mean
-from ..io.atomic import new_file
+from ..io.atomic import new_file, replaced_file
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
 
 def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = False) -> None:
     """Write the tracks of an episode atomically; reading them back gives exactly the same numbers."""
-    with new_file(path, overwrite) as temporary:
+    with replaced_file(path) if overwrite else new_file(path, "track file") as temporary:
         temporary.write_text(tracks_csv(tracks), encoding="utf-8")
 
 

@@ -52,7 +52,7 @@ def write_bop(
     folders = _split_folders(chosen)
     counts = {"scenes": 0, "images": 0, "instances": 0, "objects": len(models)}
     whole = True
-    with new_directory(path, overwrite) as folder:
+    with new_directory(path, "BOP dataset", overwrite) as folder:
         write_models(folder / "models", list(models.values()))
         for number in progress(range(len(chosen)), "scenes", len(chosen), "scene"):
             info = chosen.reader.rollouts[number]

@@ -43,7 +43,7 @@ def write_colmap(
     camera_ids = {name: number for number, name in enumerate(cameras.cameras, 1)}
     sensors = [camera_ids[image.camera] for image in cameras.images.values()]
     copied = 0
-    with new_directory(path, overwrite) as folder:
+    with new_directory(path, "COLMAP model", overwrite) as folder:
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         files = {

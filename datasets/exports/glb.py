@@ -83,7 +83,7 @@ def write_glb(path: Path | str, model: Model, overwrite: bool = False) -> dict[s
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     size = 12 + 8 + len(text) + 8 + len(buffer.data)
-    with new_file(path, overwrite) as temporary, temporary.open("wb") as stream:
+    with new_file(path, "glTF file", overwrite) as temporary, temporary.open("wb") as stream:
         stream.write(struct.pack("<4sII", b"glTF", 2, size))
         stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
         stream.write(struct.pack("<I4s", len(buffer.data), b"BIN\0") + buffer.data)

@@ -63,7 +63,7 @@ def write_lerobot(path: Path, chosen: Selection, task: str | None = None, overwr
                 "even sides, for the video's colours are stored by blocks of 2x2 px.",
                 "synthesize with an even width and height.",
             )
-    with new_directory(path, overwrite) as folder:
+    with new_directory(path, "LeRobot dataset", overwrite) as folder:
         writer = _Writer(folder, chosen, task or f"Predict the motion of {', '.join(chosen.bodies())}.")
         for number in progress(range(len(chosen)), "episodes", len(chosen), "episode"):
             writer.episode(number)

@@ -50,7 +50,7 @@ def write_nerfstudio(
     time_s = chosen.reader.read(number, "time")
     frames: list[dict[str, Any]] = []
     dropped = 0
-    with new_directory(path, overwrite) as folder:
+    with new_directory(path, "nerfstudio capture", overwrite) as folder:
         for camera in progress(chosen.cameras, "cameras", len(chosen.cameras), "camera"):
             for picture in chosen.pictures(number, camera):
                 entry, far = _frame(folder, camera, chosen.camera(number, camera, picture.frame), picture)

@@ -28,7 +28,7 @@ def write_splat_files(path: Path, model: Model, sh_degree: int = 0, overwrite: b
         write_splats(path, whole, "world", sh_degree, overwrite)
         return {path.name: len(whole)}
     counts: dict[str, int] = {}
-    with new_directory(path, overwrite) as folder:
+    with new_directory(path, "splat folder", overwrite) as folder:
         if model.scene is not None:
             write_splats(folder / "scene.ply", model.scene, "world", sh_degree)
             counts["scene.ply"] = len(model.scene)

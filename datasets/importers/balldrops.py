@@ -24,6 +24,7 @@ from ...schemas import Body, InputDataError, Shape, World
 from ...schemas.capture import SphereShape
 from ...schemas.imports import ImportResult
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from .recordings import Recording, Units, write_recordings
 
 BALL = "ball"
@@ -33,6 +34,7 @@ _TABLE = "balls.txt"
 _TODO = "get the data of github.com/briandesilva/discovery-of-physics-from-data."
 
 
+@reads("source")
 def import_balldrops(
     source: Path | str, out: Path | str, only: str | None = None, overwrite: bool = False
 ) -> ImportResult:
@@ -50,7 +52,7 @@ def import_balldrops(
     """
     source = Path(source)
     path = source / "ball_drops.csv" if source.is_dir() else source
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         recordings = _drops(path)
         balls = list(dict.fromkeys(str(recording.group) for recording in recordings))
         if only is not None and only not in balls:

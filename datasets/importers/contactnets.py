@@ -13,6 +13,7 @@ from ...schemas.imports import ImportResult
 from ..capture.manifest import write_manifest
 from ..capture.tracks import Track, tracks_csv
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from ..io.progress import note, progress
 
 Array = NDArray[np.float64]
@@ -40,6 +41,7 @@ class _Tosses:
     """Half the edge of the cube [m]."""
 
 
+@reads("source")
 def import_contactnets(
     source: Path | str,
     out: Path | str,
@@ -66,7 +68,7 @@ def import_contactnets(
         InputDataError: If the source is not such data.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         tosses = _read(Path(source))
         names = [f"{number:03d}" for number in sorted(tosses.tracks)]
         if len(names) < n_train + n_test:

@@ -16,6 +16,7 @@ from ...schemas import InputDataError, did_you_mean
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from .recordings import SI, Units, read_text, track_files, write_tracks
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ _UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
 _LENGTHS, _TIMES = ("m", "cm", "mm", "in"), ("s", "ms", "us", "ns")
 
 
+@reads("source")
 def import_csv(
     source: Path | str,
     out: Path | str,
@@ -68,7 +70,7 @@ def import_csv(
         InputDataError: If a file is not such a track, or its numbers cannot be seconds and metres.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         for name in columns or {}:
             if name not in COLUMNS:
                 raise InputDataError(

@@ -14,6 +14,7 @@ from ...schemas import InputDataError, did_you_mean
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from .recordings import SI, Units, track_files, write_tracks
 
 Array = NDArray[np.float64]
@@ -29,6 +30,7 @@ _NAMES = {
 _WIDTHS = {"time": (), "position": (3,), "quat_wxyz": (4,), "quat_xyzw": (4,)}
 
 
+@reads("source")
 def import_hdf5(
     source: Path | str,
     out: Path | str,
@@ -62,7 +64,7 @@ def import_hdf5(
         InputDataError: If a file has no such groups, or its numbers cannot be seconds and metres.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         for name in columns or {}:
             if name not in SETS:
                 raise InputDataError(

@@ -26,6 +26,7 @@ from ...schemas.capture import SphereShape
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from .recordings import Recording, drawn_splits, episode_names, write_recordings
 
 Array = NDArray[np.float64]
@@ -42,6 +43,7 @@ _SHORTEST_S = 0.3
 _TODO = "get the recordings of github.com/Project-DeepBlue-Juggling/Jugglebot."
 
 
+@reads("source")
 def import_jugglebot(
     source: Path | str,
     out: Path | str,
@@ -66,7 +68,7 @@ def import_jugglebot(
         InputDataError: If the source is not such data, or a track has no flight.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         sessions = _sessions(Path(source), only)
         recordings = []
         for path, session in zip(sessions, episode_names([path.stem for path in sessions]), strict=True):

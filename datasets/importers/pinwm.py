@@ -44,6 +44,7 @@ from ..capture.images import image_size, read_alpha, read_rgb, write_image
 from ..capture.manifest import write_manifest
 from ..capture.tracks import Track, tracks_csv
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from ..io.progress import progress
 from ..shapes.meshes import Mesh, read_mesh
 
@@ -102,6 +103,7 @@ class _Recording:
         return {BLOCK: block, PUSHER: pusher_track(self.push.ee_init_position, self.push.ee_goal_position, len(poses))}
 
 
+@reads("source")
 def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwrite: bool = False) -> ImportResult:
     """Write the pushes as a capture: block, pusher, camera, frames, masks and tracks.
 
@@ -119,7 +121,7 @@ def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwri
         UsageError: If `out` exists, before anything is read.
     """
     source = Path(source)
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         recordings = _recordings(source, n_train)
         filmed = [recording for recording in recordings if recording.frames]
         shape, mass_kg, com_m = _link(source / _BLOCK_URDF)

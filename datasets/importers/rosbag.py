@@ -13,6 +13,7 @@ from ...schemas import InputDataError, UsageError, did_you_mean
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from ..io.progress import note
 from .recordings import Units, write_tracks
 
@@ -27,6 +28,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 """A list of TransformStamped, of several frames."""
 
 
+@reads("source")
 def import_rosbag(
     source: Path | str,
     out: Path | str,
@@ -63,7 +65,7 @@ def import_rosbag(
         import_module("rosbags.highlevel")
     except ImportError:
         raise UsageError("ROS bags need the package rosbags.", todo="pip install 'cgwm[ros]'.") from None
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         bags = _bags(Path(source))
         tracks = ({body: _track(path, topic)} for path in bags)
         return write_tracks(directory, out, [path.stem for path in bags], tracks, up, (n_train, n_test, seed))

@@ -11,9 +11,11 @@ from ...schemas import InputDataError
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.outputs import reads
 from .recordings import SI, Units, read_text, track_files, write_tracks
 
 
+@reads("source")
 def import_tum(
     source: Path | str,
     out: Path | str,
@@ -45,7 +47,7 @@ def import_tum(
         InputDataError: If a file is no such trajectory, or its numbers cannot be seconds and metres.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, overwrite) as directory:
+    with new_directory(out, "capture", overwrite) as directory:
         files = track_files(Path(source), (".txt", ".tum"))
         tracks = ({body: _track(path, units)} for path in files)
         return write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))

@@ -17,57 +17,78 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ...schemas import UsageError
+from .outputs import DirectoryKind, FileKind, inside_output, refuse_output, write_record
 
 _PARTIAL = "partial"
 _REPLACED = "replaced"
 
 
 @contextmanager
-def new_directory(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+def new_directory(path: Path | str, kind: DirectoryKind, overwrite: bool = False) -> Iterator[Path]:
     """Yield an empty directory that takes the name `path` when the block ends without an exception.
 
     Args:
         path: Final path; parent directories are made.
+        kind: What the directory is; only the same kind is replaced.
         overwrite: Replace an existing directory. It disappears only after the new one is complete.
 
     Raises:
-        UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or if replacing it would
-            remove a protected directory (home, the working directory or one above it, a git work tree).
+        UsageError: Before anything is written, see :func:`refuse_output`.
     """
     path = Path(path)
     _clean_stale(path)
-    refuse_existing(path, overwrite)
+    refuse_output(path, kind, overwrite)
     temporary = _temporary(path)
     try:
         temporary.mkdir()  # inside, so that a signal that arrives right after it still removes it
-        yield temporary
+        with inside_output():
+            yield temporary
+        write_record(temporary, kind)
         _sync_tree(temporary)
-        _put_in_place(temporary, path, overwrite)
+        _put_in_place(temporary, path, kind, overwrite)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
 
 
 @contextmanager
-def new_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+def new_file(path: Path | str, kind: FileKind, overwrite: bool = False) -> Iterator[Path]:
     """Yield the path of a file to write, which takes the name `path` when the block ends without an exception.
 
     The temporary name ends with the suffix of `path`, for writers that choose their format by it.
 
+    Args:
+        path: Final path; parent directories are made.
+        kind: What the file is; only the same kind is replaced.
+        overwrite: Replace an existing file.
+
     Raises:
-        UsageError: Before anything is written, if `path` exists and `overwrite` is not set, or is a directory.
+        UsageError: Before anything is written, if `path` is a directory, and see :func:`refuse_output`.
+    """
+    path = Path(path)
+    refuse_output(path, kind, overwrite)
+    with replaced_file(path) as temporary:
+        yield temporary
+        refuse_output(path, kind, overwrite)
+
+
+@contextmanager
+def replaced_file(path: Path | str) -> Iterator[Path]:
+    """Yield the path of a file to write, which takes the name `path`, as :func:`new_file` does, whatever is there.
+
+    For files inside of cgwm's own outputs; a name that a user chose goes through :func:`new_file`.
+
+    Raises:
+        UsageError: Before anything is written, if `path` is a directory.
     """
     path = Path(path)
     if path.is_dir():
         raise UsageError(f"{path} is a directory; a file is written here.", todo="choose another name.")
     _clean_stale(path)
-    refuse_existing(path, overwrite)
     temporary = _temporary(path, path.suffix)
     try:
         yield temporary
         _sync(temporary)
-        if not overwrite:
-            refuse_existing(path, overwrite)
         os.replace(temporary, path)
         _sync(path.parent)
     except BaseException:
@@ -122,23 +143,6 @@ def sha256(path: Path | str) -> str:
         while block := stream.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Refuse an output that exists, unless it may be replaced; called before long work starts.
-
-    Raises:
-        UsageError: If it exists and `overwrite` is not given, or replacing it would remove more than an output.
-    """
-    if not os.path.lexists(path):
-        return
-    if not overwrite:
-        raise UsageError(f"{path} exists.", todo="choose another name or pass --overwrite.")
-    place = path.resolve()
-    here, home = Path.cwd().resolve(), Path.home().resolve()
-    if place in (here, home) or place in here.parents or place in home.parents or (place / ".git").exists():
-        reason = "holds a .git" if (place / ".git").exists() else "is, or contains, the home or working directory"
-        raise UsageError(f"{path} {reason}; --overwrite does not remove it.", todo="choose another name.")
 
 
 def _temporary(path: Path, suffix: str = "") -> Path:
@@ -196,12 +200,12 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _put_in_place(temporary: Path, path: Path, overwrite: bool) -> None:
+def _put_in_place(temporary: Path, path: Path, kind: DirectoryKind, overwrite: bool) -> None:
     if not os.path.lexists(path):
         os.rename(temporary, path)
         _sync(path.parent)
         return
-    refuse_existing(path, overwrite)
+    refuse_output(path, kind, overwrite)
     aside = _sibling(path, _REPLACED)
     os.rename(path, aside)
     try:

@@ -10,6 +10,7 @@ from ..capture.tracks import Track, read_tracks, write_tracks
 from ..io.atomic import new_directory
 from ..io.kinds import refuse_other_kind
 from ..shapes.ply import Splats, read_splats, write_splats
+from .effect_files import pack_effects, unpack_effects
 
 CAMERAS = "cameras.json"
 POSE_TRACKS = "pose_tracks"
@@ -62,6 +63,7 @@ def read_model(path: Path | str) -> Model:
     root = Path(path)
     refuse_other_kind(root, "model")
     file = read_json(root / "model.json", ModelFile)
+    file = file.model_copy(update={"effects": unpack_effects(file.effects, root)})
     body_splats: dict[str, Splats] = {}
     collision: dict[str, Splats] = {}
     for body in file.bodies:
@@ -105,7 +107,7 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
         bodies.append(body.model_copy(update=update))
     scene = None if model.scene is None else "scene.ply"
     file = model.file.model_copy(update={"bodies": tuple(bodies), "scene": scene})
-    with new_directory(path, overwrite) as directory:
+    with new_directory(path, "model", overwrite) as directory:
         for name, splats in files:
             write_splats(directory / name, splats, "body")
         if model.scene is not None:
@@ -119,7 +121,8 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
         for episode, tracks in model.tracks.items():
             write_tracks(directory / POSE_TRACKS / f"{episode}.csv", tracks)
         (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        (directory / "model.json").write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        packed = file.model_copy(update={"effects": pack_effects(file.effects, directory)})
+        (directory / "model.json").write_text(packed.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ...schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError, read_json
-from ..io.atomic import move_into_place, new_directory, new_file, scratch_file, sha256
+from ..io.atomic import move_into_place, new_directory, replaced_file, scratch_file, sha256
 from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
 from .index import index_fault
@@ -35,7 +35,7 @@ def read_manifest(path: Path) -> DatasetManifest:
 
 def write_manifest(path: Path, manifest: DatasetManifest) -> None:
     """Write the manifest of a dataset directory."""
-    with new_file(path / MANIFEST, overwrite=True) as temporary:
+    with replaced_file(path / MANIFEST) as temporary:
         temporary.write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
@@ -113,7 +113,7 @@ def new_dataset(
     entries: list[ShardEntry] = []
     name = shard_name(index, manifest.shard_count)
     if manifest.shard_count == 1:
-        with enough_room(path, name), new_directory(path, overwrite) as folder:
+        with enough_room(path, name), new_directory(path, "dataset", overwrite) as folder:
             yield folder / name, entries
             shutil.copytree(model, folder / MODEL_FOLDER)
             write_manifest(folder, manifest.model_copy(update={"shards": _stamped(entries, manifest)}))
@@ -134,7 +134,7 @@ def _publish(
 ) -> None:
     if not path.exists():
         try:
-            with new_directory(path) as folder:
+            with new_directory(path, "dataset") as folder:
                 shutil.copytree(model, folder / MODEL_FOLDER)
                 write_manifest(folder, manifest)
         except (UsageError, OSError):

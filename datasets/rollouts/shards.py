@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 
 from ...schemas import DatasetManifest, InputDataError, ShardEntry, read_json
-from ..io.atomic import leftovers, new_file, sha256
+from ..io.atomic import leftovers, replaced_file, sha256
 from .rollouts import Node, demo_names, open_shard
 
 SHARD = re.compile(r"rollouts-(\d{4,})-of-(\d{4,})\.h5")
@@ -56,7 +56,7 @@ def entry_file(path: Path, shard: str) -> Path:
 
 def write_entry(path: Path, entry: ShardEntry) -> None:
     """Write the entry of a shard just before the shard gets its final name."""
-    with new_file(entry_file(path, entry.file), overwrite=True) as temporary:
+    with replaced_file(entry_file(path, entry.file)) as temporary:
         temporary.write_text(entry.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 

@@ -100,7 +100,7 @@ def write_splats(
         raise ValueError("spheres with values that are not finite, or with a scale of 0, cannot be written")
     header = ["ply", "format binary_little_endian 1.0", "comment unit metre", f"comment frame {frame}"]
     header += [f"element vertex {len(splats)}", *(f"property float {name}" for name in names), "end_header"]
-    with new_file(path, overwrite) as temporary:
+    with new_file(path, "splat file", overwrite) as temporary:
         temporary.write_bytes(("\n".join(header) + "\n").encode("ascii") + table.tobytes())
 
 

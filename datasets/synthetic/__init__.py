@@ -72,7 +72,7 @@ def make_scene(
             f"{photos} photos of {photo_size[0]}x{photo_size[1]} px, videos of {video_size[0]}x{video_size[1]} px.",
             "at least 3 photos, and sides of at least 16 px.",
         )
-    with new_directory(Path(out), overwrite) as directory:
+    with new_directory(Path(out), "capture", overwrite) as directory:
         record(build_set(plan_scene(name, seed), photo_size, video_size, photos), directory)
     return Path(out)
 

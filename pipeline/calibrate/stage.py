@@ -13,7 +13,7 @@ import numpy as np
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import check_capture
 from ...datasets.capture.sparse_points import POINTS_NAME, write_points
-from ...datasets.io.atomic import new_file
+from ...datasets.io.atomic import new_file, replaced_file
 from ...datasets.io.kinds import refuse_other_kind
 from ...datasets.io.progress import progress
 from ...schemas import (
@@ -264,9 +264,9 @@ def _ground_check(capture: Capture, model: SfmModel, scale: Scale) -> tuple[floa
 def _write(root: Path, cameras: CamerasFile, model: SfmModel, report: CalibrationReport, overwrite: bool) -> None:
     """Write the three files; `cameras.json` is renamed last, so its presence means that all are complete."""
     with ExitStack() as stack:
-        cameras_path = stack.enter_context(new_file(root / CAMERAS_NAME, overwrite))
-        report_path = stack.enter_context(new_file(root / REPORT_NAME, overwrite=True))
-        points_path = stack.enter_context(new_file(root / POINTS_NAME, overwrite=True))
+        cameras_path = stack.enter_context(new_file(root / CAMERAS_NAME, "calibration", overwrite))
+        report_path = stack.enter_context(replaced_file(root / REPORT_NAME))
+        points_path = stack.enter_context(replaced_file(root / POINTS_NAME))
         cameras_path.write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
         report_path.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
         unit = "metre" if cameras.scale.kind == "metric" else "arbitrary"

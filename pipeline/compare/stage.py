@@ -9,7 +9,8 @@ from pathlib import Path
 
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode
-from ...datasets.io.atomic import new_file, refuse_existing, sha256
+from ...datasets.io.atomic import new_file, sha256
+from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note, progress
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
@@ -41,6 +42,7 @@ class Comparison:
     """The compared models, in the order given."""
 
 
+@reads("models", "capture")
 def compare(
     models: Sequence[Path],
     capture: Path,
@@ -68,7 +70,7 @@ def compare(
     """
     resolve_device(device)  # refuse a wrong device now, not after minutes
     if out is not None:
-        refuse_existing(out, overwrite)
+        refuse_output(out, "page", overwrite)
     _refuse_twice(models)
     loaded = [(str(path), read_model(path)) for path in models]
     source = Capture.open(capture, splits=(split,))
@@ -77,7 +79,7 @@ def compare(
         return comparison.result
     result = comparison.result.model_copy(update={"report": str(out)})
     footage = footage_of(comparison.models, source, device)
-    with new_file(out, overwrite) as path:
+    with new_file(out, "page", overwrite) as path:
         path.write_text(comparison_html(result, comparison.models, footage), encoding="utf-8")
     return result
 

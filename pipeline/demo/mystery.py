@@ -76,7 +76,7 @@ def run_mystery(
     resolve_device(device)  # refuse a wrong device now, not after minutes
     case = draw_mystery(seed)
     settings = (physics or PhysConfig(step_s=STEP_S)).model_dump() | {"seed": seed, "device": device}
-    with new_directory(Path(out), overwrite) as folder:
+    with new_directory(Path(out), "demo", overwrite) as folder:
         run = _Mystery(folder, Path(out), PhysConfig.model_validate(settings), seed, device)
         with run.stage("make the capture"):
             make_mystery(folder / "capture", folder / SEALED, case)

@@ -124,7 +124,7 @@ def run_demo(
     """
     resolve_device(device)  # refuse a wrong device now, not after minutes
     settings = settings or DemoSettings()
-    with new_directory(Path(out), overwrite) as folder:
+    with new_directory(Path(out), "demo", overwrite) as folder:
         demo = _Demo(folder, Path(out), settings, seed, device)
         return _run(demo, scene, renderer)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...datasets.io.atomic import new_file, refuse_existing
+from ...datasets.io.atomic import new_file
+from ...datasets.io.outputs import refuse_output, signed
 from ...schemas import DiagnoseResult, InputDataError, LawTerm, ResidualLaw, UsageError
 from ..physics.effects.registry import BUILT_IN
 
@@ -66,7 +67,7 @@ def require_law_file(path: Path, overwrite: bool) -> None:
     """
     if path.suffix != ".py":
         raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
-    refuse_existing(path, overwrite)
+    refuse_output(path, "effect", overwrite)
 
 
 def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str:
@@ -94,8 +95,8 @@ def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str
             "--save-law where something unexplained remains in flight.",
             "leave --save-law out, and see the whole diagnosis.",
         )
-    with new_file(path, overwrite) as partial:
-        partial.write_text(law_source(law.model_copy(update={"terms": terms}), path), encoding="utf-8")
+    with new_file(path, "effect", overwrite) as partial:
+        partial.write_text(signed(law_source(law.model_copy(update={"terms": terms}), path)), encoding="utf-8")
     return f"{path}:{CLASS}"
 
 

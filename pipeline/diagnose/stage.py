@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ...datasets.capture.capture import Capture
+from ...datasets.io.outputs import reads
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     ContactLimit,
@@ -44,6 +45,7 @@ from .wording import law_warnings, motion_warnings, sentence, unseen_motion
 
 
 @one_torch_thread()
+@reads("model", "capture", "throws")
 def diagnose(
     model: Path,
     capture: Path,

@@ -19,8 +19,9 @@ from ...datasets.exports.lerobot import write_lerobot
 from ...datasets.exports.nerfstudio import MaskUse, write_nerfstudio
 from ...datasets.exports.selection import Selection
 from ...datasets.exports.splat_files import in_world, write_splat_files
-from ...datasets.io.atomic import new_file, refuse_existing
+from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
+from ...datasets.io.outputs import DirectoryKind, FileKind, reads, refuse_output
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
@@ -82,7 +83,19 @@ OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
 
 Facts = dict[str, int | float | str]
 
+_KINDS: dict[ExportFormat, DirectoryKind | FileKind] = {
+    "lerobot": "LeRobot dataset",
+    "bop": "BOP dataset",
+    "nerfstudio": "nerfstudio capture",
+    "mjcf": "MJCF file",
+    "ply": "splat file",
+    "colmap": "COLMAP model",
+    "glb": "glTF file",
+}
+"""What each format writes; `ply` without that suffix writes a folder."""
 
+
+@reads("thing")
 def export(
     thing: Path, format_: ExportFormat, out: Path, options: ExportOptions | None = None, overwrite: bool = False
 ) -> ExportResult:
@@ -104,7 +117,9 @@ def export(
     suffix = SUFFIXES.get(format_)
     if suffix and out.suffix.lower() != suffix:
         raise UsageError(f"--out {out}: --to {format_} writes one file.", f"a name that ends in {suffix}.")
-    refuse_existing(out, overwrite)
+    refuse_output(
+        out, "splat folder" if format_ == "ply" and out.suffix.lower() != ".ply" else _KINDS[format_], overwrite
+    )
     facts, notes = _WORK[format_](thing, out, chosen, overwrite)
     return ExportResult(source=str(thing), format=format_, out=str(out), facts=facts, notes=tuple(notes))
 
@@ -145,7 +160,7 @@ def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tu
     start = start_of(model, options.seed, options.duration_s)
     text = write_mjcf(model, keyframe=keyframe_of(start), source=f"cgwm, of {model.file.provenance.capture}")
     away = resimulate(model, text, start, options.duration_s)
-    with new_file(out, overwrite) as temporary:
+    with new_file(out, "MJCF file", overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     facts: Facts = {"duration_s": away.duration_s}
     if away.first_contact_s is not None:

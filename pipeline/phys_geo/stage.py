@@ -20,7 +20,7 @@ from ...schemas import (
     Solver,
     UsageError,
 )
-from ..physics.effects.registry import load_effect
+from ..physics.effects.registry import effect_of
 from ..physics.world import World, inertia_elements
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
@@ -151,7 +151,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
             "correlations": (*found.correlations, *correlations),
             "effects": fitted_effects(
                 file.effects,
-                {e.name: load_effect(e.name).name for e in file.effects},
+                {e.name: effect_of(e).name for e in file.effects},
                 found.parameters,
                 found.constants,
                 {} if found.effects is None else found.effects.own_values,

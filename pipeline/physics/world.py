@@ -14,7 +14,7 @@ from torch import Tensor
 from ...schemas import InputDataError, UsageError
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
-from .effects.registry import load_effect
+from .effects.registry import effect_of
 from .paper_law import PaperLaw
 from .smooth_distance import plane_contacts
 
@@ -225,7 +225,7 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
 
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
     try:
-        effect = load_effect(entry.name)
+        effect = effect_of(entry)
         active = ActiveEffect.of(effect, entry.parameters, like)
     except UsageError as error:
         raise InputDataError(f"{where}: its effect: {error.found}", error.allowed, error.todo) from error

@@ -35,7 +35,7 @@ def page(title: str, body: Sequence[str], style: str = "", script: str = "") -> 
         script: Script that runs after that of every page.
     """
     return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<meta name="generator" content="cgwm">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         # The page needs nothing from the network, so it may not ask for anything either.
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.io.atomic import new_file
+from ...datasets.io.atomic import replaced_file
 from ...schemas import InputDataError, UsageError
 
 State = dict[str, Any]
@@ -92,9 +92,9 @@ class Checkpoint:
         """Write a state atomically."""
         if not (self.path / _KEY).is_file():
             self.path.mkdir(parents=True, exist_ok=True)
-            with new_file(self.path / _KEY, overwrite=True) as path:
+            with replaced_file(self.path / _KEY) as path:
                 path.write_text(json.dumps(self._made_of, indent=1) + "\n", encoding="utf-8")
-        with new_file(self.path / _file_name(name), overwrite=True) as path:
+        with replaced_file(self.path / _file_name(name)) as path:
             arrays: list[Array] = []
             frame = json.dumps(_taken_apart(state, arrays))
             with path.open("wb") as stream:  # an open file: savez would put another suffix after the name

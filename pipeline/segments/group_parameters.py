@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ...schemas import InputDataError, ModelFile
-from ..physics.effects.registry import load_effect
+from ..physics.effects.registry import effect_of
 from ..physics.parameters import Parameter, effect_parameters
 from ..physics.world import World
 
@@ -50,7 +50,7 @@ def with_known_groups(world: World, file: ModelFile, episodes: Sequence[str], gr
 def _known(world: World, file: ModelFile, episode: str, groups: Mapping[str, str]) -> dict[str, float]:
     """Return the group-specific parameters that the fit knows of an episode, by `effect.parameter`."""
     found: dict[str, float] = {}
-    by_effect = {load_effect(effect.name).name: effect.own for effect in file.effects if effect.own}
+    by_effect = {effect_of(effect).name: effect.own for effect in file.effects if effect.own}
     for p in group_parameters(world):
         effect, _, number = p.name.partition(".")
         if p.shared == "group" and episode not in groups:

@@ -24,7 +24,7 @@ from ...datasets.capture.tracks import Episode
 from ...schemas import FittedParameter, ModelFile
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..optimization.uncertainty import correlation_of, student_quantile
-from ..physics.effects.registry import load_effect
+from ..physics.effects.registry import effect_of
 from ..physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from ..physics.world import World
 from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors
@@ -323,7 +323,7 @@ def with_fitted_groups(
     if not own or not unknown:
         return known
     centre = {f"{a.effect.name}.{name}": float(value) for a in world.effects for name, value in a.values.items()}
-    spread = {f"{load_effect(e.name).name}.{name}": std for e in file.effects for name, std in e.spread.items()}
+    spread = {f"{effect_of(e).name}.{name}": std for e in file.effects for name, std in e.spread.items()}
     whole = Observations.of(known, unknown, [(-float("inf"), float("inf"))] * len(unknown))
     flying = bool(flight_frames(known, whole)[whole.seen.amax(-1) > 0].all())
     ties = GroupPrior({p.name: centre[p.name] for p in own}, spread)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...datasets.models.effect_files import packed_name
 from ...datasets.models.mjcf import mujoco_states, write_mjcf
 from ...datasets.rollouts.rollouts import RolloutLabels
 from ...schemas import ModelFile, SamplingPlan
@@ -53,7 +54,7 @@ def labels_of(motion: Motion, plan: SamplingPlan, seed: int, times_s: np.ndarray
         contact_force_n=contact_force_n(contacts, times_s, len(bodies)),
         contact_torque_n_m=contact_torque_n_m(motion.quat_wxyz, motion.omega_body_rad_s, inertia, times_s, free),
         parameters=draw.parameters,
-        effects={effect.name: effect.parameters for effect in file.effects},
+        effects={packed_name(effect.name): effect.parameters for effect in file.effects},
         cameras=draw.cameras,
         exposures=draw.lighting.exposures,
         light_gain_rgb=draw.lighting.gain_rgb,

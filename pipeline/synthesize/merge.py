@@ -11,6 +11,8 @@ from pathlib import Path
 
 from ...datasets.io.atomic import new_directory, new_file, sha256
 from ...datasets.io.free_space import enough_room
+from ...datasets.io.outputs import reads
+from ...datasets.io.processors import processors
 from ...datasets.io.progress import progress
 from ...datasets.rollouts.dataset import (
     MANIFEST,
@@ -24,7 +26,6 @@ from ...datasets.rollouts.dataset import (
 from ...datasets.rollouts.index import INDEX, index_fault, write_index
 from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, tidied
 from ...schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
-from ..runtime.doctor import cpu_cores
 
 SHOWN_FAULTS = 20
 
@@ -43,6 +44,7 @@ class _Shard:
         return self.root / self.entry.file
 
 
+@reads("sources")
 def merge(
     sources: Sequence[Path], out: Path | None = None, overwrite: bool = False, hashes: bool = True
 ) -> MergeSummary:
@@ -170,7 +172,7 @@ def _shard_faults(shards: Sequence[_Shard], manifest: DatasetManifest, hashes: b
         return shard_fault(shard.file, shard.entry, hashes)
 
     # Hashing releases Python's lock, so threads use all cores and hide the latency of a network file system.
-    with ThreadPoolExecutor(min(8, cpu_cores())) as pool:
+    with ThreadPoolExecutor(min(8, processors())) as pool:
         results = list(progress(pool.map(fault, shards), "check", len(shards), "shard"))
     found = [f"{shard.root}/{result}" for shard, result in zip(shards, results, strict=True) if result]
     for shard, result in zip(shards, results, strict=True):
@@ -215,7 +217,7 @@ def _index_alone(out: Path, shards: Sequence[_Shard], overwrite: bool) -> Path:
 
 
 def _dataset_of_links(out: Path, manifest: DatasetManifest, shards: Sequence[_Shard], overwrite: bool) -> Path:
-    with new_directory(out, overwrite) as folder:
+    with new_directory(out, "dataset", overwrite) as folder:
         shutil.copytree(shards[0].root / manifest.model, folder / MODEL_FOLDER)
         linked: list[_Shard] = []
         for shard in shards:
@@ -232,7 +234,7 @@ def _write(path: Path, final: Path, shards: Sequence[_Shard], overwrite: bool) -
     """Write an index with paths relative to the folder of `final`."""
     folder = final.parent.resolve()
     named = [(shard.file, _relative(shard.file, folder), shard.entry) for shard in shards]
-    with new_file(path, overwrite) as temporary:
+    with new_file(path, "index", overwrite) as temporary:
         write_index(temporary, named)
 
 

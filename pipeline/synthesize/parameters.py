@@ -24,7 +24,7 @@ from ...schemas import (
     did_you_mean,
 )
 from ..physics.contact_law import restitution
-from ..physics.effects.registry import load_effect
+from ..physics.effects.registry import effect_of
 from .distributions import draw
 
 _UNITS = {"friction": "1", "contact_time_s": "s", "damping_ratio": "1", "ground_offset_m": "m", "mass_kg": "kg"}
@@ -142,7 +142,7 @@ def _bounds(file: ModelFile, name: str) -> tuple[float, float]:
         return listed
     owner, _, number = name.partition(".")
     for effect in file.effects:
-        for entry in load_effect(effect.name).parameters if _own_name(effect) == owner else ():
+        for entry in effect_of(effect).parameters if _own_name(effect) == owner else ():
             if entry.name == number:
                 return (0.0 if entry.nonnegative else -entry.limit), entry.limit
     return -math.inf, math.inf
@@ -151,7 +151,7 @@ def _bounds(file: ModelFile, name: str) -> tuple[float, float]:
 def _unit(file: ModelFile, name: str) -> str:
     owner, _, number = name.rpartition(".")
     for effect in file.effects:
-        loaded = load_effect(effect.name)
+        loaded = effect_of(effect)
         for entry in (*loaded.parameters, *loaded.constants) if loaded.name == owner else ():
             if entry.name == number:
                 return entry.unit
@@ -221,7 +221,7 @@ def can_vary(file: ModelFile, name: str) -> bool:
 
 def _own_name(effect: EffectModel) -> str:
     """Return the name of an effect as it occurs in the names of its parameters."""
-    return load_effect(effect.name).name if ":" in effect.name or "@" in effect.name else effect.name
+    return effect_of(effect).name if ":" in effect.name or "@" in effect.name else effect.name
 
 
 def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...datasets.capture.cameras import Camera
 from ...datasets.capture.video import encoded_webm
-from ...datasets.io.atomic import new_file
+from ...datasets.io.atomic import replaced_file
 from ...datasets.rollouts.loader import RolloutReader
 from ...schemas import CgwmError, DatasetSummary, InputDataError
 from ..rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB, ContactMarks, arrow_scale, contact_marks
@@ -76,7 +76,7 @@ def with_preview(summary: DatasetSummary) -> DatasetSummary:
     try:
         sheet, film = preview(folder / summary.shard)
         for name, content in ((SHEET, sheet), (FILM, film)):
-            with new_file(folder / name, overwrite=True) as temporary:
+            with replaced_file(folder / name) as temporary:
                 temporary.write_bytes(content)
     except CgwmError as error:
         return _noted(summary, f"no preview: {error.found}")

@@ -13,6 +13,7 @@ from contextlib import chdir, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from ...datasets.io.outputs import reads
 from ...datasets.io.progress import progress
 from ...datasets.rollouts.dataset import refuse_existing_shards
 from ...datasets.rollouts.shards import shard_range
@@ -50,6 +51,7 @@ def default_shards(rollouts: int) -> int:
     return -(-rollouts // ROLLOUTS_PER_SHARD)
 
 
+@reads("model")
 def synthesize_shards(
     model: Path,
     out: Path,

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import torch
 
+from ...datasets.io.outputs import reads
 from ...datasets.io.progress import progress
 from ...datasets.rollouts.dataset import finished_shard, new_dataset, shard_entry
 from ...datasets.rollouts.rollout_writer import RolloutWriter
@@ -49,6 +50,7 @@ class _Outcome:
     """Messages on the diverged draws."""
 
 
+@reads("model")
 def synthesize(
     model: Path,
     out: Path,

@@ -172,6 +172,10 @@ def _check_shard(
 def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterator[Fault]:
     findings.rollouts += 1
     count = int(demo.attrs["num_samples"])
+    wrong = [name for name in ("params_json", "effects_json") if not _is_json_object(str(demo.attrs[name]))]
+    if wrong:
+        yield Fault(check="schema", text=f"the attribute {wrong[0]} is no JSON object; the rollout is not checked.")
+        return
     yield from _check_arrays(demo, count, findings)
     time = demo["time"][()]
     if not (np.diff(time) > 0).all():
@@ -183,6 +187,13 @@ def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterato
     yield from _check_contacts(demo, count, model, findings)
     if model is not None and "cameras" in demo:
         yield from check_pictures(demo, model, count, findings.pictures)
+
+
+def _is_json_object(text: str) -> bool:
+    try:
+        return isinstance(json.loads(text), dict)
+    except (ValueError, RecursionError):
+        return False
 
 
 def _check_states(demo: Node, findings: _Findings) -> Iterator[Fault]:

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from ...datasets.models.effect_files import packed_name
 from ...datasets.models.model import Model
 from ...datasets.rollouts.rollouts import Node
 from ...schemas import EffectModel
 from ..geometry.viewpoint import rotation_matrix
 from ..physics.effects import load_effect
+from ..physics.effects.registry import BUILT_IN
 from ..physics.net_contact_wrench import contact_torque_n_m
 from ..physics.rollout import Engine
 from ..physics.world import State, World
@@ -44,6 +46,8 @@ class MotionFindings:
     angular_excess_share: list[float] = field(default_factory=list)
     """For each body and frame in contact, the difference between the change of angular momentum and the moments of
     the contacts, as a fraction of the sum of impulses times their levers."""
+    unchecked_effects: set[str] = field(default_factory=set)
+    """Effects that are not built in, which are not run: the motion of rollouts with them is not checked."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +84,15 @@ def check_motion(
         findings: The results so far, which are extended.
     """
     effects: dict[str, dict[str, float]] = json.loads(str(demo.attrs["effects_json"]))
-    if effects and model is None:
+    named = set() if model is None else {packed_name(effect.name) for effect in model.file.effects}
+    foreign = sorted(set(effects) - named)
+    if model is not None and foreign:
+        text = f"its effects {', '.join(foreign)} are not among those of the dataset's model."
+        yield Fault(check="effects", text=text)
+        return
+    custom = {name for name in effects if name.partition("@")[0] not in BUILT_IN}
+    if custom or (effects and model is None):
+        findings.unchecked_effects |= custom
         return
     read: dict[str, np.ndarray] = {name: item[()] for name, item in demo["bodies"].items()}
     time = demo["time"][()]
@@ -310,6 +322,8 @@ def _check_spin(
 def motion_facts(findings: MotionFindings) -> dict[str, Any]:
     """Return the results of the checks of motion for the report."""
     facts: dict[str, Any] = {"impulse_excess_n_s": findings.impulse_excess_n_s}
+    if findings.unchecked_effects:
+        facts["motion_not_checked_with_effects"] = sorted(findings.unchecked_effects)
     if findings.angular_excess_share:
         facts["angular_excess_share_median"] = float(np.median(findings.angular_excess_share))
     return facts

@@ -53,7 +53,7 @@ def make_capture(directory: Path | str, case: Case, truth: Path | str | None = N
     kinds = motions(case.protocol, case.train, case.test)
     names = [f"{k:03d}" for k in range(len(kinds))]
     episodes: dict[str, Any] = {}
-    with new_directory(directory, overwrite) as folder:
+    with new_directory(directory, "capture", overwrite) as folder:
         write_manifest(folder / "capture.toml", _manifest(case, thing, names))
         (folder / "tracks").mkdir()
         for name, kind in zip(names, kinds, strict=True):
@@ -68,7 +68,7 @@ def make_capture(directory: Path | str, case: Case, truth: Path | str | None = N
                 "in_contact": float(motion.touching.mean()),
                 "outlier_times_s": track.time_s[wrong].tolist(),
             }
-    with new_file(path, overwrite) as temporary:
+    with new_file(path, "truth", overwrite) as temporary:
         temporary.write_text(json.dumps(_truth(case, thing, hidden, episodes), indent=1) + "\n", encoding="utf-8")
     return path
 

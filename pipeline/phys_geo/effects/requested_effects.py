@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from ....datasets.capture.tracks import Episode
+from ....datasets.models.effect_files import effect_file
 from ....schemas import EffectModel, FittedParameter, InputDataError, PhysConfig, UsageError
-from ...physics.effects import load_effect
-from ...physics.effects.registry import split_units
+from ...physics.effects.registry import effect_of, split_units
+from ...physics.effects.trust import trust_effects
 from ...physics.world import World
 from ...segments.release_detection import after_release, find_releases
 from ..tracks.contact_fit import fit_physics
@@ -22,10 +22,12 @@ def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple
     Raises:
         UsageError: If an effect cannot be loaded, or two have one name.
     """
-    effects = [*present, *(EffectModel(name=_absolute(name)) for name in wanted)]
+    wanted = tuple(wanted)
+    trust_effects(found[0] for name in wanted if (found := effect_file(name)) and found[0].is_file())
+    effects = [*present, *(EffectModel(name=_absolute(name, present)) for name in wanted)]
     unique: dict[str, EffectModel] = {}
     for effect in effects:
-        short = load_effect(effect.name).name
+        short = effect_of(effect).name
         if short in unique and split_units(unique[short].name)[0] == split_units(effect.name)[0]:
             # the same effect with another grouping keeps its values
             unique[short] = unique[short].model_copy(update={"name": effect.name})
@@ -37,10 +39,17 @@ def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple
     return tuple(unique.values())
 
 
-def _absolute(name: str) -> str:
-    """Return the name of an effect, with the absolute path of a user's file, so that a model works in any directory."""
-    file, _, rest = name.partition(":")
-    return f"{Path(file).resolve()}:{rest}" if file.endswith(".py") else name
+def _absolute(name: str, present: Sequence[EffectModel]) -> str:
+    """Return the name of an effect with its absolute file: the model's copy if that has the same content."""
+    found = effect_file(name)
+    if found is None:
+        return name
+    path = found[0].resolve()
+    for effect in present:
+        own = effect_file(effect.name)
+        if own is not None and path.is_file() and own[0].read_bytes() == path.read_bytes():
+            path = own[0]
+    return f"{path}:{found[1]}"
 
 
 def fitted_effects(

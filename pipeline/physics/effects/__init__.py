@@ -14,6 +14,7 @@ from .effect import (
     vector,
 )
 from .registry import effect_names, load_effect
+from .trust import trust_effects
 
 __all__ = [
     "ActiveEffect",
@@ -28,5 +29,6 @@ __all__ = [
     "horizontal",
     "length",
     "load_effect",
+    "trust_effects",
     "vector",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ....datasets.io.atomic import new_file
+from ....datasets.io.outputs import signed
 from ....schemas import UsageError
 from ....schemas.effects import EffectCard, EffectConstantCard, EffectList, EffectParameterCard, NewEffect
 from .registry import aliases, effect_names, load_effect
@@ -60,6 +61,6 @@ def new_effect(file: Path | str, overwrite: bool = False) -> NewEffect:
         raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
     text = (Path(__file__).parent / "template.py").read_text(encoding="utf-8")
     text = text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")  # from outside the package
-    with new_file(path, overwrite) as partial:
-        partial.write_text(text, encoding="utf-8")
+    with new_file(path, "effect template", overwrite) as partial:
+        partial.write_text(signed(text), encoding="utf-8")
     return NewEffect(path=str(path), name=f"{path}:MyEffect")

@@ -13,8 +13,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, cast, get_args
 
-from ....schemas import UsageError, did_you_mean
+from ....schemas import EffectModel, UsageError, did_you_mean
 from .effect import Effect, EffectConstant, EffectParameter, Need, Phase
+from .trust import require_trust
 
 GROUP = "cgwm.effects"
 """Group of the entry points that declare effects of installed packages: a name, and `module:ClassName`."""
@@ -73,7 +74,7 @@ def effect_names() -> list[str]:
 
 
 def load_effect(spec: str) -> Effect:
-    """Load an effect, importing only its module.
+    """Load an effect that the user or the caller names, importing only its module; a Python file is run.
 
     Args:
         spec: Name of a built-in effect or of an entry point, or `path/to/file.py:ClassName`; the suffix `@group` or
@@ -82,9 +83,23 @@ def load_effect(spec: str) -> Effect:
     Raises:
         UsageError: If there is no such effect, its file or class is missing or fails, or it is badly declared.
     """
+    return _loaded(spec, consented=True)
+
+
+def effect_of(entry: EffectModel) -> Effect:
+    """Load an effect of a model; the Python file of a custom one is run only with the user's consent.
+
+    Raises:
+        UsageError: See :func:`load_effect`.
+        InputDataError: If nobody has consented to run its file, see `trust`.
+    """
+    return _loaded(entry.name, consented=False)
+
+
+def _loaded(spec: str, consented: bool) -> Effect:
     plain, units = split_units(spec)
     if units is not None:
-        effect = load_effect(plain)
+        effect = _loaded(plain, consented)
         numbers = tuple(replace(number, shared=units) for number in effect.parameters)
         effect.parameters = numbers  # pyright: ignore[reportAttributeAccessIssue]
         return effect
@@ -92,7 +107,7 @@ def load_effect(spec: str) -> Effect:
         module = importlib.import_module(f".{spec}", __package__)
         found = getattr(module, "".join(word.capitalize() for word in spec.split("_")))
     elif ".py" in Path(spec.partition(":")[0]).suffixes:
-        found = _from_file(spec)
+        found = _from_file(spec, consented)
     else:
         found = _from_package(spec)
     return _checked(found, spec)
@@ -122,12 +137,15 @@ def aliases(name: str) -> list[str]:
     return found
 
 
-def _from_file(spec: str) -> Any:
+def _from_file(spec: str, consented: bool) -> Any:
     file, _, name = spec.partition(":")
     path = Path(file)
     if not path.is_file():
         raise UsageError(f"{file}: no such file.", todo="write one with 'cgwm effects new FILE'.")
-    module = _imported(path)
+    data = path.read_bytes()  # once: what is run is what was compared
+    if not consented:
+        require_trust(path, data)
+    module = _imported(path, data)
     classes = [
         key
         for key, value in vars(module).items()
@@ -143,7 +161,8 @@ def _from_file(spec: str) -> Any:
     raise UsageError(f"{spec}: {found}.", f"{legal}.{did_you_mean(name, classes)}")
 
 
-def _imported(path: Path) -> ModuleType:
+def _imported(path: Path, data: bytes) -> ModuleType:
+    """Run the content of a file as a module; a compiled file next to it, whose content is not seen, is ignored."""
     name = f"cgwm_effect_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -152,7 +171,7 @@ def _imported(path: Path) -> ModuleType:
     before = sys.modules.get(name)
     sys.modules[name] = module  # dataclasses and annotations look their module up there
     try:
-        spec.loader.exec_module(module)
+        exec(compile(data, path, "exec"), module.__dict__)
     except Exception as error:  # a user's file may raise anything
         if before is None:
             del sys.modules[name]
