@@ -16,6 +16,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 def _app() -> Callable[..., Any]:
     # inside the signal handling of `run_command`, so that an interrupt while typer is imported ends cleanly
+    from ..datasets.io.processors import use_few_threads
     from .app import app
+
+    use_few_threads()  # before any library that starts threads is loaded
 
     return app

@@ -7,9 +7,10 @@ from importlib import metadata
 
 import pytest
 import torch
+from cgwm.datasets.io.processors import processors
 from cgwm.pipeline.runtime import doctor as module
 from cgwm.pipeline.runtime import kernel_build
-from cgwm.pipeline.runtime.doctor import cpu_cores, doctor, memory_bytes, satisfies
+from cgwm.pipeline.runtime.doctor import doctor, memory_bytes, satisfies
 from cgwm.schemas import DoctorReport
 
 
@@ -27,7 +28,7 @@ def test_the_machine_that_runs_the_tests_is_ready() -> None:
     assert report.colmap == metadata.version("pycolmap")
     assert report.cgwm == metadata.version("cgwm")
     assert {package.name for package in report.packages} >= {"torch", "mujoco", "pycolmap", "typer", "h5py"}
-    assert report.cpu_cores == cpu_cores() >= 1
+    assert report.cpu_cores == processors() >= 1
     assert 0.5 * 2**30 < memory_bytes() < 2**50
     assert DoctorReport.model_validate_json(report.model_dump_json()) == report
 

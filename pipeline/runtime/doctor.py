@@ -12,6 +12,7 @@ from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
+from ...datasets.io.processors import processor_limits, processors
 from ...schemas.doctor import DoctorReport, Missing, PackageState
 from .kernel_build import compiler, unavailable
 
@@ -36,7 +37,7 @@ def doctor() -> DoctorReport:
         cgwm=_version("cgwm") or "not installed",
         python=platform.python_version(),
         platform=f"{platform.system()} {platform.machine()}",
-        cpu_cores=cpu_cores(),
+        cpu_cores=processors(),
         memory_gib=round(memory_bytes() / _GIB, 2),
         packages=tuple(packages),
         cuda_devices=cuda,
@@ -49,13 +50,6 @@ def doctor() -> DoctorReport:
         uses=_uses(cuda, not zstd_fault),
         missing=tuple(missing),
     )
-
-
-def cpu_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def memory_bytes() -> int:
@@ -208,11 +202,20 @@ def _rollouts() -> str:
     return "one kernel, compiled at run time"
 
 
+def _threads() -> str:
+    limits = processor_limits()
+    least = processors()
+    why = next(name for name, count in limits.items() if count == least)
+    others = ", ".join(f"{name} {count}" for name, count in limits.items() if name != why)
+    return f"{least}, by {why}" + (f" ({others})" if others else "") + "; threads wait without spinning"
+
+
 def _uses(cuda: tuple[str, ...], zstd: bool) -> dict[str, str]:
     return {
-        "device": f"cuda ({cuda[0]})" if cuda else f"cpu, {cpu_cores()} cores",
+        "device": f"cuda ({cuda[0]})" if cuda else f"cpu, {processors()} cores",
         "renderer": _renderer(bool(cuda)),
         "rollouts": _rollouts(),
+        "threads": _threads(),
         "photo_features": "COLMAP on the CPU, one thread (two runs agree bit for bit)",
         "demo_renderer": "ray casting, no OpenGL",
         "compression": "zstd" if zstd else "none: --set synthesize.compression=gzip works without the filter",
