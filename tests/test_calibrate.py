@@ -202,6 +202,9 @@ def test_without_scale_the_ground_is_the_dominant_plane(scene, report, tmp_path)
     root = _fresh(scene, tmp_path, MANIFEST, photos=5)
     # Cameras of photos that have since been removed are no obstacle to replacing them.
     (root / "cameras.json").write_bytes((scene / "cameras.json").read_bytes())
+    with pytest.raises(UsageError, match="is no calibration of cgwm"):
+        calibrate(root, CONFIG, overwrite=True)
+    (root / "calibration.json").write_bytes((scene / "calibration.json").read_bytes())
     unscaled = calibrate(root, CONFIG, overwrite=True)
     assert unscaled.scale == Scale(kind="unscaled", source="none given in capture.toml, [calibration]")
     assert unscaled.world_frame.startswith("the dominant plane of the sparse points is the ground")

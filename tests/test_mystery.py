@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cgwm.cli.app import app
 from cgwm.datasets.io.kinds import kind_of
+from cgwm.datasets.io.outputs import RECORD
 from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic.hidden_effects import draw_mystery, make_mystery, open_sealed
 from cgwm.datasets.synthetic.hidden_effects.mystery import CHOICES
@@ -60,7 +61,7 @@ def test_nothing_tells_what_is_hidden(tmp_path: Path) -> None:
     make_mystery(tmp_path / "capture", tmp_path / "sealed.json", case)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "sealed.json"]
     files = sorted(path.relative_to(tmp_path / "capture").as_posix() for path in (tmp_path / "capture").rglob("*.*"))
-    assert files == ["capture.toml", *(f"tracks/00{k}.csv" for k in range(6))]
+    assert files == [RECORD, "capture.toml", *(f"tracks/00{k}.csv" for k in range(6))]
     secrets = [effect for _, effect in CHOICES] + ["mystery", "hidden", str(seed)]
     for name in files:
         written = (tmp_path / "capture" / name).read_text()
@@ -113,7 +114,7 @@ def test_the_outcome_is_said_plainly(verdict, selected, aliases, hidden, outcome
 
 def test_the_whole_loop(solved: tuple[Path, MysteryResult]) -> None:
     out, result = solved
-    assert sorted(path.name for path in out.iterdir()) == sorted(result.paths.values())
+    assert sorted(path.name for path in out.iterdir()) == sorted([RECORD, *result.paths.values()])
     assert read_json(out / "report.json", MysteryResult) == result
     assert read_json(out / "diagnosis.json", DiagnoseResult) == result.diagnosis
     assert open_sealed(out / "sealed.json") == result.hidden

@@ -333,7 +333,9 @@ def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
     )
     assert done.exit_code == 0, done.output
     (effect,) = read_model(fitted).file.effects
-    assert effect.name == found["saved_law"]
+    saved = Path(found["saved_law"].partition(":")[0])
+    assert effect.name == f"{fitted / 'effects' / saved.name}:ResidualLaw"
+    assert (fitted / "effects" / saved.name).read_bytes() == saved.read_bytes()
     numbers = {p.name: p for p in read_model(fitted).file.parameters}
     assert numbers["my_law.c1"].estimate == pytest.approx(0.2, rel=0.1)
 

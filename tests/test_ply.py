@@ -109,7 +109,8 @@ def test_faults(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
 
     def fault(old: bytes, new: bytes) -> str:
-        write_splats(path, splats(), overwrite=True)
+        path.unlink(missing_ok=True)
+        write_splats(path, splats())
         edit(path, old, new)
         with pytest.raises(InputDataError) as caught:
             read_splats(path)
@@ -133,7 +134,8 @@ def test_gaussians_that_are_no_spheres_or_not_finite_are_refused(tmp_path: Path)
         (11, 0.5, f"{path}: 1 of 20 splats are no spheres."),
         (0, np.nan, f"{path}: 'x' is not finite in 1 of 20 splats."),
     ):
-        write_splats(path, splats(), overwrite=True)
+        path.unlink(missing_ok=True)
+        write_splats(path, splats())
         header, end, data = path.read_bytes().partition(b"end_header\n")
         rows = np.frombuffer(data, "<f4").reshape(20, 17).copy()
         rows[3, column] = value

@@ -10,6 +10,7 @@ from cgwm.datasets.capture import video
 from cgwm.datasets.capture.cameras import Camera
 from cgwm.datasets.capture.video import read_video
 from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.io.outputs import RECORD
 from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.pipeline.geometry.viewpoint import look_at
 from cgwm.pipeline.rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB, arrow_scale, contact_marks
@@ -107,7 +108,12 @@ def test_a_dataset_ends_with_pictures(dataset: Path) -> None:
 def test_pictures_change_no_shard(model_path: Path, dataset: Path, tmp_path: Path) -> None:
     plain = synthesize(model_path, tmp_path / "plain", CONFIG)
     assert plain.preview == ()
-    assert sorted(path.name for path in (tmp_path / "plain").iterdir()) == ["dataset.json", "model", plain.shard]
+    assert sorted(path.name for path in (tmp_path / "plain").iterdir()) == [
+        RECORD,
+        "dataset.json",
+        "model",
+        plain.shard,
+    ]
     assert sha256(dataset / plain.shard) == plain.sha256
     assert (dataset / "dataset.json").read_bytes() == (tmp_path / "plain/dataset.json").read_bytes()
 
@@ -160,7 +166,7 @@ def test_pictures_that_cannot_be_made_are_a_note(
     def full(*arguments: object, **options: object) -> object:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(previews, "new_file", full)
+    monkeypatch.setattr(previews, "replaced_file", full)
     summary = synthesize(model_path, tmp_path / "disk", one, preview=True)
     assert summary.notes[-1] == "no preview: No space left on device"
     assert sha256(tmp_path / "disk" / summary.shard) == summary.sha256

@@ -54,6 +54,8 @@ FOLDERS = (
     "the folder in which a tree ran: the rest of the path is compared",
 )
 """Part that may differ in every text, and the reason."""
+GENERATOR = '<meta name="generator" content="cgwm">'
+"""Element by which a page is recognised as cgwm's own, which the reference does not write."""
 NUMBER = r"[-+−]?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 REWORDED: Mapping[str, str] = {
     r"^mine\.py": "the template of `effects new`: comments, and parameters by keyword",
@@ -71,6 +73,8 @@ ROUNDED: Sequence[tuple[str, float, str]] = (
     (r"^(ds/dataset\.json\.shards\.0|synthesize\.stdout\.json)\.sha256$", 0.0, "the hash of the shard with them"),
 )
 """Where a library replaced code: a pattern of the place, the relative difference that passes, and the reason."""
+ADDED_FILES: Mapping[str, str] = {r"(^|/)\.cgwm-output\.json$": "the record of an output directory"}
+"""Files (a pattern of their names) that only this tree writes, with the reason."""
 DROPPED_TESTS: Mapping[str, str] = {
     r"^test_(all_is_complete|docstring_examples_run)\[cgwm\.": "named by the module, which has moved",
     r"^test_the_commands_exist\[": "named by a line of the README, which became pages",
@@ -259,6 +263,7 @@ class Differences:
         reasons = [f"masked: {reason}" for *_, reason in (*MASKS, FOLDERS)]
         reasons += [f"reworded: {reason}" for reason in REWORDED.values()]
         reasons += [f"rounded: {reason}" for *_, reason in ROUNDED]
+        reasons += [f"added: {reason}" for reason in ADDED_FILES.values()]
         self.passed = Counter(dict.fromkeys(reasons, 0))
 
     def add(self, place: str, one: Any, other: Any) -> None:
@@ -341,6 +346,7 @@ class Differences:
 
     def pages(self, place: str, one: str, other: str) -> None:
         """Compare two HTML pages: tags with their attributes, texts, style sheets, scripts, and data as JSON."""
+        other = other.replace(GENERATOR + "\n", "")
         data = [re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.S) for page in (one, other)]
         self.values(f"{place} data", *([json.loads(text) for text in texts] for texts in data))
         parts = [
@@ -503,7 +509,11 @@ def main() -> int:
     if (candidate / "out").exists():
         names = [set(files_in(folder / "out")) for folder in (reference, candidate)]
         for name in sorted(names[0] ^ names[1]):
-            found.add(name, name in names[0], name in names[1])
+            reason = next((reason for pattern, reason in ADDED_FILES.items() if re.search(pattern, name)), None)
+            if reason is not None and name in names[1]:
+                found.passed[f"added: {reason}"] += 1
+            else:
+                found.add(name, name in names[0], name in names[1])
         for name in sorted(names[0] & names[1]):
             found.files(name, reference / "out" / name, candidate / "out" / name)
         print(f"compared {len(names[0] & names[1])} files")

@@ -39,7 +39,7 @@ FileKind = Literal[
 _SYSTEM_FILES = re.compile(r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|replaced)-.*)")
 _ADDED: Mapping[str, re.Pattern[str]] = {
     "capture": re.compile(r"cameras\.json|calibration\.json|sparse_points(\.\d+)?\.ply|sparse\.\d+/.*"),
-    "dataset": re.compile(r"dataset\.json|index\.h5|rollouts-\d+-of-\d+\.h5|shards/[^/]+\.json|preview\.(png|webm)"),
+    "dataset": re.compile(r"dataset\.json|index\.h5|rollouts-\d+-of-\d+\.(h5|json)|preview\.(png|webm)"),
 }
 """Files that other commands of cgwm add to an output or rewrite in it, by its kind."""
 
