@@ -123,7 +123,8 @@ def _invoke(load_app: Callable[[], Callable[..., Any]], arguments: list[str]) ->
 
 def _report(error: BaseException, debug: bool) -> int:
     if _interrupted or isinstance(error, KeyboardInterrupt):
-        return _say_interrupted(str(error) if isinstance(error, KeyboardInterrupt) else "")
+        # recognised by its name, because the interrupt may have come while cgwm.schemas was imported
+        return _say_interrupted(str(error) if type(error).__name__ == "InterruptedWork" else "")
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 1
     from ..schemas import CgwmError

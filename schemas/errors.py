@@ -9,6 +9,13 @@ import difflib
 from collections.abc import Iterable
 
 
+class InterruptedWork(KeyboardInterrupt):
+    """An interrupt after which something is left; the message says what, and how to go on.
+
+    The message of a plain KeyboardInterrupt says nothing to a user: a codec that is interrupted puts its own there.
+    """
+
+
 class CgwmError(Exception):
     """Base of every error that cgwm raises on purpose.
 

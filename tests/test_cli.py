@@ -21,6 +21,7 @@ from cgwm.schemas import (
     CheckFailedError,
     FileModel,
     InputDataError,
+    InterruptedWork,
     NotConvergedError,
     PhysConfig,
     SplatConfig,
@@ -318,6 +319,8 @@ def test_the_command_makes_a_template_and_prints_the_plan_resolved(run: Run, tmp
         (CheckFailedError("3 faults."), 1, "3 faults.\n"),
         (InputDataError("a.csv, line 3: NaN.", "numbers."), 2, "a.csv, line 3: NaN.\nAllowed: numbers.\n"),
         (KeyboardInterrupt(), 130, "Interrupted; no output was written.\n"),
+        (KeyboardInterrupt("decoding with 'cp437' codec failed"), 130, "Interrupted; no output was written.\n"),
+        (InterruptedWork("2 of 3 are complete."), 130, "Interrupted; 2 of 3 are complete.\n"),
         (
             RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."),
             1,

@@ -21,6 +21,7 @@ from ...schemas import (
     CgwmError,
     DamagedShardError,
     DatasetSummary,
+    InterruptedWork,
     NotConvergedError,
     ShardsSummary,
     SynthesizeConfig,
@@ -82,7 +83,7 @@ def synthesize_shards(
 
     Raises:
         CgwmError: As :func:`synthesize`. If one shard diverges or is damaged, the others are still made.
-        KeyboardInterrupt: With the number of complete shards.
+        InterruptedWork: With the number of complete shards.
     """
     began = time.perf_counter()
     shard_indices(config)
@@ -108,7 +109,7 @@ def _collect(
 
     Raises:
         CgwmError: If an error concerns all shards.
-        KeyboardInterrupt: With a message that says how many shards are complete.
+        InterruptedWork: With a message that says how many shards are complete.
     """
     done: dict[int, DatasetSummary] = {}
     failed: dict[int, CgwmError] = {}
@@ -124,7 +125,7 @@ def _collect(
                     raise outcome
                 bar.update(len(shard_range(config.rollouts, config.shards, shard)))
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(
+        raise InterruptedWork(
             f"{len(done)} of {config.shards} shards of {out} are complete; the same command with --resume goes on."
         ) from None
     return done, failed
