@@ -56,6 +56,8 @@ FOLDERS = (
 """Part that may differ in every text, and the reason."""
 GENERATOR = '<meta name="generator" content="cgwm">'
 """Element by which a page is recognised as cgwm's own, which the reference does not write."""
+ADDED_LINES: Mapping[str, str] = {r"^cgwm \w+ \['--trust-effects'\]": "the option --trust-effects"}
+"""Lines of texts (a pattern) that only this tree writes, with the reason."""
 NUMBER = r"[-+−]?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 REWORDED: Mapping[str, str] = {
     r"^mine\.py": "the template of `effects new`: comments, and parameters by keyword",
@@ -342,7 +344,15 @@ class Differences:
         elif one.suffix == ".py":
             self.words(f"{place} code", *map(code_of, texts))
         else:
-            self.lists(f"{place} line", *(text.splitlines() for text in texts))
+            self.lists(f"{place} line", texts[0].splitlines(), self.without_added(texts[1].splitlines()))
+
+    def without_added(self, lines: list[str]) -> list[str]:
+        """Return lines without those of `ADDED_LINES`, which are counted."""
+        for pattern, reason in ADDED_LINES.items():
+            kept = [line for line in lines if not re.search(pattern, line)]
+            self.passed[f"added: {reason}"] += len(lines) - len(kept)
+            lines = kept
+        return lines
 
     def pages(self, place: str, one: str, other: str) -> None:
         """Compare two HTML pages: tags with their attributes, texts, style sheets, scripts, and data as JSON."""

@@ -70,11 +70,11 @@ def validate_model(path: Path | str) -> ValidationReport:
         "scene_spheres": 0 if model.scene is None else len(model.scene),
         "stages": sorted(model.fit.stages),
         "parameters": {entry.name: f"{entry.estimate:.6g} {entry.unit}".strip() for entry in model.file.parameters},
-        "effects_not_run": [
-            f"{effect.name} (SHA-256 {effect.sha256})" for effect in model.file.effects if effect.sha256
-        ],
         "warnings": [*model.file.warnings, *model.fit.warnings],
     }
+    custom = [f"{effect.name} (SHA-256 {effect.sha256})" for effect in model.file.effects if effect.sha256]
+    if custom:
+        facts["effects_not_run"] = custom
     return ValidationReport(path=str(path), kind="model", facts=facts, faults=tuple(_model_faults(model)))
 
 
