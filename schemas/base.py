@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import InputDataError, did_you_mean
 from .lines import find_line
+from .regular_files import read_text_file
 
 ModelT = TypeVar("ModelT", bound="FileModel")
 
@@ -30,7 +31,7 @@ def read_toml(path: Path, model: type[ModelT]) -> ModelT:
     Raises:
         InputDataError: If it is missing, is no TOML, or does not fit the model; with file, line and field.
     """
-    text = _read_text(path)
+    text = read_text_file(path)
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -40,7 +41,7 @@ def read_toml(path: Path, model: type[ModelT]) -> ModelT:
 
 def read_json(path: Path, model: type[ModelT]) -> ModelT:
     """Read and check a JSON file; errors as in :func:`read_toml`."""
-    text = _read_text(path)
+    text = read_text_file(path)
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
@@ -54,17 +55,6 @@ def parse(data: Any, model: type[ModelT], path: Path, text: str = "") -> ModelT:
         return model.model_validate(data)
     except ValidationError as error:
         raise _explain(error, data, model, path, text) from None
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputDataError(f"{path}: no such file.") from None
-    except (IsADirectoryError, PermissionError) as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
 
 
 def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Path, text: str) -> InputDataError:
