@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 import pytest
-
 from cgwm.schemas import InputDataError
 from cgwm.schemas.regular_files import read_text_file, require_regular_file
 
