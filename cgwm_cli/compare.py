@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import running
-from .options import AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
+from .options import AcceptUnits, AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,6 +30,7 @@ def compare(
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     trust_effects: TrustEffects = "",
+    accept_units: AcceptUnits = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -42,7 +43,7 @@ def compare(
 
         if not warmup_s > 0:
             raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
-        emit(work(models, capture, split, out, warmup_s, device, overwrite), _summary)
+        emit(work(models, capture, split, out, warmup_s, device, overwrite, accept_units), _summary)
 
 
 def _summary(result: CompareResult) -> str:

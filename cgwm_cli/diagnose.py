@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import running
-from .options import AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
+from .options import AcceptUnits, AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,6 +62,7 @@ def diagnose(
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     trust_effects: TrustEffects = "",
+    accept_units: AcceptUnits = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -72,7 +73,7 @@ def diagnose(
         from ..pipeline.diagnose import diagnose as work
 
         wanted = [name.strip() for name in candidates.split(",") if name.strip()]
-        emit(work(model, capture, split, wanted, throws, save_law, overwrite, device), _summary)
+        emit(work(model, capture, split, wanted, throws, save_law, overwrite, device, accept_units), _summary)
 
 
 def _summary(result: DiagnoseResult) -> str:

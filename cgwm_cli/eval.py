@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .execution import running
-from .options import AnyDevice, Debug, Json, Quiet, TrustEffects, trust
+from .options import AcceptUnits, AnyDevice, Debug, Json, Quiet, TrustEffects, trust
 
 if TYPE_CHECKING:
     from ..schemas import ErrorSummary, EvalResult
@@ -25,6 +25,7 @@ def evaluate(
     ] = 0.1,
     device: AnyDevice = "auto",
     trust_effects: TrustEffects = "",
+    accept_units: AcceptUnits = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -37,7 +38,7 @@ def evaluate(
 
         if not warmup_s > 0:
             raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
-        emit(work(model, target, split, warmup_s, device), _summary)
+        emit(work(model, target, split, warmup_s, device, accept_units), _summary)
 
 
 def _summary(result: EvalResult) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from .execution import running
-from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings, TrustEffects, trust
+from .options import AcceptUnits, ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings, TrustEffects, trust
 
 if TYPE_CHECKING:
     from ..schemas import FittedParameter, ModelFile
@@ -71,6 +71,7 @@ def fit(
     config: ConfigFile = None,
     set_: Settings = None,
     trust_effects: TrustEffects = "",
+    accept_units: AcceptUnits = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -95,7 +96,7 @@ def fit(
         splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, **motion)
         emit(
-            work(capture, out, stage, parent, split, splats, physics, overwrite, resume),
+            work(capture, out, stage, parent, split, splats, physics, overwrite, resume, accept_units),
             lambda model: _summary(model, out),
         )
 

@@ -45,6 +45,14 @@ Settings = Annotated[
 ]
 
 
+AcceptUnits = Annotated[
+    bool,
+    typer.Option(
+        "--accept-units", help="Take units and frames of the capture as they are, although its motion contradicts them."
+    ),
+]
+
+
 def trust(named: str) -> None:
     """Consent to what `--trust-effects` names; without it nothing is imported."""
     names = [name.strip() for name in named.split(",") if name.strip()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .execution import running
-from .options import Debug, Json, Quiet, Seed
+from .options import AcceptUnits, Debug, Json, Quiet, Seed
 
 if TYPE_CHECKING:
     from ..schemas import ValidationReport
@@ -23,6 +23,7 @@ def validate(
         ),
     ] = None,
     seed: Seed = None,
+    accept_units: AcceptUnits = False,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -31,7 +32,7 @@ def validate(
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.validate import validate as work
 
-        report = work(thing, sample, seed or 0)
+        report = work(thing, sample, seed or 0, accept_units)
         emit(report, _summary)
     if report.faults:
         raise typer.Exit(1)

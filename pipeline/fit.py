@@ -33,6 +33,7 @@ from ..schemas import (
     Provenance,
     SplatConfig,
     UsageError,
+    read_json,
 )
 from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
@@ -61,6 +62,7 @@ def fit(
     phys_config: PhysConfig | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    accept_units: bool = False,
 ) -> ModelFile:
     """Fit a capture stage by stage and write the model.
 
@@ -75,6 +77,7 @@ def fit(
         phys_config: Settings of phys-geo.
         overwrite: Replace an existing model.
         resume: Continue an interrupted fit of the same model, if there is one.
+        accept_units: Do not refuse units and frames that the motion contradicts; the model records it.
 
     Returns:
         The content of `model.json`.
@@ -87,7 +90,8 @@ def fit(
     """
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
     _refuse_early(out, stage, phys_config, overwrite)
-    opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else ())
+    splits = (split,) if stage != "sg-gs" else ()
+    opened = Capture.open(capture, splits=splits, accept_units=accept_units or _accepts_units(parent))
     started = time.perf_counter()
     request = _Request(
         capture=opened,
@@ -97,11 +101,12 @@ def fit(
         split=split,
         splat_config=splat_config,
         phys_config=phys_config,
+        accept_units=accept_units or _accepts_units(parent),
     )
     checkpoint = Checkpoint.beside(request.out, _inputs(request), resume, overwrite)
     moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
     # videos that identify nothing are reported before hours of work
-    warnings = _video_warnings(request) if moves else []
+    warnings = [*opened.inconsistencies, *_video_warnings(request)] if moves else []
     model = _fitted_model(request, checkpoint, moves, warnings)
     provenance = _provenance(request, model.file.effects)
     stages = model.fit.stages | {"total": {"seconds": round(time.perf_counter() - started, 2)}}
@@ -141,6 +146,15 @@ class _Request:
     """Settings of sg-gs."""
     phys_config: PhysConfig
     """Settings of phys-geo."""
+    accept_units: bool
+    """Whether the capture's units are right although its motion contradicts them."""
+
+
+def _accepts_units(parent: Path | None) -> bool:
+    """Return whether the model to start from was fitted with `--accept-units`."""
+    if parent is None or not (parent / "model.json").is_file():
+        return False  # what is missing is reported when the model is read
+    return bool(read_json(parent / "model.json", ModelFile).provenance.config.get("accept_units", False))
 
 
 def _inputs(request: _Request) -> dict[str, str]:
@@ -191,7 +205,8 @@ def _provenance(request: _Request, effects: Sequence[EffectModel]) -> Provenance
             "split": request.split,
             "sg-gs": request.splat_config.model_dump(mode="json"),
             "phys-geo": request.phys_config.model_dump(mode="json"),
-        },
+        }
+        | ({"accept_units": True} if request.accept_units else {}),
     )
 
 

@@ -13,6 +13,7 @@ from ...schemas import InputDataError, did_you_mean
 from ..shapes.meshes import mass_properties, read_mesh
 from ..shapes.ply import read_splats
 from .cameras import pose_count
+from .consistency import check_consistency
 from .files import files_under
 from .folder import CaptureFolder
 from .geometry_maps import KINDS, map_names, read_map
@@ -59,22 +60,31 @@ class CaptureFacts:
     """Number of their frames."""
     warnings: list[str] = field(default_factory=list)
     """Warnings about what is not a fault."""
+    inconsistencies: list[str] = field(default_factory=list)
+    """What gravity, ground, shapes and motion disagree about, without a fault."""
 
 
-def check_capture(capture: CaptureFolder) -> CaptureFacts:
+def check_capture(capture: CaptureFolder, accept_units: bool = False) -> CaptureFacts:
     """Check a capture and return its facts.
+
+    Args:
+        capture: The capture.
+        accept_units: Whether units and frames are right although the motion contradicts them.
 
     Raises:
         InputDataError: For the first fault; its last line counts the others.
     """
-    facts, faults = find_faults(capture)
+    facts, faults = find_faults(capture, accept_units)
     if faults:
         raise _first(faults, capture.root)
     return facts
 
 
-def find_faults(capture: CaptureFolder) -> tuple[CaptureFacts, list[InputDataError]]:
-    """Check a capture; return the facts and all faults, in the order of the directory's parts."""
+def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[CaptureFacts, list[InputDataError]]:
+    """Check a capture; return the facts and all faults, in the order of the directory's parts.
+
+    Units and frames that the motion contradicts are a fault, unless `accept_units`; see :func:`check_consistency`.
+    """
     facts = CaptureFacts(
         bodies=capture.body_names, splits={name: len(names) for name, names in capture.manifest.splits.items()}
     )
@@ -113,9 +123,19 @@ def find_faults(capture: CaptureFolder) -> tuple[CaptureFacts, list[InputDataErr
         attempt(_check_tracks, capture, episode, facts)
         for camera in capture.videos(episode):
             attempt(_check_video, capture, camera, episode, facts)
+    attempt(_check_consistency, capture, facts, accept_units)
     if facts.normalised_quaternions:
         facts.warnings.append(f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3).")
     return facts, faults
+
+
+def _check_consistency(capture: CaptureFolder, facts: CaptureFacts, accept_units: bool) -> None:
+    try:
+        facts.inconsistencies += check_consistency(capture)
+    except InputDataError as fault:
+        if not accept_units:
+            raise
+        facts.inconsistencies.append(f"Accepted with --accept-units: {fault.found}")
 
 
 def _first(faults: list[InputDataError], root: Path) -> InputDataError:

@@ -29,6 +29,8 @@ class CaptureFolder:
     """The calibrated cameras, or None if there are none yet."""
     only_splits: tuple[str, ...] | None = None
     """The splits that may be read; None for everything."""
+    inconsistencies: tuple[str, ...] = ()
+    """What gravity, ground, shapes and motion disagree about, without a fault."""
 
     @property
     def body_names(self) -> list[str]:

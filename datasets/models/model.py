@@ -49,6 +49,11 @@ class Model:
         return next(body for body in self.file.bodies if body.name == name)
 
     @property
+    def accepts_units(self) -> bool:
+        """Whether the model was fitted with `--accept-units`: its captures' units are right whatever their motion."""
+        return bool(self.file.provenance.config.get("accept_units", False))
+
+    @property
     def visual_count(self) -> int:
         """Return the number of spheres that are rendered."""
         return sum(map(len, self.body_splats.values())) + (0 if self.scene is None else len(self.scene))

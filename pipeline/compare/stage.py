@@ -51,6 +51,7 @@ def compare(
     warmup_s: float = 0.1,
     device: str = "auto",
     overwrite: bool = False,
+    accept_units: bool = False,
 ) -> CompareResult:
     """Compare models on disk on the episodes of a capture, and write the page.
 
@@ -62,6 +63,7 @@ def compare(
         warmup_s: Length of the start of an episode that the models may see [s].
         device: Device that renders images: auto, cpu or cuda.
         overwrite: Replace what is at `out`.
+        accept_units: Do not refuse units and frames of the capture that its motion contradicts.
 
     Raises:
         UsageError: If a model is given twice, there is no such split, or `out` exists.
@@ -73,7 +75,8 @@ def compare(
         refuse_output(out, "page", overwrite)
     _refuse_twice(models)
     loaded = [(str(path), read_model(path)) for path in models]
-    source = Capture.open(capture, splits=(split,))
+    accepted = accept_units or any(model.accepts_units for _, model in loaded)
+    source = Capture.open(capture, splits=(split,), accept_units=accepted)
     comparison = compare_models(loaded, source, split, warmup_s, device)
     if out is None:
         return comparison.result

@@ -55,6 +55,7 @@ def diagnose(
     save_law_to: Path | None = None,
     overwrite: bool = False,
     device: str = "auto",
+    accept_units: bool = False,
 ) -> DiagnoseResult:
     """Find the effects that a fitted model lacks to explain measured motions.
 
@@ -69,6 +70,7 @@ def diagnose(
         save_law_to: File to write the residual law to, as a custom effect; None to write none.
         overwrite: Replace that file.
         device: Device of the rollouts: auto, cpu or cuda. What the kernel does not support runs on the CPU.
+        accept_units: Do not refuse units and frames of the capture that its motion contradicts.
 
     Raises:
         InputDataError: If the data do not suffice for a verdict (the message says what is missing), or no residual law
@@ -79,7 +81,10 @@ def diagnose(
         require_law_file(save_law_to, overwrite)
     compared = experiments_of(DEFAULT) if throws is None else read_experiments(throws)
     library = library_of(candidates)
-    world, prepared = prepared_world(read_model(model), Capture.open(capture, splits=(split,)), split, device)
+    loaded = read_model(model)
+    accepted = accept_units or loaded.accepts_units
+    opened = Capture.open(capture, splits=(split,), accept_units=accepted)
+    world, prepared = prepared_world(loaded, opened, split, device, accepted)
     result = report(prepared, world, library, compared)
     if save_law_to is None:
         return result
@@ -87,7 +92,9 @@ def diagnose(
     return result.model_copy(update={"saved_law": saved})
 
 
-def prepared_world(model: Model, capture: Capture, split: str, device: str = "auto") -> tuple[World, Prepared]:
+def prepared_world(
+    model: Model, capture: Capture, split: str, device: str = "auto", accept_units: bool = False
+) -> tuple[World, Prepared]:
     """Return the world of a fitted model and the prepared episodes of a split.
 
     Args:
@@ -95,6 +102,7 @@ def prepared_world(model: Model, capture: Capture, split: str, device: str = "au
         capture: The capture.
         split: Name of the split.
         device: Device of the rollouts: auto, cpu or cuda.
+        accept_units: Do not check whether units, shape and ground agree with the tracks.
 
     Raises:
         InputDataError: If the data do not suffice for a verdict; the message says what is missing.
@@ -104,7 +112,8 @@ def prepared_world(model: Model, capture: Capture, split: str, device: str = "au
     found = diagnosed_episodes(model, capture, split)
     names = [name for name, _ in found.episodes]
     world = with_known_groups(world, model.file, names, capture.groups)
-    check_units_and_geometry(world, found.episodes, str(capture.root))
+    if not accept_units:
+        check_units_and_geometry(world, found.episodes, str(capture.root))
     prepared = prepare(world, found.episodes, found.noise, _groups(capture, names))
     prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
     check_observability(world, prepared, str(capture.root))

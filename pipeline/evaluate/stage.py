@@ -60,7 +60,14 @@ class Evaluation:
     """Evaluations of the episodes."""
 
 
-def evaluate(model: Path, target: Path, split: str = "test", warmup_s: float = 0.1, device: str = "auto") -> EvalResult:
+def evaluate(
+    model: Path,
+    target: Path,
+    split: str = "test",
+    warmup_s: float = 0.1,
+    device: str = "auto",
+    accept_units: bool = False,
+) -> EvalResult:
     """Evaluate a model on disk against a capture's tracks and frames, or against the states of a dataset.
 
     Args:
@@ -70,6 +77,7 @@ def evaluate(model: Path, target: Path, split: str = "test", warmup_s: float = 0
             rollouts.
         warmup_s: Duration of the start of an episode that the model may use [s].
         device: Device of the renderer: auto, cpu or cuda. Rollouts of few bodies are fastest on the CPU.
+        accept_units: Do not refuse units and frames of the capture that its motion contradicts.
 
     Raises:
         InputDataError: If the target has no data to compare with, or other bodies than the model.
@@ -80,7 +88,7 @@ def evaluate(model: Path, target: Path, split: str = "test", warmup_s: float = 0
     loaded = read_model(model)
     if kind_of(target) == "dataset":
         return evaluate_dataset(loaded, target, split, warmup_s).result
-    capture = Capture.open(target, splits=(split,))
+    capture = Capture.open(target, splits=(split,), accept_units=accept_units or loaded.accepts_units)
     tried = f"{loaded.visual_count} spheres, frames of the videos at their own size"
     with enough_memory(
         tried, str(resolve_device(device)), "a model of fewer spheres (cgwm fit --spheres), smaller videos"

@@ -15,13 +15,16 @@ from ...schemas import InputDataError, UsageError
 from ...schemas.validation import ValidationReport
 
 
-def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> ValidationReport:
+def validate(
+    thing: Path | str, sample: int | None = None, seed: int = 0, accept_units: bool = False
+) -> ValidationReport:
     """Check a capture, a model or a dataset.
 
     Args:
         thing: CAPTURE, MODEL or DATASET.
         sample: Number of rollouts of a dataset to check, drawn at random; None checks all.
         seed: Seed of that draw.
+        accept_units: Do not refuse units and frames of a capture that its motion contradicts.
 
     Returns:
         The facts that were found and measured; its `faults` are those of files that cgwm wrote (hashes, reprojection,
@@ -37,7 +40,7 @@ def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> Val
     if sample is not None and kind in ("capture", "model"):
         raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
     if kind == "capture":
-        return validate_capture(path)
+        return validate_capture(path, accept_units)
     if kind == "model":
         return validate_model(path)
     if kind == "dataset":
@@ -48,10 +51,10 @@ def validate(thing: Path | str, sample: int | None = None, seed: int = 0) -> Val
     raise InputDataError(f"{path}: {found}.", "a directory with capture.toml, model.json or dataset.json.")
 
 
-def validate_capture(path: Path | str) -> ValidationReport:
+def validate_capture(path: Path | str, accept_units: bool = False) -> ValidationReport:
     """Check a capture completely, and count its contents."""
     capture = Capture.open(path, check=False)
-    facts, faults = find_faults(capture)
+    facts, faults = find_faults(capture, accept_units)
     if len(faults) == 1:
         raise faults[0]
     if faults:

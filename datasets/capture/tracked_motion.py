@@ -1,0 +1,172 @@
+"""The measured motion of one body in one episode, and its distance from a plane, whatever their units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from ...schemas import Body, InputDataError
+from ..shapes.meshes import read_mesh
+from ..shapes.ply import read_splats
+from .folder import CaptureFolder
+from .motion_windows import MotionWindows, motion_windows
+from .tracks import Track
+from .unit_mistakes import Order
+
+Array = NDArray[np.float64]
+
+MOST_MOTIONS = 40
+"""Number of tracks that are looked at; they are spread evenly over the episodes."""
+MOST_PRODUCTS = 2_000_000
+"""Frames times points of a shape for which the lowest point is computed; more frames are interpolated."""
+RADIUS_FACTOR = 2.0
+"""Radius of a sphere of a shape in units of its Gaussian scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Points with radii whose convex hull is a shape, body frame."""
+
+    points: Array
+    """Centres [m], shape (P, 3)."""
+    radii: Array
+    """Radii [m], shape (P,)."""
+
+    @property
+    def size_m(self) -> float:
+        """Largest distance of the shape from the origin of its frame [m]."""
+        return float((np.linalg.norm(self.points, axis=1) + self.radii).max())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrackedMotion:
+    """The track of a free body in an episode."""
+
+    episode: str
+    """Name of the episode."""
+    body: Body
+    """The body, as in the manifest."""
+    track: Track
+    """Its poses."""
+    windows: MotionWindows
+    """Accelerations in windows of the track."""
+    outline: Outline | None
+    """The shape; None where the manifest has none, or where it needs an orientation that the track lacks."""
+    others: tuple[tuple[Array, float], ...] = ()
+    """Positions of the other bodies at the times of the track, shape (T, 3), and their sizes (inf: not known)."""
+    _lowest: dict[tuple[tuple[float, ...], Order], Array] = field(default_factory=dict)
+
+    def lowest(self, normal: Array, order: Order) -> Array:
+        """Return the smallest projection onto `normal` of the shape's points from the body's origin, shape (T,)."""
+        key = (tuple(normal.tolist()), order)
+        if key not in self._lowest:
+            self._lowest[key] = self._lowest_of(normal, order)
+        return self._lowest[key]
+
+    def _lowest_of(self, normal: Array, order: Order) -> Array:
+        if self.outline is None:
+            return np.zeros(len(self.track))
+        quat = self.track.quat_wxyz
+        if quat is None or not self.outline.points.any():
+            return np.full(len(self.track), float((self.outline.points @ normal - self.outline.radii).min()))
+        step = max(1, len(quat) * len(self.outline.points) // MOST_PRODUCTS)
+        some = np.unique(np.append(np.arange(0, len(quat), step), len(quat) - 1))
+        down = rotations(quat[some], order).inv().apply(normal)
+        found = (down @ self.outline.points.T - self.outline.radii).min(axis=1)
+        return np.interp(np.arange(len(quat)), some, found)
+
+
+def rotations(quat_wxyz: Array, order: Order) -> Rotation:
+    """Return rotations, body to world, from the columns of a track (T, 4) under an assumption about their order."""
+    if order == "xyzw":
+        return Rotation.from_quat(quat_wxyz)
+    turn = Rotation.from_quat(quat_wxyz, scalar_first=True)
+    return turn.inv() if order == "inverse" else turn
+
+
+def tracked_motions(capture: CaptureFolder) -> list[TrackedMotion]:
+    """Return the motions of free bodies with at least five frames, of some of the episodes, without faulty files."""
+    outlines = {body.name: outline_of(capture, body) for body in capture.manifest.bodies}
+    episodes = capture.episodes()
+    free = [body for body in capture.manifest.bodies if body.motion == "free"]
+    count = max(1, MOST_MOTIONS // max(len(free), 1))
+    chosen = np.unique(np.linspace(0, len(episodes) - 1, min(count, len(episodes))).round().astype(int))
+    motions = []
+    for name in (episodes[k] for k in chosen):
+        try:
+            tracks = capture.tracks(name)
+        except InputDataError:
+            continue  # a fault of its own
+        for body in free:
+            if body.name in tracks and len(tracks[body.name]) >= 5:
+                motions.append(_motion(capture, name, body, tracks, outlines))
+    return motions
+
+
+def _motion(
+    capture: CaptureFolder,
+    episode: str,
+    body: Body,
+    tracks: dict[str, Track],
+    outlines: dict[str, Outline | None],
+) -> TrackedMotion:
+    track, outline = tracks[body.name], outlines[body.name]
+    if outline is not None and track.quat_wxyz is None and outline.points.any():
+        outline = None
+    others = []
+    for other in capture.manifest.bodies:
+        if other.name == body.name:
+            continue
+        shape = outlines[other.name]
+        place = _positions(other, tracks.get(other.name), track.time_s)
+        others.append((place, np.inf if shape is None or place is None else shape.size_m))
+    known = tuple((np.zeros((len(track), 3)) if place is None else place, size) for place, size in others)
+    windows = motion_windows(track)
+    return TrackedMotion(episode=episode, body=body, track=track, windows=windows, outline=outline, others=known)
+
+
+def _positions(body: Body, track: Track | None, time_s: Array) -> Array | None:
+    """Return the positions of a body at times (T,), or None where they are not known."""
+    if track is not None:
+        return np.stack([np.interp(time_s, track.time_s, column) for column in track.position_m.T], axis=1)
+    if body.motion == "fixed" and body.photo_pose is not None:
+        return np.tile(body.photo_pose.position_m, (len(time_s), 1))
+    return None
+
+
+def outline_of(capture: CaptureFolder, body: Body) -> Outline | None:
+    """Return the outline of a body's shape; None without a shape, or with a file that cannot be read."""
+    shape = body.shape
+    if shape is None:
+        return None
+    if shape.sphere is not None:
+        return Outline(np.zeros((1, 3)), np.array([shape.sphere.radius_m]))
+    if shape.box is not None:
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        return Outline(signs * np.array(shape.box.half_extents_m), np.zeros(8))
+    try:
+        return _outline_in_file(capture, body, shape.mesh is not None)
+    except InputDataError:
+        return None  # a fault of its own
+
+
+def _outline_in_file(capture: CaptureFolder, body: Body, is_mesh: bool) -> Outline | None:
+    path = capture.shape_file(body)
+    if path is None:
+        return None
+    if is_mesh:
+        corners = _hull(read_mesh(path).vertices)
+        return Outline(corners, np.zeros(len(corners)))
+    splats = read_splats(path)
+    return Outline(np.asarray(splats.means, float), RADIUS_FACTOR * np.asarray(splats.scales, float))
+
+
+def _hull(points: Array) -> Array:
+    try:
+        return points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):
+        return points  # flat, or too few
