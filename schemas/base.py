@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-import tomllib
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
 
+from .documents import SHOWN, parse_json, parse_toml, shortened
 from .errors import InputDataError, did_you_mean
 from .lines import find_line
 from .regular_files import read_text_file
@@ -17,12 +19,47 @@ from .regular_files import read_text_file
 ModelT = TypeVar("ModelT", bound="FileModel")
 
 
+def _whole(value: Any) -> Any:
+    """Return a whole number as an integer: JSON does not distinguish 3.0 from 3."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+_CONVERSIONS: dict[str, Callable[[Any], Any]] = {"int": _whole, "tuple": _tuple}
+"""By the kind of a core schema, what a document has in place of Python's value."""
+_VALUES = ("default", "expected", "metadata", "serialization")
+"""Keys of a core schema that hold no further schemas to convert for."""
+
+
+def _as_in_documents(schema: Any) -> Any:
+    """Return a core schema whose strict mode takes what documents have: lists for tuples, 3.0 for an integer."""
+    if isinstance(schema, list):
+        return [_as_in_documents(entry) for entry in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if schema.get("type") == "function-before" and schema["function"]["function"] in _CONVERSIONS.values():
+        return schema  # of a model within this one
+    changed = {key: entry if key in _VALUES else _as_in_documents(entry) for key, entry in schema.items()}
+    convert = _CONVERSIONS.get(str(schema.get("type")))
+    return changed if convert is None else core_schema.no_info_before_validator_function(convert, changed)
+
+
 class FileModel(BaseModel):
-    """A model of something on disk: unknown fields are refused, instances are immutable, NaN is no number."""
+    """A model of something on disk: unknown fields are refused, instances are immutable, NaN is no number.
+
+    What is read (:func:`parse`) is taken by its type: `true` and `"-9.81"` are no numbers, and a number is no text.
+    """
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False, validate_default=True
     )
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler) -> CoreSchema:
+        return _as_in_documents(handler(source))
 
 
 def read_toml(path: Path, model: type[ModelT]) -> ModelT:
@@ -32,37 +69,29 @@ def read_toml(path: Path, model: type[ModelT]) -> ModelT:
         InputDataError: If it is missing, is no TOML, or does not fit the model; with file, line and field.
     """
     text = read_text_file(path)
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputDataError(f"{path}: not valid TOML: {error}.", todo="correct the syntax there.") from None
-    return parse(data, model, path, text)
+    return parse(parse_toml(text, path), model, path, text)
 
 
 def read_json(path: Path, model: type[ModelT]) -> ModelT:
     """Read and check a JSON file; errors as in :func:`read_toml`."""
     text = read_text_file(path)
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputDataError(f"{path}, line {error.lineno}: not valid JSON: {error.msg}.") from None
-    return parse(data, model, path, text)
+    return parse(parse_json(text, path), model, path, text)
 
 
-def parse(data: Any, model: type[ModelT], path: Path, text: str = "") -> ModelT:
+def parse(data: Any, model: type[ModelT], path: Path | str, text: str = "") -> ModelT:
     """Validate `data` against `model`, and turn the first fault into one clear message that names `path`."""
     try:
-        return model.model_validate(data)
+        return model.model_validate(data, strict=True)
     except ValidationError as error:
         raise _explain(error, data, model, path, text) from None
 
 
-def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Path, text: str) -> InputDataError:
+def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Path | str, text: str) -> InputDataError:
     # An unknown field explains the missing one beside it ("mass" for "mass_kg"), so it is told first.
-    faults = error.errors()
+    faults = error.errors(include_url=False, include_context=False)
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     location = _in_document(fault["loc"], data)
-    where = find_line(text, location, path.suffix)
+    where = find_line(text, location, Path(path).suffix)
     place = f"{path}, line {where}" if where else f"{path}"
     parent, name = location[:-1], str(location[-1]) if location else ""
     legal = _legal_fields(model, parent)
@@ -70,7 +99,7 @@ def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Pa
     others = len({_in_document(f["loc"], data) for f in faults}) - 1
     todo = f"correct the field ({others} more to correct)." if others else "correct the field."
     if fault["type"] == "extra_forbidden":
-        found = f"{place}: {section} has an unknown field '{name}'."
+        found = f"{place}: {section} has an unknown field '{name:.{SHOWN}}'."
         return InputDataError(found, ", ".join(legal) + "." + did_you_mean(name, legal), todo)
     if fault["type"] == "missing" and _has_fields(model, parent):
         return InputDataError(f"{place}: {section} lacks the field '{name}'.", ", ".join(legal) + ".", todo)
@@ -94,10 +123,10 @@ def _message(fault: Any, location: tuple, data: Any) -> str:
     try:
         value = _at(data, location)
     except (KeyError, IndexError, TypeError):
-        return message
+        return shortened(message)
     if isinstance(value, dict) or (isinstance(value, list) and fault["type"] == "value_error"):
-        return message
-    return f"{message} (found {json.dumps(value, default=str):.80})"
+        return shortened(message)
+    return f"{shortened(message)} (found {json.dumps(value, default=str):.{SHOWN}})"
 
 
 def _wrong_count(model: Any, location: tuple, data: Any) -> str:
@@ -130,7 +159,7 @@ def _at(data: Any, location: tuple) -> Any:
 def _field(data: Any, location: tuple) -> str:
     """Name a field as its author wrote it: [[bodies]] 'cube' inertia_kg_m2, or splits.train."""
     section, rest = _nearest_name(data, location)
-    dotted = ".".join(str(part) for part in rest)
+    dotted = shortened(".".join(str(part) for part in rest), SHOWN)
     return f"{section} {dotted}".strip() if section else dotted
 
 
@@ -142,7 +171,7 @@ def _nearest_name(data: Any, location: tuple) -> tuple[str, tuple]:
             path = ".".join(str(part) for part in location[:k] if not isinstance(part, int))
             return (
                 f"[[{path}]]" if isinstance(location[k - 1], int) else f"[{path}]"
-            ) + f" '{table['name']}'", location[k:]
+            ) + f" '{shortened(table['name'], SHOWN)}'", location[k:]
     return "", location
 
 

@@ -14,18 +14,30 @@ Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 
 
+Focal = Annotated[float, Field(ge=1e-3, le=1e9)]
+FARTHEST_CENTRE = 20.0
+"""Largest distance of the principal point from the middle of a picture, in sides: cut-outs have it outside."""
+
+
 class CameraIntrinsics(FileModel):
     """A pinhole camera, with OpenCV distortion where there is any. Pixel centres: top-left is (0.5, 0.5)."""
 
     model: Literal["PINHOLE", "OPENCV"] = "PINHOLE"
-    width: Annotated[int, Field(gt=0)]
-    height: Annotated[int, Field(gt=0)]
-    fx: Annotated[float, Field(gt=0)]
-    fy: Annotated[float, Field(gt=0)]
+    width: Annotated[int, Field(ge=1, le=100_000)]
+    height: Annotated[int, Field(ge=1, le=100_000)]
+    fx: Focal
+    fy: Focal
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = ()
     """k1, k2, p1, p2 [, k3] for OPENCV; empty for PINHOLE."""
+
+    @model_validator(mode="after")
+    def _centred(self) -> CameraIntrinsics:
+        for name, value, side in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
+            if abs(value - 0.5 * side) > FARTHEST_CENTRE * side:
+                raise ValueError(f"{name} of {value:g} px is far beyond a picture of {side} px")
+        return self
 
     @model_validator(mode="after")
     def _distortion(self) -> CameraIntrinsics:
@@ -41,7 +53,7 @@ class Scale(FileModel):
 
     kind: Literal["metric", "unscaled"]
     source: str = ""
-    relative_std: Annotated[float, Field(ge=0)] | None = None
+    relative_std: Annotated[float, Field(ge=0, le=1e6)] | None = None
     """Standard error of the scale, as a fraction."""
 
 

@@ -8,15 +8,24 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from .base import FileModel
+from .quantities import (
+    Coordinate,
+    Deviation,
+    FrameRate,
+    Gravity,
+    Instant,
+    Length,
+    Mass,
+    Position3,
+    Vector3,
+)
 
 CAPTURE_FORMAT = "cgwm-capture/1"
 QUATERNION_NORM_TOLERANCE = 1e-3
 """A quaternion whose norm is off by no more than this is normalised; by more, it is refused."""
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Vector3 = tuple[float, float, float]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=120)]
+Pixel = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 def unit_quaternion(quat_wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
@@ -34,21 +43,29 @@ def physical_inertia(value: tuple[float, ...]) -> tuple[float, ...]:
     """Refuse what is no inertia of a body [kg m2]: 3 or 6 numbers, positive, obeying the triangle inequality."""
     if len(value) not in (3, 6):
         raise ValueError(f"takes 3 numbers (xx, yy, zz) or 6 (xx, yy, zz, xy, xz, yz); found {len(value)}")
-    xx, yy, zz, xy, xz, yz = (*value, 0.0, 0.0, 0.0)[:6]
-    minor = xx * yy - xy * xy
-    determinant = zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz
-    if min(xx, yy, zz, minor, determinant) <= 0:
+    size = max(map(abs, value))
+    xx, yy, zz, xy, xz, yz = (entry / (size or 1.0) for entry in (*value, 0.0, 0.0, 0.0)[:6])
+    if not _positive_definite(xx, yy, zz, (xy, xz, yz)):
         raise ValueError("the inertia must be positive definite")
     # 2 % are left for rounded numbers: of a thin plate, one moment is the sum of the other two.
-    if 2 * max(xx, yy, zz) > 1.02 * (xx + yy + zz):
+    half = 0.51 * (xx + yy + zz)
+    if not _positive_definite(half - xx, half - yy, half - zz, (-xy, -xz, -yz)):
         raise ValueError("no body has this inertia: one moment is larger than the other two together")
     return value
+
+
+def _positive_definite(xx: float, yy: float, zz: float, products: Vector3) -> bool:
+    """Return whether a symmetric matrix is positive definite; products: xy, xz, yz."""
+    xy, xz, yz = products
+    minor = xx * yy - xy * xy
+    determinant = zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz
+    return min(xx, yy, zz, minor, determinant) > 0
 
 
 class Pose(FileModel):
     """A rigid pose: position [m] and unit quaternion (w, x, y, z)."""
 
-    position_m: Vector3 = (0.0, 0.0, 0.0)
+    position_m: Position3 = (0.0, 0.0, 0.0)
     quat_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     @field_validator("quat_wxyz")
@@ -62,7 +79,7 @@ class Ground(FileModel):
 
     normal: Vector3 = (0.0, 0.0, 1.0)
     """Unit normal, world frame, pointing out of the ground."""
-    offset_m: float = 0.0
+    offset_m: Coordinate = 0.0
     """Height of the plane along the normal [m]."""
 
     @field_validator("normal")
@@ -77,7 +94,7 @@ class Ground(FileModel):
 class World(FileModel):
     """What surrounds the bodies."""
 
-    gravity_m_s2: Vector3 = (0.0, 0.0, -9.81)
+    gravity_m_s2: Gravity = (0.0, 0.0, -9.81)
     """Gravitational acceleration [m/s2], world frame."""
     ground: Ground | None = None
     """The ground, or nothing where there is none."""
@@ -86,13 +103,13 @@ class World(FileModel):
 class BoxShape(FileModel):
     """A box, centred at the body frame's origin and aligned with its axes."""
 
-    half_extents_m: tuple[Positive, Positive, Positive]
+    half_extents_m: tuple[Length, Length, Length]
 
 
 class SphereShape(FileModel):
     """A ball, centred at the body frame's origin."""
 
-    radius_m: Positive
+    radius_m: Length
 
 
 class FileShape(FileModel):
@@ -125,8 +142,8 @@ class PhotoBox(FileModel):
     In the unit of the cameras: metres, unless they are unscaled.
     """
 
-    min_m: Vector3
-    max_m: Vector3
+    min_m: Position3
+    max_m: Position3
 
     @model_validator(mode="after")
     def _ordered(self) -> PhotoBox:
@@ -142,11 +159,11 @@ class Body(FileModel):
     name: Name
     motion: Literal["free", "driven", "fixed"] = "free"
     """free: moves by physics; driven: its track is the command; fixed: does not move."""
-    mass_kg: Positive | None = None
+    mass_kg: Mass | None = None
     """Mass [kg]; left out: free, and fitted only where a force makes it observable."""
     inertia_kg_m2: tuple[float, ...] | None = None
     """Inertia about the centre of mass, body axes: diagonal, or xx yy zz xy xz yz; left out: from the shape."""
-    com_m: Vector3 | None = None
+    com_m: Position3 | None = None
     """Centre of mass in the body frame [m]; left out: from the shape."""
     shape: Shape | None = None
     """Left out: from the photos (stage SG-GS)."""
@@ -164,8 +181,8 @@ class Body(FileModel):
 class Measurement(FileModel):
     """How well the tracks are measured; estimated from the data where left out."""
 
-    position_std_m: Positive | None = None
-    rotation_std_rad: Positive | None = None
+    position_std_m: Deviation | None = None
+    rotation_std_rad: Deviation | None = None
 
 
 class Episode(FileModel):
@@ -173,9 +190,9 @@ class Episode(FileModel):
 
     group: str | None = None
     """The session that the episode belongs to."""
-    start_s: float | None = None
+    start_s: Instant | None = None
     """Ignore what was measured before this time [s]."""
-    end_s: float | None = None
+    end_s: Instant | None = None
     """Ignore what was measured after this time [s]."""
 
     @model_validator(mode="after")
@@ -188,16 +205,16 @@ class Episode(FileModel):
 class Video(FileModel):
     """Timing of the videos; frame k of a camera shows the world at k / frame_rate_hz + its offset."""
 
-    frame_rate_hz: Positive = 30.0
-    camera_time_offset_s: dict[str, float] = {}
+    frame_rate_hz: FrameRate = 30.0
+    camera_time_offset_s: dict[str, Instant] = {}
     """Added to the frame times of a camera [s]."""
 
 
 class Marker(FileModel):
     """An ArUco marker of known size that is visible in the photos."""
 
-    id: Annotated[int, Field(ge=0)]
-    side_m: Positive
+    id: Annotated[int, Field(ge=0, le=100_000)]
+    side_m: Length
     """Length of the black square's side [m]."""
     pose: Pose | None = None
     """T_world_marker (x right, y up as printed, z out of the paper); fixes the world frame where given."""
@@ -206,10 +223,10 @@ class Marker(FileModel):
 class KnownDistance(FileModel):
     """A known distance between two points that are marked in at least two photos each."""
 
-    distance_m: Positive
-    a_px: dict[str, tuple[float, float]]
+    distance_m: Length
+    a_px: dict[str, tuple[Pixel, Pixel]]
     """Photo (path relative to images/) to pixel (x, y) of the first point; top-left pixel centre is (0.5, 0.5)."""
-    b_px: dict[str, tuple[float, float]]
+    b_px: dict[str, tuple[Pixel, Pixel]]
     """The same for the second point."""
 
     @model_validator(mode="after")
@@ -223,7 +240,7 @@ class KnownDistance(FileModel):
 class KnownCameraDistance(FileModel):
     """A known distance between the optical centres of two photos."""
 
-    distance_m: Positive
+    distance_m: Length
     images: tuple[str, str]
     """The two photos (paths relative to images/)."""
 

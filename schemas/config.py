@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from .base import FileModel
 from .plan import SamplingPlan
+from .quantities import Duration, FrameRate, RadiusFactor, Seed, Side, Step, Steps
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -15,26 +16,27 @@ Device = Literal["auto", "cpu", "cuda"]
 class CalibrateConfig(FileModel):
     """Settings of `cgwm calibrate`."""
 
-    seed: int = 0
-    max_features: Annotated[int, Field(ge=256)] = 4096
-    max_image_size: Annotated[int, Field(ge=128)] = 1600
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1001)] = 0
+    """COLMAP counts seeds in 31 bits; attempts take the following ones."""
+    max_features: Annotated[int, Field(ge=256, le=1_000_000)] = 4096
+    max_image_size: Annotated[int, Field(ge=128, le=100_000)] = 1600
     """Photos are reduced to this longer side [px] for feature extraction."""
-    retries: Annotated[int, Field(ge=0)] = 4
+    retries: Annotated[int, Field(ge=0, le=1000)] = 4
     """Further attempts (other seeds, then more features) after a model that fails the self-check."""
 
 
 class SplatConfig(FileModel):
     """Settings of the stage sg-gs."""
 
-    seed: int = 0
+    seed: Seed = 0
     device: Device = "auto"
-    iterations: Annotated[int, Field(ge=1)] = 400
-    max_body_spheres: Annotated[int, Field(ge=16)] = 2500
-    max_scene_spheres: Annotated[int, Field(ge=16)] = 6000
-    spheres: Annotated[int, Field(ge=16)] | None = None
+    iterations: Steps = 400
+    max_body_spheres: Annotated[int, Field(ge=16, le=10_000_000)] = 2500
+    max_scene_spheres: Annotated[int, Field(ge=16, le=10_000_000)] = 6000
+    spheres: Annotated[int, Field(ge=16, le=10_000_000)] | None = None
     """Budget of a background whose spheres multiply and move to where they are needed; left out, `max_scene_spheres`
     that stay about where they begin, which is faster by far."""
-    adaptive_iterations: Annotated[int, Field(ge=1)] = 7000
+    adaptive_iterations: Steps = 7000
     """Steps of the background's fit where there is a budget."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics of that background's colours; 0: the same from all sides."""
@@ -52,30 +54,30 @@ class SplatConfig(FileModel):
     """Write a film around what was fitted, `turntable.mp4`."""
     collision: Literal["distilled", "visual"] = "distilled"
     """What collides: a small set of spheres distilled from a body's solid, or its visual spheres themselves."""
-    max_collision_spheres: Annotated[int, Field(ge=8)] = 200
+    max_collision_spheres: Annotated[int, Field(ge=8, le=100_000)] = 200
     """Most spheres of a distilled set; fewer where their surface is within 0.2 % of the solid's size on average."""
-    image_size: Annotated[int, Field(ge=32)] = 320
+    image_size: Annotated[int, Field(ge=32, le=16384)] = 320
     """Photos are reduced to this longer side [px] for fitting."""
-    test_every: Annotated[int, Field(ge=2)] = 8
+    test_every: Annotated[int, Field(ge=2, le=1_000_000)] = 8
     """Every n-th photo is held out and its PSNR reported."""
-    radius_factor: Annotated[float, Field(gt=0)] = 2.0
+    radius_factor: RadiusFactor = 2.0
 
 
 class PhysConfig(FileModel):
     """Settings of the stage phys-geo."""
 
-    seed: int = 0
+    seed: Seed = 0
     device: Device = "auto"
     supervise: Literal["tracks", "images", "both"] = "tracks"
-    step_s: Annotated[float, Field(gt=0)] = 0.001
-    population: Annotated[int, Field(ge=8)] | None = None
+    step_s: Step = 0.001
+    population: Annotated[int, Field(ge=8, le=100_000)] | None = None
     """Samples in a generation of the global search; left out, 24 to 96, the fewer the more episodes there are."""
-    generations: Annotated[int, Field(ge=2)] = 8
+    generations: Annotated[int, Field(ge=2, le=10_000)] = 8
     """Generations of the global search; the first draws from the prior."""
-    iterations: Annotated[int, Field(ge=1)] = 10
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 10
     """Most steps of the local refinement (Levenberg-Marquardt)."""
-    warmup_s: Annotated[float, Field(gt=0)] = 0.1
-    image_size: Annotated[int, Field(ge=32)] = 320
+    warmup_s: Duration = 0.1
+    image_size: Annotated[int, Field(ge=32, le=16384)] = 320
     """Video frames are reduced to this longer side [px] for fitting."""
     geometry: bool = True
     """Whether the colliding spheres that touch are refined with the images, through the motion alone."""
@@ -89,21 +91,21 @@ class PhysConfig(FileModel):
 class SynthesizeConfig(FileModel):
     """Settings of `cgwm synthesize`."""
 
-    seed: int = 0
+    seed: Seed = 0
     device: Device = "auto"
-    rollouts: Annotated[int, Field(ge=1)] = 8
-    duration_s: Annotated[float, Field(gt=0)] = 1.0
-    frame_rate_hz: Annotated[float, Field(gt=0)] = 30.0
-    width: Annotated[int, Field(ge=16)] = 320
-    height: Annotated[int, Field(ge=16)] = 240
+    rollouts: Annotated[int, Field(ge=1, le=10_000_000)] = 8
+    duration_s: Duration = 1.0
+    frame_rate_hz: Annotated[FrameRate, Field(le=1e5)] = 30.0
+    width: Side = 320
+    height: Side = 240
     compression: Literal["zstd", "gzip", "none", "jpeg"] = "zstd"
     """Of images, depth and masks: lossless; `jpeg` is zstd but for the colours, which lose a little and take a third of
     the room."""
-    batch: Annotated[int, Field(ge=1)] | None = None
+    batch: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Rollouts that are drawn and simulated together; it changes no byte. Left out, 64 on a GPU, 1 on
     the CPU."""
-    shard: Annotated[int, Field(ge=0)] = 0
-    shards: Annotated[int, Field(ge=1)] = 1
+    shard: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    shards: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     plan: SamplingPlan = SamplingPlan()
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ class ShardEntry(FileModel):
     """One HDF5 file of a dataset."""
 
     file: str
-    index: Annotated[int, Field(ge=0)]
+    index: Annotated[int, Field(ge=0, le=1_000_000)]
     sha256: str
     bytes: int
     rollouts: int
@@ -52,7 +52,7 @@ class DatasetManifest(FileModel):
     """The resolved settings, without the shard's number."""
     rollouts: int
     """Rollouts of all shards together, whether they are there yet or not."""
-    shard_count: Annotated[int, Field(ge=1)]
+    shard_count: Annotated[int, Field(ge=1, le=1_000_000)]
     shards: tuple[ShardEntry, ...] = ()
     """The shards that are complete, by index; of several shards each has an entry file, until `cgwm merge`."""
     index: IndexEntry | None = None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .base import FileModel
 
@@ -74,8 +75,12 @@ class NextExperiment(FileModel):
     order_of_magnitude (a power of 10; 0 below 1)."""
 
 
-Several = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
-Angles = Annotated[tuple[float, ...], Field(min_length=1)]
+Several = Annotated[tuple[Annotated[float, Field(ge=0, le=1e5)], ...], Field(min_length=1, max_length=1000)]
+Angles = Annotated[tuple[Annotated[float, Field(ge=-3600, le=3600)], ...], Field(min_length=1, max_length=1000)]
+
+
+MOST_COMBINATIONS = 100_000
+"""Most combinations of values in a file of throws, before equal ones are put together."""
 
 
 class ThrowGrid(FileModel):
@@ -92,15 +97,26 @@ class ThrowGrid(FileModel):
     heading_deg: Angles = (0.0,)
     """Of the velocity about the vertical, from the world's x towards y."""
     spin_rad_s: Several = (0.0,)
-    spin_axis: Annotated[tuple[Literal["up", "along", "across"], ...], Field(min_length=1)] = ("across",)
+    spin_axis: Annotated[tuple[Literal["up", "along", "across"], ...], Field(min_length=1, max_length=1000)] = (
+        "across",
+    )
     """Against gravity; along the heading; horizontally across it."""
-    duration_s: Annotated[float, Field(gt=0, le=10)] = 0.6
+    duration_s: Annotated[float, Field(ge=1e-6, le=10)] = 0.6
 
 
 class ThrowsFile(FileModel):
     """The TOML file of `cgwm diagnose --throws`."""
 
     throws: Annotated[tuple[ThrowGrid, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _countable(self) -> ThrowsFile:
+        count = sum(
+            math.prod(len(value) for value in vars(grid).values() if isinstance(value, tuple)) for grid in self.throws
+        )
+        if count > MOST_COMBINATIONS:
+            raise ValueError(f"{count} combinations; at most {MOST_COMBINATIONS}, of which equal throws count once")
+        return self
 
 
 class LawTerm(FileModel):

@@ -2,14 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from .base import FileModel
-from .capture import Ground, Name, Pose, Shape, Vector3
+from .capture import Ground, Name, Pose, Shape, physical_inertia
+from .quantities import (
+    ContactTime,
+    DampingRatio,
+    Deviation,
+    Friction,
+    Gravity,
+    Mass,
+    Position3,
+    RadiusFactor,
+    Step,
+    Vector3,
+)
 
 MODEL_FORMAT = "cgwm-model/1"
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[1] < value[0]:
+        raise ValueError(f"a range is [low, high]; found {list(value)}")
+    return value
+
+
+Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
+NonNegative = Annotated[float, Field(ge=0)]
+ROUNDING = 1e-6
+"""Largest relative difference of numbers that are the same but for rounding."""
+
+
+def repeated(names: Iterable[str]) -> str | None:
+    """Return the first name that stands twice, or None."""
+    seen: set[str] = set()
+    return next((name for name in names if name in seen or seen.add(name)), None)
 
 
 class FittedParameter(FileModel):
@@ -19,14 +50,24 @@ class FittedParameter(FileModel):
     """For example `friction` or `cube.mass_kg`."""
     unit: str
     estimate: float
-    std_error: float | None = None
+    std_error: NonNegative | None = None
     """Standard error; none where the number was given or the data say nothing about it."""
-    interval_95: tuple[float, float] | None = None
-    bounds: tuple[float, float] | None = None
+    interval_95: Interval | None = None
+    bounds: Interval | None = None
     prior: str | None = None
     state: Literal["fitted", "given", "on_bound", "not_observable", "derived"] = "fitted"
     note: str = ""
     """What it is confounded with, or the motion that would reveal it."""
+
+    @model_validator(mode="after")
+    def _within_bounds(self) -> FittedParameter:
+        low, high = self.bounds or (self.estimate, self.estimate)
+        rounding = ROUNDING * max(high - low, abs(low), abs(high))
+        if not low - rounding <= self.estimate <= high + rounding:
+            raise ValueError(
+                f"parameter '{self.name}' is {self.estimate:g} {self.unit}, outside its bounds {low:g} to {high:g}"
+            )
+        return self
 
 
 class Correlation(FileModel):
@@ -40,8 +81,21 @@ class Correlation(FileModel):
     @model_validator(mode="after")
     def _square(self) -> Correlation:
         size = len(self.parameters)
+        twice = repeated(self.parameters)
+        if twice is not None:
+            raise ValueError(f"the correlations name the parameter '{twice}' twice")
         if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
             raise ValueError(f"the matrix of {size} parameters has {size} rows of {size} numbers")
+        for i, row in enumerate(self.matrix):
+            # of a parameter without any error the row is zero
+            if min(abs(row[i] - 1), abs(row[i])) > ROUNDING:
+                raise ValueError(f"the correlation of '{self.parameters[i]}' with itself is {row[i]:g}, not 1")
+            for j, value in enumerate(row[:i]):
+                pair = f"the correlation of '{self.parameters[i]}' and '{self.parameters[j]}'"
+                if abs(value) > 1 + ROUNDING:
+                    raise ValueError(f"{pair} is {value:g}; it lies between -1 and 1")
+                if abs(value - self.matrix[j][i]) > ROUNDING:
+                    raise ValueError(f"{pair} is {value:g}, the other way around {self.matrix[j][i]:g}")
         return self
 
 
@@ -50,10 +104,10 @@ class BodyModel(FileModel):
 
     name: Name
     motion: Literal["free", "driven", "fixed"]
-    mass_kg: Annotated[float, Field(gt=0)]
+    mass_kg: Mass
     inertia_kg_m2: tuple[float, float, float, float, float, float]
     """xx yy zz xy xz yz about the centre of mass, body axes [kg m2]."""
-    com_m: Vector3
+    com_m: Position3
     """Centre of mass in the body frame [m]."""
     photo_pose: Pose = Pose()
     """T_world_body while the photos were taken."""
@@ -63,20 +117,25 @@ class BodyModel(FileModel):
     """Visual spheres (PLY, body frame)."""
     collision: str | None = None
     """Colliding spheres (PLY, body frame); none: the visual ones collide."""
-    collision_distance_m: float | None = None
+    collision_distance_m: Annotated[float, Field(ge=0, le=1e5)] | None = None
     """Largest distance between the colliding spheres' surface and the visual (or given) surface [m]."""
-    radius_factor: float = 2.0
+    radius_factor: RadiusFactor = 2.0
     """Collision radius of a sphere in units of its Gaussian scale s."""
+
+    @field_validator("inertia_kg_m2")
+    @classmethod
+    def _physical(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        return physical_inertia(value)
 
 
 class ContactParameters(FileModel):
     """The contact law's numbers (contact model `closed_form`)."""
 
-    friction: Annotated[float, Field(ge=0)] = 0.5
+    friction: Friction = 0.5
     """Coulomb coefficient [1]."""
-    contact_time_s: Annotated[float, Field(gt=0)] = 0.005
+    contact_time_s: ContactTime = 0.005
     """Natural contact time tau = sqrt(m_eff / K) [s]."""
-    damping_ratio: Annotated[float, Field(ge=0)] = 0.3
+    damping_ratio: DampingRatio = 0.3
     """zeta [1]; together with tau it fixes the restitution e(zeta)."""
 
 
@@ -84,8 +143,8 @@ class Solver(FileModel):
     """How the model is integrated."""
 
     contact_model: Literal["closed_form"] = "closed_form"
-    step_s: Annotated[float, Field(gt=0)] = 0.001
-    sweeps: Annotated[int, Field(ge=1)] = 10
+    step_s: Step = 0.001
+    sweeps: Annotated[int, Field(ge=1, le=10_000)] = 10
     """Projected sweeps over the contacts; 1 is the closed form alone, more let contacts that touch at once agree."""
 
 
@@ -101,7 +160,7 @@ class EffectModel(FileModel):
     """Where each unit has its own: the mean over units, which serves one that the fit has not seen."""
     own: dict[str, dict[str, float]] = {}
     """By session or episode: its own values of parameters."""
-    spread: dict[str, float] = {}
+    spread: dict[str, NonNegative] = {}
     """By parameter with own values: their standard deviation from unit to unit, of the prior that ties them."""
 
 
@@ -140,7 +199,7 @@ class ModelFile(FileModel):
     """`model.json`."""
 
     format: Literal["cgwm-model/1"] = MODEL_FORMAT
-    gravity_m_s2: Vector3 = (0.0, 0.0, -9.81)
+    gravity_m_s2: Gravity = (0.0, 0.0, -9.81)
     ground: Ground | None = None
     bodies: tuple[BodyModel, ...]
     contact: ContactParameters | None = None
@@ -150,7 +209,7 @@ class ModelFile(FileModel):
     """Of parameters that were fitted together; between two of these blocks, none is known."""
     effects: tuple[EffectModel, ...] = ()
     solver: Solver = Solver()
-    measurement_std: dict[str, float] = {}
+    measurement_std: dict[str, Deviation] = {}
     """position_m and rotation_rad: the measurement noise, given or estimated."""
     scene: str | None = None
     """Background spheres (PLY, world frame), where there are any."""
@@ -160,6 +219,28 @@ class ModelFile(FileModel):
     """Where the videos tell it; None leaves a body in the light of the photos, however it turns."""
     warnings: tuple[str, ...] = ()
     provenance: Provenance
+
+    @field_validator("measurement_std")
+    @classmethod
+    def _known_measurements(cls, value: dict[str, float]) -> dict[str, float]:
+        other = sorted(set(value) - {"position_m", "rotation_rad"})
+        if other:
+            raise ValueError(f"an unknown measurement '{other[0]}'; they are position_m and rotation_rad")
+        return value
+
+    @model_validator(mode="after")
+    def _once(self) -> ModelFile:
+        for what, names in (
+            ("bodies have", (body.name for body in self.bodies)),
+            ("parameters have", (parameter.name for parameter in self.parameters)),
+            # one effect acts once, however its values are shared
+            ("effects have", (effect.name.partition("@")[0] for effect in self.effects)),
+            ("blocks of correlations have", (name for block in self.correlations for name in block.parameters)),
+        ):
+            twice = repeated(names)
+            if twice is not None:
+                raise ValueError(f"two {what} the name '{twice}'")
+        return self
 
 
 class FitFile(FileModel):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,8 +12,11 @@ from .base import FileModel, read_toml
 CUT_OFF = 3.0
 """A normal distribution is cut off at this many standard deviations, so that a plan has no outliers."""
 
-NonNegative = Annotated[float, Field(ge=0)]
+Reach = Annotated[float, Field(ge=0, le=1e5)]
+"""A distance that may be none [m]."""
 Range = tuple[float, float]
+Angle = Annotated[float, Field(ge=-3600, le=3600)]
+"""[deg]; ranges may pass any direction."""
 
 
 class Distribution(FileModel):
@@ -28,7 +30,7 @@ class Distribution(FileModel):
     """From low to high, above 0, all orders of magnitude alike."""
     normal: Range | None = None
     """Mean and standard deviation; cut off at three of them."""
-    choice: Annotated[tuple[float, ...], Field(min_length=1)] | None = None
+    choice: Annotated[tuple[float, ...], Field(min_length=1, max_length=100_000)] | None = None
     """One of these, all alike."""
 
     @model_validator(mode="before")
@@ -88,17 +90,17 @@ class Distribution(FileModel):
 class RejectionRules(FileModel):
     """Rollouts that are drawn again. A rule that is left out rejects nothing."""
 
-    off_table_m: Annotated[float, Field(gt=0)] | None = None
+    off_table_m: Annotated[float, Field(gt=0, le=1e8)] | None = None
     """A free body's middle gets farther than this from where the photos show it, measured along the ground [m]."""
     no_contact: bool = False
     """Nothing touches a free body; where a body is driven: no driven body touches a free one."""
-    penetration_m: Annotated[float, Field(gt=0)] | None = None
+    penetration_m: Annotated[float, Field(gt=0, le=1e8)] | None = None
     """A free body's spheres sink deeper than this into the ground or another body, at a frame [m]."""
-    unrest_m_s: Annotated[float, Field(gt=0)] | None = None
+    unrest_m_s: Annotated[float, Field(gt=0, le=1e8)] | None = None
     """A point of a free body's surface is faster than this at the end [m/s]."""
     unseen_share: Annotated[float, Field(ge=0, le=1)] | None = None
     """The middle of a free body is outside every camera's picture in more than this share of the frames."""
-    attempts: Annotated[int, Field(ge=1)] = 100
+    attempts: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     """Draws for one rollout, after which the plan is given up."""
 
 
@@ -112,7 +114,7 @@ class SamplingPlan(FileModel):
     """Of thrown bodies: any rotation, as in the photos but turned about the vertical, or as in the photos."""
     height_m: Distribution | None = None
     """Gap between a thrown body's bounding sphere and the ground [m]; default 0.5 to 3 radii."""
-    offset_m: NonNegative | None = None
+    offset_m: Reach | None = None
     """Largest horizontal distance from the place in the photos [m]; default half a bounding radius, 0 at rest."""
     heading_deg: Distribution | None = None
     """Direction of the horizontal speed [deg], about the ground's normal, 0 = world x; default any."""
@@ -137,12 +139,12 @@ class SamplingPlan(FileModel):
     push_miss: Annotated[float, Field(ge=0, le=1)] = 0.4
     """Largest sideways miss of the pusher's path past the object's centre [bounding radii]."""
 
-    parameter_spread: NonNegative = 1.0
+    parameter_spread: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Factor of the fit's standard errors: 1 draws from the posterior, 0 takes the estimates, 2 widens it twofold."""
 
     views: Annotated[int, Field(ge=1, le=16)] = 2
     """Number of cameras, evenly spread over `view_azimuth_deg`, looking at the bodies."""
-    view_azimuth_deg: Range = (-50.0, 50.0)
+    view_azimuth_deg: tuple[Angle, Angle] = (-50.0, 50.0)
     """First and last camera's direction as seen from the bodies [deg], about the ground's normal, 0 = from -y."""
     view_shift_deg: Distribution = Distribution(fixed=0.0)
     """Added to a camera's azimuth [deg]."""
@@ -152,7 +154,7 @@ class SamplingPlan(FileModel):
     """Cameras' distance from that point [m]; default: the sampled starts fill most of the image."""
     view_roll_deg: Distribution = Distribution(fixed=0.0)
     """Turn of a camera about its axis [deg]."""
-    view_aim_m: NonNegative = 0.0
+    view_aim_m: Reach = 0.0
     """Largest distance of the point that a camera looks at from the middle of the starts [m]."""
     view_angle_deg: Distribution = Distribution(fixed=50.0)
     """Cameras' full vertical angle of view [deg]."""
@@ -185,8 +187,8 @@ class SamplingPlan(FileModel):
                 continue
             first, last = value.support
             if not (low <= first and last <= high):
-                bounds = f"from {low:g} up" if math.isinf(high) else f"from {low:g} to {high:g}"
-                raise ValueError(f"{name} has to lie {bounds}; it reaches from {first:g} to {last:g}")
+                limits = f"from {low:g} to {high:g}"
+                raise ValueError(f"{name} has to lie {limits}; it reaches from {first:g} to {last:g}")
         return self
 
     @property
@@ -196,21 +198,28 @@ class SamplingPlan(FileModel):
         return self.view_aim_m > 0 or any(d is not None and d.varies for d in (*varied, self.view_angle_deg))
 
 
-_POSITIVE = 1e-6
+_POSITIVE, _FAR, _FAST, _BRIGHT = 1e-6, 1e5, 1e5, 1e4
 _LIMITS: dict[str, Range] = {
-    "height_m": (0.0, math.inf),
-    "horizontal_speed_m_s": (0.0, math.inf),
-    "spin_rad_s": (0.0, math.inf),
-    "push_speed_m_s": (0.0, math.inf),
-    "push_gap_m": (0.0, math.inf),
-    "push_length_m": (_POSITIVE, math.inf),
+    "height_m": (0.0, _FAR),
+    "heading_deg": (-3600.0, 3600.0),
+    "horizontal_speed_m_s": (0.0, _FAST),
+    "vertical_speed_m_s": (-_FAST, _FAST),
+    "spin_rad_s": (0.0, _FAST),
+    "push_speed_m_s": (0.0, _FAST),
+    "push_heading_deg": (-3600.0, 3600.0),
+    "push_curve_1_m": (-_FAR, _FAR),
+    "push_gap_m": (0.0, _FAR),
+    "push_length_m": (_POSITIVE, _FAR),
+    "view_shift_deg": (-3600.0, 3600.0),
     "view_elevation_deg": (-85.0, 85.0),
-    "view_distance_m": (_POSITIVE, math.inf),
+    "view_distance_m": (_POSITIVE, _FAR),
+    "view_roll_deg": (-3600.0, 3600.0),
     "view_angle_deg": (1.0, 150.0),
-    "light_gain": (0.0, math.inf),
-    "light_tint": (0.0, math.inf),
-    "exposure_gain": (0.0, math.inf),
-    "exposure_tint": (0.0, math.inf),
+    "light_gain": (0.0, _BRIGHT),
+    "light_tint": (0.0, _BRIGHT),
+    "light_turn_deg": (-3600.0, 3600.0),
+    "exposure_gain": (0.0, _BRIGHT),
+    "exposure_tint": (0.0, _BRIGHT),
     "exposure_offset": (-1.0, 1.0),
 }
 

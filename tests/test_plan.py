@@ -83,7 +83,7 @@ def test_draws_stay_in_the_support_and_follow_the_distribution(given: object) ->
         ("height_m = [1, 2, 3]", r"height_m: a list is a range \[low, high\]; found 3 values"),
         ("height_m = { uniform = [0, 1], fixed = 2 }", "takes one of .*; found fixed and uniform"),
         ("height_m = { gauss = [0, 1] }", r"height_m\] has an unknown field 'gauss'"),
-        ("push_speed_m_s = [-1, 1]", "push_speed_m_s has to lie from 0 up; it reaches from -1 to 1"),
+        ("push_speed_m_s = [-1, 1]", "push_speed_m_s has to lie from 0 to 100000; it reaches from -1 to 1"),
         ("view_elevation_deg = { normal = [80, 5] }", "view_elevation_deg has to lie from -85 to 85"),
         ("[reject]\noff_table = 1", r"\[reject\] has an unknown field 'off_table'[\s\S]*Did you mean 'off_table_m'"),
         ("[parameters]\nfriction = { log_uniform = [0, 1] }", "friction: log_uniform lies above 0"),
