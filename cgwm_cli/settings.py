@@ -31,11 +31,12 @@ class StageSettings:
         self._stages = list(stages)
         self._model = _document_model(stages)
         self._values: dict[str, Any] = {}
+        self._file, self._assignments = file, tuple(assignments or ())
         if file is not None:
             from ..schemas import read_toml
 
             self._values = read_toml(file, self._model).model_dump(exclude_unset=True, by_alias=True)
-        for assignment in assignments or ():
+        for assignment in self._assignments:
             self._assign(assignment)
 
     def configure(self, stage: str, config: type[ConfigT], **options: Any) -> ConfigT:
@@ -53,7 +54,14 @@ class StageSettings:
 
         given = {name: value for name, value in options.items() if value is not None}
         document = {stage: self._values.get(stage, {}) | given}
-        return getattr(parse(document, self._model, Path("settings")), _attribute(stage))
+        return getattr(parse(document, self._model, self._sources(stage)), _attribute(stage))
+
+    def _sources(self, stage: str) -> str:
+        """Return where the settings of a stage come from, for messages."""
+        sources = [f"--set {text:.80}" for text in self._assignments if text.partition(".")[0].strip() == stage]
+        if self._file is not None:
+            sources.insert(0, str(self._file))
+        return f"settings ({', '.join(sources)})" if sources else "settings"
 
     def _assign(self, text: str) -> None:
         from ..schemas import UsageError, did_you_mean
@@ -95,5 +103,5 @@ def _value(text: str) -> Any:
 
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # a number of thousands of digits, brackets without end
         return text

@@ -88,7 +88,7 @@ def parse(data: Any, model: type[ModelT], path: Path | str, text: str = "") -> M
 
 def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Path | str, text: str) -> InputDataError:
     # An unknown field explains the missing one beside it ("mass" for "mass_kg"), so it is told first.
-    faults = error.errors(include_url=False, include_context=False)
+    faults = error.errors(include_url=False)
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     location = _in_document(fault["loc"], data)
     where = find_line(text, location, Path(path).suffix)
@@ -111,9 +111,20 @@ def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Pa
     return InputDataError(f"{place}: {field}: {message}." if field else f"{place}: {message}.", todo=todo)
 
 
+_BOUNDS = {
+    "greater_than": ("gt", "greater than"),
+    "greater_than_equal": ("ge", "greater than or equal to"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "less than or equal to"),
+}
+
+
 def _message(fault: Any, location: tuple, data: Any) -> str:
     """Say what is wrong with a value, and show it."""
     message = fault["msg"].removeprefix("Value error, ")
+    bound = _BOUNDS.get(fault["type"])
+    if bound is not None and isinstance(limit := fault["ctx"][bound[0]], float):
+        message = f"input should be {bound[1]} {limit:g}"  # pydantic writes 1e-12 with all its zeros
     if fault["type"] == "string_pattern_mismatch":
         message = "a name begins with a letter or digit and holds only letters, digits, '_', '.' and '-'"
     # "valid tuple" is Python's word for what is a list in the file.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_serializer, model_validator
+from pydantic import Field, PrivateAttr, model_serializer, model_validator
 
 from .base import FileModel, read_toml
 
@@ -176,6 +176,12 @@ class SamplingPlan(FileModel):
     """Rollouts that are drawn again."""
     parameters: dict[str, Distribution] = {}
     """Distributions of physical parameters by name, in place of the fit's posterior."""
+    _source: str = PrivateAttr("the plan")
+
+    @property
+    def source(self) -> str:
+        """Where the plan comes from, for messages: its file where it was read from one of its own."""
+        return self._source
 
     @model_validator(mode="after")
     def _in_range(self) -> SamplingPlan:
@@ -230,7 +236,9 @@ def read_plan(path: Path) -> SamplingPlan:
     Raises:
         InputDataError: If it is missing, is no TOML, or does not fit the schema; with file, line and field.
     """
-    return read_toml(path, SamplingPlan)
+    plan = read_toml(path, SamplingPlan)
+    plan._source = str(path)
+    return plan
 
 
 def plan_toml(plan: SamplingPlan, comments: bool = True) -> str:

@@ -251,12 +251,16 @@ def test_wrong_settings(run: Run, settings_seen: list[Any], tmp_path: Path) -> N
     assert run("calibrate", "c", "--set", "calibrate.retrys=1") == (
         2,
         "",
-        "settings: [calibrate] has an unknown field 'retrys'.\n"
+        "settings (--set calibrate.retrys=1): [calibrate] has an unknown field 'retrys'.\n"
         "Allowed: seed, max_features, max_image_size, retries. Did you mean 'retries'?\n"
         "Next: correct the field.\n",
     )
     missing = tmp_path / "none.toml"
-    assert run("calibrate", "c", "--config", missing) == (2, "", f"{missing}: no such file.\n")
+    assert run("calibrate", "c", "--config", missing) == (
+        2,
+        "",
+        f"{missing}: no such file.\nAllowed: a regular file.\nNext: check the path.\n",
+    )
     file = tmp_path / "settings.toml"
     file.write_text("[calibrat]\nseed = 1\n")
     assert run("calibrate", "c", "--config", file) == (

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale, parse
 from ...schemas.cameras import Matrix4
 from .transforms import matrix4
 
@@ -105,16 +105,17 @@ def _intrinsics(
     fx, fy, cx, cy, *rest = (params[0], *params) if single_focal else params
     # COLMAP's FULL_OPENCV continues k1, k2, p1, p2, k3; the radial models have no p1, p2.
     distortion = (*rest, 0.0, 0.0, 0.0, 0.0)[:4] if len(rest) < 5 or not rest[4] else tuple(rest[:5])
-    return CameraIntrinsics(
-        model="OPENCV" if any(distortion) else "PINHOLE",
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        distortion=distortion if any(distortion) else (),
-    )
+    fields = {
+        "model": "OPENCV" if any(distortion) else "PINHOLE",
+        "width": width,
+        "height": height,
+        "fx": fx,
+        "fy": fy,
+        "cx": cx,
+        "cy": cy,
+        "distortion": distortion if any(distortion) else (),
+    }
+    return parse(fields, CameraIntrinsics, f"{path}: camera {number}")
 
 
 CameraRecord = tuple[int, str, int, int, tuple[float, ...]]

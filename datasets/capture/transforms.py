@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale, parse
 from ...schemas.cameras import Matrix4
+from ...schemas.documents import parse_json
+from ...schemas.regular_files import read_text_file
 from .images import IMAGE_SUFFIXES, image_size
 
 _INTRINSICS = (
@@ -46,10 +47,7 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
     Raises:
         InputDataError: For a field that is missing or wrong, or a camera model that is not a pinhole.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputDataError(f"{path}: not valid JSON: {error}.") from None
+    data = parse_json(read_text_file(path), path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputDataError(f"{path}: no list 'frames' with at least one frame.")
     cameras: dict[str, CameraIntrinsics] = {}
@@ -123,16 +121,17 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
     fx, fy = _focal_lengths(where, values, width, height)
     distortion = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     distortion = distortion if distortion[4] else distortion[:4]
-    return CameraIntrinsics(
-        model="OPENCV" if any(distortion) else "PINHOLE",
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fy,
-        cx=values.get("cx", width / 2),
-        cy=values.get("cy", height / 2),
-        distortion=distortion if any(distortion) else (),
-    )
+    entry = {
+        "model": "OPENCV" if any(distortion) else "PINHOLE",
+        "width": width,
+        "height": height,
+        "fx": fx,
+        "fy": fy,
+        "cx": values.get("cx", width / 2),
+        "cy": values.get("cy", height / 2),
+        "distortion": distortion if any(distortion) else (),
+    }
+    return parse(entry, CameraIntrinsics, where)
 
 
 def _focal_lengths(where: str, values: dict[str, float], width: int, height: int) -> tuple[float, float]:

@@ -13,7 +13,6 @@ holds and throws the ball, which flies, hits the floor once and rolls away. It i
 
 from __future__ import annotations
 
-import json
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,9 @@ from numpy.typing import NDArray
 
 from ...schemas import Body, InputDataError, Shape, World
 from ...schemas.capture import SphereShape
+from ...schemas.documents import parse_json
 from ...schemas.imports import ImportResult
+from ...schemas.regular_files import read_text_file
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
 from ..io.outputs import reads
@@ -181,7 +182,7 @@ def _read_npz(path: Path) -> list[tuple[Array, Array]]:
 def _read_json(path: Path) -> list[tuple[Array, Array]]:
     """Return times [s] and positions [m] of the throws in an export, whose positions are in millimetres."""
     try:
-        data: Any = json.loads(path.read_text(encoding="utf-8-sig"))
+        data: Any = parse_json(read_text_file(path), path)
         rate = float(data["Timebase"]["Frequency"])
         throws = []
         for marker in data["Markers"]:
@@ -191,9 +192,7 @@ def _read_json(path: Path) -> list[tuple[Array, Array]]:
                 times.append((part["Range"]["Start"] + np.arange(len(values))) / rate)
                 positions.append(1e-3 * values)
             throws.append((np.concatenate(times), np.concatenate(positions)))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputDataError(f"{path}: not a .json that can be read: {error}.") from None
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, ZeroDivisionError) as error:
         raise InputDataError(
             f"{path}: not an export of Qualisys' tracks: {type(error).__name__}: {error}.",
             "Timebase.Frequency, and Markers with Parts of Range.Start and Values in mm.",

@@ -10,6 +10,7 @@ from ..capture.tracks import Track, read_tracks, write_tracks
 from ..io.atomic import new_directory
 from ..io.kinds import refuse_other_kind
 from ..shapes.ply import Splats, read_splats, write_splats
+from .agreement import require_agreement
 from .effect_files import pack_effects, unpack_effects
 
 CAMERAS = "cameras.json"
@@ -63,7 +64,8 @@ def read_model(path: Path | str) -> Model:
     """Read a model directory.
 
     Raises:
-        InputDataError: If it is not a model (a capture, a dataset, ...), or a file is missing or wrong.
+        InputDataError: If it is not a model (a capture, a dataset, ...), a file is missing or wrong, or its parts
+            contradict each other.
     """
     root = Path(path)
     refuse_other_kind(root, "model")
@@ -76,6 +78,7 @@ def read_model(path: Path | str) -> Model:
             body_splats[body.name] = collision[body.name] = read_splats(_inside(root, body.splats))
         if body.collision is not None:
             collision[body.name] = read_splats(_inside(root, body.collision))
+    require_agreement(file, collision, root / "model.json")
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
     pictures = {name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()}

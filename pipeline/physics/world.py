@@ -156,7 +156,7 @@ class World:
             contact=law,
             step_s=file.solver.step_s,
             iterations=file.solver.sweeps,
-            effects=tuple(_active(effect, str(model.root), tensor(0.0)) for effect in file.effects),
+            effects=tuple(_active(effect, _place(model, effect), tensor(0.0)) for effect in file.effects),
         )
 
     def with_body(self, index: int, **changes: Tensor) -> World:
@@ -223,12 +223,17 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
     )
 
 
+def _place(model: Model, effect: EffectModel) -> str:
+    file = "the model" if model.root is None else f"{model.root / 'model.json'}"
+    return f"{file}: effect '{effect.name}'"
+
+
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
     try:
         effect = effect_of(entry)
         active = ActiveEffect.of(effect, entry.parameters, like)
     except UsageError as error:
-        raise InputDataError(f"{where}: its effect: {error.found}", error.allowed, error.todo) from error
+        raise InputDataError(f"{where}: {error.found}", error.allowed, error.todo) from error
     except KeyError as error:
         raise InputDataError(f"{where}: {error.args[0]}.", todo="fit the model again with this effect.") from error
     for number in effect.parameters:

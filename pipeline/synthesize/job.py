@@ -79,7 +79,7 @@ def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
     if model.file.contact is None:
         World.from_model(model)  # raises an error that names missing physics
     model = replace(model, file=with_correlations(model))
-    require_admissible(model.file, plan.parameters)
+    require_admissible(model.file, plan.parameters, plan.source)
     return model, resolve_plan(model, plan)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from ...schemas import (
     InputDataError,
     ModelFile,
     did_you_mean,
+    parse,
 )
 from ..physics.contact_law import restitution
 from ..physics.effects.registry import effect_of
@@ -86,12 +88,18 @@ def with_correlations(model: Model) -> ModelFile:
     if model.file.correlations or not found:
         return model.file
     names = tuple(parameter.name for parameter in model.file.parameters[: len(found)])
-    block = Correlation(parameters=names, matrix=tuple(map(tuple, found)))
+    path = (model.root or Path("model")) / "fit.json"
+    block = parse({"parameters": names, "matrix": found}, Correlation, path)
     return model.file.model_copy(update={"correlations": (block,)})
 
 
-def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution]) -> None:
+def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution], source: str = "the plan") -> None:
     """Check that a plan's distributions are of existing parameters and stay within the admissible ranges.
+
+    Args:
+        file: The model.
+        replaced: The distributions, by parameter.
+        source: Where the plan comes from, for messages.
 
     Raises:
         InputDataError: If not, with the name, the admissible range and the given one.
@@ -100,7 +108,7 @@ def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution]) ->
     for name, distribution in replaced.items():
         if name not in legal:
             raise InputDataError(
-                f"the plan's [parameters] has '{name}', which is no parameter of this model.",
+                f"{source}: [parameters] has '{name}', which is no parameter of this model.",
                 f"{', '.join(legal)}.{did_you_mean(name, legal)}",
                 "correct the name.",
             )
@@ -108,7 +116,7 @@ def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution]) ->
         first, last = _bounds(file, name)
         if not (first <= low and high <= last):
             raise InputDataError(
-                f"the plan's [parameters] {name} reaches from {low:g} to {high:g}.",
+                f"{source}: [parameters] {name} reaches from {low:g} to {high:g}.",
                 f"{first:g} to {last:g} {_unit(file, name)}.",
                 "narrow the distribution.",
             )
@@ -117,7 +125,7 @@ def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution]) ->
                 ModelFile.model_validate(with_parameter(file, name, end).model_dump())
             except ValidationError as error:
                 fault = error.errors()[0]["msg"]
-                raise InputDataError(f"the plan's [parameters] {name} reaches {end:g}: {fault}.") from None
+                raise InputDataError(f"{source}: [parameters] {name} reaches {end:g}: {fault}.") from None
 
 
 def settable(file: ModelFile) -> list[str]:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import numpy as np
-
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import find_faults
 from ...datasets.io.kinds import kind_of
-from ...datasets.models.model import Model, read_model
+from ...datasets.models.model import read_model
 from ...schemas import InputDataError, UsageError
 from ...schemas.validation import ValidationReport
 
@@ -64,7 +62,7 @@ def validate_capture(path: Path | str, accept_units: bool = False) -> Validation
 
 
 def validate_model(path: Path | str) -> ValidationReport:
-    """Check the files of a model, its inertia and its parameters."""
+    """Check the files of a model, and that its world can be simulated (`trial_run`)."""
     model = read_model(path)
     facts = {
         "bodies": [body.name for body in model.file.bodies],
@@ -78,24 +76,7 @@ def validate_model(path: Path | str) -> ValidationReport:
     custom = [f"{effect.name} (SHA-256 {effect.sha256})" for effect in model.file.effects if effect.sha256]
     if custom:
         facts["effects_not_run"] = custom
-    return ValidationReport(path=str(path), kind="model", facts=facts, faults=tuple(_model_faults(model)))
+    from .trial_run import run_faults
 
-
-def _model_faults(model: Model) -> list[str]:
-    faults = []
-    for body in model.file.bodies:
-        xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
-        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        if moments[0] <= 0 or moments[2] > 1.02 * (moments[0] + moments[1]):
-            shown = ", ".join(f"{moment:.3g}" for moment in moments)
-            faults.append(f"model.json: body '{body.name}': principal moments {shown} kg m2 are impossible.")
-        if model.file.contact is not None and body.name not in model.collision:
-            faults.append(f"model.json: body '{body.name}' has no collision spheres, but the model has contacts.")
-    for entry in model.file.parameters:
-        low, high = entry.bounds or (-np.inf, np.inf)
-        if not low <= entry.estimate <= high:
-            faults.append(
-                f"model.json: parameter '{entry.name}' is {entry.estimate:g} {entry.unit}, outside its bounds "
-                f"{low:g} to {high:g}."
-            )
-    return faults
+    faults, run = run_faults(model)
+    return ValidationReport(path=str(path), kind="model", facts=facts | run, faults=tuple(faults))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import zlib
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ....schemas import HiddenEffect, InputDataError, SealedFile, UsageError, read_json
+from ....schemas.documents import parse_json
 from .case import Case
 from .record import make_capture
 from .things import Kind
@@ -73,8 +73,9 @@ def open_sealed(path: Path) -> tuple[HiddenEffect, ...]:
         InputDataError: If the file is not such a file.
     """
     try:
-        content: dict[str, Any] = json.loads(zlib.decompress(base64.b64decode(read_json(path, SealedFile).zlib_base64)))
+        packed = base64.b64decode(read_json(path, SealedFile).zlib_base64)
+        content: dict[str, Any] = parse_json(zlib.decompress(packed).decode(), path)
         found = content["effects"]
         return tuple(HiddenEffect(name=e["name"], values=e["values"], form=e["form"]) for e in found)
-    except (ValueError, zlib.error, KeyError) as error:
+    except (ValueError, zlib.error, KeyError, TypeError) as error:
         raise InputDataError(f"{path}: its content cannot be opened ({error}).", todo="make it again.") from None

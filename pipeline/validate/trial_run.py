@@ -1,0 +1,133 @@
+"""A trial run of a model: its world is built and simulated for a second from just above the ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ...datasets.models.effect_files import packed_name
+from ...datasets.models.model import Model
+from ...schemas import CgwmError, InputDataError, ModelFile
+from ..geometry.rotation import quat_to_matrix
+from ..physics.checks import require_apart
+from ..physics.effects.registry import BUILT_IN
+from ..physics.engine import rollout
+from ..physics.fused.host import lacking
+from ..physics.rollout import Rollout, simulate
+from ..physics.world import State, World
+
+LENGTH_S = 1.0
+"""Length of the trial run [s]; shorter where the steps or sweeps are many."""
+FRAMES = 21
+MOST_SWEEPS, MOST_SWEEPS_TORCH = 200_000, 2_000
+"""Most sweeps over the contacts, of all steps together: in the fused kernel, and in the torch engine."""
+ABSURD_GAIN = 10.0
+"""Largest gain of energy, in units of a fall by the largest body's diameter; contact and friction only take energy."""
+STRAY_SPEED_M_S, EFFECT_SPEED_M_S = 10.0, 300.0
+"""Speeds that a body may gain beyond that: where bodies touch at the start, and by effects (a storm, a magnet)."""
+
+
+def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
+    """Simulate a model, and return what goes wrong, as sentences, and the facts of the run.
+
+    Free bodies fall from where they were in the photos, or from a body's diameter above the ground where that is
+    higher; driven bodies stand still. Effects that are not built in are left out, so that nothing of the model is
+    executed.
+    """
+    file = _still(model.file)
+    if file.contact is None or not any(body.motion == "free" for body in file.bodies):
+        return [], {}
+    facts = {}
+    if len(file.effects) < len(model.file.effects):
+        left_out = [packed_name(effect.name) for effect in model.file.effects if effect not in file.effects]
+        facts["simulated_without_effects"] = ", ".join(left_out)
+    try:
+        with torch.no_grad():
+            world = World.from_model(replace(model, file=file))
+            state = _start(world)
+            result = _simulated(world, state)
+    except CgwmError as error:
+        return [f"model.json: it cannot be simulated: {error.found}"], facts
+    if result.times_s[-1] < LENGTH_S:
+        facts["simulated_s"] = f"{float(result.times_s[-1]):.3g}"
+    fault = _fault(world, state, result)
+    return ([] if fault is None else [f"model.json: {fault}"]), facts
+
+
+def _still(file: ModelFile) -> ModelFile:
+    """Return the model without commands of driven bodies, and without effects that are not built in."""
+    bodies = tuple(
+        body.model_copy(update={"motion": "fixed"}) if body.motion == "driven" else body for body in file.bodies
+    )
+    effects = tuple(effect for effect in file.effects if effect.name.partition("@")[0] in BUILT_IN)
+    return file.model_copy(update={"bodies": bodies, "effects": effects})
+
+
+def _start(world: World) -> State:
+    """Return the bodies at rest, the free ones high enough above the ground."""
+    places = torch.cat([body.place for body in world.bodies if body.place is not None])
+    position, quat = places[None, :, :3].clone(), places[None, :, 3:].clone()
+    if world.ground_normal is not None:
+        normal, offset = world.ground
+        for index in world.free:
+            body = world.bodies[index]
+            centers = (quat_to_matrix(quat[:, index]) @ body.centers[0].T)[0].T + position[0, index]
+            lowest = (centers @ normal - body.radii[0]).min() - offset[0]
+            position[0, index] += normal * (_diameter(world, index) - lowest).clamp_min(0.0)
+    return State(position, quat, torch.zeros_like(position), torch.zeros_like(position))
+
+
+def _diameter(world: World, index: int) -> Tensor:
+    """Return the longest side of the box around a body's spheres [m]."""
+    body = world.bodies[index]
+    radii = body.radii[0][:, None]
+    return ((body.centers[0] + radii).amax(0) - (body.centers[0] - radii).amin(0)).max()
+
+
+def _simulated(world: World, state: State) -> Rollout:
+    fused = lacking(world) is None
+    steps = max((MOST_SWEEPS if fused else MOST_SWEEPS_TORCH) // world.iterations, FRAMES)
+    times = torch.linspace(0.0, min(LENGTH_S, steps * world.step_s), FRAMES, dtype=torch.float64)
+    return (rollout if fused else simulate)(world, state, times)
+
+
+def _fault(world: World, state: State, result: Rollout) -> str | None:
+    """Return what is wrong with a run, in words."""
+    parts = (result.position_m, result.quat_wxyz, result.velocity_m_s, result.omega_body_rad_s)
+    finite = torch.isfinite(torch.cat(parts, -1)).flatten(2).all(-1)[0]
+    if not bool(finite.all()):
+        when = float(result.times_s[int((~finite).nonzero()[0])])
+        return f"left to fall, it diverges within {when:.3g} s: its state is not finite."
+    try:
+        require_apart(world, state)
+    except InputDataError:
+        return None  # bodies that begin deep inside each other are thrown apart
+    energy = sum((_energy(world, index, result) for index in world.free), torch.zeros(FRAMES, dtype=torch.float64))
+    gain = float((energy - energy[0]).max())
+    speed = EFFECT_SPEED_M_S if world.effects else STRAY_SPEED_M_S
+    limit = 0.0
+    for index in world.free:
+        fall = float(world.gravity[0].norm() * _diameter(world, index))
+        limit += float(world.bodies[index].mass[0]) * (ABSURD_GAIN * fall + 0.5 * speed**2)
+    if not (math.isfinite(gain) and gain <= limit):
+        return f"left to fall, it gains {gain:.3g} J within {float(result.times_s[-1]):.3g} s; at most {limit:.3g} J."
+    return None
+
+
+def _energy(world: World, index: int, result: Rollout) -> Tensor:
+    """Return kinetic and potential energy of a body at each frame [J], shape (T,)."""
+    body = world.bodies[index]
+    rotation = quat_to_matrix(result.quat_wxyz[0, :, index])
+    omega = result.omega_body_rad_s[0, :, index]
+    com = body.com[0].expand_as(omega)
+    velocity = result.velocity_m_s[0, :, index] + _turned(rotation, torch.linalg.cross(omega, com))
+    height = (result.position_m[0, :, index] + _turned(rotation, com)) @ world.gravity[0]
+    spin = 0.5 * (omega * (omega @ body.inertia[0])).sum(-1)
+    return body.mass[0] * (0.5 * velocity.square().sum(-1) - height) + spin
+
+
+def _turned(rotation: Tensor, vectors: Tensor) -> Tensor:
+    return (rotation @ vectors[..., None]).squeeze(-1)
