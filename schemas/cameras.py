@@ -10,7 +10,8 @@ from .base import FileModel
 
 CAMERAS_FORMAT = "cgwm-cameras/1"
 
-Row4 = tuple[float, float, float, float]
+Entry = Annotated[float, Field(ge=-1e8, le=1e8)]
+Row4 = tuple[Entry, Entry, Entry, Entry]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 
 
@@ -69,7 +70,7 @@ class PosedVideo(FileModel):
     """A video camera: one pose when it stands still, one for each frame when it moves."""
 
     camera: str
-    T_world_cam: Matrix4 | tuple[Matrix4, ...]
+    T_world_cam: Matrix4 | Annotated[tuple[Matrix4, ...], Field(min_length=1)]
 
 
 class CamerasFile(FileModel):

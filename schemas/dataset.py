@@ -11,6 +11,7 @@ from .plan import SamplingPlan
 
 DATASET_FORMAT = "cgwm-dataset/1"
 ROLLOUTS_FORMAT = "cgwm-rollouts/1"
+Count = Annotated[int, Field(ge=0, le=10**15)]
 
 
 class ShardEntry(FileModel):
@@ -19,11 +20,11 @@ class ShardEntry(FileModel):
     file: str
     index: Annotated[int, Field(ge=0, le=1_000_000)]
     sha256: str
-    bytes: int
-    rollouts: int
-    frames: int
+    bytes: Count
+    rollouts: Count
+    frames: Count
     """Labelled camera images: rollouts x frames x cameras; time steps where there are no cameras."""
-    rejected: dict[str, int] = {}
+    rejected: dict[str, Count] = {}
     """Draws that the plan's rules rejected, by rule; each was drawn again."""
     model_sha256: str | None = None
     """Hash of the model that it was made of."""
@@ -38,7 +39,7 @@ class IndexEntry(FileModel):
 
     file: str
     sha256: str
-    bytes: int
+    bytes: Count
 
 
 class DatasetManifest(FileModel):
@@ -50,7 +51,7 @@ class DatasetManifest(FileModel):
     model_sha256: str
     config: dict[str, Any]
     """The resolved settings, without the shard's number."""
-    rollouts: int
+    rollouts: Count
     """Rollouts of all shards together, whether they are there yet or not."""
     shard_count: Annotated[int, Field(ge=1, le=1_000_000)]
     shards: tuple[ShardEntry, ...] = ()

@@ -19,10 +19,12 @@ from .quantities import (
     Position3,
     RadiusFactor,
     Step,
-    Vector3,
 )
 
 MODEL_FORMAT = "cgwm-model/1"
+
+
+Colour = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
@@ -31,8 +33,10 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
-NonNegative = Annotated[float, Field(ge=0)]
+NonNegative = Annotated[float, Field(ge=0, le=1e30)]
+Value = Annotated[float, Field(ge=-1e30, le=1e30)]
+Interval = Annotated[tuple[Value, Value], AfterValidator(_ordered)]
+Colour3 = tuple[Colour, Colour, Colour]
 ROUNDING = 1e-6
 """Largest relative difference of numbers that are the same but for rounding."""
 
@@ -49,7 +53,7 @@ class FittedParameter(FileModel):
     name: str
     """For example `friction` or `cube.mass_kg`."""
     unit: str
-    estimate: float
+    estimate: Value
     std_error: NonNegative | None = None
     """Standard error; none where the number was given or the data say nothing about it."""
     interval_95: Interval | None = None
@@ -156,9 +160,9 @@ class EffectModel(FileModel):
     of the group `cgwm.effects`; with `@group` or `@episode` behind it each session, or episode, has specific values."""
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """SHA-256 of the file; none for effects without one."""
-    parameters: dict[str, float] = {}
+    parameters: dict[str, Value] = {}
     """Where each unit has its own: the mean over units, which serves one that the fit has not seen."""
-    own: dict[str, dict[str, float]] = {}
+    own: dict[str, dict[str, Value]] = {}
     """By session or episode: its own values of parameters."""
     spread: dict[str, NonNegative] = {}
     """By parameter with own values: their standard deviation from unit to unit, of the prior that ties them."""
@@ -167,8 +171,8 @@ class EffectModel(FileModel):
 class Exposure(FileModel):
     """Colour gain and offset of a camera against the model's colours: image = gain * model + offset."""
 
-    gain_rgb: Vector3 = (1.0, 1.0, 1.0)
-    offset_rgb: Vector3 = (0.0, 0.0, 0.0)
+    gain_rgb: Colour3 = (1.0, 1.0, 1.0)
+    offset_rgb: Colour3 = (0.0, 0.0, 0.0)
 
 
 class Light(FileModel):
@@ -177,7 +181,7 @@ class Light(FileModel):
     A white surface of unit normal n (world frame) has brightness 1 + sky n_z + max(0, lamp . n).
     """
 
-    lamp: tuple[float, float, float]
+    lamp: Colour3
     """Direction to the lamp, world frame, times its brightness relative to the room's mean [1]."""
     sky: float = Field(ge=-1, le=1)
     """How much brighter the room is from above than from its side, relative to its mean [1]."""

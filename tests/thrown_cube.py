@@ -115,4 +115,7 @@ def with_friction(value: float) -> Model:
     model = truth()
     assert model.file.contact is not None
     contact = model.file.contact.model_copy(update={"friction": value})
-    return replace(model, file=model.file.model_copy(update={"contact": contact}))
+    parameters = tuple(
+        p.model_copy(update={"estimate": value}) if p.name == "friction" else p for p in model.file.parameters
+    )
+    return replace(model, file=model.file.model_copy(update={"contact": contact, "parameters": parameters}))

@@ -48,6 +48,7 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
         with torch.no_grad():
             world = World.from_model(replace(model, file=file))
             state = _start(world)
+            _require_own_values(model, file, world)
             result = _simulated(world, state)
     except CgwmError as error:
         return [f"model.json: it cannot be simulated: {error.found}"], facts
@@ -64,6 +65,16 @@ def _still(file: ModelFile) -> ModelFile:
     )
     effects = tuple(effect for effect in file.effects if effect.name.partition("@")[0] in BUILT_IN)
     return file.model_copy(update={"bodies": bodies, "effects": effects})
+
+
+def _require_own_values(model: Model, file: ModelFile, world: World) -> None:
+    """Refuse values of single groups or episodes that an effect does not admit."""
+    for place, effect in enumerate(file.effects):
+        for values in effect.own.values():
+            effects = list(file.effects)
+            effects[place] = effect.model_copy(update={"parameters": effect.parameters | values})
+            own = replace(model, file=file.model_copy(update={"effects": tuple(effects)}))
+            World.from_model(own, geometry=world)
 
 
 def _start(world: World) -> State:
