@@ -69,7 +69,13 @@ class CheckFailedError(CgwmError):
     """A check found faults (exit code 1)."""
 
 
+LONGEST_NAME = 100
+"""Longest name that is compared with others [characters]; comparing takes time by its length."""
+
+
 def did_you_mean(name: str, legal: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` with the nearest legal name, or an empty string."""
+    if len(name) > LONGEST_NAME:
+        return ""
     near = difflib.get_close_matches(name, list(legal), n=1, cutoff=0.5)
     return f" Did you mean '{near[0]}'?" if near else ""

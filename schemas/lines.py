@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 
 _KEY = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[A-Za-z0-9_-]+)"""
+LONGEST_KEY = 1000
+"""Longest key that is searched for in a JSON text [characters]; longer ones take seconds to compile a pattern of."""
 _DOTTED = rf"{_KEY}(?:\s*\.\s*{_KEY})*"
 _HEADER = re.compile(rf"\s*(\[\[?)\s*({_DOTTED})\s*\]\]?\s*(?:#.*)?")
 _ASSIGNMENT = re.compile(rf"\s*({_DOTTED})\s*=")
@@ -60,7 +62,7 @@ def _keys(dotted: str) -> tuple:
 def _json_line(text: str, location: tuple) -> int | None:
     """Return the only line with the innermost key of `location`; None if several hold one of that name."""
     names = [part for part in location if isinstance(part, str)]
-    if not names:
+    if not names or len(names[-1]) > LONGEST_KEY:
         return None
     pattern = re.compile(rf'"{re.escape(names[-1])}"\s*:')
     lines = [number for number, line in enumerate(text.splitlines(), 1) if pattern.search(line)]

@@ -14,7 +14,8 @@ CUT_OFF = 3.0
 
 Reach = Annotated[float, Field(ge=0, le=1e5)]
 """A distance that may be none [m]."""
-Range = tuple[float, float]
+Number = Annotated[float, Field(ge=-1e30, le=1e30)]
+Range = tuple[Number, Number]
 Angle = Annotated[float, Field(ge=-3600, le=3600)]
 """[deg]; ranges may pass any direction."""
 
@@ -22,7 +23,7 @@ Angle = Annotated[float, Field(ge=-3600, le=3600)]
 class Distribution(FileModel):
     """What a number is drawn from. Short forms: a number is `fixed`, a list of two is `uniform`."""
 
-    fixed: float | None = None
+    fixed: Number | None = None
     """Always this."""
     uniform: Range | None = None
     """From low to high, all alike."""
@@ -30,7 +31,7 @@ class Distribution(FileModel):
     """From low to high, above 0, all orders of magnitude alike."""
     normal: Range | None = None
     """Mean and standard deviation; cut off at three of them."""
-    choice: Annotated[tuple[float, ...], Field(min_length=1, max_length=100_000)] | None = None
+    choice: Annotated[tuple[Number, ...], Field(min_length=1, max_length=100_000)] | None = None
     """One of these, all alike."""
 
     @model_validator(mode="before")
