@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputDataError
-from .lines import find_line
+from .lines import LONGEST_KEY, find_line
 
 MAX_DEPTH = 100
 """Largest depth of nested lists and tables; deeper ones exhaust the stack of whatever reads them."""
@@ -146,11 +146,11 @@ def _fault(value: object, doubtful: bool) -> str | None:
 
 
 def _twice(text: str, path: Path | str, keys: list[str]) -> InputDataError:
-    key = next(key for k, key in enumerate(keys) if key in keys[:k])
-    lines = [
-        text.count("\n", 0, found.start()) + 1 for found in re.finditer(rf"{re.escape(json.dumps(key))}\s*:", text)
-    ]
-    where = f", line {lines[1]}" if len(lines) == 2 else ""
+    seen: set[str] = set()
+    key = next(key for key in keys if key in seen or seen.add(key))
+    pattern = rf"{re.escape(json.dumps(key))}\s*:" if len(key) <= LONGEST_KEY else "$^"
+    places = [found.start() for found in re.finditer(pattern, text)]
+    where = f", line {text.count(chr(10), 0, places[1]) + 1}" if len(places) == 2 else ""
     todo = "keep one of the two; a reader would take the last without a word."
     return InputDataError(f"{path}{where}: the key {json.dumps(key):.{SHOWN}} stands twice in one table.", todo=todo)
 

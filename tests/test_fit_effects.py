@@ -154,7 +154,7 @@ def test_what_a_fit_cannot_find_is_refused(tmp_path: Path) -> None:
         ("gone.py:Mine", {}, "gone.py"),
     ):
         file = model.file.model_copy(update={"effects": (EffectModel(name=name, parameters=values),)})
-        with pytest.raises(InputDataError, match=rf"model: .*{found}"):
+        with pytest.raises(InputDataError, match=rf"model/model\.json: .*{found}"):
             World.from_model(replace(model, file=file))
 
 

@@ -143,6 +143,10 @@ TEXTS = {
     "deep but closed": ('{"a": ' * 300 + "1" + "}" * 300, "nested deeper than 100 levels"),
     "twice": ('{"stages": {},\n"warnings": [],\n"stages": {}}', 'line 3: the key "stages" stands twice'),
     "twice inside": ('{"stages": {"a": {"b": 1, "b": 2}}}', 'line 1: the key "b" stands twice'),
+    "twice among many": (
+        '{"stages": {' + ", ".join(f'"k{number}": {{}}' for number in range(100_000)) + ', "k7": {}}}',
+        'line 1: the key "k7" stands twice',
+    ),
     "infinite": ('{"stages":\n{"a": {"loss": 1e999}}}', "line 2: stages.a.loss: input should be a finite number"),
     "no number": ('{"stages": {"a": {"loss": [NaN]}}}', "stages.a.loss.0: input should be a finite number (found NaN)"),
     "thousands of digits": (
