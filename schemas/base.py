@@ -42,7 +42,7 @@ def _as_in_documents(schema: Any) -> Any:
         return schema
     if schema.get("type") == "function-before" and schema["function"]["function"] in _CONVERSIONS.values():
         return schema  # of a model within this one
-    changed = {key: entry if key in _VALUES else _as_in_documents(entry) for key, entry in schema.items()}
+    changed: Any = {key: entry if key in _VALUES else _as_in_documents(entry) for key, entry in schema.items()}
     convert = _CONVERSIONS.get(str(schema.get("type")))
     return changed if convert is None else core_schema.no_info_before_validator_function(convert, changed)
 

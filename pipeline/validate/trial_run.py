@@ -116,7 +116,7 @@ def _fault(world: World, state: State, result: Rollout) -> str | None:
         require_apart(world, state)
     except InputDataError:
         return None  # bodies that begin deep inside each other are thrown apart
-    energy = sum((_energy(world, index, result) for index in world.free), torch.zeros(FRAMES, dtype=torch.float64))
+    energy = torch.stack([_energy(world, index, result) for index in world.free]).sum(0)
     gain = float((energy - energy[0]).max())
     speed = EFFECT_SPEED_M_S if world.effects else STRAY_SPEED_M_S
     limit = 0.0
