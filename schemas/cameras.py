@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from .base import FileModel
+from .base import FileModel, parse
 
 CAMERAS_FORMAT = "cgwm-cameras/1"
 
@@ -47,6 +48,47 @@ class CameraIntrinsics(FileModel):
         if self.model == "OPENCV" and len(self.distortion) not in (4, 5):
             raise ValueError(f"OPENCV takes 4 or 5 distortion values; found {len(self.distortion)}")
         return self
+
+    @classmethod
+    def of_lens(
+        cls,
+        where: str,
+        *,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        distortion: Sequence[float],
+    ) -> CameraIntrinsics:
+        """Return a camera, with the model OPENCV where a value of the distortion is not zero, else PINHOLE.
+
+        Args:
+            where: What holds the numbers, for a message: a file and a place in it.
+            width: Width of its images [px].
+            height: Height of its images [px].
+            fx: Focal length along rows [px].
+            fy: Focal length along columns [px].
+            cx: Column of the principal point [px].
+            cy: Row of the principal point [px].
+            distortion: OpenCV's k1, k2, p1, p2 [, k3], or nothing.
+
+        Raises:
+            InputDataError: If a number is out of bounds, or there are neither 0, 4 nor 5 distortion values.
+        """
+        bends = any(distortion)
+        fields = {
+            "model": "OPENCV" if bends else "PINHOLE",
+            "width": width,
+            "height": height,
+            "fx": fx,
+            "fy": fy,
+            "cx": cx,
+            "cy": cy,
+            "distortion": tuple(distortion) if bends else (),
+        }
+        return parse(fields, cls, where)
 
 
 class Scale(FileModel):

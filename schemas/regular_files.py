@@ -63,6 +63,22 @@ def read_text_file(path: Path | str, encoding: str = "utf-8") -> str:
         raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
 
 
+def read_binary_file(path: Path | str, most_bytes: int = MAX_BYTES) -> bytes:
+    """Return the bytes of a file.
+
+    Raises:
+        InputDataError: If it is no regular, readable file, or larger than `most_bytes`.
+    """
+    path = require_regular_file(path)
+    size = path.stat().st_size
+    if size > most_bytes:
+        raise InputDataError(f"{path}: {size / 2**30:.1f} GiB.", f"a file of at most {most_bytes / 2**30:g} GiB.")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+
+
 def _reason(path: Path, error: OSError) -> str:
     if error.errno == errno.ELOOP:
         return "a link that leads in circles"

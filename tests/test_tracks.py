@@ -161,7 +161,7 @@ def test_faults_in_the_header(tmp_path: Path, header: str, expected: str) -> Non
 
 
 def test_files_that_are_no_tracks(tmp_path: Path) -> None:
-    assert message(tmp_path / "absent.csv") == "T: no such file."
+    assert message(tmp_path / "absent.csv").startswith("T: no such file.")
     (tmp_path / "empty.csv").touch()
     assert message(tmp_path / "empty.csv").startswith("T: the file is empty.\nAllowed: a header line of time_s, ")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00\x01")

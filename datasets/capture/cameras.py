@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, PosedVideo, did_you_mean, read_json
 from .colmap_model import find_colmap_model, read_colmap_model
+from .files import optional_file
 from .transforms import read_transforms
 
 Array = NDArray[np.float64]
@@ -141,10 +142,10 @@ def read_cameras(root: Path | str, metric: bool = False) -> CamerasFile | None:
             that is not a rotation and a translation.
     """
     root = Path(root)
-    if (root / "cameras.json").is_file():
-        path, cameras = root / "cameras.json", read_json(root / "cameras.json", CamerasFile)
-    elif (root / "transforms.json").is_file():
-        path, cameras = root / "transforms.json", read_transforms(root / "transforms.json", metric)
+    if (path := optional_file(root / "cameras.json")) is not None:
+        cameras = read_json(path, CamerasFile)
+    elif (path := optional_file(root / "transforms.json")) is not None:
+        cameras = read_transforms(path, metric)
     elif (model := find_colmap_model(root)) is not None:
         path, cameras = model, read_colmap_model(model, metric)
     else:
@@ -223,16 +224,15 @@ def from_intrinsics(intrinsics: CameraIntrinsics, T_world_cam: Array) -> Camera:
 
 def to_intrinsics(camera: Camera) -> CameraIntrinsics:
     """Return the intrinsics of a camera in the format of `cameras.json`."""
-    distortion = tuple(float(value) for value in camera.distortion)
-    return CameraIntrinsics(
-        model="OPENCV" if any(distortion) else "PINHOLE",
+    return CameraIntrinsics.of_lens(
+        "camera",
         width=camera.width,
         height=camera.height,
         fx=float(camera.K[0, 0]),
         fy=float(camera.K[1, 1]),
         cx=float(camera.K[0, 2]),
         cy=float(camera.K[1, 2]),
-        distortion=distortion if any(distortion) else (),
+        distortion=[float(value) for value in camera.distortion],
     )
 
 

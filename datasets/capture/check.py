@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,14 @@ from ..shapes.meshes import mass_properties, read_mesh
 from ..shapes.ply import read_splats
 from .cameras import pose_count
 from .consistency import check_consistency
-from .files import files_under
+from .files import entries_of, files_under, has_folder
 from .folder import CaptureFolder
 from .geometry_maps import KINDS, map_names, read_map
-from .images import image_size, read_label
+from .images import IMAGE_SUFFIXES, image_size, read_label
 from .video import VideoInfo, frame_files, video_info
 
 _UNREAD_IMAGES = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng", ".raw", ".npy")
+_UNREAD_TRACKS = (".csv", ".tsv", ".xls", ".xlsx", ".ods")
 _UNREAD = (
     ("images", _UNREAD_IMAGES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
     ("masks", _UNREAD_IMAGES, ".png.", "convert it without loss."),
@@ -90,42 +92,51 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
     )
     faults: list[InputDataError] = []
 
-    def attempt(check: Callable[..., None], *arguments: object) -> None:
+    told: set[str] = set()
+
+    def attempt(check: Callable[..., Any], *arguments: object) -> Any:
         try:
-            check(*arguments)
+            return check(*arguments)
         except InputDataError as fault:
-            faults.append(fault)
+            if str(fault) not in told:  # a directory that cannot be listed is met by several checks
+                faults.append(fault)
+            told.add(str(fault))
+            return None
+
+    def listed(names: Callable[..., list[str]], *arguments: object) -> list[str]:
+        return attempt(names, *arguments) or []
 
     attempt(_check_names, capture)
     for body in capture.manifest.bodies:
         attempt(_check_shape, capture, body.name)
     attempt(_check_formats, capture)
     sizes: dict[str, tuple[int, int]] = {}
-    photos = capture.photos()
+    photos = listed(capture.photos)
     for name in photos:
         attempt(_check_photo, capture, name, sizes)
     facts.photos = len(sizes)
     coverage: list[NDArray[np.float64]] = []
     by_stem = {Path(name).with_suffix(""): name for name in photos}
-    for name in capture.masks():
+    for name in listed(capture.masks):
         attempt(_check_mask, capture, name, by_stem, sizes, coverage)
     facts.masks = len(coverage)
     for kind in KINDS:
-        for name in map_names(capture.root, kind):
+        for name in listed(map_names, capture.root, kind):
             attempt(_check_map, capture, kind, name, by_stem, sizes, facts)
     if coverage:
         facts.mask_coverage = dict(zip(facts.bodies, np.mean(coverage, axis=0)[1:].tolist(), strict=True))
     attempt(_check_cameras, capture, sizes, facts)
-    episodes: list[str] = []
-    attempt(lambda: episodes.extend(capture.episodes()))
+    episodes, unturned = listed(capture.episodes), {}
     facts.episodes = len(episodes)
     for episode in episodes:
-        attempt(_check_tracks, capture, episode, facts)
-        for camera in capture.videos(episode):
+        attempt(_check_tracks, capture, episode, facts, unturned)
+        for camera in listed(capture.videos, episode):
             attempt(_check_video, capture, camera, episode, facts)
     attempt(_check_consistency, capture, facts, accept_units)
     if facts.normalised_quaternions:
         facts.warnings.append(f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3).")
+    if warning := capture.unturned_warning(unturned):
+        facts.warnings.append(warning)
     return facts, faults
 
 
@@ -186,8 +197,11 @@ def _listed(names: list[str], noun: str) -> str:
 
 def _check_formats(capture: CaptureFolder) -> None:
     """Refuse photos and videos in formats that would be silently ignored."""
+    for path in entries_of(capture.root / "tracks"):
+        if path.suffix != ".csv" and path.suffix.lower() in _UNREAD_TRACKS:
+            raise InputDataError(f"{path}: {path.suffix} is not read.", ".csv.", "rename or convert it.")
     for folder, unread, allowed, convert in _UNREAD:
-        for name in files_under(capture.root / folder):
+        for name in files_under(capture.root / folder, IMAGE_SUFFIXES):
             if Path(name).suffix.lower() in unread:
                 raise InputDataError(
                     f"{capture.root / folder / name}: {Path(name).suffix} is not read.", allowed, convert
@@ -308,10 +322,13 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
             )
 
 
-def _check_tracks(capture: CaptureFolder, episode: str, facts: CaptureFacts) -> None:
-    tracks, normalised = capture.tracks_counted(episode)
-    facts.track_samples += sum(len(track) for track in tracks.values())
-    facts.normalised_quaternions += normalised
+def _check_tracks(
+    capture: CaptureFolder, episode: str, facts: CaptureFacts, unturned: dict[str, tuple[str, ...]]
+) -> None:
+    found = capture.checked_tracks(episode)
+    facts.track_samples += sum(len(track) for track in found.tracks.values())
+    facts.normalised_quaternions += found.normalised
+    unturned[episode] = found.unturned
 
 
 def _check_video(capture: CaptureFolder, camera: str, episode: str, facts: CaptureFacts) -> None:
@@ -332,7 +349,7 @@ def _check_video(capture: CaptureFolder, camera: str, episode: str, facts: Captu
         )
     _check_video_camera(capture, camera, episode, path, info)
     masks = capture.root / "video_masks" / camera / episode
-    if masks.is_dir():
+    if has_folder(masks):
         files = frame_files(masks)
         if len(files) != info.frames:
             raise InputDataError(

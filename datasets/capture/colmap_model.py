@@ -15,8 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale, parse
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
 from ...schemas.cameras import Matrix4
+from ...schemas.regular_files import read_binary_file, read_text_file
+from .files import optional_file
 from .transforms import matrix4
 
 MODEL_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
@@ -43,7 +45,7 @@ def find_colmap_model(root: Path) -> Path | None:
     """Return the directory of the capture's COLMAP model, or None."""
     for place in MODEL_PLACES:
         for suffix in (".bin", ".txt"):
-            if all((root / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            if all(optional_file(root / place / f"{name}{suffix}") for name in ("cameras", "images")):
                 return root / place
     return None
 
@@ -60,7 +62,7 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
     Raises:
         InputDataError: If a file is truncated or a camera model is not a pinhole with OpenCV's distortion.
     """
-    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+    binary = all(optional_file(folder / f"{name}.bin") for name in ("cameras", "images"))
     suffix = ".bin" if binary else ".txt"
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     cameras: dict[str, CameraIntrinsics] = {}
@@ -105,17 +107,9 @@ def _intrinsics(
     fx, fy, cx, cy, *rest = (params[0], *params) if single_focal else params
     # COLMAP's FULL_OPENCV continues k1, k2, p1, p2, k3; the radial models have no p1, p2.
     distortion = (*rest, 0.0, 0.0, 0.0, 0.0)[:4] if len(rest) < 5 or not rest[4] else tuple(rest[:5])
-    fields = {
-        "model": "OPENCV" if any(distortion) else "PINHOLE",
-        "width": width,
-        "height": height,
-        "fx": fx,
-        "fy": fy,
-        "cx": cx,
-        "cy": cy,
-        "distortion": distortion if any(distortion) else (),
-    }
-    return parse(fields, CameraIntrinsics, f"{path}: camera {number}")
+    return CameraIntrinsics.of_lens(
+        f"{path}: camera {number}", width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
+    )
 
 
 CameraRecord = tuple[int, str, int, int, tuple[float, ...]]
@@ -124,7 +118,7 @@ ImageRecord = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 
 def _lines(path: Path) -> list[str]:
     # A line of 2D points may be empty and counts, so that only comments are dropped.
-    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    return [line for line in read_text_file(path).splitlines() if not line.startswith("#")]
 
 
 def _cameras_txt(path: Path) -> Iterator[CameraRecord]:
@@ -143,7 +137,7 @@ def _images_txt(path: Path) -> Iterator[ImageRecord]:
 
 
 def _cameras_bin(path: Path) -> Iterator[CameraRecord]:
-    data, offset = path.read_bytes(), 8
+    data, offset = read_binary_file(path), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, offset)
         offset += 24
@@ -155,7 +149,7 @@ def _cameras_bin(path: Path) -> Iterator[CameraRecord]:
 
 
 def _images_bin(path: Path) -> Iterator[ImageRecord]:
-    data, offset = path.read_bytes(), 8
+    data, offset = read_binary_file(path), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         _, *pose, camera = struct.unpack_from("<i7di", data, offset)
         offset += 64

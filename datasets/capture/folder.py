@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
+from ...schemas.regular_files import require_regular_file
 from .cameras import Camera, camera_of
-from .files import files_under
+from .files import entries_of, files_under, has_folder, optional_file
 from .geometry_maps import GeometryMaps, read_maps
 from .images import IMAGE_SUFFIXES, read_label, read_rgb
 from .tracks import Track, read_tracks
 from .video import VIDEO_SUFFIXES, VideoInfo, read_video, read_video_labels, video_info
+
+
+class CheckedTracks(NamedTuple):
+    """The tracks of an episode, and what was found in their file."""
+
+    tracks: dict[str, Track]
+    """Tracks by body, between the episode's `start_s` and `end_s`; empty without any."""
+    normalised: int
+    """Number of quaternions that were normalised (see :func:`read_tracks`)."""
+    unturned: tuple[str, ...]
+    """Free bodies whose orientation is the same in all rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +72,7 @@ class CaptureFolder:
             raise InputDataError(
                 f"{where} lies outside the capture.", "a file of the capture directory.", "copy the file into it."
             )
-        if not path.is_file():
+        if optional_file(path) is None:
             raise InputDataError(f"{where}: no such file.", "a path relative to the capture directory.")
         legal = (".obj", ".stl") if body.shape and body.shape.mesh else (".ply",)
         if path.suffix.lower() not in legal:
@@ -81,8 +95,8 @@ class CaptureFolder:
 
     def photo_mask(self, name: str) -> NDArray[np.uint8] | None:
         """Return a photo's labels (k: the k-th body), uint8, shape (height, width), or None without a mask."""
-        path = self.root / "masks" / Path(name).with_suffix(".png")
-        return read_label(path) if path.is_file() else None
+        path = optional_file(self.root / "masks" / Path(name).with_suffix(".png"))
+        return None if path is None else read_label(path)
 
     def photo_maps(self, name: str) -> GeometryMaps:
         """Return the geometry maps of a photo: depth, normals, features."""
@@ -99,6 +113,8 @@ class CaptureFolder:
 
         Raises:
             UsageError: If there is no such split.
+            InputDataError: If a directory of episodes cannot be listed, or holds what is neither a file nor a
+                directory.
         """
         if split is not None:
             if split not in self.manifest.splits:
@@ -106,8 +122,8 @@ class CaptureFolder:
                 allowed = ", ".join(legal) + "." + did_you_mean(split, legal) if legal else "none: [splits] is empty."
                 raise UsageError(f"{self.root / 'capture.toml'}: no split '{split}'.", allowed, "name it in [splits].")
             return list(self.manifest.splits[split])
-        found = {path.stem for path in self.root.glob("tracks/*.csv") if not path.name.startswith(".")}
-        for camera in _folders(self.root / "videos"):
+        found = {path.stem for path in entries_of(self.root / "tracks") if path.suffix == ".csv"}
+        for camera in _cameras(self.root / "videos"):
             found |= set(_videos_in(camera))
         if self.only_splits is not None:
             found &= {name for split in self.only_splits for name in self.episodes(split)}
@@ -120,14 +136,23 @@ class CaptureFolder:
 
     def tracks(self, episode: str) -> dict[str, Track]:
         """Return the tracks of an episode by body, between its `start_s` and `end_s`; empty without any."""
-        return self.tracks_counted(episode)[0]
+        return self.checked_tracks(episode).tracks
 
-    def tracks_counted(self, episode: str) -> tuple[dict[str, Track], int]:
-        """Return the tracks of an episode, and how many quaternions were normalised (see :func:`read_tracks`)."""
-        path = self.root / "tracks" / f"{episode}.csv"
-        if not path.is_file():
-            return {}, 0
+    def checked_tracks(self, episode: str) -> CheckedTracks:
+        """Return the tracks of an episode with the findings about them.
+
+        A ball whose orientation is the same in all samples was tracked without one, whatever fills the columns: taken
+        as measured, it would mean that the ball slides without friction. Such tracks are returned as centroids.
+        """
+        path = optional_file(self.root / "tracks" / f"{episode}.csv")
+        if path is None:
+            return CheckedTracks({}, 0, ())
         tracks, normalised = read_tracks(path, self.body_names)
+        unturned = [name for name, track in tracks.items() if track.quat_wxyz is not None and not track.turns]
+        unturned = [name for name in unturned if self.body(name).motion == "free"]
+        for name in unturned:
+            if self._is_ball(name):
+                tracks[name] = replace(tracks[name], quat_wxyz=None)
         start_s, end_s = self._window(episode)
         windowed = {name: track.window(start_s, end_s) for name, track in tracks.items()}
         for name, track in windowed.items():
@@ -139,17 +164,40 @@ class CaptureFolder:
                     f"correct [episodes] '{episode}' in capture.toml; the track lasts from "
                     f"{tracks[name].time_s[0]:g} s to {tracks[name].time_s[-1]:g} s.",
                 )
-        return windowed, normalised
+        return CheckedTracks(windowed, normalised, tuple(unturned))
+
+    def unturned_warning(self, episodes: Mapping[str, Sequence[str]]) -> str:
+        """Return a warning about tracks whose orientation never changes, or an empty text.
+
+        Args:
+            episodes: The `unturned` bodies of each episode.
+        """
+        bodies = sorted({name for names in episodes.values() for name in names})
+        if not bodies:
+            return ""
+        places = [name for name, names in episodes.items() if names]
+        shown = ", ".join(places[:5]) + (", ..." if len(places) > 5 else "")
+        balls = [name for name in bodies if self._is_ball(name)]
+        text = f"the orientation of {', '.join(bodies)} is the same in all rows of {len(places)} episodes ({shown}). "
+        if balls:
+            text += f"A ball that never turns was tracked without orientation: that of {', '.join(balls)} is not used. "
+        if len(balls) < len(bodies):
+            text += "If it was not measured, leave the columns qw, qx, qy, qz out."
+        return text.strip()
+
+    def _is_ball(self, name: str) -> bool:
+        shape = self.body(name).shape
+        return shape is not None and shape.sphere is not None
 
     # Videos
 
     def video_cameras(self) -> list[str]:
         """Return the names of the video cameras, sorted."""
-        return [folder.name for folder in _folders(self.root / "videos")]
+        return [folder.name for folder in _cameras(self.root / "videos")]
 
     def videos(self, episode: str) -> list[str]:
         """Return the video cameras that saw an episode, sorted."""
-        return [folder.name for folder in _folders(self.root / "videos") if episode in _videos_in(folder)]
+        return [folder.name for folder in _cameras(self.root / "videos") if episode in _videos_in(folder)]
 
     def video_path(self, camera: str, episode: str) -> Path:
         """Return the directory of frames or the file of a video.
@@ -175,7 +223,7 @@ class CaptureFolder:
     def video_masks(self, camera: str, episode: str) -> NDArray[np.uint8] | None:
         """Return the labels that belong to :meth:`video_frames`, uint8, shape (frames, height, width), or None."""
         folder = self.root / "video_masks" / camera / episode
-        if not folder.is_dir():
+        if not has_folder(folder):
             return None
         labels = read_video_labels(folder)
         return labels[self._in_window(camera, episode, len(labels))]
@@ -223,20 +271,27 @@ class CaptureFolder:
 
 
 def _images_under(folder: Path) -> list[str]:
-    return [name for name in files_under(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+    return [name for name in files_under(folder, IMAGE_SUFFIXES) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
 
 
-def _folders(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+def _cameras(videos: Path) -> list[Path]:
+    """Return the directories of the video cameras; a video beside them belongs to no camera and is refused."""
+    found = entries_of(videos)
+    for path in found:
+        if not path.is_dir() and require_regular_file(path).suffix.lower() in VIDEO_SUFFIXES:
+            raise InputDataError(
+                f"{path}: a video without a camera.",
+                "videos/<camera>/<episode>.mp4.",
+                f"move it into the directory of its camera, such as {videos / 'cam' / path.name}.",
+            )
+    return [path for path in found if path.is_dir()]
 
 
 def _videos_in(camera: Path) -> dict[str, Path]:
-    """Return the videos of a camera by episode; duplicates are refused."""
+    """Return the videos of a camera by episode; duplicates, and what is neither file nor directory, are refused."""
     found: dict[str, Path] = {}
-    for path in sorted(camera.iterdir()):
-        if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
+    for path in entries_of(camera):
+        if not path.is_dir() and require_regular_file(path).suffix.lower() not in VIDEO_SUFFIXES:
             continue
         episode = path.name if path.is_dir() else path.stem
         if episode in found:

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
-from .files import files_under
+from ..io.arrays import read_npy
+from .files import files_under, optional_file
+from .images import decoded
 
 KINDS = {"depth": (".npy", ".png"), "normals": (".npy", ".png"), "features": (".npy",)}
 """Readable suffixes of each kind of map, by its folder."""
@@ -42,7 +44,7 @@ class GeometryMaps:
 
 def map_names(root: Path, kind: str) -> list[str]:
     """Return the maps of a kind in a capture, relative to their folder, sorted."""
-    return [name for name in files_under(root / kind) if Path(name).suffix.lower() in KINDS[kind]]
+    return [name for name in files_under(root / kind, KINDS[kind]) if Path(name).suffix.lower() in KINDS[kind]]
 
 
 def read_maps(root: Path, photo: str) -> GeometryMaps:
@@ -57,8 +59,8 @@ def read_maps(root: Path, photo: str) -> GeometryMaps:
 
 def _read(root: Path, kind: str, photo: str) -> Map | None:
     for suffix in KINDS[kind]:
-        path = root / kind / Path(photo).with_suffix(suffix)
-        if path.is_file():
+        path = optional_file(root / kind / Path(photo).with_suffix(suffix))
+        if path is not None:
             return read_map(path, kind)
     return None
 
@@ -74,8 +76,8 @@ def read_map(path: Path, kind: str) -> Map:
 
 def _depth(path: Path) -> Map:
     if path.suffix.lower() == ".png":
-        values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-        if values is None or values.ndim != 2 or values.dtype != np.uint16:
+        values = decoded(path, cv2.IMREAD_UNCHANGED)
+        if values.ndim != 2 or values.dtype != np.uint16:
             raise InputDataError(f"{path}: no image of one channel with 16 bits.", "16-bit PNG, millimetres; or .npy.")
         depth = values.astype(np.float32) * _MILLIMETRE_M
     else:
@@ -87,8 +89,8 @@ def _depth(path: Path) -> Map:
 
 def _normals(path: Path) -> Map:
     if path.suffix.lower() == ".png":
-        values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-        if values is None or values.ndim != 3 or values.shape[2] != 3 or values.dtype != np.uint8:
+        values = decoded(path, cv2.IMREAD_UNCHANGED)
+        if values.ndim != 3 or values.shape[2] != 3 or values.dtype != np.uint8:
             raise InputDataError(f"{path}: no RGB image with 8 bits.", "8-bit PNG, 127.5 (n + 1); or .npy.")
         normals = values[..., ::-1].astype(np.float32) / 127.5 - 1
     else:
@@ -108,12 +110,7 @@ def _features(path: Path) -> Map:
 
 
 def _array(path: Path, dimensions: tuple[int, ...], wanted: str) -> Map:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        fault = f"{path}: no readable array ({type(error).__name__})."
-        raise InputDataError(fault, f"a .npy file, {wanted}.") from None
-    if not isinstance(array, np.ndarray) or array.ndim not in dimensions or array.dtype.kind != "f" or not array.size:
-        shape = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
-        raise InputDataError(f"{path}: {shape}.", f"floating-point numbers, {wanted}.")
+    array = read_npy(path)
+    if array.ndim not in dimensions or array.dtype.kind != "f" or not array.size:
+        raise InputDataError(f"{path}: {array.dtype} {array.shape}.", f"floating-point numbers, {wanted}.")
     return array.astype(np.float32)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.regular_files import read_binary_file
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 """Suffixes of readable images, in lower case."""
@@ -19,6 +20,8 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 _JPEG_FRAME_HEADERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _REPLACE = "replace the file, or remove it."
+MOST_PIXELS = 256_000_000
+"""Maximum number of pixels of a picture: the header of a small file may declare any number."""
 
 
 def read_rgb(path: Path | str) -> NDArray[np.uint8]:
@@ -29,7 +32,7 @@ def read_rgb(path: Path | str) -> NDArray[np.uint8]:
     Raises:
         InputDataError: If it is missing, truncated or not an image.
     """
-    image = _decode(Path(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
@@ -39,7 +42,7 @@ def read_label(path: Path | str) -> NDArray[np.uint8]:
     Raises:
         InputDataError: If it is missing, truncated, or not 8 bits and one channel.
     """
-    image = _decode(Path(path), cv2.IMREAD_UNCHANGED)
+    image = decoded(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint8:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise InputDataError(
@@ -56,7 +59,7 @@ def read_alpha(path: Path | str) -> NDArray[np.uint8]:
     Raises:
         InputDataError: If it is missing, truncated, or has no opacity.
     """
-    image = _decode(Path(path), cv2.IMREAD_UNCHANGED)
+    image = decoded(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
         raise InputDataError(f"{path}: a picture without opacity.", "four channels of 8 bits.")
     return image[..., 3]
@@ -99,40 +102,52 @@ def image_size(path: Path | str) -> tuple[int, int]:
     without decoding it.
 
     Raises:
-        InputDataError: If it is missing, truncated or neither PNG nor JPEG.
+        InputDataError: If it is missing, truncated, neither PNG nor JPEG, or of more pixels than `MOST_PIXELS`.
     """
-    return _size(Path(path), _bytes(Path(path)))
+    return _size(Path(path), read_binary_file(path))
 
 
-def _decode(path: Path, flags: int) -> NDArray:
-    data = _bytes(path)
+def decoded(path: Path | str, flags: int) -> NDArray:
+    """Return a PNG or JPEG as OpenCV decodes it, after a look at its headers.
+
+    Args:
+        path: The file.
+        flags: OpenCV's flags of decoding.
+
+    Raises:
+        InputDataError: As `image_size`, or if it does not decode.
+    """
+    path = Path(path)
+    data = read_binary_file(path)
     _size(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
     if image is None:
         raise InputDataError(f"{path}: the image does not decode.", todo=_REPLACE)
     return image
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputDataError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
-
-
 def _size(path: Path, data: bytes) -> tuple[int, int]:
     try:
         if data.startswith(_PNG_SIGNATURE):
-            return _png_size(data)
-        if data.startswith(b"\xff\xd8"):
-            return _jpeg_size(data)
+            width, height = _png_size(data)
+        elif data.startswith(b"\xff\xd8"):
+            width, height = _jpeg_size(data)
+        else:
+            raise ValueError("neither PNG nor JPEG")
     except (struct.error, IndexError):
         raise _undecodable(path, data, "truncated") from None
     except ValueError as error:
         raise _undecodable(path, data, str(error)) from None
-    raise _undecodable(path, data, "neither PNG nor JPEG")
+    if not 0 < width * height <= MOST_PIXELS:
+        raise InputDataError(
+            f"{path}: its header declares {width}x{height} px ({len(data)} bytes).",
+            f"1 to {MOST_PIXELS // 10**6} million pixels.",
+            _REPLACE,
+        )
+    return width, height
 
 
 def _undecodable(path: Path, data: bytes, reason: str) -> InputDataError:
@@ -148,11 +163,11 @@ def _png_size(data: bytes) -> tuple[int, int]:
         (checksum,) = struct.unpack_from(">I", data, offset + 8 + length)
         if zlib.crc32(data[offset + 4 : offset + 8 + length]) != checksum:
             raise ValueError(f"damaged at byte {offset}")
-        if kind == b"IHDR":
+        if (kind == b"IHDR") != (size is None):
+            raise ValueError("two image headers" if size else "no image header")
+        if size is None:
             size = struct.unpack_from(">II", data, offset + 8)
-        if kind == b"IEND":
-            if size is None:
-                raise ValueError("no image header")
+        elif kind == b"IEND":
             return size
         offset += 12 + length
 
@@ -168,6 +183,8 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             continue
         (length,) = struct.unpack_from(">H", data, offset + 2)
         if marker in _JPEG_FRAME_HEADERS:
+            if size is not None:
+                raise ValueError("two image headers")
             height, width = struct.unpack_from(">HH", data, offset + 5)
             size = (width, height)
         offset += 2 + length

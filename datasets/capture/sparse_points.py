@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.regular_files import read_binary_file
 
 Array = NDArray[np.float64]
 
 POINTS_NAME = "sparse_points.ply"
-
+MOST_BYTES = 8 << 30
+"""Largest size of the file [bytes]."""
 
 _VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
 
@@ -50,11 +52,12 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
     Raises:
         InputDataError: If it is another kind of file, truncated, or contains a point that is not finite.
     """
-    data = path.read_bytes()
+    data = read_binary_file(path, MOST_BYTES)
     header, found, body = data.partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
     counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
-    if not found or len(counts) != 1 or [line for line in lines if line.startswith("property")] != _PROPERTIES:
+    properties = [line for line in lines if line.startswith("property")]
+    if not found or len(counts) != 1 or not counts[0].isdigit() or properties != _PROPERTIES:
         raise InputDataError(
             f"{path}: not the sparse points of a calibration.", todo="run 'cgwm calibrate --overwrite'."
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...schemas import QUATERNION_NORM_TOLERANCE, InputDataError, did_you_mean
 from ..io.atomic import new_file, replaced_file
+from ..io.cells import LARGEST, MOST_SHOWN, csv_rows, number_of, shown
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,8 @@ _REQUIRED = ("time_s", "body", *_POSITION)
 _OPTIONAL_GROUPS = {"quat_wxyz": _QUATERNION, "velocity_m_s": _VELOCITY, "omega_body_rad_s": _OMEGA}
 COLUMNS = (*_REQUIRED, *_QUATERNION, *_VELOCITY, *_OMEGA)
 """The columns of a track file, in the order in which they are written."""
+SHORTEST_STEP_S = 1e-9
+"""Smallest difference of two times [s]; velocities from smaller ones would overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,11 @@ class Track:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @property
+    def turns(self) -> bool:
+        """Whether the orientation was measured and is not the same in all samples."""
+        return self.quat_wxyz is not None and bool(np.ptp(self.quat_wxyz, axis=0).any())
 
     def window(self, start_s: float | None = None, end_s: float | None = None) -> Track:
         """Return the samples with start_s <= time <= end_s [s]; None leaves that side open."""
@@ -82,19 +89,11 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
             finite, a quaternion that is not of unit norm, times that do not increase, or a single sample.
     """
     path, legal = Path(path), list(bodies)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.reader(stream))
-    except FileNotFoundError:
-        raise InputDataError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
-    except (UnicodeDecodeError, csv.Error):
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    rows = csv_rows(path)
+    header = [cell.strip() for cell in next(rows, (0, []))[1]]
     _check_header(path, header)
     by_body: dict[str, list[tuple[int, list[str]]]] = {}
-    for line, row in enumerate(rows[1:], 2):
+    for line, row in rows:
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(header):
@@ -105,7 +104,7 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
         if name not in by_body and name not in legal:
             allowed = ", ".join(legal) + "." + did_you_mean(name, legal) if legal else "no body: [[bodies]] is empty."
             raise InputDataError(
-                f"{path}, line {line}: unknown body '{name}'.", allowed, "correct it, or add it to capture.toml."
+                f"{path}, line {line}: unknown body {shown(name)}.", allowed, "correct it, or add it to capture.toml."
             )
         by_body.setdefault(name, []).append((line, row))
     if not by_body:
@@ -158,7 +157,7 @@ def _check_header(path: Path, header: list[str]) -> None:
     for column in header:
         if column not in COLUMNS:
             raise InputDataError(
-                f"{path}, line 1: unknown column '{column}'.", f"{allowed}." + did_you_mean(column, COLUMNS), todo
+                f"{path}, line 1: unknown column {shown(column)}.", f"{allowed}." + did_you_mean(column, COLUMNS), todo
             )
         if header.count(column) > 1:
             raise InputDataError(f"{path}, line 1: the column '{column}' stands twice.", todo="remove one.")
@@ -199,18 +198,24 @@ def _columns(
     for k, (line, row) in enumerate(rows):
         for j, index in enumerate(indices):
             try:
-                values[k, j] = float(row[index])
+                values[k, j] = number_of(row[index])
             except ValueError:
-                shown = f"'{row[index].strip()}' is no number" if row[index].strip() else "the value is missing"
+                fault = f"{shown(row[index])} is no number" if row[index].strip() else "the value is missing"
                 raise InputDataError(
-                    f"{path}, line {line}: body '{body}', column '{names[j]}': {shown}.",
+                    f"{path}, line {line}: body '{body}', column '{names[j]}': {fault}.",
                     "finite numbers; leave out the whole line where nothing was measured.",
                 ) from None
             if not math.isfinite(values[k, j]):
                 raise InputDataError(
-                    f"{path}, line {line}: body '{body}', column '{names[j]}' is {row[index].strip()}.",
+                    f"{path}, line {line}: body '{body}', column '{names[j]}' is {row[index].strip()[:MOST_SHOWN]}.",
                     "finite numbers; gaps are allowed.",
                     "leave out the whole line where nothing was measured.",
+                )
+            if abs(values[k, j]) > LARGEST:
+                raise InputDataError(
+                    f"{path}, line {line}: body '{body}', column '{names[j]}' is {values[k, j]:g}.",
+                    f"numbers up to {LARGEST:g}, in SI units.",
+                    "correct the value.",
                 )
     return values
 
@@ -227,12 +232,14 @@ def _optional(
 
 
 def _check_times(path: Path, body: str, time_s: Array, lines: list[int]) -> None:
-    bad = np.flatnonzero(np.diff(time_s) <= 0)
+    bad = np.flatnonzero(np.diff(time_s) < SHORTEST_STEP_S)
     if len(bad) == 0:
         return
     k = int(bad[0]) + 1
     before, now = time_s[k - 1], time_s[k]
-    fault = "stands twice" if now == before else f"comes after {before:.6g} s (line {lines[k - 1]})"
+    fault = f"comes after {before:.6g} s (line {lines[k - 1]})"
+    if now >= before:
+        fault = "stands twice" if now == before else f"is {now - before:.2g} s after that of line {lines[k - 1]}"
     raise InputDataError(
         f"{path}, line {lines[k]}: body '{body}': time {now:.6g} s {fault}.",
         "for each body, times that increase from line to line.",

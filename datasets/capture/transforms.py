@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale, parse
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
 from ...schemas.cameras import Matrix4
 from ...schemas.documents import parse_json
 from ...schemas.regular_files import read_text_file
+from .files import optional_file
 from .images import IMAGE_SUFFIXES, image_size
 
 _INTRINSICS = (
@@ -85,10 +86,10 @@ def matrix4(pose: np.ndarray) -> Matrix4:
 
 def _image_file(folder: Path, file_path: str) -> str:
     name = file_path.removeprefix("./")
-    if Path(name).suffix.lower() in IMAGE_SUFFIXES or (folder / name).is_file():
+    if Path(name).suffix.lower() in IMAGE_SUFFIXES or optional_file(folder / name) is not None:
         return name
     # Blender's synthetic scenes leave the suffix out.
-    return next((name + suffix for suffix in (".png", ".jpg") if (folder / (name + suffix)).is_file()), name)
+    return next((name + suffix for suffix in (".png", ".jpg") if optional_file(folder / (name + suffix))), name)
 
 
 def _pose(where: str, frame: dict[str, Any]) -> Matrix4:
@@ -120,18 +121,16 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
         width, height = image_size(image)
     fx, fy = _focal_lengths(where, values, width, height)
     distortion = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
-    distortion = distortion if distortion[4] else distortion[:4]
-    entry = {
-        "model": "OPENCV" if any(distortion) else "PINHOLE",
-        "width": width,
-        "height": height,
-        "fx": fx,
-        "fy": fy,
-        "cx": values.get("cx", width / 2),
-        "cy": values.get("cy", height / 2),
-        "distortion": distortion if any(distortion) else (),
-    }
-    return parse(entry, CameraIntrinsics, where)
+    return CameraIntrinsics.of_lens(
+        where,
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=values.get("cx", width / 2),
+        cy=values.get("cy", height / 2),
+        distortion=distortion if distortion[4] else distortion[:4],
+    )
 
 
 def _focal_lengths(where: str, values: dict[str, float], width: int, height: int) -> tuple[float, float]:

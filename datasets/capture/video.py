@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.regular_files import require_regular_file
+from .files import entries_of
 from .images import IMAGE_SUFFIXES, image_size, read_label, read_rgb
 
 VIDEO_SUFFIXES = (".mp4", ".webm")
 """Suffixes of readable video files."""
+_HEAD_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,10 @@ def frame_files(folder: Path) -> list[Path]:
     Raises:
         InputDataError: If a name is not a number, or a number is missing, which would shift the times of later frames.
     """
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    files = [path for path in entries_of(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
     numbered: dict[int, Path] = {}
     for file in files:
-        if not file.stem.isdecimal():
+        if not (file.stem.isascii() and file.stem.isdecimal()):
             raise InputDataError(f"{file}: the name is no frame number.", "000000.png, 000001.png, ...")
         number = int(file.stem)
         if number in numbered:
@@ -82,8 +85,9 @@ def video_info(path: Path, decode: bool = False) -> VideoInfo:
         capture.release()
     if not readable:
         raise _undecodable(path)
-    # A webm that was streamed carries no frame count in its header.
-    if decode or frames <= 0:
+    # A webm that was streamed carries no frame count in its header; no header is believed that counts more frames than
+    # there are bytes.
+    if decode or not 0 < frames <= path.stat().st_size:
         frames = _count(path)
     return VideoInfo(frames, width, height, rate if rate > 0 else None)
 
@@ -172,8 +176,11 @@ def _quiet() -> Iterator[None]:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    if not path.is_file():
-        raise InputDataError(f"{path}: no such video.")
+    with require_regular_file(path).open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    # A text may be a playlist, through which the decoder would open other files.
+    if b"\0" not in head:
+        raise _undecodable(path)
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise _undecodable(path)

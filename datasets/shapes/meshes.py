@@ -13,8 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.regular_files import read_binary_file
+from ..io.cells import number_of
 
 Array = NDArray[np.float64]
+
+MOST_BYTES = 8 << 30
+"""Largest size of the file of a mesh [bytes]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +63,13 @@ def read_mesh(path: Path | str, merge: bool = True) -> Mesh:
     readers = {".obj": _read_obj, ".stl": _read_stl}
     if path.suffix.lower() not in readers:
         raise InputDataError(f"{path}: a mesh with the suffix '{path.suffix}'.", ".obj or .stl.")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    data = read_binary_file(path, MOST_BYTES)
     try:
         mesh = readers[path.suffix.lower()](data)
         if merge or path.suffix.lower() == ".stl":
             mesh = _merged(mesh)
-    except (ValueError, IndexError) as error:
-        raise InputDataError(f"{path}: no mesh that can be read: {error}.") from None
+    except (ValueError, IndexError, OverflowError) as error:
+        raise InputDataError(f"{path}: no mesh that can be read: {str(error)[:200]}.") from None
     if len(mesh.faces) == 0:
         raise InputDataError(f"{path}: the mesh has no triangles.")
     if not np.isfinite(mesh.vertices).all():
@@ -161,7 +163,7 @@ def _read_obj(data: bytes) -> Mesh:
         if words[0] == "v":
             if len(words) < 4:
                 raise ValueError(f"line {number}: a vertex of {len(words) - 1} coordinate(s)")
-            vertices.append([float(word) for word in words[1:4]])
+            vertices.append([number_of(word) for word in words[1:4]])
         elif words[0] == "f":
             corners = _face_corners(words[1:], len(vertices), number)
             faces += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
@@ -191,7 +193,8 @@ def _read_stl(data: bytes) -> Mesh:
         corners = np.frombuffer(data, record, count, 84)["corners"].astype(np.float64)
     elif data[:5] == b"solid":
         words = [line.split() for line in data.decode("utf-8", "replace").splitlines()]
-        corners = np.array([word[1:4] for word in words if word[:1] == ["vertex"]], np.float64)
+        listed = [[number_of(number) for number in word[1:4]] for word in words if word[:1] == ["vertex"]]
+        corners = np.array(listed, np.float64)
         if len(corners) % 3 or not any(word[:1] == ["endsolid"] for word in words):
             raise ValueError("it is cut off")
     else:

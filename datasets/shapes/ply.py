@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.regular_files import read_binary_file
 from ..io.atomic import new_file
 
 Array = NDArray[np.floating]
@@ -17,10 +18,15 @@ Array = NDArray[np.floating]
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc."""
 
+MOST_BYTES = 16 << 30
+"""Largest size of a file [bytes]; of a splat with all harmonics, 248 bytes."""
 _OPACITY_MARGIN = 1e-6
 _HIGHER_TERMS = (3, 8, 15)
 """Harmonics from degree 1 up to degree 1, 2 and 3."""
 _ISOTROPY_TOLERANCE = 0.01
+_MOST_LOG_SCALE = 80.0
+"""Largest magnitude of the logarithm of a scale, far beyond every size in metres, at which its exponential is finite in
+float32."""
 _PLY_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "char": "i1", "int8": "i1"}
 _PLY_TYPES |= {"uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2"}
 _PLY_TYPES |= {"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"}
@@ -127,6 +133,12 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
             "three scales that are equal within 1 %.",
             "leave the shape out, so that cgwm fit makes spheres from the photos.",
         )
+    far = int(np.count_nonzero(np.abs(log_scales) > _MOST_LOG_SCALE))
+    if far:
+        raise InputDataError(
+            f"{path}: the logarithm of a scale of {far} splats is {log_scales.flat[np.abs(log_scales).argmax()]:.4g}.",
+            f"-{_MOST_LOG_SCALE:g} to {_MOST_LOG_SCALE:g}.",
+        )
     colors = 0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1)
     higher = _harmonics(path, columns) if harmonics else None
     return Splats(
@@ -166,7 +178,7 @@ def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:
     count = sum(name.startswith("f_rest_") for name in columns)
     if count == 0:
         return None
-    if count % 3 or count // 3 not in _HIGHER_TERMS:
+    if count % 3 or count // 3 not in _HIGHER_TERMS or any(f"f_rest_{k}" not in columns for k in range(count)):
         raise InputDataError(f"{path}: {count} properties 'f_rest_*'.", "9, 24 or 45 of them, of degree 1, 2 or 3.")
     values = np.stack([np.asarray(columns[f"f_rest_{k}"], np.float64) for k in range(count)], axis=1)
     if not np.isfinite(values).all():
@@ -186,19 +198,17 @@ def _unit_normals(columns: dict[str, Array]) -> Array | None:
 
 
 def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputDataError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+    data = read_binary_file(path, MOST_BYTES)
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
         raise InputDataError(f"{path}: no .ply file.")
     body = data.find(b"\n", end) + 1
     kind, count, properties, comments = _parse_header(path, data[:end].decode("ascii", "replace"))
     if kind == "ascii":
-        words = np.array(data[body:].split()[: count * len(properties)], np.float64)
+        try:
+            words = np.array(data[body:].split()[: count * len(properties)], np.float64)
+        except ValueError as error:
+            raise InputDataError(f"{path}: a value that is no number: {str(error)[:80]}.") from None
         if len(words) < count * len(properties):
             raise _cut_off(path, count)
         rows = words.reshape(count, len(properties))
@@ -213,6 +223,12 @@ def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
 
 def _cut_off(path: Path, count: int) -> InputDataError:
     return InputDataError(f"{path}: cut off: it holds fewer than the {count} splats of its header.")
+
+
+def _count(word: str) -> int:
+    if not (word.isascii() and word.isdigit()):
+        raise ValueError(f"{word[:40]!r} is no number of splats")
+    return int(word)
 
 
 def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]], list[str]]:
@@ -230,11 +246,14 @@ def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]
                 if not element and rest[0] != "vertex":
                     raise ValueError(f"its first element is '{rest[0]}', not 'vertex'")
                 element = rest[0]
-                count = int(rest[1]) if element == "vertex" else count
+                count = _count(rest[1]) if element == "vertex" else count
             elif word == "property" and element == "vertex":
                 properties.append((rest[1], _PLY_TYPES[rest[0]]))
         if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
             raise ValueError(f"its format is '{kind}'")
+        names = [name for name, _ in properties]
+        if not names or len(set(names)) < len(names):
+            raise ValueError("a property stands twice" if names else "its splats have no properties")
     except (ValueError, KeyError, IndexError) as error:
         raise InputDataError(f"{path}: the .ply header cannot be read: {error}.") from None
     return kind, count, properties, comments

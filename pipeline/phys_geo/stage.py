@@ -100,7 +100,10 @@ def _fitted_motion(
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        return fit_with_effects(world, track_episodes(capture, split), config, noise, warm_started, capture.groups)
+        found = fit_with_effects(world, track_episodes(capture, split), config, noise, warm_started, capture.groups)
+        unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
+        warnings = [text for text in (capture.unturned_warning(unturned),) if text]
+        return replace(found, warnings=(*found.warnings, *warnings))
     if config.mass_distribution:
         raise UsageError(
             f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not identify it.",

@@ -170,7 +170,9 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     kept = [w.without(WRONG * float(np.median(sizes))) for w in windows]
     windows = [w for w in kept if len(w.left)]
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
-    alone = _likelihood(windows, CorrelatedNoise())[0]
+    alone, white_std = _likelihood(windows, CorrelatedNoise())
+    if white_std == 0:  # values that never change, or repeat a polynomial to the last bit: there are no errors to see
+        return _Found(CorrelatedNoise(), 0.0, 0.0)
     tried = []
     for remembered, share in itertools.product(REMEMBERED, SHARES):
         noise = CorrelatedNoise(share, -step / math.log(remembered))
