@@ -9,9 +9,11 @@ import h5py
 import numpy as np
 import pytest
 from cgwm.datasets.rollouts import loader
+from cgwm.datasets.rollouts.dataset import shard_entry
+from cgwm.datasets.rollouts.index import write_index
 from cgwm.datasets.rollouts.loader import RolloutDataset, RolloutReader, shard_files
 from cgwm.pipeline.synthesize import synthesize
-from cgwm.schemas import ROLLOUTS_FORMAT, SynthesizeConfig, UsageError
+from cgwm.schemas import SynthesizeConfig, UsageError
 from small_model import HALF, write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=3, shards=2, duration_s=0.3, width=32, height=24, device="cpu", seed=3)
@@ -110,12 +112,8 @@ def test_the_index_of_a_merged_dataset_is_read_in_place_of_its_shards(dataset: P
     merged = tmp_path / "merged"
     merged.mkdir()
     shutil.copy(dataset / "dataset.json", merged)
-    with h5py.File(merged / "index.h5", "w") as index:
-        index.attrs["format"] = ROLLOUTS_FORMAT
-        for shard in shards:
-            with h5py.File(shard) as file:
-                for name in file["data"]:
-                    index[f"data/{name}"] = h5py.ExternalLink(os.path.relpath(shard, merged), f"/data/{name}")
+    entries = [shard_entry(shard, k, rollouts=1, frames=1) for k, shard in enumerate(shards)]
+    write_index(merged / "index.h5", [(s, os.path.relpath(s, merged), e) for s, e in zip(shards, entries, strict=True)])
     assert shard_files(merged) == [merged / "index.h5"] and shard_files(dataset) == shards
     whole, parts = RolloutDataset(merged, length=4), RolloutDataset(dataset, length=4)
     assert len(whole) == len(parts) == 6

@@ -354,7 +354,7 @@ def test_balldrops(tmp_path: Path) -> None:
     assert "no ball 'golf'" in fault(tmp_path, lambda out: import_balldrops(tmp_path / "in", out, only="golf"))
     (tmp_path / "in" / "ball_drops.csv").write_text("ball,Time (s)\n")
     assert "no column 'Drop #'" in fault(tmp_path, import_balldrops, tmp_path / "in")
-    assert "cannot be read" in fault(tmp_path, import_balldrops, tmp_path / "absent")
+    assert "no such file" in fault(tmp_path, import_balldrops, tmp_path / "absent")
 
 
 def test_balldrops_as_published(tmp_path: Path) -> None:

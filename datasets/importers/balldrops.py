@@ -14,7 +14,6 @@ The files contain the height above the ground by time, weights and circumference
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
@@ -23,9 +22,11 @@ import numpy as np
 from ...schemas import Body, InputDataError, Shape, World
 from ...schemas.capture import SphereShape
 from ...schemas.imports import ImportResult
+from ...schemas.regular_files import read_text_file
 from ..io.atomic import new_directory
+from ..io.cells import csv_rows, number_of, shown
 from ..io.outputs import reads
-from .recordings import Recording, Units, write_recordings
+from .recordings import Recording, Units, require_name, write_recordings
 
 BALL = "ball"
 _OUNCE_KG = 0.028349523125
@@ -67,26 +68,26 @@ def import_balldrops(
 
 
 def _drops(path: Path) -> list[Recording]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            lacking = [column for column in _COLUMNS if column not in (reader.fieldnames or ())]
-            rows = [] if lacking else list(reader)
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.", todo=_TODO) from None
-    except (UnicodeDecodeError, csv.Error):
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+    lines = csv_rows(path)
+    header = next(lines, (0, []))[1]
+    lacking = [column for column in _COLUMNS if column not in header]
+    rows = [] if lacking else [(line, dict(zip(header, row, strict=False))) for line, row in lines if row]
     if lacking or not rows:
         what = f"no column '{lacking[0]}'" if lacking else "no rows"
         raise InputDataError(f"{path}: {what}.", f"{', '.join(_COLUMNS)}.", _TODO)
     drops: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for line, row in enumerate(rows, 2):
-        name = "-".join(row["ball"].lower().split())
+    for line, row in rows:
         try:
-            number = str(int(row["Drop #"]))
-            sample = float(row["Time (s)"]), float(row["Height (m)"])
-        except (TypeError, ValueError):
+            name = "-".join(row["ball"].lower().split())
+            drop = number_of(row["Drop #"])
+            number = f"{drop:.0f}"
+            if drop != int(drop):
+                raise ValueError
+            sample = number_of(row["Time (s)"]), number_of(row["Height (m)"])
+        except (KeyError, ValueError, OverflowError):
             raise InputDataError(f"{path}, line {line}: no drop number, time and height.", "numbers.") from None
+        if (name, number) not in drops:
+            require_name(name, f"{path}, line {line}")
         drops.setdefault((name, number), []).append(sample)
     recordings = []
     for (name, number), samples in drops.items():
@@ -110,10 +111,7 @@ def _body(path: Path, balls: list[str], only: str | None) -> Body:
 
 def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
     """Return mass [kg] and radius [m] by ball; None for a value that was not measured ("??")."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.", todo=_TODO) from None
+    lines = read_text_file(path).splitlines()
     table = {}
     for number, line in enumerate(lines, 1):
         words = line.split()
@@ -121,10 +119,12 @@ def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
             continue
         try:
             name, weight, circumference = words
-            mass = None if weight == "??" else float(weight) * _OUNCE_KG
-            radius = None if circumference == "??" else float(circumference) * 0.01 / (2 * math.pi)
+            mass = None if weight == "??" else number_of(weight) * _OUNCE_KG
+            radius = None if circumference == "??" else number_of(circumference) * 0.01 / (2 * math.pi)
+            if not all(value is None or 0 < value < math.inf for value in (mass, radius)):
+                raise ValueError
         except ValueError:
-            raise InputDataError(f"{path}, line {number}: '{line.strip()}'.", "ball, ounces, centimetres.") from None
+            raise InputDataError(f"{path}, line {number}: {shown(line)}.", "ball, ounces, centimetres.") from None
         table[_key(name)] = mass, radius
     return table
 

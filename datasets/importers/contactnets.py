@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from ...schemas import Body, BoxShape, CaptureManifest, Ground, InputDataError, Shape, World
 from ...schemas.imports import ImportResult
+from ...schemas.regular_files import require_regular_file
+from ..capture.files import entries_of
 from ..capture.manifest import write_manifest
 from ..capture.tracks import Track, tracks_csv
+from ..io.arrays import read_npz
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from ..io.progress import note, progress
@@ -27,6 +30,7 @@ INERTIA_KG_M2 = 0.00081
 BODY = "cube"
 
 _COLUMNS = 19
+_MOST_NUMBERS = 10_000_000
 _POSITION, _QUATERNION, _VELOCITY, _OMEGA = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 _NPZ_FIELDS = ("offsets", "pos", "quat_wxyz", "vel", "omega_body", "toss_index", "rate_hz", "half_width_m")
 
@@ -106,12 +110,12 @@ def _splits(names: list[str], n_train: int, n_test: int, seed: int) -> dict[str,
 
 def _read(source: Path) -> _Tosses:
     """Find the data: the .pt files in `source`, else an .npz, else the .pt files in `source/tosses`."""
-    if source.is_file() and source.suffix == ".npz":
+    if source.suffix == ".npz" and not source.is_dir():
         return _read_npz(source)
     if source.is_dir():
         for folder in (source, source / "tosses"):
-            files = sorted(folder.glob("*.pt"))
-            archives = sorted(folder.glob("*.npz"))
+            files = [path for path in entries_of(folder) if path.suffix == ".pt"]
+            archives = [path for path in entries_of(folder) if path.suffix == ".npz"]
             if files:
                 return _read_pt(files)
             if len(archives) == 1:
@@ -133,13 +137,18 @@ def _read_pt(files: list[Path]) -> _Tosses:
             raise InputDataError(f"{file}: the name is no toss number.", "<number>.pt.")
         try:
             # weights_only: tensors are read, nothing that the file may carry is executed.
-            tensor = torch.load(file, weights_only=True, map_location="cpu")
+            tensor = torch.load(require_regular_file(file), weights_only=True, map_location="cpu")
+        except InputDataError:
+            raise
         except Exception as error:  # torch raises whatever its readers raise
             reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
             raise InputDataError(f"{file}: not a tensor that can be read safely: {reason}") from None
         if not isinstance(tensor, torch.Tensor) or tensor.shape[-1:] != (_COLUMNS,) or tensor.dim() not in (2, 3):
             shape = tuple(tensor.shape) if isinstance(tensor, torch.Tensor) else type(tensor).__name__
             raise InputDataError(f"{file}: {shape} where a toss was expected.", f"a tensor (1, T, {_COLUMNS}).")
+        if tensor.numel() > _MOST_NUMBERS or tensor.is_complex():  # a tensor may repeat few numbers without end
+            found = f"{file}: {tensor.numel()} numbers, {tensor.dtype}."
+            raise InputDataError(found, f"at most {_MOST_NUMBERS} real numbers.")
         rows = tensor.reshape(-1, _COLUMNS).numpy().astype(np.float64)
         rows[:, _POSITION] *= HALF_WIDTH_M
         rows[:, _VELOCITY] *= HALF_WIDTH_M
@@ -148,13 +157,12 @@ def _read_pt(files: list[Path]) -> _Tosses:
 
 
 def _read_npz(path: Path) -> _Tosses:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            data = {name: archive[name] for name in _NPZ_FIELDS}
-    except KeyError as error:
-        raise InputDataError(f"{path}: no array {error}.", ", ".join(_NPZ_FIELDS) + ".") from None
-    except Exception as error:  # numpy and zipfile raise many kinds
-        raise InputDataError(f"{path}: not an .npz that can be read: {error}.") from None
+    data = read_npz(path, _NPZ_FIELDS)
+    for name, dimensions in (("offsets", 1), ("toss_index", 1), ("rate_hz", 0), ("half_width_m", 0), ("pos", 2)):
+        if data[name].ndim != dimensions or data[name].dtype.kind not in "iuf":
+            raise InputDataError(
+                f"{path}: '{name}' is {data[name].dtype} {data[name].shape}.", f"numbers with {dimensions} axes."
+            )
     for name, width in (("pos", 3), ("quat_wxyz", 4), ("vel", 3), ("omega_body", 3)):
         if data[name].shape != (len(data["pos"]), width):
             raise InputDataError(f"{path}: '{name}' has the shape {data[name].shape}.", f"(rows, {width}).")

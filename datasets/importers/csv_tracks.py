@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,8 +16,9 @@ from ...schemas import InputDataError, did_you_mean
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.cells import csv_rows, number_of, shown
 from ..io.outputs import reads
-from .recordings import SI, Units, read_text, track_files, write_tracks
+from .recordings import SI, Units, read_text, require_name, track_files, write_tracks
 
 Array = NDArray[np.float64]
 
@@ -96,18 +97,21 @@ def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> 
     text = read_text(path)
     first, _, _ = text.partition("\n")
     separator = max(",;\t", key=first.count)
-    rows = list(csv.reader(text.splitlines(), delimiter=separator))
-    header = _header(path, rows[0] if rows else [], columns, units)
+    rows = csv_rows(path, text, separator)
+    names = next(rows, (0, []))[1]
+    header = _header(path, names, columns, units)
     by_body: dict[str, list[list[float]]] = {}
     wanted = [name for name in COLUMNS if name in header.index and name != "body"]
-    for line, row in enumerate(rows[1:], 2):
+    for line, row in rows:
         if not any(cell.strip() for cell in row):
             continue
-        if len(row) != len(rows[0]):
+        if len(row) != len(names):
             raise InputDataError(
-                f"{path}, line {line}: {len(row)} values under {len(rows[0])} columns.", todo="correct the line."
+                f"{path}, line {line}: {len(row)} values under {len(names)} columns.", todo="correct the line."
             )
         name = row[header.index["body"]].strip() if "body" in header.index else body
+        if name not in by_body:
+            require_name(name, f"{path}, line {line}" if "body" in header.index else "--body")
         by_body.setdefault(name, []).append([_number(path, line, row, header, key) for key in wanted])
     if not by_body:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
@@ -180,9 +184,12 @@ def _plain(name: str) -> tuple[str, str]:
 def _number(path: Path, line: int, row: list[str], header: _Header, key: str) -> float:
     cell = row[header.index[key]].strip()
     try:
-        return float(cell) if cell or key == "time" else float("nan")
+        number = number_of(cell) if cell or key == "time" else math.nan
+        if math.isinf(number):
+            raise ValueError
     except ValueError:
-        shown = f"'{cell}' is no number" if cell else "the time is missing"
+        fault = f"{shown(cell)} is no number" if cell else "the time is missing"
         raise InputDataError(
-            f"{path}, line {line}: {key}: {shown}.", "numbers; empty where nothing was seen."
+            f"{path}, line {line}: {key}: {fault}.", "numbers; empty or nan where nothing was seen."
         ) from None
+    return number

@@ -14,8 +14,9 @@ from ...schemas import InputDataError, did_you_mean
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.hdf5_files import hdf5_faults, open_hdf5, own_objects, require_stored
 from ..io.outputs import reads
-from .recordings import SI, Units, track_files, write_tracks
+from .recordings import SI, Units, require_name, track_files, write_tracks
 
 Array = NDArray[np.float64]
 
@@ -27,6 +28,8 @@ _NAMES = {
     "quat_wxyz": ("quat_wxyz", "quaternion_wxyz"),
     "quat_xyzw": ("quat_xyzw", "quaternion_xyzw"),
 }
+MOST_ROWS = 10_000_000
+"""Maximum number of samples of an episode: nearly three hours at 1 kHz."""
 _WIDTHS = {"time": (), "position": (3,), "quat_wxyz": (4,), "quat_xyzw": (4,)}
 
 
@@ -71,6 +74,7 @@ def import_hdf5(
                     f"--columns: '{name}' is nothing that a set can be.",
                     f"{', '.join(SETS)}.{did_you_mean(name, SETS)}",
                 )
+        require_name(body, "--body")
         files = track_files(Path(source), (".h5", ".hdf5"))
         found = [(path, name, track) for path in files for name, track in _episodes(path, columns or {}, units)]
         several = len(files) > 1
@@ -82,20 +86,20 @@ def import_hdf5(
 def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tuple[str, Track]]:
     tracks: list[tuple[str, Track]] = []
     seen: list[str] = []
-    try:
-        with h5py.File(path, "r") as file:
-            groups: list[h5py.Group] = [file]
-            file.visititems(lambda _, item: groups.append(item) if isinstance(item, h5py.Group) else seen.append(_))
-            for group in groups:
-                sets = {key: _set(path, group, key, columns) for key in SETS}
-                if sets["time"] is None or sets["position"] is None:
-                    continue
-                where = f"{path}: {group.name}"
-                quat = _orientation(where, group, sets["quat_wxyz"], sets["quat_xyzw"])
-                track = units.track(where, sets["time"], sets["position"], quat)
-                tracks.append((str(group.name).strip("/").replace("/", "-") or path.stem, track))
-    except OSError as error:
-        raise InputDataError(f"{path}: not an HDF5 file that can be read: {str(error)[:120]}.") from None
+    with open_hdf5(path) as file, hdf5_faults(path):
+        groups: list[h5py.Group] = [file]
+        for name, item in own_objects(file, f"{path}: "):
+            groups.append(item) if isinstance(item, h5py.Group) else seen.append(name)
+        for group in groups:
+            found = {key: _found(group, key, columns) for key in SETS}
+            if found["time"] is None or found["position"] is None:
+                continue
+            where = f"{path}: {group.name}"
+            sets = {key: None if item is None else _numbers(path, item, key) for key, item in found.items()}
+            quat = _orientation(where, group, sets["quat_wxyz"], sets["quat_xyzw"])
+            assert sets["time"] is not None and sets["position"] is not None  # looked at above
+            track = units.track(where, sets["time"], sets["position"], quat)
+            tracks.append((str(group.name).strip("/").replace("/", "-") or path.stem, track))
     if not tracks:
         shown = ", ".join(seen[:8]) + (", ..." if len(seen) > 8 else "")
         raise InputDataError(
@@ -106,15 +110,25 @@ def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tupl
     return tracks
 
 
-def _set(path: Path, group: h5py.Group, key: str, columns: Mapping[str, str]) -> Array | None:
+def _found(group: h5py.Group, key: str, columns: Mapping[str, str]) -> h5py.Dataset | None:
+    """Return the dataset with the quantity `key`, or None."""
     for name in (columns[key],) if key in columns else _NAMES[key]:
         item = group.get(name)
         if isinstance(item, h5py.Dataset):
-            if item.dtype.kind not in "fiu" or item.shape[1:] != _WIDTHS[key] or item.ndim != 1 + len(_WIDTHS[key]):
-                wanted = "(T, " + ", ".join(map(str, _WIDTHS[key])) + ")" if _WIDTHS[key] else "(T,)"
-                raise InputDataError(f"{path}: {item.name} has the shape {item.shape}.", f"numbers, {wanted}.")
-            return np.asarray(item, np.float64)
+            return item
     return None
+
+
+def _numbers(path: Path, item: h5py.Dataset, key: str) -> Array:
+    """Return the numbers of a dataset, after a look at what it declares."""
+    where, width = f"{path}: {item.name}", _WIDTHS[key]
+    wanted = "(T, " + ", ".join(map(str, width)) + ")" if width else "(T,)"
+    if item.dtype.kind not in "fiu" or item.shape is None or item.ndim != 1 + len(width) or item.shape[1:] != width:
+        raise InputDataError(f"{where} has the shape {item.shape} and the type {item.dtype}.", f"numbers, {wanted}.")
+    if len(item) > MOST_ROWS:
+        raise InputDataError(f"{where} declares {len(item)} rows.", f"up to {MOST_ROWS} rows.", "split the recording.")
+    require_stored(item, where)
+    return np.asarray(item, np.float64)
 
 
 def _orientation(where: str, group: h5py.Group, wxyz: Array | None, xyzw: Array | None) -> Array | None:

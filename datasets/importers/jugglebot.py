@@ -13,6 +13,7 @@ holds and throws the ball, which flies, hits the floor once and rolls away. It i
 
 from __future__ import annotations
 
+import os
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,9 @@ from ...schemas.capture import SphereShape
 from ...schemas.documents import parse_json
 from ...schemas.imports import ImportResult
 from ...schemas.regular_files import read_text_file
+from ..capture.files import entries_of
 from ..capture.tracks import Track
+from ..io.arrays import read_npz
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from .recordings import Recording, drawn_splits, episode_names, write_recordings
@@ -150,7 +153,8 @@ def _throw(where: str, name: str, session: str, time: Array, position: Array) ->
 
 
 def _sessions(source: Path, only: str | None) -> list[Path]:
-    files = [source] if source.is_file() else [*source.glob("*.json"), *source.glob("*.npz")]
+    folder = sorted(entries_of(source), key=lambda path: path.suffix) if source.is_dir() else [source]
+    files = [path for path in folder if os.path.lexists(path)]
     by_name = {path.stem: path for path in files if path.suffix in (".json", ".npz")}  # .npz comes last and stays
     if not by_name:
         what = "no sessions of Jugglebot" if source.exists() else "no such file or directory"
@@ -162,14 +166,11 @@ def _sessions(source: Path, only: str | None) -> list[Path]:
 
 def _read_npz(path: Path) -> list[tuple[Array, Array]]:
     """Return times [s] and positions [m] of the throws."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            offsets, rows = archive["offsets"].astype(np.int64), archive["txyz"].astype(np.float64)
-    except KeyError as error:
-        raise InputDataError(f"{path}: no array {error}.", "offsets, txyz.", _TODO) from None
-    except Exception as error:  # numpy and zipfile raise many kinds
-        raise InputDataError(f"{path}: not an .npz that can be read: {error}.") from None
-    sound = rows.ndim == 2 and rows.shape[1] == 4 and len(offsets) > 1
+    found = read_npz(path, ("offsets", "txyz"))
+    numbers = all(array.dtype.kind in "iuf" for array in found.values())
+    offsets, rows = (found["offsets"], found["txyz"]) if numbers else (np.zeros(0), np.zeros(0))
+    offsets, rows = offsets.astype(np.int64), rows.astype(np.float64)
+    sound = rows.ndim == 2 and rows.shape[1] == 4 and offsets.ndim == 1 and len(offsets) > 1
     if not sound or offsets[0] != 0 or offsets[-1] != len(rows) or (np.diff(offsets) <= 0).any():
         raise InputDataError(
             f"{path}: 'txyz' has the shape {rows.shape}, 'offsets' {offsets.shape}.",
@@ -192,7 +193,7 @@ def _read_json(path: Path) -> list[tuple[Array, Array]]:
                 times.append((part["Range"]["Start"] + np.arange(len(values))) / rate)
                 positions.append(1e-3 * values)
             throws.append((np.concatenate(times), np.concatenate(positions)))
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, ZeroDivisionError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         raise InputDataError(
             f"{path}: not an export of Qualisys' tracks: {type(error).__name__}: {error}.",
             "Timebase.Frequency, and Markers with Parts of Range.Start and Values in mm.",

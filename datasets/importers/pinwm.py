@@ -14,6 +14,7 @@ of the pusher in the plane. The following is assumed, because the files do not c
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,11 +40,14 @@ from ...schemas import (
 from ...schemas.base import FileModel
 from ...schemas.capture import FileShape, Video
 from ...schemas.imports import ImportResult
+from ...schemas.regular_files import require_regular_file
 from ..capture.cameras import Camera, to_intrinsics
+from ..capture.files import entries_of, optional_file
 from ..capture.images import image_size, read_alpha, read_rgb, write_image
 from ..capture.manifest import write_manifest
 from ..capture.tracks import Track, tracks_csv
 from ..io.atomic import new_directory
+from ..io.cells import number_of
 from ..io.outputs import reads
 from ..io.progress import progress
 from ..shapes.meshes import Mesh, read_mesh
@@ -124,9 +128,9 @@ def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwri
     with new_directory(out, "capture", overwrite) as directory:
         recordings = _recordings(source, n_train)
         filmed = [recording for recording in recordings if recording.frames]
-        shape, mass_kg, com_m = _link(source / _BLOCK_URDF)
+        shape, mass_kg, com_m = _link(source, _BLOCK_URDF)
         write_obj(directory / "block.obj", shape)
-        write_obj(directory / "pusher.obj", widened(hull(_link(source / _PUSHER_URDF)[0]), 2 * MARGIN_M))
+        write_obj(directory / "pusher.obj", widened(hull(_link(source, _PUSHER_URDF)[0]), 2 * MARGIN_M))
         train = {f"{recording.name}{FIRST}": recording for recording in filmed}
         manifest = CaptureManifest(
             format="cgwm-capture/1",
@@ -201,7 +205,8 @@ def write_obj(path: Path, mesh: Mesh) -> None:
 
 
 def _recordings(source: Path, n_train: int) -> list[_Recording]:
-    files = sorted(source.glob("dataset/*/dynamic_*.json"))
+    folders = [folder for folder in entries_of(source / "dataset") if folder.is_dir()]
+    files = [path for folder in folders for path in entries_of(folder) if path.match("dynamic_*.json")]
     if not files:
         what = "no pushes of PIN-WM" if source.is_dir() else "no such directory"
         raise InputDataError(
@@ -222,7 +227,9 @@ def _frames(file: Path, push: _Push) -> tuple[_Frame, ...]:
     """Return the frames of a push with pictures, in the order of its poses: one for each pose, or none."""
     numbered = {_number(file, frame): frame for frame in push.image_datas}
     wanted = [numbered[k] for k in range(len(push.pose_datas)) if k in numbered]
-    frames = tuple(frame for frame in wanted if (file.parent / frame.file_path).is_file())
+    for frame in wanted:
+        _require_inside(file.parent / frame.file_path, file.parent.parent, str(file))
+    frames = tuple(frame for frame in wanted if optional_file(file.parent / frame.file_path))
     if frames and len(frames) < len(push.pose_datas):
         raise InputDataError(
             f"{file.parent}: {len(frames)} pictures for {len(push.pose_datas)} poses.",
@@ -251,20 +258,34 @@ def _number(file: Path, frame: _Frame) -> int:
     return int(found[1])
 
 
-def _link(urdf: Path) -> tuple[Mesh, float, tuple[float, float, float]]:
+def _require_inside(path: Path, folder: Path, where: str) -> None:
+    """Refuse a file that another file names outside the data."""
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputDataError(f"{where}: names {path}, which lies outside the data.", f"files in {folder}.", _TODO)
+
+
+def _link(source: Path, place: str) -> tuple[Mesh, float, tuple[float, float, float]]:
     """Return the collision mesh, the mass [kg] and the centre of mass [m] of the first link with a mesh."""
+    urdf = source / place
     try:
-        root = ElementTree.parse(urdf).getroot()
-    except (OSError, ElementTree.ParseError) as error:
+        root = ElementTree.parse(require_regular_file(urdf)).getroot()
+    except (OSError, ValueError, ElementTree.ParseError) as error:
         raise InputDataError(f"{urdf}: cannot be read: {error}.", todo=_TODO) from None
     for link in root.iter("link"):
         mesh, mass = link.find("collision/geometry/mesh"), link.find("inertial/mass")
         if mesh is None or mass is None:
             continue
         origin = link.find("inertial/origin")
-        com = [float(word) for word in ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split()]
-        x, y, z = com
-        return read_mesh(urdf.parent / mesh.get("filename", "")), float(mass.get("value", "nan")), (x, y, z)
+        try:
+            x, y, z = map(number_of, ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split())
+            mass_kg = number_of(mass.get("value", ""))
+            if not (0 < mass_kg < math.inf and math.isfinite(x + y + z)):
+                raise ValueError("a mass that is not positive, or a place that is not finite")
+        except ValueError as error:
+            raise InputDataError(f"{urdf}: inertial: {error}.", "a mass [kg] and a centre of mass [m].") from None
+        path = urdf.parent / mesh.get("filename", "")
+        _require_inside(path, source, str(urdf))
+        return read_mesh(path), mass_kg, (x, y, z)
     raise InputDataError(f"{urdf}: no link with a mesh and a mass.", todo=_TODO)
 
 

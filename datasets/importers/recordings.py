@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +12,16 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from ...schemas import QUATERNION_NORM_TOLERANCE, Body, CaptureManifest, InputDataError, World
-from ...schemas.capture import Episode
+from ...schemas.capture import Episode, Name
 from ...schemas.imports import ImportResult
+from ...schemas.regular_files import read_text_file, require_regular_file
+from ..capture.files import entries_of
 from ..capture.manifest import write_manifest
-from ..capture.tracks import Track, tracks_csv
+from ..capture.tracks import SHORTEST_STEP_S, Track, tracks_csv
+from ..io.cells import LARGEST, shown
 from ..io.progress import note, progress
 
 Array = NDArray[np.float64]
@@ -27,6 +32,8 @@ _LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
 """Largest time step and largest extent of a path for which numbers without a unit count as seconds and metres."""
+_LONGEST_NAME = 150
+"""Maximum length of the name of an episode, which becomes that of a file."""
 _TRAIN_SHARE = 0.6
 """Default share of the episodes in the split "train"."""
 
@@ -79,6 +86,12 @@ class Units:
             InputDataError: If fewer than two samples are left, times do not increase, are not finite or step so far
                 that they are no seconds, positions spread so far that they are no metres, or quaternions are not unit.
         """
+        counts = {"times": len(time), "positions": len(position)}
+        counts |= {} if quat_wxyz is None else {"orientations": len(quat_wxyz)}
+        if len(set(counts.values())) > 1:
+            raise InputDataError(
+                f"{where}: {', '.join(f'{count} {name}' for name, count in counts.items())}.", "as many of each."
+            )
         seen = np.asarray(np.isfinite(position).all(1))
         if quat_wxyz is not None:
             seen &= np.isfinite(quat_wxyz).all(1)
@@ -91,7 +104,13 @@ class Units:
             raise InputDataError(f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.")
         self._check(where, time, position)
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
-        return Track(time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat)
+        track = Track(time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat)
+        for name, unit, values in (("times", "s", track.time_s), ("positions", "m", track.position_m)):
+            if (largest := float(np.abs(values).max())) > LARGEST:
+                raise InputDataError(f"{where}: {name} up to {largest:.4g} {unit}.", f"up to {LARGEST:g} {unit}.")
+        if (shortest := float(np.diff(track.time_s).min())) < SHORTEST_STEP_S:
+            raise InputDataError(f"{where}: two times are {shortest:.2g} s apart.", f"{SHORTEST_STEP_S:g} s or more.")
+        return track
 
     def _check(self, where: str, time: Array, position: Array) -> None:
         steps = np.diff(time)
@@ -128,12 +147,14 @@ def track_files(source: Path, suffixes: tuple[str, ...]) -> list[Path]:
     Raises:
         InputDataError: If there is none.
     """
-    if source.is_file():
-        return [source]
-    files = sorted(path for path in source.glob("*") if path.suffix.lower() in suffixes and path.is_file())
+    allowed = f"a {' or '.join(suffixes)} file, or a folder of them."
+    if not os.path.lexists(source):
+        raise InputDataError(f"{source}: no such file or directory.", allowed)
+    if not source.is_dir():
+        return [require_regular_file(source)]
+    files = [require_regular_file(path) for path in entries_of(source) if path.suffix.lower() in suffixes]
     if not files:
-        what = f"no {' or '.join(suffixes)} files" if source.is_dir() else "no such file or directory"
-        raise InputDataError(f"{source}: {what}.", f"a {' or '.join(suffixes)} file, or a folder of them.")
+        raise InputDataError(f"{source}: no {' or '.join(suffixes)} files.", allowed)
     return files
 
 
@@ -143,12 +164,27 @@ def read_text(path: Path) -> str:
     Raises:
         InputDataError: If it cannot be read, or is no such text.
     """
+    return read_text_file(path, "utf-8-sig")
+
+
+def require_name(name: str, where: str) -> str:
+    """Return a name that becomes that of a body or of a file of the capture.
+
+    Args:
+        name: The name.
+        where: Where it stands, for the message.
+
+    Raises:
+        InputDataError: If it is not legal in a manifest.
+    """
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+        return TypeAdapter(Name).validate_python(name)
+    except ValidationError:
+        raise InputDataError(
+            f"{where}: {shown(name)} is no name.",
+            "letters, digits, '_', '.' and '-', beginning with a letter or digit.",
+            "change the name there.",
+        ) from None
 
 
 def from_zero(tracks: Mapping[str, Track]) -> dict[str, Track]:
@@ -159,14 +195,15 @@ def from_zero(tracks: Mapping[str, Track]) -> dict[str, Track]:
 
 def episode_names(stems: Sequence[str]) -> list[str]:
     """Return legal, distinct names of episodes for names of files."""
-    names: list[str] = []
+    names: dict[str, None] = {}
+    repeated: dict[str, int] = {}
     for stem in stems:
-        name = re.sub(r"[^A-Za-z0-9_.-]+", "-", stem).strip("-.") or "episode"
-        count = 1
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "-", stem).strip("-.")[:_LONGEST_NAME] or "episode"
+        count = repeated.get(name, 1)
         while (chosen := name if count == 1 else f"{name}-{count}") in names:
             count += 1
-        names.append(chosen)
-    return names
+        names[chosen], repeated[name] = None, count
+    return list(names)
 
 
 def write_tracks(

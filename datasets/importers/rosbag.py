@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -11,11 +12,13 @@ import numpy as np
 
 from ...schemas import InputDataError, UsageError, did_you_mean
 from ...schemas.imports import ImportResult
+from ...schemas.regular_files import require_regular_file
+from ..capture.files import entries_of, files_under, optional_file
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from ..io.progress import note
-from .recordings import Units, write_tracks
+from .recordings import Units, require_name, write_tracks
 
 POSES = {
     "geometry_msgs/msg/PoseStamped": "pose",
@@ -66,6 +69,7 @@ def import_rosbag(
     except ImportError:
         raise UsageError("ROS bags need the package rosbags.", todo="pip install 'cgwm[ros]'.") from None
     with new_directory(out, "capture", overwrite) as directory:
+        require_name(body, "--body")
         bags = _bags(Path(source))
         tracks = ({body: _track(path, topic)} for path in bags)
         return write_tracks(directory, out, [path.stem for path in bags], tracks, up, (n_train, n_test, seed))
@@ -73,11 +77,15 @@ def import_rosbag(
 
 def _bags(source: Path) -> list[Path]:
     def is_bag(path: Path) -> bool:
-        return path.suffix in (".bag", ".mcap") if path.is_file() else (path / "metadata.yaml").is_file()
+        if path.is_dir():
+            return optional_file(path / "metadata.yaml") is not None
+        return path.suffix in (".bag", ".mcap") and require_regular_file(path) == path
 
-    bags = [source] if is_bag(source) else sorted(filter(is_bag, source.glob("*")))
+    there = os.path.lexists(source)
+    bags = [source] if there and is_bag(source) else []
+    bags = bags or [path for path in (entries_of(source) if source.is_dir() else ()) if is_bag(path)]
     if not bags:
-        what = "no ROS bags" if source.exists() else "no such file or directory"
+        what = "no ROS bags" if there else "no such file or directory"
         raise InputDataError(
             f"{source}: {what}.", "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them."
         )
@@ -87,12 +95,17 @@ def _bags(source: Path) -> list[Path]:
 def _track(path: Path, topic: str | None) -> Track:
     rosbags: Any = import_module("rosbags.highlevel")
     stores: Any = import_module("rosbags.typesys")
+    for name in files_under(path) if path.is_dir() else ():  # each must be a regular file
+        require_regular_file(path / name)
     try:
         with rosbags.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as reader:
             name, frame = _chosen(path, reader, topic)
             rows = list(_poses(reader, name, frame))
-    except (rosbags.AnyReaderError, OSError) as error:
-        raise InputDataError(f"{path}: not a ROS bag that can be read: {str(error)[:160]}.") from None
+    except InputDataError:
+        raise
+    except Exception as error:  # the readers raise what their parsers raise: of struct, yaml, sqlite, their own
+        reason = str(error)[:160] or type(error).__name__
+        raise InputDataError(f"{path}: not a ROS bag that can be read: {reason}.") from None
     if not rows:
         shown = f" of '{frame}'" if frame else ""
         raise InputDataError(f"{path}: no poses{shown} on {name}.", todo="choose another: --topic NAME.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -11,8 +12,9 @@ from ...schemas import InputDataError
 from ...schemas.imports import ImportResult
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
+from ..io.cells import number_of, shown
 from ..io.outputs import reads
-from .recordings import SI, Units, read_text, track_files, write_tracks
+from .recordings import SI, Units, read_text, require_name, track_files, write_tracks
 
 
 @reads("source")
@@ -48,6 +50,7 @@ def import_tum(
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
+        require_name(body, "--body")
         files = track_files(Path(source), (".txt", ".tum"))
         tracks = ({body: _track(path, units)} for path in files)
         return write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
@@ -60,13 +63,11 @@ def _track(path: Path, units: Units) -> Track:
         if not words:
             continue
         try:
-            values = [float(word) for word in words]
+            values = [number_of(word) for word in words]
         except ValueError:
             values = []
-        if len(values) != 8:
-            raise InputDataError(
-                f"{path}, line {number}: '{line.strip()[:60]}'.", "8 numbers: timestamp tx ty tz qx qy qz qw."
-            )
+        if len(values) != 8 or any(map(math.isinf, values)):
+            raise InputDataError(f"{path}, line {number}: {shown(line)}.", "8 numbers: timestamp tx ty tz qx qy qz qw.")
         rows.append(values)
     table = np.array(rows).reshape(-1, 8)
     return units.track(str(path), table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])

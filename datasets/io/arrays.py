@@ -48,7 +48,7 @@ def read_npz(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
                         f"{path}: '{name}' declares {members[name].file_size / 2**30:.1f} GiB.",
                         f"arrays of at most {MOST_UNPACKED / 2**30:g} GiB.",
                     )
-                found[name] = _parsed(f"{path}: '{name}'", archive.read(members[name]))
+                found[name] = _parsed(f"{path}: not an .npz that can be read: '{name}'", archive.read(members[name]))
             return found
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
         raise InputDataError(f"{path}: not an .npz that can be read: {error}.", allowed) from None

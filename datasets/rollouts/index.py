@@ -15,9 +15,10 @@ import numpy as np
 
 from ...schemas import DatasetManifest, ShardEntry
 from ..io.atomic import sha256
+from ..io.hdf5_files import hdf5_faults
 from ..io.progress import progress
 from .guarded_file import GuardedFile
-from .rollouts import SHARDS, Node, demo_names, open_shard
+from .rollouts import SHARDS, Node, demo_names, demo_of, open_shard
 
 INDEX = "index.h5"
 
@@ -40,7 +41,7 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
             splits: dict[str, list[str]] = {}
             total = 0
             for file, name, _ in progress(shards, "shards", len(shards), "shard"):
-                with open_shard(file) as opened:
+                with open_shard(file) as opened, hdf5_faults(file):
                     shard: Node = opened
                     if not len(data):
                         _copy_attributes(shard, index)
@@ -49,7 +50,7 @@ def write_index(path: Path, shards: Sequence[tuple[Path, str, ShardEntry]]) -> N
                     for split, members in shard["mask"].items():
                         splits.setdefault(split, []).extend(member.decode() for member in members[()])
                     for demo in demo_names(shard):
-                        _mirror(shard["data"][demo], data.create_group(demo), name.encode())
+                        _mirror(demo_of(opened, demo), data.create_group(demo), name.encode())
                 _check(guarded)
             data.attrs["total"] = total
             _write_splits(index.create_group("mask"), splits)
@@ -66,7 +67,7 @@ def index_fault(file: Path, manifest: DatasetManifest) -> str | None:
         return f"{file.name}: listed in dataset.json, but no such file."
     if sha256(file) != manifest.index.sha256:
         return f"{file.name}: its sha256 differs from dataset.json; make it again with 'cgwm merge --overwrite'."
-    with open_shard(file) as index:
+    with open_shard(file) as index, hdf5_faults(file):
         listed: Node = index[SHARDS]
         found = [value.decode() for value in listed["sha256"][()]]
     if found != [shard.sha256 for shard in manifest.shards]:

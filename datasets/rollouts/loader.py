@@ -12,10 +12,12 @@ import h5py
 import numpy as np
 
 from ...schemas import InputDataError, UsageError, did_you_mean
+from ...schemas.regular_files import require_regular_file
 from ..capture.cameras import Camera
+from ..io.hdf5_files import hdf5_faults
 from ..io.kinds import refuse_other_kind
 from .chunks import image_of
-from .rollouts import Node, demo_names, open_shard
+from .rollouts import Node, demo_names, demo_of, open_shard
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class RolloutInfo:
 
 INDEX = "index.h5"
 """Name of the file of virtual datasets that `cgwm merge` writes."""
+MOST_FRAMES = 10_000_000
+"""Maximum number of frames of a rollout."""
 MOST_OPEN = 64
 """Maximum number of shards that a process keeps open; the one opened first is closed for another. Systems allow about a
 thousand files, and each open shard has a cache of decoded chunks."""
@@ -44,10 +48,10 @@ def shard_files(path: Path) -> list[Path]:
 
     A `path` that is a file, a shard or an index, is returned itself.
     """
-    if path.is_file():
-        return [path]
+    if os.path.lexists(path) and not path.is_dir():
+        return [require_regular_file(path)]
     refuse_other_kind(path, "dataset")
-    if (path / INDEX).is_file():
+    if os.path.lexists(path / INDEX):
         return [path / INDEX]
     files = sorted(path.glob("rollouts-*-of-*.h5"))
     if not files:
@@ -81,9 +85,10 @@ class RolloutReader:
     def __init__(self, path: Path | str, split: str | None = None):
         self.path = Path(path)
         self._files: dict[tuple[int, Path], Node] = {}
+        self._checked: set[tuple[Path, str]] = set()
         self.rollouts: list[RolloutInfo] = []
         for file in shard_files(self.path):
-            with open_shard(file) as handle:
+            with open_shard(file) as handle, hdf5_faults(file):
                 self.rollouts.extend(_list(handle, file, split))
         self.rollouts.sort(key=lambda info: info.index)
 
@@ -109,6 +114,9 @@ class RolloutReader:
             if len(mine) >= MOST_OPEN:
                 self._files.pop(mine[0]).close()
             self._files[key] = open_shard(info.file)
+        if (info.file, info.demo) not in self._checked:
+            demo_of(self._files[key], info.demo)
+            self._checked.add((info.file, info.demo))
         return self._files[key]["data"][info.demo]
 
     def keys(self, number: int = 0) -> list[str]:
@@ -140,9 +148,10 @@ class RolloutReader:
             raise UsageError(
                 f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names)
             ) from None
-        if data.attrs.get("encoding") == "jpeg":
-            return np.stack([image_of(row) for row in data[start:stop]])
-        return data[start:stop] if data.ndim else data[()]
+        with hdf5_faults(self.rollouts[number].file):
+            if data.attrs.get("encoding") == "jpeg":
+                return np.stack([image_of(row) for row in data[start:stop]])
+            return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:
         """Return the contacts of one frame: its rows of the arrays of the group `contacts`, except `offsets`."""
@@ -247,4 +256,7 @@ def _list(handle: Node, file: Path, split: str | None) -> Iterable[RolloutInfo]:
         names = [name for name in names if name in members]
     for name in names:
         demo = handle["data"][name]
-        yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), int(demo.attrs["num_samples"]))
+        frames = int(demo.attrs["num_samples"])
+        if not 0 <= frames <= MOST_FRAMES:
+            raise InputDataError(f"{file}: data/{name}: num_samples is {frames}.", f"0 to {MOST_FRAMES}.")
+        yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), frames)

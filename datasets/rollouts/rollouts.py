@@ -6,16 +6,20 @@ after the global index of its rollout, whatever the shard, so joining shards ren
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import h5py
 import numpy as np
 
 from ...schemas import ROLLOUTS_FORMAT, Exposure, InputDataError, Light
+from ...schemas.regular_files import require_regular_file
 from ..capture.cameras import Camera
+from ..io.hdf5_files import hdf5_faults, is_own_link, open_hdf5, own_objects, require_stored
 from .chunks import require_zstd
 
 Node = Any
@@ -23,6 +27,10 @@ Node = Any
 
 SHARDS = "shards"
 """Group of an index with the files that it refers to (`file`, relative to it), with their `bytes` and `sha256`."""
+
+SHARD = re.compile(r"rollouts-(\d{4,})-of-(\d{4,})\.h5")
+"""Name of the file of a shard."""
+_DEMO = re.compile(r"demo_[0-9]{1,18}")
 
 VALID_EVERY = 5
 """Every n-th rollout (by global index, the last of each group) belongs to `mask/valid`, the others to `mask/train`."""
@@ -187,22 +195,21 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
         cache_bytes: Chunk cache of a dataset; at least one chunk, or random access decodes each chunk again.
 
     Raises:
-        InputDataError: If it is missing, damaged, not a file of rollouts, or needs a missing filter.
+        InputDataError: If it is missing, damaged, not a file of rollouts, refers to other files than shards, or needs a
+            missing filter.
     """
-    if not path.is_file():
-        raise InputDataError(f"{path}: no such file.")
+    file = open_hdf5(path, rdcc_nbytes=cache_bytes)
     try:
-        file = h5py.File(path, "r", rdcc_nbytes=cache_bytes)
-    except OSError as error:
-        raise InputDataError(f"{path}: not a readable HDF5 file: {str(error).splitlines()[0]}.") from None
-    try:
-        if file.attrs.get("format") != ROLLOUTS_FORMAT:
+        with hdf5_faults(path):
             found = file.attrs.get("format", "none")
-            raise InputDataError(f"{path}: its format attribute is '{found}'.", f"'{ROLLOUTS_FORMAT}'.")
-        if "zstd" in str(file.attrs.get("filters", "")):
-            require_zstd(f"reading {path}")
-        if SHARDS in file:
-            _refuse_lost(path, file[SHARDS])
+            if not isinstance(found, str) or found != ROLLOUTS_FORMAT:
+                raise InputDataError(f"{path}: its format attribute is '{found!s:.80}'.", f"'{ROLLOUTS_FORMAT}'.")
+            if "zstd" in str(file.attrs.get("filters", "")):
+                require_zstd(f"reading {path}")
+            for name in file:
+                is_own_link(file, name, f"{path}: {name}")
+            if SHARDS in file:
+                _refuse_lost(path, file[SHARDS])
     except BaseException:
         file.close()
         raise
@@ -211,18 +218,68 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
 
 def _refuse_lost(path: Path, shards: Node) -> None:
     """Refuse an index with missing shards, for which HDF5 would silently read fill values."""
-    for name, size in zip(shards["file"][()], shards["bytes"][()], strict=True):
-        shard = path.resolve().parent / name.decode()
-        if not shard.is_file() or shard.stat().st_size != size:
-            found = f"{shard.stat().st_size} bytes" if shard.is_file() else "no such file"
+    for place, item in own_objects(shards, f"{path}: {SHARDS}"):
+        if isinstance(item, h5py.Dataset):
+            require_stored(item, f"{path}: {SHARDS}/{place}")
+    for name, size in zip(_shard_files(path, shards), shards["bytes"][()].tolist(), strict=True):
+        shard = path.resolve().parent / name
+        there = os.path.lexists(shard) and require_regular_file(shard).stat().st_size
+        if there != size:
             raise InputDataError(
-                f"{path}: an index that looks into {name.decode()}: {found}.",
+                f"{path}: an index that looks into {name}: {f'{there} bytes' if there else 'no such file'}.",
                 f"a shard of {size} bytes there.",
                 "put the shard back, or make the index again with 'cgwm merge --overwrite'.",
             )
 
 
+def _shard_files(path: Path, shards: Node) -> list[str]:
+    """Return the files that an index looks into, relative to it; all must have the names of shards."""
+    names = [name.decode() for name in shards["file"][()].tolist()]
+    strange = next((name for name in names if not SHARD.fullmatch(PurePosixPath(name).name)), None)
+    if strange is not None:
+        raise InputDataError(f"{path}: an index that looks into {strange!a:.80}.", "rollouts-<i>-of-<n>.h5.")
+    return names
+
+
 def demo_names(file: h5py.File) -> list[str]:
-    """Return the names of the demos of a shard, by rollout index."""
-    data: Node = file["data"]
-    return sorted(data, key=lambda name: int(name.removeprefix("demo_")))
+    """Return the names of the demos of a shard, by rollout index.
+
+    Raises:
+        InputDataError: If something else is among them.
+    """
+    path = Path(file.filename)
+    with hdf5_faults(path):
+        data: Node = file["data"]
+        for name in data:
+            where = f"{path}: data/{name!a:.80}"
+            if not _DEMO.fullmatch(name) or not is_own_link(data, name, where):
+                raise InputDataError(f"{where}: no rollout.", "groups demo_<index> in data.")
+        return sorted(data, key=lambda name: int(name.removeprefix("demo_")))
+
+
+def demo_of(file: h5py.File, name: str) -> Node:
+    """Return the group of a rollout of a shard or of an index, after a look at what it declares.
+
+    Raises:
+        InputDataError: If it refers to files that are no shards of the dataset, declares numbers that are not stored,
+            or images of another size than that of their camera; or if it is damaged.
+    """
+    path = Path(file.filename)
+    with hdf5_faults(path):
+        demo: Node = file["data"][name]
+        if not isinstance(demo, h5py.Group):
+            raise InputDataError(f"{path}: data/{name}: no rollout.", "groups demo_<index> in data.")
+        where, files = f"{path}: data/{name}", _shard_files(path, file[SHARDS]) if SHARDS in file else ()
+        for place, item in own_objects(demo, where):
+            if isinstance(item, h5py.Dataset):
+                require_stored(item, f"{where}/{place}", files)
+        for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
+            size = tuple(int(entry[key][()]) for key in ("height", "width"))
+            for kind in ("image", "depth", "mask", "amodal"):
+                item = demo.get(f"obs/{camera}_{kind}")
+                if item is not None and item.attrs.get("encoding") != "jpeg" and item.shape[1:3] != size:
+                    raise InputDataError(
+                        f"{where}/obs/{camera}_{kind}: images of {item.shape[1:3]} px; its camera says {size}.",
+                        "images of the size of their camera.",
+                    )
+        return demo

@@ -15,9 +15,8 @@ import h5py
 
 from ...schemas import DatasetManifest, InputDataError, ShardEntry, read_json
 from ..io.atomic import leftovers, replaced_file, sha256
-from .rollouts import Node, demo_names, open_shard
-
-SHARD = re.compile(r"rollouts-(\d{4,})-of-(\d{4,})\.h5")
+from ..io.hdf5_files import hdf5_faults, require_stored
+from .rollouts import SHARD, Node, demo_names, open_shard
 
 
 def shard_name(index: int, count: int) -> str:
@@ -99,6 +98,7 @@ def unreadable_block(file: Path) -> str | None:
 
     def visit(name: str, item: object) -> bool | None:
         if isinstance(item, h5py.Dataset) and not item.is_virtual:
+            require_stored(item, f"{file}: {name}")
             blocks = item.iter_chunks() if item.chunks else [()]
             for block in blocks:
                 try:
@@ -112,7 +112,7 @@ def unreadable_block(file: Path) -> str | None:
     try:
         with open_shard(file) as handle:
             handle.visititems(visit)
-    except (InputDataError, OSError, RuntimeError, KeyError) as error:
+    except (InputDataError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         return f"the HDF5 structure ({str(error).splitlines()[0][:120]})"
     return found[0] if found else None
 
@@ -121,7 +121,7 @@ def contact_count(file: Path) -> int:
     """Return the number of contact labels in a shard."""
     with open_shard(file) as handle:
         data: Node = handle["data"]
-        return sum(len(demo["contacts"]["body_a"]) for demo in data.values())
+        return sum(len(data[name]["contacts"]["body_a"]) for name in demo_names(handle))
 
 
 def foreign(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_json: str) -> str | None:
@@ -142,7 +142,7 @@ def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_js
     for name, version in entry.versions.items():
         if manifest.versions.get(name) != version:
             yield f"{file.name}: made with {name} {version}; the dataset's is {manifest.versions.get(name, 'none')}."
-    with open_shard(file) as handle:
+    with open_shard(file) as handle, hdf5_faults(file):
         attributes: Node = handle.attrs
         if int(attributes["seed"]) != manifest.config.get("seed"):
             yield f"{file.name}: made with seed {attributes['seed']}; the dataset's is {manifest.config.get('seed')}."

@@ -11,10 +11,11 @@ from typing import Any
 import h5py
 import numpy as np
 
+from ...datasets.io.hdf5_files import hdf5_faults
 from ...datasets.io.progress import progress
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.dataset import check_hashes, read_manifest
-from ...datasets.rollouts.rollouts import Node, demo_names, open_shard
+from ...datasets.rollouts.rollouts import Node, demo_names, demo_of, open_shard
 from ...schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
 from .faults import Fault
 from .newton import MotionFindings, check_motion, motion_facts
@@ -78,7 +79,7 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
         if not file.is_file():
             continue  # reported by check_hashes
         try:
-            with open_shard(file) as handle:
+            with open_shard(file) as handle, hdf5_faults(file):
                 _check_shard(handle, shard, model, findings, None if chosen is None else chosen[shard.file])
         except InputDataError as error:
             findings.faults.append(f"{shard.file}: {error.found}")
@@ -152,15 +153,17 @@ def _check_shard(
     names = demo_names(file)
     if len(names) != shard.rollouts:
         findings.faults.append(f"{shard.file}: {len(names)} rollouts; dataset.json says {shard.rollouts}.")
-    total = sum(int(demo.attrs["num_samples"]) for demo in file["data"].values())
+    total = sum(int(file["data"][name].attrs["num_samples"]) for name in names)
     if total != int(file["data"].attrs["total"]):
         listed = file["data"].attrs["total"]
         findings.faults.append(f"{shard.file}: data/@total is {listed}; the demos sum up to {total}.")
     chosen = names if places is None else [names[place] for place in sorted(places) if place < len(names)]
     for name in progress(chosen, shard.file, len(chosen), "rollout"):
         try:
-            for fault in _check_demo(file["data"][name], model, findings):
+            for fault in _check_demo(demo_of(file, name), model, findings):
                 findings.add(shard.file, name, fault)
+        except InputDataError as error:
+            findings.add(shard.file, name, Fault(check="schema", text=error.found))
         except KeyError as error:
             text = f"an array or attribute is missing: {error.args[0]}."
             findings.add(shard.file, name, Fault(check="schema", text=text))

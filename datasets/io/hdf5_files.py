@@ -1,0 +1,196 @@
+"""HDF5 files from elsewhere: what a file declares, and where it refers to, is looked at before anything is read.
+
+A link to another file would make cgwm open any file of this machine, and a few bytes may declare arrays of terabytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from ...schemas import InputDataError
+from ...schemas.regular_files import require_regular_file
+
+MOST_DEEP = 64
+"""Maximum depth of groups in groups."""
+MOST_OBJECTS = 1_000_000
+"""Maximum number of groups and arrays of a file that are visited."""
+MOST_CHUNK_BYTES = 1 << 30
+"""Largest chunk, which HDF5 unpacks as a whole [bytes]."""
+NEEDS_NO_PROOF_BYTES = 64 << 20
+"""Size up to which an array may be stored in part [bytes]."""
+_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)
+"""What h5py raises for damaged files and for what is no HDF5."""
+
+
+@contextmanager
+def hdf5_faults(path: Path) -> Iterator[None]:
+    """Turn what h5py raises in the block into one message that names the file.
+
+    Raises:
+        InputDataError: In place of an error of h5py.
+    """
+    try:
+        yield
+    except _ERRORS as error:
+        reason = (str(error).splitlines() or [""])[0][:160] or type(error).__name__
+        raise InputDataError(f"{path}: not a readable HDF5 file: {reason}.") from None
+
+
+def open_hdf5(path: Path, **options: Any) -> h5py.File:
+    """Open an HDF5 file for reading.
+
+    Args:
+        path: The file.
+        options: Of `h5py.File`.
+
+    Raises:
+        InputDataError: If it is no regular file, or no HDF5 file that can be read.
+    """
+    with hdf5_faults(require_regular_file(path)):
+        return h5py.File(path, "r", **options)
+
+
+def own_objects(group: h5py.Group, where: str) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
+    """Yield path and object of all groups and arrays within a group: by name, each once, in front of what it contains.
+
+    Args:
+        group: The group; what it leads to by soft links within the file is not yielded again.
+        where: What the group is called in messages.
+
+    Raises:
+        InputDataError: For a link to another file, a soft link that leads nowhere or in circles, or groups without end.
+    """
+    soft: list[tuple[h5py.Group, str, str]] = []
+    pending: list[tuple[str, Any]] = [("", group)]
+    seen: set[tuple[int, int]] = set()
+    while pending:
+        place, item = pending.pop()
+        info = h5py.h5o.get_info(item.id)
+        if (info.fileno, info.addr) in seen:
+            continue
+        seen.add((info.fileno, info.addr))
+        if place:
+            yield place, item
+        if not isinstance(item, h5py.Group):
+            continue
+        if place.count("/") > MOST_DEEP or len(seen) + len(pending) > MOST_OBJECTS:
+            raise InputDataError(f"{where}/{place[:80]}: groups without end.", f"{MOST_DEEP} groups in each other.")
+        inside: list[tuple[str, Any]] = []
+        for name in sorted(item):
+            path = f"{place}/{name}".lstrip("/")
+            if is_own_link(item, name, f"{where}/{path}"):
+                inside.append((path, item[name]))
+            else:
+                soft.append((item, name, path))
+        pending.extend(entry for entry in reversed(inside) if isinstance(entry[1], h5py.Group | h5py.Dataset))
+    for parent, name, path in soft:  # last, when it is known that no path leads through a link to another file
+        _require_target(parent, name, f"{where}/{path}")
+
+
+def is_own_link(group: h5py.Group, name: str, where: str) -> bool:
+    """Return whether an entry of a group is an object of its own; False for a soft link.
+
+    Args:
+        group: The group.
+        name: Name of the entry.
+        where: What the entry is called in messages.
+
+    Raises:
+        InputDataError: If it is a link to another file.
+    """
+    link = group.get(name, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        raise InputDataError(
+            f"{where}: a link to another file, {link.filename}.",
+            "groups and arrays in the file itself.",
+            "copy what it leads to into the file, or pass the other file.",
+        )
+    return isinstance(link, h5py.HardLink)
+
+
+def _require_target(group: h5py.Group, name: str, where: str) -> None:
+    try:
+        found = group[name]
+    except _ERRORS:
+        found = None
+    if found is None:
+        raise InputDataError(
+            f"{where}: a soft link that leads nowhere or in circles.", "links to what is there.", "remove the link."
+        )
+
+
+def require_stored(item: h5py.Dataset, where: str, files: Collection[str] = (), depth: int = 0) -> None:
+    """Refuse an array whose numbers lie in other files, or that declares numbers which are not stored.
+
+    Args:
+        item: The array.
+        where: What it is called in messages.
+        files: Names of the files that a virtual array may look into, relative to its own; its own is always among them.
+        depth: Number of virtual arrays through which it was reached.
+
+    Raises:
+        InputDataError: If it is such an array.
+    """
+    if item.shape is None:
+        raise InputDataError(f"{where}: an array without a shape.")
+    if item.external:
+        raise InputDataError(f"{where}: its numbers lie in another file, {item.external[0][0]}.", "arrays in the file.")
+    if item.is_virtual:
+        _require_sources(item, where, files, depth)
+        return
+    size = math.prod(item.shape) * item.dtype.itemsize
+    if item.chunks is not None:
+        chunk = math.prod(item.chunks) * item.dtype.itemsize
+        if chunk > MOST_CHUNK_BYTES:
+            raise InputDataError(f"{where}: chunks of {chunk / 2**30:.1f} GiB.", f"{MOST_CHUNK_BYTES / 2**30:g} GiB.")
+    stored = item.id.get_storage_size()
+    whole = stored > 0
+    if whole and size > NEEDS_NO_PROOF_BYTES:
+        if item.chunks is None:
+            whole = stored >= size
+        else:
+            chunks = math.prod(-(-length // part) for length, part in zip(item.shape, item.chunks, strict=True))
+            whole = item.id.get_num_chunks() == chunks
+    if size and not whole:
+        raise InputDataError(
+            f"{where}: declares {item.dtype} {item.shape}, {size / 2**20:.3g} MiB, of which {stored} bytes are stored.",
+            "arrays that are written completely.",
+        )
+
+
+def _require_sources(item: h5py.Dataset, where: str, files: Collection[str], depth: int) -> None:
+    """Refuse a virtual array that looks elsewhere than into the given files, or whose sources do not cover it."""
+    covered = 0
+    if depth > 1:
+        raise InputDataError(f"{where}: a virtual array of virtual arrays.", "arrays in files.")
+    for source in item.virtual_sources():
+        if source.file_name not in (".", *files):
+            raise InputDataError(f"{where}: looks into another file, {source.file_name}.", "the files of the dataset.")
+        taken = source.vspace.get_select_npoints()
+        covered += taken
+        if source.file_name == ".":
+            _require_source(item.file, source.dset_name, taken, where, files, depth)
+        else:
+            path = Path(item.file.filename).resolve().parent / source.file_name
+            with open_hdf5(path) as file:
+                _require_source(file, source.dset_name, taken, where, files, depth)
+    if covered < math.prod(item.shape):
+        raise InputDataError(f"{where}: declares {item.shape}, of which {covered} numbers have a source.")
+
+
+def _require_source(file: h5py.File, name: str, taken: int, where: str, files: Collection[str], depth: int) -> None:
+    """Refuse the source of a virtual array that holds fewer numbers than are taken from it."""
+    place: Any = file
+    for part in name.strip("/").split("/"):
+        if not is_own_link(place, part, f"{where}: its source {name}"):
+            raise InputDataError(f"{where}: its source {name} is a link.")
+        place = place[part]
+    if not isinstance(place, h5py.Dataset) or place.shape is None or place.size < taken:
+        raise InputDataError(f"{where}: its source {name} is no array of {taken} numbers.")
+    require_stored(place, where, files, depth + 1)
