@@ -11,23 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError, did_you_mean
+from ...schemas.regular_files import require_regular_file
 from ..shapes.meshes import mass_properties, read_mesh
 from ..shapes.ply import read_splats
 from .cameras import pose_count
 from .consistency import check_consistency
-from .files import entries_of, files_under, has_folder
+from .files import files_under, has_folder
 from .folder import CaptureFolder
 from .geometry_maps import KINDS, map_names, read_map
 from .images import IMAGE_SUFFIXES, image_size, read_label
-from .video import VideoInfo, frame_files, video_info
+from .video import VIDEO_SUFFIXES, VideoInfo, frame_files, video_info
 
 _UNREAD_IMAGES = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng", ".raw", ".npy")
-_UNREAD_TRACKS = (".csv", ".tsv", ".xls", ".xlsx", ".ods")
-_UNREAD = (
-    ("images", _UNREAD_IMAGES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
-    ("masks", _UNREAD_IMAGES, ".png.", "convert it without loss."),
-    ("videos", (".mov", ".avi", ".mkv", ".m4v"), ".mp4, .webm, or a directory of frames.", "convert it with ffmpeg."),
-)
+_UNREAD = {
+    "tracks": ((".tsv", ".xls", ".xlsx", ".ods"), ".csv.", "convert it, or see 'cgwm import'."),
+    "images": (_UNREAD_IMAGES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
+    "masks": (_UNREAD_IMAGES, ".png.", "convert it without loss."),
+    "videos": ((".mov", ".avi", ".mkv", ".m4v"), ".mp4, .webm, or a directory of frames.", "convert it with ffmpeg."),
+}
+"""Suffixes that are not read, in lower case, by folder; which are, and what to do."""
+_READ = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, ".csv", ".npy")
+"""Suffixes of files whose readers refuse what is no regular file."""
 
 
 @dataclass(kw_only=True)
@@ -66,6 +70,28 @@ class CaptureFacts:
     """What gravity, ground, shapes and motion disagree about, without a fault."""
 
 
+class _Faults:
+    """The faults found so far, each once: a directory that cannot be listed is met by several checks."""
+
+    def __init__(self) -> None:
+        self.found: list[InputDataError] = []
+        self._told: set[str] = set()
+
+    def attempt(self, check: Callable[..., Any], *arguments: object) -> Any:
+        """Return what a check returns; None, and its fault is added, if it refuses."""
+        try:
+            return check(*arguments)
+        except InputDataError as fault:
+            if str(fault) not in self._told:
+                self.found.append(fault)
+            self._told.add(str(fault))
+            return None
+
+    def listed(self, names: Callable[..., list[str]], *arguments: object) -> list[str]:
+        """Return the names that a function returns; none if it refuses."""
+        return self.attempt(names, *arguments) or []
+
+
 def check_capture(capture: CaptureFolder, accept_units: bool = False) -> CaptureFacts:
     """Check a capture and return its facts.
 
@@ -90,26 +116,12 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
     facts = CaptureFacts(
         bodies=capture.body_names, splits={name: len(names) for name, names in capture.manifest.splits.items()}
     )
-    faults: list[InputDataError] = []
-
-    told: set[str] = set()
-
-    def attempt(check: Callable[..., Any], *arguments: object) -> Any:
-        try:
-            return check(*arguments)
-        except InputDataError as fault:
-            if str(fault) not in told:  # a directory that cannot be listed is met by several checks
-                faults.append(fault)
-            told.add(str(fault))
-            return None
-
-    def listed(names: Callable[..., list[str]], *arguments: object) -> list[str]:
-        return attempt(names, *arguments) or []
-
+    faults = _Faults()
+    attempt, listed = faults.attempt, faults.listed
     attempt(_check_names, capture)
     for body in capture.manifest.bodies:
         attempt(_check_shape, capture, body.name)
-    attempt(_check_formats, capture)
+    _check_files(capture, faults)
     sizes: dict[str, tuple[int, int]] = {}
     photos = listed(capture.photos)
     for name in photos:
@@ -132,12 +144,12 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
         attempt(_check_tracks, capture, episode, facts, unturned)
         for camera in listed(capture.videos, episode):
             attempt(_check_video, capture, camera, episode, facts)
-    attempt(_check_consistency, capture, facts, accept_units)
+    faults.attempt(_check_consistency, capture, facts, accept_units)
     if facts.normalised_quaternions:
         facts.warnings.append(f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3).")
     if warning := capture.unturned_warning(unturned):
         facts.warnings.append(warning)
-    return facts, faults
+    return facts, faults.found
 
 
 def _check_consistency(capture: CaptureFolder, facts: CaptureFacts, accept_units: bool) -> None:
@@ -195,17 +207,23 @@ def _listed(names: list[str], noun: str) -> str:
     return f"{shown}, ... ({len(names)} {noun})." if len(names) > 8 else f"{shown}."
 
 
-def _check_formats(capture: CaptureFolder) -> None:
-    """Refuse photos and videos in formats that would be silently ignored."""
-    for path in entries_of(capture.root / "tracks"):
-        if path.suffix != ".csv" and path.suffix.lower() in _UNREAD_TRACKS:
-            raise InputDataError(f"{path}: {path.suffix} is not read.", ".csv.", "rename or convert it.")
-    for folder, unread, allowed, convert in _UNREAD:
-        for name in files_under(capture.root / folder, IMAGE_SUFFIXES):
-            if Path(name).suffix.lower() in unread:
-                raise InputDataError(
-                    f"{capture.root / folder / name}: {Path(name).suffix} is not read.", allowed, convert
-                )
+def _check_files(capture: CaptureFolder, faults: _Faults) -> None:
+    """Refuse what would be silently passed over: files in other formats, and what is no file at all."""
+    for folder in dict.fromkeys((*_UNREAD, "video_masks", *KINDS)):
+        found = [capture.root / folder / name for name in faults.listed(files_under, capture.root / folder)]
+        faults.attempt(_check_formats, folder, found)
+        for path in found:
+            if path.suffix.lower() not in _READ:
+                faults.attempt(require_regular_file, path)
+
+
+def _check_formats(folder: str, found: list[Path]) -> None:
+    """Refuse files in formats that would be silently ignored."""
+    unread, allowed, convert = _UNREAD.get(folder, ((), "", ""))
+    for path in found:
+        suffix = path.suffix.lower()
+        if suffix in unread or (folder == "tracks" and suffix == ".csv" != path.suffix):
+            raise InputDataError(f"{path}: {path.suffix} is not read.", allowed, convert)
 
 
 def _check_shape(capture: CaptureFolder, name: str) -> None:

@@ -69,20 +69,20 @@ def files_under(folder: Path, suffixes: Collection[str] = ()) -> list[str]:
 
     Args:
         folder: The directory, which may be absent.
-        suffixes: Those of the files that are wanted, in lower case. What has such a name is returned whatever it is,
-            for its reader to refuse it by name; anything else must be a file or a directory.
+        suffixes: Those of the files that are wanted, in lower case; a directory with such a name is returned like a
+            file.
 
     Raises:
-        InputDataError: As `entries_of`, and for a link that leads nowhere, a pipe or a device.
+        InputDataError: As `entries_of`. What is no regular file, such as a link that leads nowhere, is returned, for
+            its reader to refuse it by name.
     """
     names: list[str] = []
     places = [(folder, (os.path.realpath(folder),))]
     while places:
         place, within = places.pop()
         for path in entries_of(place):
-            wanted = path.suffix.lower() in suffixes
-            if wanted or not path.is_dir():
-                names.append((path if wanted else require_regular_file(path)).relative_to(folder).as_posix())
+            if path.suffix.lower() in suffixes or not path.is_dir():
+                names.append(path.relative_to(folder).as_posix())
             elif (real := os.path.realpath(path)) not in within:
                 places.append((path, (*within, real)))
         if len(names) > MOST_FILES or len(places) > MOST_FILES:
