@@ -106,6 +106,19 @@ def test_rounding_does_not_last() -> None:
     assert prepared.noise_model == WHITE and prepared.noise == NOISE
 
 
+@pytest.mark.parametrize("body", ["ball", "box"])
+def test_an_orientation_that_never_changes_tells_nothing_of_noise(body: str) -> None:
+    unturned = [
+        (
+            name,
+            {key: replace(track, quat_wxyz=np.tile([1.0, 0, 0, 0], (len(track), 1))) for key, track in own.items()},
+        )
+        for name, own in tosses(world_with(body), 1, count=4, duration_s=0.5)
+    ]
+    prepared = prepare(world_with(body), unturned, NOISE)
+    assert prepared.noise_model == WHITE and prepared.noise == NOISE
+
+
 def test_few_frames_tell_nothing() -> None:
     prepared, _ = ready("ball", {}, lasting(0.9, 3))
     assert estimate_noise_model(prepared.observations, [prepared.flight.items[0]]) == (WHITE, (None, None))  # pyright: ignore

@@ -113,6 +113,48 @@ def test_csv_gaps_bodies_and_splits(tmp_path: Path) -> None:
     assert (len(other["train"]), len(other["test"])) == (3, 2) and other["train"] != splits["train"][:3]
 
 
+@pytest.mark.parametrize("number", ["1_000", "0x10", "1e400", "inf", "١٢", "1.5\0", "9" * 400])
+def test_what_is_no_plain_number_is_refused_with_its_line(number: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"t,x,y,z\n0,1,2,3\n0.1,{number},2,3\n", encoding="utf-8")
+    said = fault(tmp_path, import_csv, tmp_path / "a.csv")
+    assert said.startswith("T/a.csv, line 3: px: '") and said.splitlines()[0].isprintable() and len(said) < 300
+    (tmp_path / "a.txt").write_text(f"0 1 2 3 0 0 0 1\n0.1 {number} 2 3 0 0 0 1\n", encoding="utf-8")
+    assert fault(tmp_path, import_tum, tmp_path / "a.txt").startswith("T/a.txt, line 2: '")
+
+
+@pytest.mark.parametrize("name", ["a b", "../a", "a\x1b[31m", "", "x" * 10 + "/"])
+def test_names_that_no_manifest_takes_are_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"t,body,x,y,z\n0,cube,1,2,3\n0.1,{name},1,2,3\n", encoding="utf-8")
+    assert "T/a.csv, line 3: '" in fault(tmp_path, import_csv, tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_text("t,x,y,z\n0,1,2,3\n0.1,1,2,3\n")
+    assert "--body: '" in fault(tmp_path, import_csv, tmp_path / "b.csv", body=name)
+    (tmp_path / "ball_drops.csv").write_text(f"ball,Drop #,Time (s),Height (m)\nBall,1,0,1\n../{name},1,0,1\n")
+    assert "ball_drops.csv, line 3: '" in fault(tmp_path, import_balldrops, tmp_path)
+
+
+def test_times_and_lengths_beyond_every_unit_are_refused(tmp_path: Path) -> None:
+    for row, unit in (("1e300,1,2,3", "up to 1e+300 s"), ("0.1,1e300,2,3", "up to 1e+300 m"), ("1e-12,1,2,3", "apart")):
+        (tmp_path / "a.csv").write_text(f"t,x,y,z\n0,1,2,3\n{row}\n")
+        assert unit in fault(tmp_path, import_csv, tmp_path / "a.csv", units=Units("m", "s"))
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("gone"), os.mkdir])
+@pytest.mark.parametrize(
+    ("name", "load"),
+    [
+        *(("b.csv", import_csv), ("b.tum", import_tum), ("b.h5", import_hdf5), ("b.bag", import_rosbag)),
+        *(("b.json", import_jugglebot), ("b.npz", import_contactnets), ("0.pt", import_contactnets)),
+    ],
+)
+def test_what_is_no_file_is_not_passed_over(name: str, load, make, tmp_path: Path) -> None:
+    if load is import_rosbag and make is os.mkdir:
+        return  # a bag may be a directory
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.csv").write_text("t,x,y,z\n0,1,2,3\n0.1,1,2,3\n")
+    make(tmp_path / "in" / name)
+    assert f"T/in/{name}: " in fault(tmp_path, load, tmp_path / "in")
+
+
 def test_csv_faults(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
 
@@ -188,7 +230,7 @@ def test_hdf5(tmp_path: Path) -> None:
         file["time"], file["position"] = TIMES, POSITIONS[:, :2]
     assert "/position has the shape (5, 2)" in fault(tmp_path, import_hdf5, tmp_path / "d.h5")
     (tmp_path / "e.h5").write_text("no HDF5")
-    assert "not an HDF5 file" in fault(tmp_path, import_hdf5, tmp_path / "e.h5")
+    assert "not a readable HDF5 file" in fault(tmp_path, import_hdf5, tmp_path / "e.h5")
 
 
 def write_bag(path: Path, topics: dict[str, str]) -> None:

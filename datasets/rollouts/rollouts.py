@@ -266,8 +266,9 @@ def demo_of(file: h5py.File, name: str) -> Node:
     """
     path = Path(file.filename)
     with hdf5_faults(path):
-        demo: Node = file["data"][name]
-        if not isinstance(demo, h5py.Group):
+        data: Node = file["data"]
+        demo: Node = data[name]
+        if not hasattr(demo, "items"):
             raise InputDataError(f"{path}: data/{name}: no rollout.", "groups demo_<index> in data.")
         where, files = f"{path}: data/{name}", _shard_files(path, file[SHARDS]) if SHARDS in file else ()
         for place, item in own_objects(demo, where):
