@@ -6,7 +6,7 @@ A link to another file would make cgwm open any file of this machine, and a few 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -104,14 +104,15 @@ def is_own_link(group: h5py.Group, name: str, where: str) -> bool:
     Raises:
         InputDataError: If it is a link to another file.
     """
-    link = group.get(name, getlink=True)
-    if isinstance(link, h5py.ExternalLink):
+    kind = group.id.links.get_info(name.encode("utf-8", "surrogateescape")).type
+    if kind not in (h5py.h5l.TYPE_HARD, h5py.h5l.TYPE_SOFT):
+        link = group.get(name, getlink=True)
         raise InputDataError(
-            f"{where}: a link to another file, {link.filename}.",
+            f"{where}: a link to another file, {getattr(link, 'filename', '')}.",
             "groups and arrays in the file itself.",
             "copy what it leads to into the file, or pass the other file.",
         )
-    return isinstance(link, h5py.HardLink)
+    return kind == h5py.h5l.TYPE_HARD
 
 
 def _require_target(group: h5py.Group, name: str, where: str) -> None:
@@ -125,13 +126,15 @@ def _require_target(group: h5py.Group, name: str, where: str) -> None:
         )
 
 
-def require_stored(item: h5py.Dataset, where: str, files: Collection[str] = (), depth: int = 0) -> None:
+def require_stored(
+    item: h5py.Dataset, where: str, files: Mapping[str, Callable[[], h5py.File]] | None = None, depth: int = 0
+) -> None:
     """Refuse an array whose numbers lie in other files, or that declares numbers which are not stored.
 
     Args:
         item: The array.
         where: What it is called in messages.
-        files: Names of the files that a virtual array may look into, relative to its own; its own is always among them.
+        files: The other files that a virtual array may look into, by the names that it has for them: each opened.
         depth: Number of virtual arrays through which it was reached.
 
     Raises:
@@ -139,24 +142,26 @@ def require_stored(item: h5py.Dataset, where: str, files: Collection[str] = (), 
     """
     if item.shape is None:
         raise InputDataError(f"{where}: an array without a shape.")
-    if item.external:
+    made = item.id.get_create_plist()
+    if made.get_external_count():
         raise InputDataError(f"{where}: its numbers lie in another file, {item.external[0][0]}.", "arrays in the file.")
-    if item.is_virtual:
-        _require_sources(item, where, files, depth)
+    if made.get_layout() == h5py.h5d.VIRTUAL:
+        _require_sources(item, where, files or {}, depth)
         return
     size = math.prod(item.shape) * item.dtype.itemsize
-    if item.chunks is not None:
-        chunk = math.prod(item.chunks) * item.dtype.itemsize
+    chunks = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else None
+    if chunks is not None:
+        chunk = math.prod(chunks) * item.dtype.itemsize
         if chunk > MOST_CHUNK_BYTES:
             raise InputDataError(f"{where}: chunks of {chunk / 2**30:.1f} GiB.", f"{MOST_CHUNK_BYTES / 2**30:g} GiB.")
     stored = item.id.get_storage_size()
     whole = stored > 0
     if whole and size > NEEDS_NO_PROOF_BYTES:
-        if item.chunks is None:
+        if chunks is None:
             whole = stored >= size
         else:
-            chunks = math.prod(-(-length // part) for length, part in zip(item.shape, item.chunks, strict=True))
-            whole = item.id.get_num_chunks() == chunks
+            count = math.prod(-(-length // part) for length, part in zip(item.shape, chunks, strict=True))
+            whole = item.id.get_num_chunks() == count
     if size and not whole:
         raise InputDataError(
             f"{where}: declares {item.dtype} {item.shape}, {size / 2**20:.3g} MiB, of which {stored} bytes are stored.",
@@ -164,27 +169,27 @@ def require_stored(item: h5py.Dataset, where: str, files: Collection[str] = (), 
         )
 
 
-def _require_sources(item: h5py.Dataset, where: str, files: Collection[str], depth: int) -> None:
+def _require_sources(item: h5py.Dataset, where: str, files: Mapping[str, Callable[[], h5py.File]], depth: int) -> None:
     """Refuse a virtual array that looks elsewhere than into the given files, or whose sources do not cover it."""
     covered = 0
     if depth > 1:
         raise InputDataError(f"{where}: a virtual array of virtual arrays.", "arrays in files.")
     for source in item.virtual_sources():
-        if source.file_name not in (".", *files):
+        if source.file_name != "." and source.file_name not in files:
             raise InputDataError(f"{where}: looks into another file, {source.file_name}.", "the files of the dataset.")
         taken = source.vspace.get_select_npoints()
         covered += taken
         if source.file_name == ".":
             _require_source(item.file, source.dset_name, taken, where, files, depth)
         else:
-            path = Path(item.file.filename).resolve().parent / source.file_name
-            with open_hdf5(path) as file:
-                _require_source(file, source.dset_name, taken, where, files, depth)
+            _require_source(files[source.file_name](), source.dset_name, taken, where, files, depth)
     if covered < math.prod(item.shape):
         raise InputDataError(f"{where}: declares {item.shape}, of which {covered} numbers have a source.")
 
 
-def _require_source(file: h5py.File, name: str, taken: int, where: str, files: Collection[str], depth: int) -> None:
+def _require_source(
+    file: h5py.File, name: str, taken: int, where: str, files: Mapping[str, Callable[[], h5py.File]], depth: int
+) -> None:
     """Refuse the source of a virtual array that holds fewer numbers than are taken from it."""
     place: Any = file
     for part in name.strip("/").split("/"):

@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -270,10 +272,21 @@ def demo_of(file: h5py.File, name: str) -> Node:
         demo: Node = data[name]
         if not hasattr(demo, "items"):
             raise InputDataError(f"{path}: data/{name}: no rollout.", "groups demo_<index> in data.")
-        where, files = f"{path}: data/{name}", _shard_files(path, file[SHARDS]) if SHARDS in file else ()
-        for place, item in own_objects(demo, where):
-            if isinstance(item, h5py.Dataset):
-                require_stored(item, f"{where}/{place}", files)
+        where = f"{path}: data/{name}"
+        with ExitStack() as stack:
+
+            @cache
+            def opened(shard: str) -> h5py.File:
+                return stack.enter_context(open_hdf5(path.resolve().parent / shard))
+
+            shards = _shard_files(path, file[SHARDS]) if SHARDS in file else ()
+            files = {shard: partial(opened, shard) for shard in shards}
+            for place, item in own_objects(demo, where):
+                if isinstance(item, h5py.Dataset):
+                    require_stored(item, f"{where}/{place}", files)
+        frames, count = demo["time"].shape, demo.attrs["num_samples"]
+        if not isinstance(count, int | np.integer) or frames != (count,):
+            raise InputDataError(f"{where}/time: shape {frames}; num_samples says {count!s:.40}.", "as many frames.")
         for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
             size = tuple(int(entry[key][()]) for key in ("height", "width"))
             for kind in ("image", "depth", "mask", "amodal"):
