@@ -144,7 +144,7 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
         attempt(_check_tracks, capture, episode, facts, unturned)
         for camera in listed(capture.videos, episode):
             attempt(_check_video, capture, camera, episode, facts)
-    faults.attempt(_check_consistency, capture, facts, accept_units)
+    attempt(_check_consistency, capture, facts, accept_units)
     if facts.normalised_quaternions:
         facts.warnings.append(f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3).")
     if warning := capture.unturned_warning(unturned):
