@@ -7,6 +7,7 @@ needs 12 ms. So an array is made once, empty, with its attributes, in a file in 
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -14,10 +15,12 @@ import h5py
 import numpy as np
 from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
 
+from .array_entry import ATTRIBUTES, ArrayEntry
+from .array_table import ARRAYS
 from .rollouts import Node
 
 MOST_PROTOTYPES = 2000
-_NAMES = (b"unit", b"frame", b"order", b"shape_meaning", b"description")
+_NAMES = tuple(name.encode() for name in ATTRIBUTES)
 
 
 def new_group(parent: Node, name: str) -> Node:
@@ -25,22 +28,25 @@ def new_group(parent: Node, name: str) -> Node:
     return h5py.Group(h5py.h5g.create(parent.id, name.encode()))
 
 
-def put(
-    group: Node,
-    name: str,
-    data: Any,
-    unit: str,
-    frame: str,
-    order: str,
-    shape: str,
-    text: str,
-    in_chunks: bool = True,
-) -> Any:
-    """Write an array with its description, in one chunk with a checksum or contiguously, and return its DatasetID."""
+def put(group: Node, name: str, data: Any, in_chunks: bool = True, **words: str) -> Any:
+    """Write an array with its description, in one chunk with a checksum or contiguously, and return its DatasetID.
+
+    Args:
+        group: The group that contains it.
+        name: Its documented name, a key of :data:`array_table.ARRAYS`.
+        data: Its numbers.
+        in_chunks: Write one chunk with a checksum.
+        words: The words in braces of its name and description.
+    """
+    return put_entry(group, ARRAYS[name], data, in_chunks, words)
+
+
+def put_entry(group: Node, entry: ArrayEntry, data: Any, in_chunks: bool, words: Mapping[str, str]) -> Any:
+    """Write an array as `put` does, by its documentation."""
     values = np.asarray(data)
-    texts = (unit, frame, order, shape, text)
     properties = checked(values.shape if in_chunks else ())
-    made = new_dataset(group, name, values.dtype, values.shape, properties, *texts)
+    name = entry.last_name.format_map(words)
+    made = new_dataset(group, name, values.dtype, values.shape, properties, *entry.texts(words))
     if values.size:
         made.write(h5py.h5s.ALL, h5py.h5s.ALL, values if values.flags.c_contiguous else values.copy())
     return made

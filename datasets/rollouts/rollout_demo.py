@@ -9,29 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..capture.cameras import Camera
+from .array_table import ARRAYS, JPEG
 from .chunks import CHUNK_FRAMES, JPEG_QUALITY, Compression, chunked
-from .described import new_dataset, new_group, put, write_number, write_text
+from .described import new_dataset, new_group, put, put_entry, write_number, write_text
 from .rollout_tables import link_next_observations, write_tables
 from .rollouts import Node, RolloutLabels, amodal_dtype
-
-_IMAGES = {
-    "image": ("1", "row, column, RGB", "(T, H, W, 3)", "Rendered colour, 0 to 255."),
-    "depth": ("m", "row, column", "(T, H, W)", "Depth along the optical axis of what the mask names; 0 = no surface."),
-    "mask": ("1", "row, column", "(T, H, W)", "Visible instance: 0 = background, k = the k-th body."),
-    "amodal": (
-        "1",
-        "row, column; bit k - 1 of a pixel belongs to the k-th body",
-        "(T, H, W)",
-        "Amodal masks as bits: (pixel >> (k - 1)) & 1 is 1 where the k-th body would be seen if it were alone, hidden "
-        "or not.",
-    ),
-}
-_JPEG = (
-    "1",
-    "bytes of a JPEG file, filled up with zeros",
-    "(T, longest)",
-    "Rendered colour, lossy: decode each row with any JPEG reader (cv2.imdecode), to height x width, RGB.",
-)
 
 
 @dataclass(frozen=True)
@@ -92,8 +74,7 @@ class Demo:
         made: dict[str, Any] = {}
         for key, (dtype, shape) in kinds.items():
             properties = chunked(self._compression, dtype, (chunk_frames_of(count), *shape))
-            unit, order, axes, text = _IMAGES[key]
-            texts = (unit, f"image of camera {name}", order, axes, text)
+            texts = ARRAYS[f"obs/{{camera}}_{key}"].texts({"camera": name})
             made[key] = new_dataset(self._obs, f"{name}_{key}", dtype, (count, *shape), properties, *texts)
         return made
 
@@ -130,30 +111,16 @@ class Demo:
         counts = np.stack([self._counts[name] for name in sorted(self._counts)], axis=2)
         visible, whole = counts
         fraction = np.where(whole > 0, visible / np.maximum(whole, 1), 0.0)
-        axes, cameras = "(T, camera, body)", "cameras in the order of their names"
-        texts = {
-            "visible_px": (visible, "px", f"Pixels of the body in the mask; {cameras}."),
-            "amodal_px": (whole, "px", f"Pixels of the body in the image, hidden ones too; {cameras}."),
-            "visible_fraction": (
-                fraction,
-                "1",
-                f"visible_px over amodal_px: how much of what is in the image is not hidden, 0 where nothing is; "
-                f"{cameras}.",
-            ),
-        }
-        for name, (values, unit, text) in texts.items():
-            put(bodies, name, values, unit, "image", "-", axes, text)
+        for name, values in {"visible_px": visible, "amodal_px": whole, "visible_fraction": fraction}.items():
+            put(bodies, f"bodies/{name}", values)
 
     def _write_jpegs(self, name: str, camera: Camera) -> None:
         files = [data for _, data in sorted(self._jpegs[name].items())]
         rows = np.zeros((len(files), max(map(len, files))), np.uint8)
         for row, data in zip(rows, files, strict=True):
             row[: len(data)] = data
-        unit, order, axes, text = _JPEG
         # not in chunks: a frame is read without its neighbours
-        made = put(
-            self._obs, f"{name}_image", rows, unit, f"image of camera {name}", order, axes, text, in_chunks=False
-        )
+        made = put_entry(self._obs, JPEG, rows, in_chunks=False, words={"camera": name})
         write_text(made, b"encoding", "jpeg")
         for key, value in {"quality": JPEG_QUALITY, "height": camera.height, "width": camera.width}.items():
             write_number(made, key, np.int64(value))

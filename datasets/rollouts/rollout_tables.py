@@ -10,10 +10,9 @@ import numpy as np
 
 from ...schemas import Exposure
 from ..capture.cameras import Camera
+from .array_table import turning
 from .described import new_group, put, write_number, write_text
 from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
-
-TORQUE = "Mean torque on free bodies about the centre of mass since the frame before, from the angular momentum"
 
 
 def write_tables(demo: Node, labels: RolloutLabels) -> Node:
@@ -49,55 +48,40 @@ def _write_timeline(demo: Node, labels: RolloutLabels) -> None:
     count = len(labels.time_s)
     done = np.zeros(count, np.uint8)
     done[-1] = 1
-    state_text = "MuJoCo's state of the attribute model_file (free bodies; velocities linear world, angular body)."
-    put(demo, "time", labels.time_s, "s", "-", "-", "(T,)", "Time since the rollout's start.")
-    put(demo, "states", labels.states, "SI", "world", "time, qpos, qvel; quaternions w x y z", "(T, D)", state_text)
-    put(demo, "actions", labels.actions, "1", "world", "x y z a driven body", "(T, A)", labels.action_meaning)
-    put(demo, "rewards", np.zeros(count), "1", "-", "-", "(T,)", "No task is defined: zero.")
-    put(demo, "dones", done, "1", "-", "-", "(T,)", "1 at the last frame.")
+    put(demo, "time", labels.time_s)
+    put(demo, "states", labels.states)
+    put(demo, "actions", labels.actions, action_meaning=labels.action_meaning)
+    put(demo, "rewards", np.zeros(count))
+    put(demo, "dones", done)
 
 
 def _write_bodies(demo: Node, labels: RolloutLabels) -> None:
     group = new_group(demo, "bodies")
-    names = np.array([name.encode() for name in labels.bodies])
-    motions = np.array([motion.encode() for motion in labels.motions])
-    inertia_text = "About the centre of mass, body axes."
-    put(group, "names", names, "-", "-", "-", "(B,)", "Body k has the value k + 1 in the masks.")
-    put(group, "motions", motions, "-", "-", "-", "(B,)", "free, driven (its track is a command) or fixed.")
-    put(group, "pos", labels.position_m, "m", "world", "x y z", "(T, B, 3)", "Origin of the body frame.")
-    put(group, "quat_wxyz", labels.quat_wxyz, "1", "world", "w x y z", "(T, B, 4)", "Rotation of T_world_body.")
-    put(group, "vel", labels.velocity_m_s, "m/s", "world", "x y z", "(T, B, 3)", "Velocity of the body origin.")
-    put(group, "omega_body", labels.omega_body_rad_s, "rad/s", "body", "x y z", "(T, B, 3)", "Angular velocity.")
-    torque = f"{TORQUE} ({_turning(labels)}); 0 at frame 0 and for other bodies."
-    force = "Mean force of all contacts on the body since the frame before; 0 at frame 0."
-    put(group, "contact_force", labels.contact_force_n, "N", "world", "x y z", "(T, B, 3)", force)
-    put(group, "contact_torque", labels.contact_torque_n_m, "N m", "world", "x y z", "(T, B, 3)", torque)
-    put(group, "mass", labels.mass_kg, "kg", "-", "-", "(B,)", "Mass in this rollout.")
-    put(group, "com", labels.com_m, "m", "body", "x y z", "(B, 3)", "Centre of mass in the body frame.")
-    put(group, "inertia", labels.inertia_kg_m2, "kg m2", "body", "xx yy zz xy xz yz", "(B, 6)", inertia_text)
-    put(group, "gravity", labels.gravity_m_s2, "m/s2", "world", "x y z", "(3,)", "Gravitational acceleration.")
-
-
-def _turning(labels: RolloutLabels) -> str:
-    names = ", ".join(labels.effects or ())
-    return f"contacts, and what the effects {names} add" if names else "contacts alone turn them"
+    put(group, "bodies/names", np.array([name.encode() for name in labels.bodies]))
+    put(group, "bodies/motions", np.array([motion.encode() for motion in labels.motions]))
+    put(group, "bodies/pos", labels.position_m)
+    put(group, "bodies/quat_wxyz", labels.quat_wxyz)
+    put(group, "bodies/vel", labels.velocity_m_s)
+    put(group, "bodies/omega_body", labels.omega_body_rad_s)
+    put(group, "bodies/contact_force", labels.contact_force_n)
+    put(group, "bodies/contact_torque", labels.contact_torque_n_m, turning=turning(labels.effects))
+    put(group, "bodies/mass", labels.mass_kg)
+    put(group, "bodies/com", labels.com_m)
+    put(group, "bodies/inertia", labels.inertia_kg_m2)
+    put(group, "bodies/gravity", labels.gravity_m_s2)
 
 
 def _write_contacts(demo: Node, labels: RolloutLabels) -> None:
     table, group = labels.contacts, new_group(demo, "contacts")
-    impulse = "Impulse on body a since the frame before (frame 0: zero); body b gets its opposite."
-    force = "Mean force on body a since the frame before (frame 0: zero): the impulse over the time between the frames."
-    offsets = "Rows offsets[t]:offsets[t + 1] of the other arrays belong to frame t."
-    mode = "0 = sticking, 1 = sliding (friction at its limit)."
-    put(group, "offsets", table.offsets, "1", "-", "-", "(T + 1,)", offsets)
-    put(group, "body_a", table.body_a, "1", "-", "-", "(N,)", "Index into bodies/names.")
-    put(group, "body_b", table.body_b, "1", "-", "-", "(N,)", "Index into bodies/names; -1 = the ground.")
-    put(group, "pos_world", table.position_m, "m", "world", "x y z", "(N, 3)", "Contact point.")
-    put(group, "normal_world", table.normal, "1", "world", "x y z", "(N, 3)", "Unit normal from b to a.")
-    put(group, "distance", table.distance_m, "m", "-", "-", "(N,)", "Signed distance; negative = penetration.")
-    put(group, "impulse_world", table.impulse_n_s, "N s", "world", "x y z", "(N, 3)", impulse)
-    put(group, "force_world", _forces(table, labels.time_s), "N", "world", "x y z", "(N, 3)", force)
-    put(group, "mode", table.sliding, "1", "-", "-", "(N,)", mode)
+    put(group, "contacts/offsets", table.offsets)
+    put(group, "contacts/body_a", table.body_a)
+    put(group, "contacts/body_b", table.body_b)
+    put(group, "contacts/pos_world", table.position_m)
+    put(group, "contacts/normal_world", table.normal)
+    put(group, "contacts/distance", table.distance_m)
+    put(group, "contacts/impulse_world", table.impulse_n_s)
+    put(group, "contacts/force_world", _forces(table, labels.time_s))
+    put(group, "contacts/mode", table.sliding)
 
 
 def _forces(table: ContactTable, time_s: np.ndarray) -> np.ndarray:
@@ -109,7 +93,7 @@ def _forces(table: ContactTable, time_s: np.ndarray) -> np.ndarray:
 def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> None:
     group = new_group(demo, "parameters")
     for p in parameters:
-        made = put(group, p.name, np.float64(p.value), p.unit, "-", "-", "scalar", "Value used in this rollout.")
+        made = put(group, "parameters/{parameter}", np.float64(p.value), parameter=p.name, unit=p.unit)
         for key, value in (("estimate", p.estimate), ("std_error", p.std_error)):
             if value is not None:
                 write_number(made, key, np.float64(value))
@@ -117,38 +101,31 @@ def _write_parameters(demo: Node, parameters: tuple[RolloutParameter, ...]) -> N
 
 def _write_object_observation(group: Node, labels: RolloutLabels) -> None:
     parts = (labels.position_m, labels.quat_wxyz, labels.velocity_m_s, labels.omega_body_rad_s)
-    values = np.concatenate(parts, axis=-1).reshape(len(labels.time_s), -1)
-    order = "for each body: position, quaternion w x y z, velocity (world), angular velocity (body)"
-    put(group, "object", values, "SI", "world", order, "(T, 13 B)", "State of all bodies, robomimic's low-dim key.")
+    put(group, "obs/object", np.concatenate(parts, axis=-1).reshape(len(labels.time_s), -1))
 
 
 def _write_cameras(demo: Node, cameras: Mapping[str, Camera], exposures: Mapping[str, Exposure]) -> None:
     group = new_group(demo, "cameras")
     for name, camera in cameras.items():
         entry = new_group(group, name)
-        distortion = np.asarray(camera.distortion, float)
-        text = "Camera to world; OpenCV axes (x right, y down, z forward)."
-        put(entry, "K", camera.K, "px", "image", "row", "(3, 3)", "Intrinsics; top-left pixel centre (0.5, 0.5).")
-        put(entry, "dist", distortion, "1", "-", "k1 k2 p1 p2 k3", "(k,)", "OpenCV distortion; empty: none.")
-        put(entry, "T_world_cam", camera.T_world_cam, "m", "world", "row", "(4, 4)", text)
-        put(entry, "width", camera.width, "px", "-", "-", "scalar", "Image width.")
-        put(entry, "height", camera.height, "px", "-", "-", "scalar", "Image height.")
-        exposure = exposures.get(name, Exposure())
-        seen = "What the model shows, 0 to 1, times this, plus offset_rgb, cut off at 0 and 1, is the image."
-        put(entry, "gain_rgb", exposure.gain_rgb, "1", "-", "RGB", "(3,)", f"Exposure and light. {seen}")
-        put(entry, "offset_rgb", exposure.offset_rgb, "1", "-", "RGB", "(3,)", "Exposure: see gain_rgb.")
+        distortion, exposure = np.asarray(camera.distortion, float), exposures.get(name, Exposure())
+        put(entry, "cameras/{camera}/K", camera.K)
+        put(entry, "cameras/{camera}/dist", distortion)
+        put(entry, "cameras/{camera}/T_world_cam", camera.T_world_cam)
+        put(entry, "cameras/{camera}/width", camera.width)
+        put(entry, "cameras/{camera}/height", camera.height)
+        put(entry, "cameras/{camera}/gain_rgb", exposure.gain_rgb)
+        put(entry, "cameras/{camera}/offset_rgb", exposure.offset_rgb)
         write_text(entry.id, b"camera_model", "OPENCV" if distortion.any() else "PINHOLE")
 
 
 def _write_light(demo: Node, labels: RolloutLabels) -> None:
     """The rollout's light; its gain is part of every camera's `gain_rgb`."""
     group = new_group(demo, "light")
-    gain = np.ones(3) if labels.light_gain_rgb is None else labels.light_gain_rgb
-    put(group, "gain_rgb", gain, "1", "-", "RGB", "(3,)", "Brightness relative to the photos; in the cameras' gain.")
+    put(group, "light/gain_rgb", np.ones(3) if labels.light_gain_rgb is None else labels.light_gain_rgb)
     if labels.light is not None:
-        text = "Direction to the lamp times its brightness relative to the room's mean; shades the moving bodies."
-        put(group, "lamp", labels.light.lamp, "1", "world", "x y z", "(3,)", text)
-        put(group, "sky", labels.light.sky, "1", "world", "-", "scalar", "Brightness from above against the side.")
+        put(group, "light/lamp", labels.light.lamp)
+        put(group, "light/sky", labels.light.sky)
 
 
 def link_next_observations(demo: Node, observations: Node) -> None:
