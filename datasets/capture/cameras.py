@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, PosedVideo, did_you_mean, read_json
+from .camera_faults import ROTATION_TOLERANCE, pose_fault
 from .colmap_model import find_colmap_model, read_colmap_model
 from .files import optional_file
 from .transforms import read_transforms
 
 Array = NDArray[np.float64]
-
-_ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +149,15 @@ def read_cameras(root: Path | str, metric: bool = False) -> CamerasFile | None:
         path, cameras = model, read_colmap_model(model, metric)
     else:
         return None
+    return require_rigid(path, cameras)
+
+
+def require_rigid(path: Path, cameras: CamerasFile) -> CamerasFile:
+    """Return the cameras of a file.
+
+    Raises:
+        InputDataError: If a pose is not a rotation and a translation.
+    """
     for name, image in cameras.images.items():
         _check_rigid(f"{path}: image '{name}'", np.array(image.T_world_cam))
     for name, video in cameras.videos.items():
@@ -258,16 +266,10 @@ def _pose_at(name: str, poses: Array, frame: int | None) -> Array:
 
 
 def _check_rigid(where: str, pose: Array) -> None:
-    rotation = pose[:3, :3]
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    todo = "write the pose camera to world, 4x4, without scaling."
-    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        fault = f"R R^T differs from 1 by {off:.2g}" if off > _ROTATION_TOLERANCE else "it mirrors (determinant -1)"
-        raise InputDataError(
-            f"{where}: the pose is no rotation and translation: {fault}.", f"within {_ROTATION_TOLERANCE:g}.", todo
-        )
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-9:
-        raise InputDataError(f"{where}: the pose's last row is {pose[3].tolist()}.", "0, 0, 0, 1.", todo)
+    fault = pose_fault(pose)
+    if fault is not None:
+        allowed = f"a rotation within {ROTATION_TOLERANCE:g} and a translation, last row 0, 0, 0, 1."
+        raise InputDataError(f"{where}: {fault}.", allowed, "write the pose camera to world, 4x4, without scaling.")
 
 
 def require_metric(cameras: CamerasFile) -> None:

@@ -46,7 +46,7 @@ def write_nerfstudio(
     Raises:
         UsageError: If there is no such rollout.
     """
-    number = _place(chosen, rollout)
+    number = place_of(chosen, rollout)
     time_s = chosen.reader.read(number, "time")
     frames: list[dict[str, Any]] = []
     dropped = 0
@@ -68,7 +68,12 @@ def write_nerfstudio(
     return {**counts, "duration_s": float(time_s[-1]), "pixels_beyond_65_m": dropped, "mask_path": mask}
 
 
-def _place(chosen: Selection, rollout: int) -> int:
+def place_of(chosen: Selection, rollout: int) -> int:
+    """Return the place of a rollout, by its global index, in a selection.
+
+    Raises:
+        UsageError: If there is no such rollout.
+    """
     indices = [info.index for info in chosen.reader.rollouts]
     if rollout not in indices:
         raise UsageError(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ...schemas import BodyModel, CamerasFile, FitFile, InputDataError, ModelFile, read_json
+from ..capture.cameras import require_rigid
 from ..capture.tracks import Track, read_tracks, write_tracks
 from ..io.atomic import new_directory
 from ..io.kinds import refuse_other_kind
@@ -82,7 +83,9 @@ def read_model(path: Path | str) -> Model:
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
     pictures = {name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()}
-    cameras = read_json(root / CAMERAS, CamerasFile) if (root / CAMERAS).is_file() else None
+    cameras = None
+    if (root / CAMERAS).is_file():
+        cameras = require_rigid(root / CAMERAS, read_json(root / CAMERAS, CamerasFile))
     names = [body.name for body in file.bodies]
     tracks = {path.stem: read_tracks(path, names)[0] for path in sorted((root / POSE_TRACKS).glob("*.csv"))}
     return Model(

@@ -148,13 +148,23 @@ def jpeg_of(image: np.ndarray) -> np.ndarray:
     return data.reshape(-1)
 
 
-def image_of(data: np.ndarray) -> np.ndarray:
+def image_of(data: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return the image, uint8 RGB (H, W, 3), of a JPEG file, uint8 (n,); bytes after its end do not count.
 
+    Args:
+        data: The bytes of the file.
+        size: Height and width [px] that it has to have; None: any.
+
     Raises:
-        InputDataError: If it is none.
+        InputDataError: If it is none, or of another size.
     """
     image = cv2.imdecode(np.ascontiguousarray(data), cv2.IMREAD_COLOR)
     if image is None:
         raise InputDataError("an image of the dataset is no JPEG: the file is damaged.", todo="run 'cgwm validate'.")
+    if size is not None and image.shape[:2] != size:
+        raise InputDataError(
+            f"an image of the dataset is {image.shape[1]} x {image.shape[0]} px.",
+            f"{size[1]} x {size[0]} px, as its attributes say.",
+            "run 'cgwm validate'.",
+        )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -150,7 +150,8 @@ class RolloutReader:
             ) from None
         with hdf5_faults(self.rollouts[number].file):
             if data.attrs.get("encoding") == "jpeg":
-                return np.stack([image_of(row) for row in data[start:stop]])
+                size = int(data.attrs["height"]), int(data.attrs["width"])
+                return np.stack([image_of(row, size) for row in data[start:stop]])
             return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:

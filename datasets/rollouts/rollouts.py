@@ -32,7 +32,6 @@ SHARDS = "shards"
 
 SHARD = re.compile(r"rollouts-(\d{4,})-of-(\d{4,})\.h5")
 """Name of the file of a shard."""
-_DEMO = re.compile(r"demo_[0-9]{1,18}")
 
 VALID_EVERY = 5
 """Every n-th rollout (by global index, the last of each group) belongs to `mask/valid`, the others to `mask/train`."""
@@ -173,6 +172,8 @@ class FrameBlock:
         return {"image": self.image, "depth": self.depth, "mask": self.mask, "amodal": self.amodal}
 
 
+DEMO = re.compile(r"demo_(0|[1-9][0-9]{0,17})")
+"""Name of a rollout's group, with its global index."""
 MOST_BODIES = 64
 """Maximum number of bodies, because an amodal mask has a bit for each."""
 
@@ -254,7 +255,7 @@ def demo_names(file: h5py.File) -> list[str]:
         data: Node = file["data"]
         for name in data:
             where = f"{path}: data/{name!a:.80}"
-            if not _DEMO.fullmatch(name) or not is_own_link(data, name, where):
+            if not DEMO.fullmatch(name) or not is_own_link(data, name, where):
                 raise InputDataError(f"{where}: no rollout.", "groups demo_<index> in data.")
         return sorted(data, key=lambda name: int(name.removeprefix("demo_")))
 
@@ -263,8 +264,21 @@ def demo_of(file: h5py.File, name: str) -> Node:
     """Return the group of a rollout of a shard or of an index, after a look at what it declares.
 
     Raises:
-        InputDataError: If it refers to files that are no shards of the dataset, declares numbers that are not stored,
-            or images of another size than that of their camera; or if it is damaged.
+        InputDataError: As :func:`stored_demo`, or if it has another number of frames than it says, or images of another
+            size than that of their camera.
+    """
+    demo, path = stored_demo(file, name), Path(file.filename)
+    with hdf5_faults(path):
+        _require_sizes(demo, f"{path}: data/{name}")
+    return demo
+
+
+def stored_demo(file: h5py.File, name: str) -> Node:
+    """Return the group of a rollout of a shard or of an index, of which all numbers are stored there.
+
+    Raises:
+        InputDataError: If it refers to files that are no shards of the dataset, or declares numbers that are not
+            stored; or if it is damaged.
     """
     path = Path(file.filename)
     with hdf5_faults(path):
@@ -284,16 +298,19 @@ def demo_of(file: h5py.File, name: str) -> Node:
             for place, item in own_objects(demo, where):
                 if isinstance(item, h5py.Dataset):
                     require_stored(item, f"{where}/{place}", files)
-        frames, count = demo["time"].shape, demo.attrs["num_samples"]
-        if not isinstance(count, int | np.integer) or frames != (count,):
-            raise InputDataError(f"{where}/time: shape {frames}; num_samples says {count!s:.40}.", "as many frames.")
-        for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
-            size = tuple(int(entry[key][()]) for key in ("height", "width"))
-            for kind in ("image", "depth", "mask", "amodal"):
-                item = demo.get(f"obs/{camera}_{kind}")
-                if item is not None and item.attrs.get("encoding") != "jpeg" and item.shape[1:3] != size:
-                    raise InputDataError(
-                        f"{where}/obs/{camera}_{kind}: images of {item.shape[1:3]} px; its camera says {size}.",
-                        "images of the size of their camera.",
-                    )
         return demo
+
+
+def _require_sizes(demo: Node, where: str) -> None:
+    frames, count = demo["time"].shape, demo.attrs["num_samples"]
+    if not isinstance(count, int | np.integer) or frames != (count,):
+        raise InputDataError(f"{where}/time: shape {frames}; num_samples says {count!s:.40}.", "as many frames.")
+    for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
+        size = tuple(int(entry[key][()]) for key in ("height", "width"))
+        for kind in ("image", "depth", "mask", "amodal"):
+            item = demo.get(f"obs/{camera}_{kind}")
+            if item is not None and item.attrs.get("encoding") != "jpeg" and item.shape[1:3] != size:
+                raise InputDataError(
+                    f"{where}/obs/{camera}_{kind}: images of {item.shape[1:3]} px; its camera says {size}.",
+                    "images of the size of their camera.",
+                )

@@ -16,7 +16,7 @@ from ...datasets.exports.bop_models import ObjectModel
 from ...datasets.exports.colmap import write_colmap
 from ...datasets.exports.glb import write_glb
 from ...datasets.exports.lerobot import write_lerobot
-from ...datasets.exports.nerfstudio import MaskUse, write_nerfstudio
+from ...datasets.exports.nerfstudio import MaskUse, place_of, write_nerfstudio
 from ...datasets.exports.selection import Selection
 from ...datasets.exports.splat_files import in_world, write_splat_files
 from ...datasets.io.atomic import new_file
@@ -25,6 +25,7 @@ from ...datasets.io.outputs import DirectoryKind, FileKind, reads, refuse_output
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
+from .soundness import require_sound, require_sound_files
 
 DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio")
 MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "ply", "colmap", "glb")
@@ -136,21 +137,31 @@ def _refuse_kind(thing: Path, format_: ExportFormat) -> None:
 
 
 def _lerobot(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
-    chosen = Selection(thing, options.split, options.cameras, options.every)
+    chosen = _selected(thing, options)
+    folder = thing / chosen.manifest.model
+    require_sound(chosen, read_model(folder) if folder.exists() else None)
     return write_lerobot(out, chosen, options.task, overwrite), [*chosen.notes, *LEROBOT_NOTES]
 
 
 def _bop(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
-    chosen = Selection(thing, options.split, options.cameras, options.every)
+    chosen = _selected(thing, options)
     model = read_model(thing / chosen.manifest.model)
+    require_sound(chosen, model)
     meshes = {name: object_model(model, name) for name in chosen.bodies()}
     counts, notes = write_bop(out, chosen, meshes, overwrite)
     return {**counts}, [*chosen.notes, BOP_NOTE, *notes]
 
 
 def _nerfstudio(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
-    chosen = Selection(thing, None, options.cameras, options.every)
+    chosen = _selected(thing, options)
+    require_sound(chosen, read_model(thing / chosen.manifest.model), [place_of(chosen, options.rollout)])
     return write_nerfstudio(out, chosen, options.rollout, options.mask, overwrite), [*chosen.notes, NERFSTUDIO_NOTE]
+
+
+def _selected(thing: Path, options: ExportOptions) -> Selection:
+    """Return what is exported of a dataset whose files can be listed."""
+    require_sound_files(thing)
+    return Selection(thing, options.split, options.cameras, options.every)
 
 
 def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from ...datasets.io.hdf5_files import hdf5_faults
 from ...datasets.io.progress import progress
 from ...datasets.models.model import Model, read_model
-from ...datasets.rollouts.dataset import check_hashes, read_manifest
-from ...datasets.rollouts.rollouts import Node, demo_names, demo_of, open_shard
+from ...datasets.rollouts.dataset import check_hashes, read_manifest, settings_text
+from ...datasets.rollouts.rollouts import Node, demo_names, open_shard, stored_demo
+from ...datasets.rollouts.shards import ranges, shard_range
 from ...schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
 from .faults import Fault
 from .newton import MotionFindings, check_motion, motion_facts
 from .reprojection import PictureFindings, check_pictures, picture_facts
+from .rollout import Dataset, Rollout
+from .structure import check_file, check_structure, has_usable_contacts, listing_fault
 
-QUATERNION_TOLERANCE = 1e-6
-"""Largest difference of the norm of a quaternion or normal from 1."""
 SHOWN_FAULTS = 20
 """Maximum number of faults listed in the report."""
 
@@ -47,12 +46,24 @@ class _Findings:
     """Results of the comparison of poses with pictures."""
     units: dict[str, str] = field(default_factory=dict)
     """Units of the arrays, by name."""
+    undocumented: set[str] = field(default_factory=set)
+    """Names of arrays that are not documented, and not checked."""
 
     def add(self, shard: str, demo: str, fault: Fault) -> None:
         """Record a fault of a rollout."""
         failure = fault.at(shard, demo)
         self.failures.append(failure)
         self.faults.append(failure.text)
+
+    def record(self, rollout: Rollout) -> None:
+        """Record what a rollout contains."""
+        self.contacts += len(rollout.values["contacts/body_a"])
+        norms = np.linalg.norm(rollout.values["bodies/quat_wxyz"], axis=-1)
+        self.quaternion_error = max(self.quaternion_error, float(np.abs(norms - 1).max()))
+        self.undocumented |= set(rollout.undocumented)
+        for name in sorted(rollout.values):
+            if not name.startswith(("parameters/", "cameras/", "obs/")):
+                self.units[name] = str(rollout.group[name].attrs.get("unit", ""))
 
 
 def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0) -> ValidationReport:
@@ -72,7 +83,7 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
     manifest = read_manifest(root)
     chosen = None if sample is None else _sample(manifest.shards, sample, seed)
     findings = _Findings(faults=check_hashes(root, manifest, None if chosen is None else set(chosen)))
-    model = _model(root, manifest, findings)
+    dataset = Dataset(manifest=manifest, model=_model(root, manifest, findings))
     shards = [shard for shard in manifest.shards if chosen is None or shard.file in chosen]
     for shard in progress(shards, "shards"):
         file = root / shard.file
@@ -80,7 +91,7 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
             continue  # reported by check_hashes
         try:
             with open_shard(file) as handle, hdf5_faults(file):
-                _check_shard(handle, shard, model, findings, None if chosen is None else chosen[shard.file])
+                _check_shard(handle, shard, dataset, findings, None if chosen is None else chosen[shard.file])
         except InputDataError as error:
             findings.faults.append(f"{shard.file}: {error.found}")
     facts = _facts(manifest, findings)
@@ -136,6 +147,7 @@ def _facts(manifest: DatasetManifest, findings: _Findings) -> dict[str, Any]:
         "rejected_draws": _rejected(manifest),
         "units": findings.units,
         "notes": list(manifest.notes),
+        **({"arrays_not_documented": sorted(findings.undocumented)} if findings.undocumented else {}),
     }
 
 
@@ -148,154 +160,74 @@ def _rejected(manifest: DatasetManifest) -> dict[str, int]:
 
 
 def _check_shard(
-    file: Node, shard: ShardEntry, model: Model | None, findings: _Findings, places: list[int] | None
+    file: Node, shard: ShardEntry, dataset: Dataset, findings: _Findings, places: list[int] | None
 ) -> None:
-    names = demo_names(file)
+    fault = listing_fault(file)
+    if fault is not None:
+        findings.faults.append(f"{shard.file}: {fault}")
+        return
+    names, manifest = demo_names(file), dataset.manifest
     if len(names) != shard.rollouts:
         findings.faults.append(f"{shard.file}: {len(names)} rollouts; dataset.json says {shard.rollouts}.")
-    total = sum(int(file["data"][name].attrs["num_samples"]) for name in names)
-    if total != int(file["data"].attrs["total"]):
-        listed = file["data"].attrs["total"]
-        findings.faults.append(f"{shard.file}: data/@total is {listed}; the demos sum up to {total}.")
+    wanted = shard_range(manifest.rollouts, manifest.shard_count, shard.index)
+    strange = [name for name in names if int(name.removeprefix("demo_")) not in wanted]
+    if strange:
+        findings.faults.append(f"{shard.file}: holds {strange[0]}; its number stands for {ranges(wanted)}.")
+    if file.attrs.get("config_json") != settings_text(manifest):
+        findings.faults.append(f"{shard.file}: its attribute config_json differs from the settings in dataset.json.")
+    findings.faults += [f"{shard.file}: {text}" for text in check_file(file)]
     chosen = names if places is None else [names[place] for place in sorted(places) if place < len(names)]
     for name in progress(chosen, shard.file, len(chosen), "rollout"):
         try:
-            for fault in _check_demo(demo_of(file, name), model, findings):
+            for fault in _check_demo(stored_demo(file, name), name, dataset, findings):
                 findings.add(shard.file, name, fault)
         except InputDataError as error:
             findings.add(shard.file, name, Fault(check="schema", text=error.found))
-        except KeyError as error:
-            text = f"an array or attribute is missing: {error.args[0]}."
-            findings.add(shard.file, name, Fault(check="schema", text=text))
         except OSError as error:
             text = f"a block cannot be read: {str(error).splitlines()[0]}."
             findings.add(shard.file, name, Fault(check="readable", text=text))
+        except InputDataError as error:  # of the model's effects with the values of this rollout
+            findings.add(shard.file, name, Fault(check="effects", text=error.found))
 
 
-def _check_demo(demo: Node, model: Model | None, findings: _Findings) -> Iterator[Fault]:
+def _check_demo(demo: Node, name: str, dataset: Dataset, findings: _Findings) -> Iterator[Fault]:
     findings.rollouts += 1
-    count = int(demo.attrs["num_samples"])
-    wrong = [name for name in ("params_json", "effects_json") if not _is_json_object(str(demo.attrs[name]))]
-    if wrong:
-        yield Fault(check="schema", text=f"the attribute {wrong[0]} is no JSON object; the rollout is not checked.")
+    rollout, faults = check_structure(demo, name, dataset)
+    yield from faults
+    if rollout is None:
         return
-    yield from _check_arrays(demo, count, findings)
-    time = demo["time"][()]
-    if not (np.diff(time) > 0).all():
-        frame = int(np.argmin(np.diff(time) > 0)) + 1
-        yield Fault(check="time", text=f"time: not increasing at frame {frame}.", frame=frame, value=float(time[frame]))
+    findings.record(rollout)
+    if any(fault.check == "time" for fault in faults):
         return
-    yield from _check_states(demo, findings)
-    yield from _check_parameters(demo, model)
-    yield from _check_contacts(demo, count, model, findings)
-    if model is not None and "cameras" in demo:
-        yield from check_pictures(demo, model, count, findings.pictures)
+    yield from _check_parameters(rollout)
+    if has_usable_contacts(rollout):
+        yield from _check_pulls(rollout)
+        yield from check_motion(rollout, findings.motion)
+    crooked = {fault.camera for fault in faults if fault.check == "cameras"}
+    if dataset.model is not None:
+        cameras = [camera for camera in rollout.cameras if camera not in crooked]
+        yield from check_pictures(rollout, dataset.model, cameras, findings.pictures)
 
 
-def _is_json_object(text: str) -> bool:
-    try:
-        return isinstance(json.loads(text), dict)
-    except (ValueError, RecursionError):
-        return False
-
-
-def _check_states(demo: Node, findings: _Findings) -> Iterator[Fault]:
-    """Check that quaternions have length 1 and that robomimic's low-dimensional state equals that of the bodies."""
-    norms = np.linalg.norm(demo["bodies/quat_wxyz"][()], axis=-1)
-    errors = np.abs(norms - 1).max(axis=1)
-    error = float(errors.max())
-    findings.quaternion_error = max(findings.quaternion_error, error)
-    if not error <= QUATERNION_TOLERANCE:
-        frame = int(errors.argmax())
-        text = f"bodies/quat_wxyz: frame {frame}: a norm differs from 1 by {error:.2g}; "
-        text += f"{QUATERNION_TOLERANCE:g} is allowed."
-        yield Fault(check="quaternions", text=text, frame=frame, value=error, limit=QUATERNION_TOLERANCE)
-    parts = [demo[f"bodies/{key}"][()] for key in ("pos", "quat_wxyz", "vel", "omega_body")]
-    expected = np.concatenate(parts, axis=-1).reshape(len(norms), -1)
-    found = demo["obs/object"][()]
-    if found.shape != expected.shape or not np.array_equal(found, expected, equal_nan=True):
-        yield Fault(check="schema", text="obs/object: differs from the bodies' poses and velocities.")
-
-
-def _check_arrays(demo: Node, count: int, findings: _Findings) -> Iterator[Fault]:
-    """Check that every array has its unit, the right number of frames, and finite numbers."""
-    arrays: dict[str, h5py.Dataset] = {}
-
-    def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset) and not name.startswith("next_obs/"):
-            arrays[name] = item
-
-    demo.visititems(visit)
-    for name, item in arrays.items():
-        lacking = [key for key in ("unit", "frame", "order", "shape_meaning", "description") if key not in item.attrs]
-        if lacking:
-            yield Fault(check="schema", text=f"{name}: has no attribute {', '.join(lacking)}.")
-            continue
-        if not name.startswith(("parameters/", "cameras/", "obs/")):
-            findings.units[name] = str(item.attrs["unit"])
-        if str(item.attrs["shape_meaning"]).startswith("(T,") and item.shape[0] != count:
-            yield Fault(check="schema", text=f"{name}: {item.shape[0]} frames; num_samples says {count}.")
-        if item.dtype.kind == "f" and item.size and not _finite(item):
-            yield Fault(check="finite", text=f"{name}: contains numbers that are not finite.")
-    for name in json.loads(str(demo.attrs["params_json"])):
-        if f"parameters/{name}" not in arrays:
-            yield Fault(check="schema", text=f"params_json names '{name}', which is not in parameters/.")
-
-
-def _finite(item: h5py.Dataset) -> bool:
-    if item.chunks is None:
-        return bool(np.isfinite(item[()]).all())
-    return all(bool(np.isfinite(item[rows]).all()) for rows in item.iter_chunks())
-
-
-def _check_parameters(demo: Node, model: Model | None) -> Iterator[Fault]:
+def _check_parameters(rollout: Rollout) -> Iterator[Fault]:
     """Check that physical parameters lie within the bounds of the model."""
+    model, values = rollout.dataset.model, rollout.attributes.parameters
     for listed in model.file.parameters if model is not None else ():
-        if listed.bounds is None or listed.name not in demo["parameters"]:
+        if listed.bounds is None or listed.name not in values:
             continue
-        value, (low, high) = float(demo["parameters"][listed.name][()]), listed.bounds
+        value, (low, high) = float(rollout.values[f"parameters/{listed.name}"]), listed.bounds
         if not low <= value <= high:
             text = f"parameters/{listed.name}: {value:g} {listed.unit}; {low:g} to {high:g} is allowed."
             yield Fault(check="parameters", text=text, value=value, limit=low if value < low else high)
 
 
-def _check_contacts(demo: Node, count: int, model: Model | None, findings: _Findings) -> Iterator[Fault]:
-    contacts: dict[str, np.ndarray] = {name: item[()] for name, item in demo["contacts"].items()}
-    offsets = contacts["offsets"]
-    rows = len(contacts["body_a"])
-    findings.contacts += rows
-    if len(offsets) != count + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
-        yield Fault(
-            check="contacts", text=f"contacts/offsets: they do not divide {rows} contacts among {count} frames."
-        )
-        return
-    bodies = len(demo["bodies/names"])
-    indices = np.concatenate([contacts["body_a"], contacts["body_b"]])
-    if rows and (indices.min() < -1 or indices.max() >= bodies or contacts["body_a"].min() < 0):
-        text = f"contacts: body indices outside 0 to {bodies - 1} (-1 = ground, only as body_b)."
-        yield Fault(check="contacts", text=text)
-        return
-    yield from _check_normals(contacts)
-    yield from _check_pulls(demo, contacts)
-    yield from check_motion(demo, contacts, model, findings.motion)
-
-
-def _check_normals(contacts: dict[str, np.ndarray]) -> Iterator[Fault]:
-    """Check that the normals of contacts have length 1."""
-    errors = np.abs(np.linalg.norm(contacts["normal_world"], axis=-1) - 1)
-    if len(contacts["body_a"]) and not errors.max() <= QUATERNION_TOLERANCE:
-        row = int(errors.argmax())
-        frame = int(np.searchsorted(contacts["offsets"], row, side="right")) - 1
-        text = f"contacts/normal_world: frame {frame}, row {row}: the length differs from 1 by {errors[row]:.2g}."
-        yield Fault(check="contacts", text=text, frame=frame, value=float(errors[row]), limit=QUATERNION_TOLERANCE)
-
-
-def _check_pulls(demo: Node, contacts: dict[str, np.ndarray]) -> Iterator[Fault]:
+def _check_pulls(rollout: Rollout) -> Iterator[Fault]:
     """Check that contacts do not pull; effects may add forces that do."""
+    contacts = rollout.part("contacts")
     rows = len(contacts["body_a"])
     pulls = (contacts["impulse_world"] * contacts["normal_world"]).sum(-1)
     scale = float(np.abs(contacts["impulse_world"]).max()) if rows else 0.0
-    if rows and pulls.min() < -1e-6 * scale and not json.loads(str(demo.attrs["effects_json"])):
+    if rows and pulls.min() < -1e-6 * scale and not rollout.attributes.effects:
         row = int(pulls.argmin())
         frame = int(np.searchsorted(contacts["offsets"], row, side="right")) - 1
         text = f"contacts/impulse_world: frame {frame}: a contact pulls by {-pulls.min():.2g} N s; contacts only push."

@@ -6,7 +6,6 @@ the labelled states, and integrated from frame to frame by the trapezoidal rule.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,9 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...datasets.models.effect_files import packed_name
 from ...datasets.models.model import Model
-from ...datasets.rollouts.rollouts import Node
 from ...schemas import EffectModel
 from ..geometry.viewpoint import rotation_matrix
 from ..physics.effects import load_effect
@@ -25,6 +22,7 @@ from ..physics.net_contact_wrench import contact_torque_n_m
 from ..physics.rollout import Engine
 from ..physics.world import State, World
 from .faults import Fault
+from .rollout import Rollout
 
 IMPULSE_TOLERANCE = 1e-6
 """Largest difference between a change of momentum and the impulses, as a fraction of the largest change; it allows for
@@ -72,30 +70,20 @@ class _Body:
     """Torque by effects [N m], shape (T, 3)."""
 
 
-def check_motion(
-    demo: Node, contacts: dict[str, np.ndarray], model: Model | None, findings: MotionFindings
-) -> Iterator[Fault]:
+def check_motion(rollout: Rollout, findings: MotionFindings) -> Iterator[Fault]:
     """Compare the changes of momentum and of angular momentum of every free body with its contacts.
 
     Args:
-        demo: The rollout.
-        contacts: The arrays of its contacts, with checked offsets and bodies.
-        model: The dataset's model, for the formulas of its effects; without it, rollouts with effects are skipped.
+        rollout: The rollout, with contacts at existing frames and bodies. The formulas of its effects are those of its
+            dataset's model; without it, rollouts with effects are skipped.
         findings: The results so far, which are extended.
     """
-    effects: dict[str, dict[str, float]] = json.loads(str(demo.attrs["effects_json"]))
-    named = set() if model is None else {packed_name(effect.name) for effect in model.file.effects}
-    foreign = sorted(set(effects) - named)
-    if model is not None and foreign:
-        text = f"its effects {', '.join(foreign)} are not among those of the dataset's model."
-        yield Fault(check="effects", text=text)
-        return
+    model, effects = rollout.dataset.model, rollout.attributes.effects
     custom = {name for name in effects if name.partition("@")[0] not in BUILT_IN}
     if custom or (effects and model is None):
         findings.unchecked_effects |= custom
         return
-    read: dict[str, np.ndarray] = {name: item[()] for name, item in demo["bodies"].items()}
-    time = demo["time"][()]
+    read, contacts, time = rollout.part("bodies"), rollout.part("contacts"), rollout.values["time"]
     frame = np.repeat(np.arange(len(time)), np.diff(contacts["offsets"]))
     turned = any(load_effect(name).has("contact") for name in effects)
     yield from _check_forces(contacts, read, time, frame)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
-from ...datasets.rollouts.loader import camera_of
 from ...datasets.rollouts.rollouts import Node
 from ..geometry.viewpoint import rotation_matrix
 from .faults import Fault
+from .rollout import Rollout
 
 SPHERE_RADIUS = 1.177
 """Radius at which a single opaque sphere transmits half of the light, in units of its scale s: sqrt(2 ln 2)."""
@@ -87,28 +87,37 @@ class _Picture:
         return Fault(check=check, text=text, frame=self.frame, camera=self.camera, body=body, value=value, limit=limit)
 
 
-def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindings) -> Iterator[Fault]:
-    """Compare every body in every picture of a rollout with its pose."""
-    names = [name.decode() for name in demo["bodies/names"][()]]
-    position, quat = demo["bodies/pos"][()], demo["bodies/quat_wxyz"][()]
-    for number, camera_name in enumerate(sorted(demo["cameras"])):
-        camera = camera_of(demo[f"cameras/{camera_name}"])
-        findings.frames += count
-        sets = [demo[f"obs/{camera_name}_{key}"] for key in ("mask", "depth")]
-        size = (camera.height, camera.width)
-        if any(item.shape[1:] != size for item in sets):
-            yield Fault(
-                check="shape", text=f"obs/{camera_name}_mask: shape {sets[0].shape[1:]}; the camera has {size}."
-            )
+def check_pictures(
+    rollout: Rollout,
+    model: Model,
+    cameras: Collection[str],
+    findings: PictureFindings,
+    frames: Collection[int] | None = None,
+) -> Iterator[Fault]:
+    """Compare every body in pictures of a rollout with its pose.
+
+    Args:
+        rollout: The rollout.
+        model: The dataset's model, with the spheres of the bodies.
+        cameras: Names of the cameras whose pictures are compared; their poses and intrinsics are those of cameras.
+        findings: The results so far, which are extended.
+        frames: Frames that are compared; None: all.
+    """
+    names, group = list(rollout.bodies), rollout.group
+    position, quat = rollout.values["bodies/pos"], rollout.values["bodies/quat_wxyz"]
+    chosen = range(rollout.attributes.frames) if frames is None else sorted(frames)
+    for number, camera_name in enumerate(rollout.cameras):
+        if camera_name not in cameras:
             continue
-        sets.append(demo[f"obs/{camera_name}_amodal"])
-        counts = {key: demo[f"bodies/{key}"][:, number] for key in ("visible_px", "amodal_px", "visible_fraction")}
-        for picture in _pictures(sets, camera_name, count, len(names)):
-            highest, frame = picture.mask.max(initial=0), picture.frame
-            if highest > len(names):
-                text = f"obs/{camera_name}_mask, frame {frame}: label {highest}; there are {len(names)} bodies."
-                yield picture.fault("labels", text, float(highest), len(names))
-                continue
+        camera = rollout.camera(camera_name)
+        findings.frames += len(chosen)
+        sets = [group[f"obs/{camera_name}_{key}"] for key in ("mask", "depth", "amodal")]
+        keys = ("visible_px", "amodal_px", "visible_fraction")
+        counts = {key: rollout.values[f"bodies/{key}"][:, number] for key in keys}
+        for picture in _pictures(sets, camera_name, chosen, len(names)):
+            frame = picture.frame
+            if picture.mask.max(initial=0) > len(names):
+                continue  # reported with the values of the array
             yield from _check_counts(picture, {key: values[frame] for key, values in counts.items()}, names)
             painted = {
                 body: _paint(model, name, position[frame, body], quat[frame, body], camera)
@@ -118,15 +127,16 @@ def check_pictures(demo: Node, model: Model, count: int, findings: PictureFindin
             yield from _check_bodies(picture, painted, names, findings)
 
 
-def _pictures(sets: list[Node], camera: str, count: int, bodies: int) -> Iterator[_Picture]:
-    """Read the pictures of a camera from its masks, depths and amodal masks, in the blocks of the file."""
-    step = sets[0].chunks[0] if sets[0].chunks else count
-    for first in range(0, count, step):
-        last = min(count, first + step)
+def _pictures(sets: list[Node], camera: str, frames: Sequence[int], bodies: int) -> Iterator[_Picture]:
+    """Read pictures of a camera from its masks, depths and amodal masks, in the blocks of the file."""
+    step = sets[0].chunks[0] if sets[0].chunks else len(sets[0])
+    for block in sorted({frame // step for frame in frames}):
+        wanted = [frame for frame in frames if frame // step == block]
+        first, last = wanted[0], wanted[-1] + 1
         masks, depths, amodals = (item[first:last] for item in sets)
-        for frame in range(first, last):
+        for frame in wanted:
             amodal = amodals[frame - first]
-            alone = [amodal >> np.uint8(body) & 1 > 0 for body in range(bodies)]
+            alone = [amodal >> amodal.dtype.type(body) & 1 > 0 for body in range(bodies)]
             mask, depth = masks[frame - first], depths[frame - first]
             yield _Picture(camera=camera, frame=frame, mask=mask, depth=depth, amodal=alone)
 
