@@ -284,7 +284,8 @@ def _value_faults(
         outside = values > limit + slack if sign > 0 else values < limit - slack
         if outside.any():
             worst = float(values.max() if sign > 0 else values.min())
-            text = f"{worst:g} is outside of what is documented, {entry.values_text}."
+            here = "" if term.lstrip("-").isdigit() else f", here at most {limit}"
+            text = f"{worst:g} is not among what is documented, {entry.values_text}{here}."
             yield fault("values", outside, text, worst, float(limit))
     if entry.unit_norm:
         errors = np.abs(np.linalg.norm(values, axis=-1) - 1)

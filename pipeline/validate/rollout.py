@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import h5py
 import numpy as np
 
 from ...datasets.capture.cameras import Camera
@@ -160,6 +161,13 @@ def _text(group: Node, key: str, faults: list[Fault]) -> str | None:
         faults.append(_fault(f"the attribute {key} is {'missing' if value is None else 'no text'}."))
         return None
     return value
+
+
+def own_member(parent: Node, name: str, kind: type) -> Any:
+    """Return a member that a group contains itself, not by a link, if it is of a kind (Group, Dataset), else None."""
+    if not isinstance(parent.get(name, getlink=True), h5py.HardLink):
+        return None
+    return parent[name] if parent.get(name, getclass=True) is kind else None
 
 
 def parsed_object(text: str) -> dict[str, Any] | None:

@@ -17,7 +17,7 @@ from ...schemas import InputDataError
 from .arrays import check_arrays
 from .copies import check_copies, check_next_observations, check_time
 from .faults import Fault
-from .rollout import Dataset, Rollout, integer_attribute, name_fault, parsed_object, read_attributes, shown
+from .rollout import Dataset, Rollout, integer_attribute, name_fault, own_member, parsed_object, read_attributes, shown
 
 EXCLUSIVE = ("train", "valid")
 """Splits that share no rollout; others, robomimic's filter keys, may."""
@@ -130,12 +130,12 @@ def listing_fault(file: Node) -> str | None:
 
 
 def _listing_faults(file: Node) -> Iterator[str]:
-    data = _own(file, "data", h5py.Group)
+    data = own_member(file, "data", h5py.Group)
     if data is None:
         yield "it has no group 'data' of its own."
         return
     for name in data:
-        group = _own(data, name, h5py.Group)
+        group = own_member(data, name, h5py.Group)
         if group is None or not DEMO.fullmatch(name):
             yield f"data/{shown(name)} is no rollout; these are groups called demo_<index>."
             return
@@ -165,18 +165,9 @@ def _file_faults(file: Node) -> Iterator[str]:
     yield from _split_faults(file, set(data))
 
 
-def _own(parent: Node, name: str, kind: type) -> Any:
-    """Return a member that the file contains itself, if it is of a kind, else None."""
-    return (
-        parent[name]
-        if isinstance(parent.get(name, getlink=True), h5py.HardLink) and parent.get(name, getclass=True) is kind
-        else None
-    )
-
-
 def _split_faults(file: Node, demos: set[str]) -> Iterator[str]:
     """Check that splits are lists of different rollouts of this file, and that no rollout is in `train` and `valid`."""
-    group = _own(file, "mask", h5py.Group)
+    group = own_member(file, "mask", h5py.Group)
     if group is None:
         yield "it has no group 'mask' of its own, with the splits."
         return
@@ -186,7 +177,7 @@ def _split_faults(file: Node, demos: set[str]) -> Iterator[str]:
         if fault is not None:
             yield f"mask: the name '{shown(split)}' {fault}."
             continue
-        item = _own(group, split, h5py.Dataset)
+        item = own_member(group, split, h5py.Dataset)
         if item is None or item.ndim != 1 or item.dtype.kind not in "SO" or len(item) > 10 * len(demos) + 10:
             yield f"mask/{split}: is no list of the file's {len(demos)} rollouts."
             continue
