@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import mujoco
 import numpy as np
 import pycolmap
@@ -35,6 +36,7 @@ from cgwm.pipeline.export.mujoco_check import _commanded, keyframe_of, resimulat
 from cgwm.pipeline.export.stage import DATASET_FORMATS, MODEL_FORMATS, OPTIONS, ExportOptions, export, object_model
 from cgwm.pipeline.geometry.isosurface import union_mesh
 from cgwm.pipeline.synthesize import synthesize
+from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     CamerasFile,
     EffectModel,
@@ -638,3 +640,104 @@ def test_every_format_has_its_options() -> None:
     assert set(OPTIONS) == {*DATASET_FORMATS, *MODEL_FORMATS}
     assert {name for names in OPTIONS.values() for name in names} == set(ExportOptions.__dataclass_fields__)
     assert option_name("duration_s") == "--duration" and option_name("sh_degree") == "--sh-degree"
+
+
+# what cannot be right
+
+
+def rolled_pictures(demo: h5py.Group) -> None:
+    for key in ("mask", "amodal", "depth"):
+        pictures = demo[f"obs/view0_{key}"]
+        pictures[...] = np.roll(pictures[()], 9, axis=1)
+
+
+def smaller_image(demo: h5py.Group) -> None:
+    attributes, images = dict(demo["obs/view1_image"].attrs), demo["obs/view1_image"][()]
+    del demo["obs/view1_image"]
+    demo.create_dataset("obs/view1_image", data=images[:, :-2]).attrs.update(attributes)
+
+
+def miscounted(demo: h5py.Group) -> None:
+    demo["bodies/visible_px"][0, 0, 0] += 5
+
+
+def zero_focal_length(demo: h5py.Group) -> None:
+    demo["cameras/view0/K"][...] = 0
+
+
+def no_rotation(demo: h5py.Group) -> None:
+    demo["cameras/view1/T_world_cam"][...] = 0
+
+
+def no_orientation(demo: h5py.Group) -> None:
+    demo["bodies/quat_wxyz"][2, 0] = 0
+
+
+def no_number(demo: h5py.Group) -> None:
+    demo["bodies/pos"][2, 0, 0] = np.nan
+
+
+def split_above(demo: h5py.Group) -> None:
+    demo.file["mask"].create_dataset("..", data=np.array([b"demo_1"]))
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("short")
+    config = SynthesizeConfig(rollouts=2, duration_s=0.1, width=WIDTH, height=HEIGHT, device="cpu", seed=5)
+    synthesize(write_small_model(root / "model"), root / "dataset", config)
+    return root / "dataset"
+
+
+@pytest.mark.parametrize(
+    ("edit", "format_", "message"),
+    [
+        (rolled_pictures, "bop", "body 'cube': .* the pose or the camera is wrong"),
+        (smaller_image, "lerobot", r"obs/view1_image: its shape is \(4, 34, 48, 3\); \(T, H, W, 3\) is documented"),
+        (miscounted, "nerfstudio", r"bodies/visible_px: frame 0, camera view0, body 'cube'"),
+        (zero_focal_length, "bop", "cameras/view0: the focal lengths in K are 0 and 0 px"),
+        (no_rotation, "nerfstudio", "cameras/view1: the pose is no rotation and translation"),
+        (no_orientation, "bop", "bodies/quat_wxyz: frame 2: a norm differs from 1 by 1"),
+        (no_number, "lerobot", "bodies/pos: frame 2: contains numbers that are not finite"),
+        (split_above, "bop", "mask: the name '..' is no name of a file"),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else "",
+)
+def test_a_dataset_is_refused_as_validate_would(
+    short: Path, tmp_path: Path, edit: Callable[[h5py.Group], None], format_: ExportFormat, message: str
+) -> None:
+    copy = shutil.copytree(short, tmp_path / "dataset")
+    with h5py.File(next(copy.glob("*.h5")), "r+") as file:
+        edit(file["data/demo_1"])
+    with pytest.raises(InputDataError, match=message) as caught:
+        export(copy, format_, tmp_path / "out", ExportOptions(rollout=1 if format_ == "nerfstudio" else 0))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset"]
+    assert caught.value.found.removeprefix(f"{copy}: ") in validate(copy).faults
+    if edit is no_number:  # what is not exported is not looked at
+        export(copy, "nerfstudio", tmp_path / "out", ExportOptions(rollout=0))
+
+
+def test_an_image_of_another_size_in_jpeg_is_refused(tmp_path: Path) -> None:
+    config = SynthesizeConfig(rollouts=1, duration_s=0.1, width=48, height=36, device="cpu", compression="jpeg")
+    synthesize(write_small_model(tmp_path / "model"), tmp_path / "dataset", config)
+    with h5py.File(next((tmp_path / "dataset").glob("*.h5")), "r+") as file:
+        images = file["data/demo_0/obs/view0_image"]
+        small = cv2.imencode(".jpg", np.zeros((20, 20, 3), np.uint8))[1].reshape(-1)
+        images[2] = np.resize(small, images.shape[1])
+    message = "obs/view0_image: frame 2: 20 x 20 px; the camera has 48 x 36"
+    with pytest.raises(InputDataError, match=message):
+        export(tmp_path / "dataset", "lerobot", tmp_path / "out")
+    assert any(message in fault for fault in validate(tmp_path / "dataset").faults)
+    with pytest.raises(InputDataError, match="demo_0/obs/view0_image: an image is no JPEG of 48 x 36 px"):
+        RolloutReader(tmp_path / "dataset").read(0, "obs/view0_image")
+
+
+@pytest.mark.parametrize("format_", MODEL_FORMATS)
+def test_a_model_with_a_singular_camera_is_refused(model: Path, tmp_path: Path, format_: ExportFormat) -> None:
+    copy = shutil.copytree(model, tmp_path / "model")
+    cameras = json.loads((copy / "cameras.json").read_text())
+    cameras["images"]["b.png"]["T_world_cam"][1] = [0, 0, 0, 0]
+    (copy / "cameras.json").write_text(json.dumps(cameras))
+    with pytest.raises(InputDataError, match=r"cameras\.json: image 'b\.png': the pose is no rotation and translation"):
+        export(copy, format_, tmp_path / f"out{'.xml' if format_ == 'mjcf' else '.glb' if format_ == 'glb' else ''}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model"]

@@ -148,23 +148,35 @@ def jpeg_of(image: np.ndarray) -> np.ndarray:
     return data.reshape(-1)
 
 
-def image_of(data: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+def jpeg_size(data: np.ndarray) -> tuple[int, int] | None:
+    """Return height and width [px] in the header of a JPEG file, uint8 (n,), or None if it has none."""
+    content = data.tobytes()
+    place = 2 if content[:2] == b"\xff\xd8" else len(content)
+    while place + 9 <= len(content) and content[place] == 0xFF:
+        marker, length = content[place + 1], int.from_bytes(content[place + 2 : place + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a frame header (SOF)
+            height, width = content[place + 5 : place + 7], content[place + 7 : place + 9]
+            return int.from_bytes(height, "big"), int.from_bytes(width, "big")
+        place += 2 + length
+    return None
+
+
+def image_of(data: np.ndarray, size: tuple[int, int] | None = None, where: str = "the dataset") -> np.ndarray:
     """Return the image, uint8 RGB (H, W, 3), of a JPEG file, uint8 (n,); bytes after its end do not count.
 
     Args:
         data: The bytes of the file.
         size: Height and width [px] that it has to have; None: any.
+        where: Its place, for messages.
 
     Raises:
         InputDataError: If it is none, or of another size.
     """
-    image = cv2.imdecode(np.ascontiguousarray(data), cv2.IMREAD_COLOR)
+    found = jpeg_size(data)
+    if size is not None and size != found:
+        text = f"{where}: an image is no JPEG of {size[1]} x {size[0]} px, as its attributes say."
+        raise InputDataError(text, todo="run 'cgwm validate'.")
+    image = None if found is None else cv2.imdecode(np.ascontiguousarray(data), cv2.IMREAD_COLOR)
     if image is None:
-        raise InputDataError("an image of the dataset is no JPEG: the file is damaged.", todo="run 'cgwm validate'.")
-    if size is not None and image.shape[:2] != size:
-        raise InputDataError(
-            f"an image of the dataset is {image.shape[1]} x {image.shape[0]} px.",
-            f"{size[1]} x {size[0]} px, as its attributes say.",
-            "run 'cgwm validate'.",
-        )
+        raise InputDataError(f"{where}: an image is no JPEG: the file is damaged.", todo="run 'cgwm validate'.")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

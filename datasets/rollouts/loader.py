@@ -151,7 +151,8 @@ class RolloutReader:
         with hdf5_faults(self.rollouts[number].file):
             if data.attrs.get("encoding") == "jpeg":
                 size = int(data.attrs["height"]), int(data.attrs["width"])
-                return np.stack([image_of(row, size) for row in data[start:stop]])
+                where = f"{self.rollouts[number].file}: {self.rollouts[number].demo}/{key}"
+                return np.stack([image_of(row, size, where) for row in data[start:stop]])
             return data[start:stop] if data.ndim else data[()]
 
     def contacts(self, number: int, frame: int) -> dict[str, np.ndarray]:

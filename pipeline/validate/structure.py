@@ -11,13 +11,21 @@ import numpy as np
 
 from ...datasets.capture.camera_faults import intrinsics_fault, pose_fault
 from ...datasets.rollouts.array_table import JPEG
-from ...datasets.rollouts.chunks import image_of
+from ...datasets.rollouts.chunks import jpeg_size
 from ...datasets.rollouts.rollouts import CONVENTION, DEMO, Node
-from ...schemas import InputDataError
 from .arrays import check_arrays
 from .copies import check_copies, check_next_observations, check_time
 from .faults import Fault
-from .rollout import Dataset, Rollout, integer_attribute, name_fault, own_member, parsed_object, read_attributes, shown
+from .rollout import (
+    Dataset,
+    Rollout,
+    integer_attribute,
+    name_fault,
+    own_member,
+    parsed_object,
+    read_attributes,
+    shown,
+)
 
 EXCLUSIVE = ("train", "valid")
 """Splits that share no rollout; others, robomimic's filter keys, may."""
@@ -108,17 +116,18 @@ def _check_cameras(rollout: Rollout) -> Iterator[Fault]:
 
 
 def _check_jpeg(images: Any, name: str, size: tuple[int, int]) -> Iterator[Fault]:
-    """Check that JPEG images, as their attributes say, and the first and the last of them have the camera's size."""
-    for key, value in zip(("height", "width"), size, strict=True):
-        if (found := integer_attribute(images, key)) != value:
-            text = f"obs/{name}_image: its {key} is {found} px; the camera's is {value}."
-            yield Fault(check="shape", text=text, camera=name)
-    for frame in sorted({0, len(images) - 1}):
-        try:
-            image_of(images[frame], size)
-        except InputDataError as error:
-            text = f"obs/{name}_image: frame {frame}: {error.found}"
+    """Check that JPEG images have the size of their camera: in the attributes, and in each file's header."""
+    listed = tuple(integer_attribute(images, key) for key in ("height", "width"))
+    if listed != size:
+        text = f"obs/{name}_image: its attributes height and width are {listed}; the camera has {size}."
+        yield Fault(check="shape", text=text, camera=name)
+    for frame, row in enumerate(images):
+        found = jpeg_size(row)
+        if found != size:
+            what = "is no JPEG" if found is None else f"{found[1]} x {found[0]} px"
+            text = f"obs/{name}_image: frame {frame}: {what}; the camera has {size[1]} x {size[0]}."
             yield Fault(check="shape", text=text, frame=frame, camera=name)
+            return
 
 
 def listing_fault(file: Node) -> str | None:
