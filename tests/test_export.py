@@ -96,6 +96,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "dataset"
 
 
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("short")
+    config = SynthesizeConfig(rollouts=2, duration_s=0.1, width=WIDTH, height=HEIGHT, device="cpu", seed=5)
+    synthesize(write_small_model(root / "model"), root / "dataset", config)
+    return root / "dataset"
+
+
 @pytest.fixture
 def reader(dataset: Path) -> Iterator[RolloutReader]:
     reader = RolloutReader(dataset)
@@ -513,6 +521,12 @@ def decoded(path: Path) -> np.ndarray:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
+def test_lerobot_takes_episodes_of_few_frames(short: Path, tmp_path: Path) -> None:
+    # the encoder has written nothing yet when the second episode begins
+    facts = export(short, "lerobot", tmp_path / "out", ExportOptions(every=3)).facts
+    assert facts["episodes"] == 2 and facts["frames"] == 4
+
+
 def test_lerobot_begins_new_files(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("av", reason="the extra 'lerobot' is not installed")
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra 'lerobot' is not installed")
@@ -679,14 +693,6 @@ def no_number(demo: h5py.Group) -> None:
 
 def split_above(demo: h5py.Group) -> None:
     demo.file["mask"].create_dataset("..", data=np.array([b"demo_1"]))
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("short")
-    config = SynthesizeConfig(rollouts=2, duration_s=0.1, width=WIDTH, height=HEIGHT, device="cpu", seed=5)
-    synthesize(write_small_model(root / "model"), root / "dataset", config)
-    return root / "dataset"
 
 
 @pytest.mark.parametrize(

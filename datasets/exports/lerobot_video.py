@@ -43,7 +43,8 @@ class EpisodeVideos:
 
     def begin(self) -> None:
         """Begin an episode."""
-        if self._container is not None and self._path.stat().st_size > MAX_FILE_BYTES:
+        size = self._path.stat().st_size if self._path.exists() else 0  # nothing is written of the first frames at once
+        if self._container is not None and size > MAX_FILE_BYTES:
             self.close()
             self._places.advance()
         if self._container is None:

@@ -19,6 +19,8 @@ NORM_TOLERANCE = 1e-6
 """Largest difference of the norm of a quaternion or normal from 1."""
 BOUND_TOLERANCE = 1e-9
 """Distance by which rounding may put a floating-point number outside of its bounds."""
+MOST_NAME_BYTES = 1 << 20
+"""Largest list of names of bodies that is read [bytes]."""
 DEPTH = 3
 """Number of groups on the way to the deepest documented array, itself included."""
 
@@ -134,7 +136,7 @@ def _collect(group: Node, prefix: str, found: _Found, index: bool) -> None:
 def _names(found: _Found, dataset: Dataset, faults: list[Fault]) -> tuple[list[str], list[str]]:
     """Return the names of bodies and cameras, and add what is wrong with them to the faults."""
     item, names = found.arrays.get("bodies/names"), list(dataset.manifest.bodies)
-    if item is not None and item.dtype.kind == "S" and item.ndim == 1 and item.size <= max(len(names), 64):
+    if item is not None and item.dtype.kind == "S" and item.ndim == 1 and item.nbytes <= MOST_NAME_BYTES:
         read = [name.decode("utf-8", "backslashreplace") for name in item[()]]
         if names and read != names:
             text = f"bodies/names: {', '.join(map(shown, read))}; dataset.json has {', '.join(map(shown, names))}."
@@ -176,7 +178,8 @@ def _symbols(found: _Found, attributes: Attributes, names: list[str], cameras: l
     symbols = {"T": attributes.frames, "B": len(names), "body": len(names)}
     symbols |= {"C": len(cameras), "camera": len(cameras)}
     motions, rows = found.arrays.get("bodies/motions"), found.arrays.get("contacts/body_a")
-    if motions is not None and motions.dtype.kind == "S" and motions.shape == (len(names),):
+    whole = motions is not None and motions.dtype.kind == "S" and motions.shape == (len(names),)
+    if motions is not None and whole and motions.nbytes <= MOST_NAME_BYTES:
         kinds = motions[()].tolist()
         symbols |= {"D": 1 + 13 * kinds.count(b"free"), "A": max(1, 3 * kinds.count(b"driven"))}
     if rows is not None and rows.ndim == 1:
