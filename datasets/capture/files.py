@@ -77,7 +77,7 @@ def files_under(folder: Path, suffixes: Collection[str] = ()) -> list[str]:
             its reader to refuse it by name.
     """
     names: list[str] = []
-    places = [(folder, (os.path.realpath(folder),))]
+    places: list[tuple[Path, tuple[str, ...]]] = [(folder, (os.path.realpath(folder),))]
     while places:
         place, within = places.pop()
         for path in entries_of(place):

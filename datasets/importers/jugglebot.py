@@ -168,7 +168,7 @@ def _read_npz(path: Path) -> list[tuple[Array, Array]]:
     """Return times [s] and positions [m] of the throws."""
     found = read_npz(path, ("offsets", "txyz"))
     numbers = all(array.dtype.kind in "iuf" for array in found.values())
-    offsets, rows = (found["offsets"], found["txyz"]) if numbers else (np.zeros(0), np.zeros(0))
+    offsets, rows = (found["offsets"], found["txyz"]) if numbers else (np.zeros(0), np.zeros((0, 0)))
     offsets, rows = offsets.astype(np.int64), rows.astype(np.float64)
     sound = rows.ndim == 2 and rows.shape[1] == 4 and offsets.ndim == 1 and len(offsets) > 1
     if not sound or offsets[0] != 0 or offsets[-1] != len(rows) or (np.diff(offsets) <= 0).any():

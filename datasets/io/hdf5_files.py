@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+from h5py import h5l, h5o  # pyright: ignore[reportAttributeAccessIssue]
 
 from ...schemas import InputDataError
 from ...schemas.regular_files import require_regular_file
@@ -71,7 +72,7 @@ def own_objects(group: h5py.Group, where: str) -> Iterator[tuple[str, h5py.Group
     seen: set[tuple[int, int]] = set()
     while pending:
         place, item = pending.pop()
-        info = h5py.h5o.get_info(item.id)
+        info = h5o.get_info(item.id)
         if (info.fileno, info.addr) in seen:
             continue
         seen.add((info.fileno, info.addr))
@@ -105,14 +106,14 @@ def is_own_link(group: h5py.Group, name: str, where: str) -> bool:
         InputDataError: If it is a link to another file.
     """
     kind = group.id.links.get_info(name.encode("utf-8", "surrogateescape")).type
-    if kind not in (h5py.h5l.TYPE_HARD, h5py.h5l.TYPE_SOFT):
+    if kind not in (h5l.TYPE_HARD, h5l.TYPE_SOFT):
         link = group.get(name, getlink=True)
         raise InputDataError(
             f"{where}: a link to another file, {getattr(link, 'filename', '')}.",
             "groups and arrays in the file itself.",
             "copy what it leads to into the file, or pass the other file.",
         )
-    return kind == h5py.h5l.TYPE_HARD
+    return kind == h5l.TYPE_HARD
 
 
 def _require_target(group: h5py.Group, name: str, where: str) -> None:
@@ -144,7 +145,9 @@ def require_stored(
         raise InputDataError(f"{where}: an array without a shape.")
     made = item.id.get_create_plist()
     if made.get_external_count():
-        raise InputDataError(f"{where}: its numbers lie in another file, {item.external[0][0]}.", "arrays in the file.")
+        raise InputDataError(
+            f"{where}: its numbers lie in another file, {(item.external or [['']])[0][0]}.", "arrays in the file."
+        )
     if made.get_layout() == h5py.h5d.VIRTUAL:
         _require_sources(item, where, files or {}, depth)
         return
@@ -196,6 +199,6 @@ def _require_source(
         if not is_own_link(place, part, f"{where}: its source {name}"):
             raise InputDataError(f"{where}: its source {name} is a link.")
         place = place[part]
-    if not isinstance(place, h5py.Dataset) or place.shape is None or place.size < taken:
+    if not isinstance(place, h5py.Dataset) or place.shape is None or (place.size or 0) < taken:
         raise InputDataError(f"{where}: its source {name} is no array of {taken} numbers.")
     require_stored(place, where, files, depth + 1)

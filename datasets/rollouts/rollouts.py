@@ -209,7 +209,8 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
                 raise InputDataError(f"{path}: its format attribute is '{found!s:.80}'.", f"'{ROLLOUTS_FORMAT}'.")
             if "zstd" in str(file.attrs.get("filters", "")):
                 require_zstd(f"reading {path}")
-            for name in file:
+            root: Node = file
+            for name in root:
                 is_own_link(file, name, f"{path}: {name}")
             if SHARDS in file:
                 _refuse_lost(path, file[SHARDS])
