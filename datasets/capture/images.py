@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -81,18 +82,34 @@ def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -
     pixels = array if array.ndim == 2 else cv2.cvtColor(array, cv2.COLOR_RGB2BGR)
     # OpenCV warns on stderr about a JPEG setting that is given to a PNG.
     settings = [] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, quality]
-    done, data = cv2.imencode(path.suffix, pixels, settings)
-    if not done:
-        raise ValueError(f"OpenCV cannot write {path.name}")
-    path.write_bytes(data.tobytes())
+    path.write_bytes(encoded_image(path.suffix, pixels, settings).tobytes())
 
 
 def write_depth(path: Path | str, depth: NDArray[np.uint16]) -> None:
     """Write depth (height, width), uint16 in a unit of the caller's choice, as a 16-bit PNG."""
-    done, data = cv2.imencode(".png", depth)
-    if depth.dtype != np.uint16 or depth.ndim != 2 or not done:
+    if depth.dtype != np.uint16 or depth.ndim != 2:
         raise ValueError(f"depth is uint16 (H, W); found {depth.dtype} {depth.shape}")
-    Path(path).write_bytes(data.tobytes())
+    Path(path).write_bytes(encoded_image(".png", depth).tobytes())
+
+
+def encoded_image(suffix: str, pixels: NDArray, settings: Sequence[int] = ()) -> NDArray[np.uint8]:
+    """Return an image in OpenCV's order of channels, (H, W) or (H, W, 3), as the bytes of a file, uint8 (n,).
+
+    Args:
+        suffix: Suffix of the format, ".png" or ".jpg".
+        pixels: The image.
+        settings: OpenCV's settings for the format.
+
+    Raises:
+        InputDataError: If the format does not take the image, such as a JPEG of more than 65535 pixels a side.
+    """
+    done, data = cv2.imencode(suffix, pixels, settings)  # returns False, and raises nothing
+    if not done:
+        height, width = pixels.shape[:2]
+        raise InputDataError(
+            f"an image of {width} x {height} px cannot be written as {suffix}.", todo="write smaller images."
+        )
+    return np.asarray(data, np.uint8).reshape(-1)
 
 
 def image_size(path: Path | str) -> tuple[int, int]:

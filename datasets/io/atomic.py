@@ -6,6 +6,7 @@ that behind, and the next process that writes the same output removes it.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -17,10 +18,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ...schemas import UsageError
+from .free_space import enough_room
 from .outputs import DirectoryKind, FileKind, inside_output, refuse_output, write_record
+from .places import require_place
 
 _PARTIAL = "partial"
 _REPLACED = "replaced"
+_LOST = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""Errors of a flush after which the written bytes are lost."""
 
 
 @contextmanager
@@ -34,21 +39,24 @@ def new_directory(path: Path | str, kind: DirectoryKind, overwrite: bool = False
 
     Raises:
         UsageError: Before anything is written, see :func:`refuse_output`.
+        NotEnoughSpaceError: If the disk is full.
     """
     path = Path(path)
+    require_place(path)
     _clean_stale(path)
     refuse_output(path, kind, overwrite)
-    temporary = _temporary(path)
-    try:
-        temporary.mkdir()  # inside, so that a signal that arrives right after it still removes it
-        with inside_output():
-            yield temporary
-        write_record(temporary, kind)
-        _sync_tree(temporary)
-        _put_in_place(temporary, path, kind, overwrite)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+    with enough_room(path, f"the {kind}"):
+        temporary = _temporary(path)
+        try:
+            temporary.mkdir()  # inside, so that a signal that arrives right after it still removes it
+            with inside_output():
+                yield temporary
+            write_record(temporary, kind)
+            _sync_tree(temporary)
+            _put_in_place(temporary, path, kind, overwrite)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
 
 
 @contextmanager
@@ -64,10 +72,11 @@ def new_file(path: Path | str, kind: FileKind, overwrite: bool = False) -> Itera
 
     Raises:
         UsageError: Before anything is written, if `path` is a directory, and see :func:`refuse_output`.
+        NotEnoughSpaceError: If the disk is full.
     """
     path = Path(path)
     refuse_output(path, kind, overwrite)
-    with replaced_file(path) as temporary:
+    with enough_room(path, f"the {kind}"), replaced_file(path) as temporary:
         yield temporary
         refuse_output(path, kind, overwrite)
 
@@ -80,20 +89,23 @@ def replaced_file(path: Path | str) -> Iterator[Path]:
 
     Raises:
         UsageError: Before anything is written, if `path` is a directory.
+        NotEnoughSpaceError: If the disk is full.
     """
     path = Path(path)
+    require_place(path)
     if path.is_dir():
         raise UsageError(f"{path} is a directory; a file is written here.", todo="choose another name.")
     _clean_stale(path)
-    temporary = _temporary(path, path.suffix)
-    try:
-        yield temporary
-        _sync(temporary)
-        os.replace(temporary, path)
-        _sync(path.parent)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with enough_room(path, "it"):
+        temporary = _temporary(path, path.suffix)
+        try:
+            yield temporary
+            _sync(temporary)
+            os.replace(temporary, path)
+            _sync(path.parent)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
@@ -101,13 +113,18 @@ def scratch_file(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file next to `path`, which is removed at the end unless it was moved before.
 
     For output that takes several steps to complete: :func:`move_into_place` gives the file its final name.
+
+    Raises:
+        NotEnoughSpaceError: If the disk is full.
     """
+    require_place(path)
     _clean_stale(path)
-    temporary = _temporary(path, path.suffix)
-    try:
-        yield temporary
-    finally:
-        temporary.unlink(missing_ok=True)
+    with enough_room(path, "it"):
+        temporary = _temporary(path, path.suffix)
+        try:
+            yield temporary
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def move_into_place(temporary: Path, path: Path) -> None:
@@ -228,7 +245,9 @@ def _sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
-    except OSError:
-        pass  # some file systems cannot flush a directory; the rename is atomic all the same
+    except OSError as error:
+        if error.errno in _LOST:
+            raise
+        # some file systems cannot flush a directory; the rename is atomic all the same
     finally:
         os.close(descriptor)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar
 
 from ...schemas import UsageError
+from .places import require_place
 
 RECORD = ".cgwm-output.json"
 _FORMAT = "cgwm-output/1"
@@ -98,8 +99,9 @@ def refuse_output(path: Path, kind: DirectoryKind | FileKind, overwrite: bool) -
     Raises:
         UsageError: If it exists and `overwrite` is not set or it is no output of cgwm of this kind; if it is, holds or
             lies among the inputs of the command; or if it is or holds the home or working directory, or a git work
-            tree.
+            tree; or if nothing can be written under that name.
     """
+    require_place(path)
     exists = os.path.lexists(path)
     if exists and not overwrite:
         raise UsageError(f"{path} exists.", todo="choose another name or pass --overwrite.")

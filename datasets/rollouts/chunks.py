@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 
 from ...schemas import InputDataError
+from ..capture.images import encoded_image
 
 Compression = Literal["zstd", "gzip", "none", "jpeg"]
 
@@ -144,8 +145,7 @@ def zstd_module() -> Any:
 
 def jpeg_of(image: np.ndarray) -> np.ndarray:
     """Return an image, uint8 RGB (H, W, 3), as the bytes of a JPEG file, uint8 (n,)."""
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return data.reshape(-1)
+    return encoded_image(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
 
 
 def jpeg_size(data: np.ndarray) -> tuple[int, int] | None:

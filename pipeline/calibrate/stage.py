@@ -14,7 +14,9 @@ from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import check_capture
 from ...datasets.capture.sparse_points import POINTS_NAME, write_points
 from ...datasets.io.atomic import new_file, replaced_file
+from ...datasets.io.free_space import enough_room
 from ...datasets.io.kinds import refuse_other_kind
+from ...datasets.io.places import require_place
 from ...datasets.io.progress import progress
 from ...schemas import (
     CalibrateConfig,
@@ -68,7 +70,12 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     start = time.monotonic()
     capture_root = Path(capture_root)
     capture = _open(capture_root, overwrite)
-    with tempfile.TemporaryDirectory(prefix="cgwm-calibrate-") as folder:
+    require_place(capture_root / CAMERAS_NAME)  # now, not after minutes
+    temporary, todo = Path(tempfile.gettempdir()), "make room there, or set TMPDIR to another folder, and run it again."
+    with (
+        enough_room(temporary, "the photos and COLMAP's database", todo),
+        tempfile.TemporaryDirectory(prefix="cgwm-calibrate-") as folder,
+    ):
         inputs = gather(capture, Path(folder))
         best, attempts = search(Path(folder), inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.capture.images import encoded_image
+
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
@@ -181,8 +183,7 @@ def png_uri(image: Image) -> str:
 
 def encoded(image: Image, suffix: str, options: Sequence[int] = ()) -> bytes:
     """Encode an RGB image in OpenCV's format for a suffix, ".png" or ".jpg"."""
-    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
-    return data.tobytes()
+    return encoded_image(suffix, np.ascontiguousarray(image[..., ::-1]), options).tobytes()
 
 
 def small_png(image: Image, most_bytes: int = 400_000) -> bytes:

@@ -179,10 +179,13 @@ def _check_shard(
     chosen = names if places is None else [names[place] for place in sorted(places) if place < len(names)]
     for name in progress(chosen, shard.file, len(chosen), "rollout"):
         try:
-            for fault in _check_demo(stored_demo(file, name), name, dataset, findings):
-                findings.add(shard.file, name, fault)
+            demo = stored_demo(file, name)
         except InputDataError as error:
             findings.add(shard.file, name, Fault(check="schema", text=error.found))
+            continue
+        try:
+            for fault in _check_demo(demo, name, dataset, findings):
+                findings.add(shard.file, name, fault)
         except OSError as error:
             text = f"a block cannot be read: {str(error).splitlines()[0]}."
             findings.add(shard.file, name, Fault(check="readable", text=text))
