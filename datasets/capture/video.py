@@ -5,9 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas import InputDataError
 from ...schemas.regular_files import require_regular_file
-from ..io.free_space import enough_room
+from ..io.atomic import temporary_directory
 from .files import entries_of
 from .images import IMAGE_SUFFIXES, image_size, read_label, read_rgb
 
@@ -146,8 +145,8 @@ def encoded_webm(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float) -> b
 
 def _encoded(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float, suffix: str, codecs: Sequence[str]) -> bytes:
     height, width = frames[0].shape[:2]
-    with _room_for_a_film(), tempfile.TemporaryDirectory(prefix="cgwm-film-") as folder:
-        path = Path(folder) / f"film{suffix}"
+    with temporary_directory("film", "a film") as folder:
+        path = folder / f"film{suffix}"
         for codec in codecs:
             with _quiet():
                 writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), frame_rate_hz, (width, height))
@@ -163,11 +162,6 @@ def _encoded(frames: Sequence[NDArray[np.uint8]], frame_rate_hz: float, suffix: 
         if _count(path) < len(frames):  # OpenCV's writer reports no error
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         return path.read_bytes()
-
-
-def _room_for_a_film() -> AbstractContextManager[None]:
-    todo = "make room there, or set TMPDIR to another folder, and run the command again."
-    return enough_room(Path(tempfile.gettempdir()), "a film", todo)
 
 
 @contextmanager

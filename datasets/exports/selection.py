@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...schemas import InputDataError, UsageError, did_you_mean
 from ..capture.cameras import Camera
-from ..rollouts.dataset import missing_shards, read_manifest
+from ..rollouts.dataset import missing_count, read_manifest
 from ..rollouts.loader import RolloutReader
 
 READ_FRAMES = 8
@@ -75,8 +75,8 @@ class Selection:
     @property
     def notes(self) -> list[str]:
         """Return notes on what the dataset itself lacks."""
-        lacking = missing_shards(self.manifest)
-        return [f"the dataset lacks {len(lacking)} of {self.manifest.shard_count} shards"] if lacking else []
+        lacking = missing_count(self.manifest)
+        return [f"the dataset lacks {lacking} of {self.manifest.shard_count} shards"] if lacking else []
 
     def frames(self, number: int) -> range:
         """Return the exported frames of the rollout at index `number`."""

@@ -13,6 +13,7 @@ import re
 import secrets
 import shutil
 import socket
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -125,6 +126,31 @@ def scratch_file(path: Path) -> Iterator[Path]:
             yield temporary
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_directory(purpose: str, content: str) -> Iterator[Path]:
+    """Yield an empty directory in the system's temporary folder, which is removed at the end.
+
+    What a killed process left there is removed by the next one with the same purpose.
+
+    Args:
+        purpose: Part of its name.
+        content: What is written there, for messages.
+
+    Raises:
+        NotEnoughSpaceError: If the disk of the temporary folder is full.
+    """
+    path = Path(tempfile.gettempdir()) / f"cgwm-{purpose}"
+    _clean_stale(path)
+    todo = "make room there, or set TMPDIR to another folder, and run the command again."
+    with enough_room(path.parent, content, todo):
+        temporary = _temporary(path)
+        try:
+            temporary.mkdir(mode=0o700)
+            yield temporary
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def move_into_place(temporary: Path, path: Path) -> None:

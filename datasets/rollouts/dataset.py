@@ -12,6 +12,7 @@ import shutil
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,12 @@ from ..io.atomic import move_into_place, new_directory, replaced_file, scratch_f
 from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
 from .index import index_fault
-from .shards import gathered, shard_fault, shard_name, tidied, write_entry
+from .shards import SHARD, gathered, shard_fault, shard_name, tidied, write_entry
 
 MANIFEST = "dataset.json"
 MODEL_FOLDER = "model"
+LISTED_MISSING = 1000
+"""Maximum number of missing shards that are listed one by one."""
 
 
 def read_manifest(path: Path) -> DatasetManifest:
@@ -172,9 +175,10 @@ def refuse_existing_shards(path: Path, count: int) -> None:
     Raises:
         UsageError: For the first shard that exists.
     """
-    for index in range(count):
-        if (path / shard_name(index, count)).exists():
-            raise _exists(path / shard_name(index, count))
+    names = (SHARD.fullmatch(file.name) for file in path.glob("rollouts-*-of-*.h5"))
+    there = [int(name[1]) for name in names if name is not None and int(name[2]) == count]
+    if there:
+        raise _exists(path / shard_name(min(there), count))
 
 
 def _exists(path: Path) -> UsageError:
@@ -222,10 +226,20 @@ def _short(value: object) -> str:
     return f"{value!r:.200}"
 
 
-def missing_shards(manifest: DatasetManifest) -> list[int]:
-    """Return the numbers of the shards that a dataset still lacks."""
-    present = {shard.index for shard in manifest.shards}
-    return [index for index in range(manifest.shard_count) if index not in present]
+def missing_shards(manifest: DatasetManifest) -> list[range]:
+    """Return the numbers of the shards that a dataset still lacks, as ranges of successive ones.
+
+    Their number is at most that of the shards that are there, plus one, whatever number of shards a manifest names.
+    """
+    count = manifest.shard_count
+    present = sorted({shard.index for shard in manifest.shards if shard.index < count})
+    gaps = zip([-1, *present], [*present, count], strict=True)
+    return [range(before + 1, after) for before, after in gaps if after - before > 1]
+
+
+def missing_count(manifest: DatasetManifest) -> int:
+    """Return the number of shards that a dataset still lacks."""
+    return sum(gap.stop - gap.start for gap in missing_shards(manifest))
 
 
 def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] | None = None) -> list[str]:
@@ -236,9 +250,13 @@ def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] |
         manifest: Its manifest.
         files: Names of the shards whose hash is compared, or None for all; for others only the size is compared.
     """
+    lacking, count = chain.from_iterable(missing_shards(manifest)), missing_count(manifest)
     faults = [
-        f"{shard_name(index, manifest.shard_count)}: this shard is missing." for index in missing_shards(manifest)
+        f"{shard_name(index, manifest.shard_count)}: this shard is missing."
+        for index in islice(lacking, LISTED_MISSING)
     ]
+    if count > LISTED_MISSING:
+        faults.append(f"and {count - LISTED_MISSING} more shards are missing.")
     found = (shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards)
     faults += [fault for fault in found if fault is not None]
     listed = {shard.file for shard in manifest.shards}

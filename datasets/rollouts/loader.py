@@ -258,7 +258,10 @@ def _list(handle: Node, file: Path, split: str | None) -> Iterable[RolloutInfo]:
         names = [name for name in names if name in members]
     for name in names:
         demo = handle["data"][name]
-        frames = int(demo.attrs["num_samples"])
-        if not 0 <= frames <= MOST_FRAMES:
-            raise InputDataError(f"{file}: data/{name}: num_samples is {frames}.", f"0 to {MOST_FRAMES}.")
+        frames, there = int(demo.attrs["num_samples"]), h5py.h5d.open(demo.id, b"time").shape
+        if there != (frames,):
+            raise InputDataError(
+                f"{file}, {name}: num_samples says {frames} frames; its array 'time' has the shape {there}.",
+                todo="run 'cgwm validate' on the dataset.",
+            )
         yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), frames)

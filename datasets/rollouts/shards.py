@@ -48,6 +48,18 @@ def ranges(numbers: Iterable[int]) -> str:
     return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
 
 
+def span(numbers: range) -> str:
+    """Write successive numbers, which may be too many to go through, in the same format.
+
+    >>> span(range(3, 10**12)), span(range(4, 5)), span(range(0))
+    ('3-999999999999', '4', '')
+    """
+    if numbers.stop <= numbers.start:
+        return ""
+    last = numbers.stop - 1
+    return f"{numbers.start}" if last == numbers.start else f"{numbers.start}-{last}"
+
+
 def entry_file(path: Path, shard: str) -> Path:
     """Return the path of the entry of a shard before the shards are merged."""
     return (path / shard).with_suffix(".json")
@@ -150,8 +162,8 @@ def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_js
             yield f"{file.name}: made with other settings (its attribute config_json)."
         found = [int(name.removeprefix("demo_")) for name in demo_names(handle)]
     wanted = shard_range(manifest.rollouts, manifest.shard_count, entry.index)
-    if not set(found) <= set(wanted):  # fewer are right: rollouts that diverge are left out
-        yield f"{file.name}: holds the rollouts {ranges(found)}; its number stands for {ranges(wanted)}."
+    if not all(number in wanted for number in found):  # fewer are right: rollouts that diverge are left out
+        yield f"{file.name}: holds the rollouts {ranges(found)}; its number stands for {span(wanted)}."
     if len(found) != entry.rollouts:
         yield f"{file.name}: holds {len(found)} rollouts; its entry says {entry.rollouts}."
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -13,8 +12,7 @@ import numpy as np
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import check_capture
 from ...datasets.capture.sparse_points import POINTS_NAME, write_points
-from ...datasets.io.atomic import new_file, replaced_file
-from ...datasets.io.free_space import enough_room
+from ...datasets.io.atomic import new_file, replaced_file, temporary_directory
 from ...datasets.io.kinds import refuse_other_kind
 from ...datasets.io.places import require_place
 from ...datasets.io.progress import progress
@@ -71,13 +69,9 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     capture_root = Path(capture_root)
     capture = _open(capture_root, overwrite)
     require_place(capture_root / CAMERAS_NAME)  # now, not after minutes
-    temporary, todo = Path(tempfile.gettempdir()), "make room there, or set TMPDIR to another folder, and run it again."
-    with (
-        enough_room(temporary, "the photos and COLMAP's database", todo),
-        tempfile.TemporaryDirectory(prefix="cgwm-calibrate-") as folder,
-    ):
-        inputs = gather(capture, Path(folder))
-        best, attempts = search(Path(folder), inputs, config)
+    with temporary_directory("calibrate", "the photos and COLMAP's database") as folder:
+        inputs = gather(capture, folder)
+        best, attempts = search(folder, inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)
     model = best.model.transformed(similarity)
     cameras = _cameras_file(model, _scale(frame))

@@ -278,7 +278,8 @@ def _merged(track_s: Array, video_s: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return the times of a track and a video together (G,), from the track's start, and the track's rows (T,)."""
     later = video_s[video_s > track_s[0] + SAME_TIME_S]
     if len(later):
-        nearest = np.abs(track_s[:, None] - later).min(0)
+        after = np.searchsorted(track_s, later).clip(1, len(track_s) - 1)  # tracks have two samples or more
+        nearest = np.minimum(np.abs(track_s[after - 1] - later), np.abs(track_s[after] - later))
         later = later[nearest > SAME_TIME_S]
     later = later[np.diff(later, prepend=-np.inf) > SAME_TIME_S]
     grid = np.sort(np.concatenate((track_s, later)))

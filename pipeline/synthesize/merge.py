@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 
 from ...datasets.io.atomic import new_directory, new_file, sha256
@@ -18,13 +19,14 @@ from ...datasets.rollouts.dataset import (
     MANIFEST,
     MODEL_FOLDER,
     difference,
+    missing_count,
     missing_shards,
     read_manifest,
     settings_text,
     write_manifest,
 )
 from ...datasets.rollouts.index import INDEX, index_fault, write_index
-from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, tidied
+from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, span, tidied
 from ...schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
 
 SHOWN_FAULTS = 20
@@ -135,12 +137,13 @@ def _by_number(
 
 def _missing(shards: Sequence[_Shard], manifest: DatasetManifest) -> list[str]:
     """Return one fault that lists the missing shards; empty if none is missing."""
-    lacking = missing_shards(manifest.model_copy(update={"shards": tuple(shard.entry for shard in shards)}))
+    joined = manifest.model_copy(update={"shards": tuple(shard.entry for shard in shards)})
+    gaps, lacking, count = missing_shards(joined), missing_count(joined), manifest.shard_count
     if not lacking:
         return []
-    count = manifest.shard_count
-    names = ", ".join(shard_name(index, count) for index in lacking[:3]) + (", ..." if len(lacking) > 3 else "")
-    return [f"{len(lacking)} of {count} shards are missing: {names} (--array={ranges(lacking)})."]
+    first = islice(chain.from_iterable(gaps), 3)
+    names = ", ".join(shard_name(index, count) for index in first) + (", ..." if lacking > 3 else "")
+    return [f"{lacking} of {count} shards are missing: {names} (--array={','.join(map(span, gaps))})."]
 
 
 def _device_notes(shards: Sequence[_Shard]) -> list[str]:

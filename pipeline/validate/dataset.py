@@ -22,6 +22,8 @@ from .reprojection import PictureFindings, check_pictures, picture_facts
 from .rollout import Dataset, Rollout
 from .structure import check_file, check_structure, has_usable_contacts, listing_fault
 
+_LEAST_BYTES = 1024
+"""Lower bound of the size of a rollout in a shard [bytes]: its some fifty arrays have more in their headers alone."""
 SHOWN_FAULTS = 20
 """Maximum number of faults listed in the report."""
 
@@ -81,7 +83,7 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
     """
     root = Path(path)
     manifest = read_manifest(root)
-    chosen = None if sample is None else _sample(manifest.shards, sample, seed)
+    chosen = None if sample is None else _sample(root, manifest.shards, sample, seed)
     findings = _Findings(faults=check_hashes(root, manifest, None if chosen is None else set(chosen)))
     dataset = Dataset(manifest=manifest, model=_model(root, manifest, findings))
     shards = [shard for shard in manifest.shards if chosen is None or shard.file in chosen]
@@ -106,17 +108,23 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
     )
 
 
-def _sample(shards: Sequence[ShardEntry], count: int, seed: int) -> dict[str, list[int]]:
+def _sample(root: Path, shards: Sequence[ShardEntry], count: int, seed: int) -> dict[str, list[int]]:
     """Draw `count` rollouts, or all if there are fewer; return their indices within their shards, by file."""
     if count < 1:
         raise UsageError(f"--sample {count}: not a valid number of rollouts.", "1 or more.")
-    places = [(shard.file, place) for shard in shards for place in range(shard.rollouts)]
+    places = [(shard.file, place) for shard in shards for place in range(_most_rollouts(root, shard))]
     order = np.random.default_rng(seed).permutation(len(places))[:count]
     chosen: dict[str, list[int]] = {}
     for number in order:
         file, place = places[number]
         chosen.setdefault(file, []).append(place)
     return chosen
+
+
+def _most_rollouts(root: Path, shard: ShardEntry) -> int:
+    """Return the number of rollouts of a shard, or what its file has room for if its entry names an absurd number."""
+    file = root / shard.file
+    return min(shard.rollouts, file.stat().st_size // _LEAST_BYTES) if file.is_file() else 0
 
 
 def _model(root: Path, manifest: DatasetManifest, findings: _Findings) -> Model | None:
