@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +15,14 @@ from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note, progress
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
+from ..evaluate.prediction import STATE_FIT_EPISODES
 from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
+from ..evaluate.work import LESS, evaluation_parts
+from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
+from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.prepare import Prepared, prepare
 from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import after_release
@@ -77,7 +82,8 @@ def compare(
     loaded = [(str(path), read_model(path)) for path in models]
     accepted = accept_units or any(model.accepts_units for _, model in loaded)
     source = Capture.open(capture, splits=(split,), accept_units=accepted)
-    comparison = compare_models(loaded, source, split, warmup_s, device)
+    with _checked_work(loaded, source, split):
+        comparison = compare_models(loaded, source, split, warmup_s, device)
     if out is None:
         return comparison.result
     result = comparison.result.model_copy(update={"report": str(out)})
@@ -178,6 +184,20 @@ def _with_short_predictions(
             )
             bar.update(1)
     return compared
+
+
+@contextmanager
+def _checked_work(models: Sequence[tuple[str, Model]], capture: Capture, split: str) -> Iterator[None]:
+    """Refuse a comparison that this machine cannot finish; models that do not fit the capture are refused inside."""
+    episodes = [Episode(name, tracks) for name in capture.episodes(split) if (tracks := capture.tracks(name))]
+    spans, parts = durations(episodes), []
+    for name, model in models:
+        _check(name, model, capture)
+        world = World.from_model(model)
+        parts += evaluation_parts(world, episodes, STATE_FIT_EPISODES)
+        parts.append(segment_part(f"short predictions of {name}", world, spans))
+    with within_budget(parts, LESS, doubt=motion_doubt(spans)):
+        yield
 
 
 def _refuse_twice(models: Sequence[Path]) -> None:

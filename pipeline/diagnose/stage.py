@@ -25,9 +25,11 @@ from ...schemas import (
     UsageError,
 )
 from ..physics.effects.registry import effect_names, load_effect, split_units
+from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
+from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.candidates import Candidate, admissible
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
@@ -42,6 +44,8 @@ from .next_experiment import next_experiment
 from .sparse_regression import residual_law
 from .verdict import Findings, find
 from .wording import law_warnings, motion_warnings, sentence, unseen_motion
+
+_LESS = "Fewer episodes in the split, or a model with a longer step_s reduce it."
 
 
 @one_torch_thread()
@@ -114,7 +118,9 @@ def prepared_world(
     world = with_known_groups(world, model.file, names, capture.groups)
     if not accept_units:
         check_units_and_geometry(world, found.episodes, str(capture.root))
-    prepared = prepare(world, found.episodes, found.noise, _groups(capture, names))
+    spans = durations(found.episodes)
+    with within_budget([segment_part("the tests of all effects", world, spans)], _LESS, doubt=motion_doubt(spans)):
+        prepared = prepare(world, found.episodes, found.noise, _groups(capture, names))
     prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
     check_observability(world, prepared, str(capture.root))
     return world, prepared

@@ -31,6 +31,7 @@ from ..segments.random_effects import with_fitted_groups
 from ..trajectories.track_noise import Noise, estimate_noise
 from .image_errors import VideoComparison, VideoErrors
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, EpisodePrediction, predict
+from .work import checked_work
 
 Array = NDArray[np.float64]
 
@@ -260,7 +261,8 @@ def _predict(
     state_fits: int = STATE_FIT_EPISODES,
     fitted: World | None = None,
 ) -> list[EpisodePrediction]:
-    with progress(desc="eval: rollouts", total=len(episodes), unit="episode") as bar:
+    bar = progress(desc="eval: rollouts", total=len(episodes), unit="episode")
+    with checked_work(world, episodes, state_fits), bar:
         return predict(world, episodes, noise, warmup_s, video_times, bar.update, state_fits, fitted)
 
 

@@ -21,12 +21,15 @@ from ...schemas import (
     UsageError,
 )
 from ..physics.effects.registry import effect_of
+from ..physics.rollout_cost import durations
 from ..physics.world import World, inertia_elements
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
+from ..runtime.work_budget import motion_doubt, within_budget
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .tracks.contact_result import PhysicsFit
+from .work import LESS, fit_parts
 
 
 def fit_motion(
@@ -100,7 +103,10 @@ def _fitted_motion(
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        found = fit_with_effects(world, track_episodes(capture, split), config, noise, warm_started, capture.groups)
+        episodes = track_episodes(capture, split)
+        spans = durations(episodes)
+        with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
+            found = fit_with_effects(world, episodes, config, noise, warm_started, capture.groups)
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
         return replace(found, warnings=(*found.warnings, *warnings))
@@ -112,7 +118,15 @@ def _fitted_motion(
         )
     from .images.image_fit import fit_physics_from_images
 
-    return fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both", checkpoint)
+    spans = [max(_video_s(capture, name), 0.0) for name in capture.episodes(split)]
+    with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
+        return fit_physics_from_images(world, ready, capture, split, config, config.supervise == "both", checkpoint)
+
+
+def _video_s(capture: Capture, episode: str) -> float:
+    """Return the duration of the longest video of an episode [s]; 0 without one."""
+    times = [capture.frame_times(camera, episode) for camera in capture.videos(episode)]
+    return max((float(time[-1] - time[0]) for time in times if len(time)), default=0.0)
 
 
 def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from ...datasets.models.model import Model
     from ...schemas import EffectModel
 
+MOST_STEPS = 2_000_000_000
+"""Maximum number of steps of a rollout: some hours; the kernels count them in 32 bits."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
@@ -103,8 +106,19 @@ class World:
         return self.ground_normal, self.ground_offset
 
     def substeps(self, times_s: Tensor) -> list[int]:
-        """Return the number of steps in each interval of times (B, T) [s], none of them longer than `step_s`."""
+        """Return the number of steps in each interval of times (B, T) [s], none of them longer than `step_s`.
+
+        Raises:
+            InputDataError: If these are more than `MOST_STEPS`.
+        """
         longest = times_s.detach().diff(dim=1).amax(0).tolist()
+        steps = sum(longest) / self.step_s
+        if steps > MOST_STEPS:
+            raise InputDataError(
+                f"{sum(longest):.4g} s of motion in steps of {self.step_s:g} s are {steps:.3g} steps.",
+                f"up to {MOST_STEPS:.3g} steps.",
+                "check the times (seconds?) and the step_s of the model.",
+            )
         return [max(1, math.ceil(length / self.step_s - 1e-6)) for length in longest]
 
     @property

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,21 +13,26 @@ import numpy as np
 from ...datasets.capture.cameras import Camera
 from ...datasets.io.atomic import sha256
 from ...datasets.models.model import Model, read_model
+from ...datasets.rollouts.shards import shard_range
 from ...schemas import DatasetManifest, InputDataError, ModelFile, SamplingPlan, SynthesizeConfig, UsageError
 from ..physics.world import World
 from ..rendering.label_renderer import LabelRenderer
 from ..runtime.device import resolve_device
+from ..runtime.work_budget import within_budget
 from .parameters import DERIVED, not_varied, require_admissible, with_correlations
 from .plan import resolve_plan
 from .rejection import Rejection
 from .simulator import Simulator
 from .viewpoints import look_at_cameras
+from .work import LESS, shard_parts, synthesis_parts
 
 STATE_ONLY = (
     "state only: the model has no visual spheres, so there is nothing to render; "
     "obs/ holds the bodies' state and no images"
 )
 RECORDED_PACKAGES = ("cgwm", "h5py", "hdf5plugin", "mujoco", "numpy", "torch")
+_ENDLESS_SHARDS_S = 366 * 86400.0
+"""Duration of all shards of a dataset from which it is refused [s]: several machines may share them."""
 NOT_CONTENT = {"shard", "batch"}
 """Settings that do not affect the content of rollouts."""
 
@@ -83,12 +89,17 @@ def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
     return model, resolve_plan(model, plan)
 
 
-def prepared(path: Path, config: SynthesizeConfig) -> Job:
+def prepared(path: Path, config: SynthesizeConfig, out: Path | None = None) -> Job:
     """Read the model and prepare the shared inputs of all rollouts.
+
+    Args:
+        path: MODEL.
+        config: The settings.
+        out: Where the shard will be written, if it will.
 
     Raises:
         InputDataError: If `path` is no model, has no fitted physics, or the plan does not fit it.
-        UsageError: If the settings cannot be met.
+        UsageError: If the settings cannot be met, or this machine cannot finish the work.
     """
     model, plan = _with_plan(path, config.plan)
     count = round(config.duration_s * config.frame_rate_hz) + 1
@@ -103,8 +114,15 @@ def prepared(path: Path, config: SynthesizeConfig) -> Job:
             f"{path}: the model has no visual spheres, so that no camera sees it, and the plan has unseen_share.",
             todo="leave unseen_share out of [reject].",
         )
-    cameras = look_at_cameras(model, plan, config) if visible else {}
-    renderer = LabelRenderer(model, cameras, device) if visible else None
+    rollouts = len(shard_range(config.rollouts, config.shards, config.shard))
+    with within_budget(synthesis_parts(model, plan, config, rollouts, device, config.batch or 1), LESS, out):
+        return _job(model, plan, config, device, count)
+
+
+def _job(model: Model, plan: SamplingPlan, config: SynthesizeConfig, device: str, count: int) -> Job:
+    """Allocate what all rollouts of a shard share."""
+    cameras = look_at_cameras(model, plan, config) if model.body_splats else {}
+    renderer = LabelRenderer(model, cameras, device) if model.body_splats else None
     times = np.arange(count) / config.frame_rate_hz
     simulator, rejection = Simulator(model, times, device), Rejection.of(model, plan.reject)
     return Job(
@@ -118,6 +136,25 @@ def prepared(path: Path, config: SynthesizeConfig) -> Job:
         rejection=rejection,
         device=device,
     )
+
+
+@contextmanager
+def checked_work(path: Path, config: SynthesizeConfig, workers: int) -> Iterator[None]:
+    """Refuse a dataset of several shards that this machine cannot finish; shards already there are counted, too.
+
+    Args:
+        path: MODEL.
+        config: The settings.
+        workers: Number of shards made at a time.
+
+    Raises:
+        UsageError: If it cannot, with the numbers.
+    """
+    model, plan = _with_plan(path, config.plan)
+    device = str(resolve_device(config.device))
+    parts = synthesis_parts(model, plan, config, config.rollouts, device, config.batch or 1)
+    with within_budget(shard_parts(parts, config.shards, workers), LESS, endless_s=_ENDLESS_SHARDS_S):
+        yield
 
 
 def manifest_of(path: Path, job: Job, notes: tuple[str, ...]) -> DatasetManifest:

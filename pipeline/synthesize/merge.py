@@ -28,8 +28,11 @@ from ...datasets.rollouts.dataset import (
 from ...datasets.rollouts.index import INDEX, index_fault, write_index
 from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, span, tidied
 from ...schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
+from ..runtime.work_budget import Part, data_size, within_budget
 
 SHOWN_FAULTS = 20
+_READ_BYTES_S = 2e8
+"""Speed of reading and hashing shards [bytes/s]."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ def merge(
             "pass --out DATASET.",
         )
     manifests = [read_manifest(source) for source in sources]
-    shards, notes = _joined(sources, manifests, hashes)
+    with within_budget(_parts(sources, manifests) if hashes else [], "--sizes compares only the sizes of the shards."):
+        shards, notes = _joined(sources, manifests, hashes)
     manifest = manifests[0].model_copy(update={"shards": tuple(shard.entry for shard in shards), "index": None})
     for source in sources:
         notes += [f"left unfinished by a process that may be running: {file}" for file in tidied(source.resolve())]
@@ -96,6 +100,14 @@ def merge(
         up_to_date=kept,
         notes=tuple(notes),
     )
+
+
+def _parts(sources: Sequence[Path], manifests: Sequence[DatasetManifest]) -> list[Part]:
+    """Return the work of reading all shards that are there."""
+    pairs = zip(sources, manifests, strict=True)
+    files = [source / entry.file for source, manifest in pairs for entry in manifest.shards]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    return [Part(what=f"the hashes of {len(files)} shards, {data_size(size)}", seconds=size / _READ_BYTES_S)]
 
 
 def _joined(

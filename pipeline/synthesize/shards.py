@@ -28,6 +28,7 @@ from ...schemas import (
     UsageError,
 )
 from ..runtime.processes import in_workers
+from .job import checked_work
 from .stage import shard_indices, synthesize
 
 ROLLOUTS_PER_SHARD = 32
@@ -89,14 +90,15 @@ def synthesize_shards(
     shard_indices(config)
     if not (resume or overwrite):
         refuse_existing_shards(out, config.shards)
-    parts = [config.model_copy(update={"shard": shard}) for shard in range(config.shards)]
-    if ray is None and workers > 1:
-        outcomes = _in_processes(model, out, parts, overwrite, resume, preview, workers)
-    elif ray is None:
-        outcomes = _here(model, out, parts, overwrite, resume, preview)
-    else:
-        outcomes = _on_ray(model, out, parts, overwrite, resume, preview, ray)
-    done, failed = _collect(outcomes, out, config)
+    with checked_work(model, config, config.shards if ray is not None else workers):
+        parts = [config.model_copy(update={"shard": shard}) for shard in range(config.shards)]
+        if ray is None and workers > 1:
+            outcomes = _in_processes(model, out, parts, overwrite, resume, preview, workers)
+        elif ray is None:
+            outcomes = _here(model, out, parts, overwrite, resume, preview)
+        else:
+            outcomes = _on_ray(model, out, parts, overwrite, resume, preview, ray)
+        done, failed = _collect(outcomes, out, config)
     if failed:
         raise _failure(failed, len(done), config.shards)
     return _summary(out, config, done, time.perf_counter() - began)

@@ -87,7 +87,8 @@ def synthesize(
     """
     began = time.perf_counter()
     with one_torch_thread(kernels_too=True):
-        job = prepared(model, config)
+        shard_indices(config)
+        job = prepared(model, config, Path(out))
     tried = f"{job.model.visual_count} spheres, pictures of {config.width}x{config.height} px"
     with enough_memory(tried, job.device, "a smaller --width and --height, a model of fewer spheres"):
         summary = _written(job, model, out, config, overwrite, resume, began, stopwatch or Stopwatch())

@@ -86,7 +86,7 @@ def search_contact(
         open_loop_errors(world, batch.observations, batch.warm, names),
         prior,
         seed=config.seed,
-        population=config.population or _population(episodes),
+        population=config.population or default_population(episodes),
         generations=generations,
         first=np.array([p.encode(value) for p, value in start]),
         errors=ERRORS_PER_EPISODE * episodes,
@@ -101,7 +101,7 @@ def search_contact(
     return result
 
 
-def _population(episodes: int) -> int:
+def default_population(episodes: int) -> int:
     """Return the number of samples in a generation."""
     rollouts = MAX_ROLLOUTS
     if SEVERAL_EPISODES <= episodes < ENOUGH_EPISODES:  # shooting follows, and the cost has a single basin
