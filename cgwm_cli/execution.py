@@ -227,23 +227,30 @@ def _hush() -> None:
 
 @contextlib.contextmanager
 def _warnings_kept(discarded: bool) -> Iterator[None]:
-    """Print cgwm's own warnings at the end, because what is printed inside is discarded, unless they are, too."""
+    """Print cgwm's own warnings on the real stderr, as what is printed inside is discarded, unless they are, too.
+
+    They are printed at once: a warning that the work takes days is of no use after it.
+    """
     if discarded:
         yield
         return
     import logging
 
-    warned: list[str] = []
     handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: warned.append(record.getMessage())  # type: ignore[method-assign]
+    stderr = os.dup(2)
+
+    def emit(record: logging.LogRecord) -> None:
+        with contextlib.suppress(OSError):
+            os.write(stderr, f"Warning: {record.getMessage()}\n".encode(errors="backslashreplace"))
+
+    handler.emit = emit  # type: ignore[method-assign]
     logger = logging.getLogger("cgwm")
     logger.addHandler(handler)
     try:
         yield
     finally:
         logger.removeHandler(handler)
-        for text in warned:
-            print(f"Warning: {text}", file=sys.stderr)
+        os.close(stderr)
 
 
 @contextlib.contextmanager

@@ -111,7 +111,7 @@ def test_a_failure_leaves_nothing(
 
     simulate = batches.roll_out
     monkeypatch.setattr(batches, "roll_out", diverge)
-    with pytest.raises(NotConvergedError, match=r"rollout 0 \(seed 5\) diverged by step 0(.|\n)*Its start is in"):
+    with pytest.raises(NotConvergedError, match=r"rollout 0 \(seed 5\) diverged by step 0(.|\n)*Its start: "):
         synthesize(model_path, tmp_path / "out", CONFIG.model_copy(update={"shards": shards}))
     assert list(tmp_path.iterdir()) == []
 

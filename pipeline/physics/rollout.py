@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,6 +24,9 @@ from .world import State, World
 
 if TYPE_CHECKING:
     from ...datasets.capture.tracks import Track
+
+_SHOWN_STARTS = 3
+"""Maximum number of bodies whose start is in the message about a rollout that diverged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,7 +274,7 @@ def _expanded(x: Tensor, batch: int) -> Tensor:
 def require_finite(
     rollout: Rollout, world: World, state: State, names: Sequence[str] = (), frames: Sequence[int] = ()
 ) -> None:
-    """Check that a rollout stayed finite; otherwise save its initial state, so that it can be replayed.
+    """Check that a rollout stayed finite; the error has the initial state, so that it can be replayed.
 
     Args:
         rollout: The rollout.
@@ -283,7 +284,8 @@ def require_finite(
         frames: Number of frames of each environment to check; all where left out.
 
     Raises:
-        NotConvergedError: If a state is not finite, with the environment, the step and the file of its initial state.
+        NotConvergedError: If a state is not finite, with the environment, the step, and the start of the bodies whose
+            state is not.
     """
     poses = torch.cat((rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s), -1)
     finite = torch.isfinite(poses).flatten(2).all(-1)
@@ -295,19 +297,20 @@ def require_finite(
     item, frame = (int(k) for k in wrong[0])
     times = rollout.times_s if rollout.times_s.ndim == 1 else rollout.times_s[min(item, len(rollout.times_s) - 1)]
     since = float(times[frame] - times[0])
-    path = Path(tempfile.mkdtemp(prefix="cgwm-diverged-")) / "start.json"
-    path.write_text(json.dumps(_start(state, world.body_names, item), indent=2) + "\n")
+    lost = (~torch.isfinite(poses[item, frame]).all(-1)).nonzero()[:_SHOWN_STARTS, 0].tolist()
+    began = _start(state, world.body_names, item, lost)
     raise NotConvergedError(
         f"{names[item] if names else f'environment {item}'} diverged by step {math.ceil(since / world.step_s - 1e-6)}, "
-        f"{since:.4g} s after its start: its state is not finite. Its start is in {path}.",
+        f"{since:.4g} s after its start: its state is not finite. Its start: {began}.",
         todo="fit again with a smaller step (--set phys-geo.step_s=...), or check masses, units and the sampling plan.",
     )
 
 
-def _start(state: State, names: Sequence[str], item: int) -> dict[str, dict[str, list[float]]]:
-    """Return the state of one environment by body."""
+def _start(state: State, names: Sequence[str], item: int, bodies: Sequence[int]) -> str:
+    """Return the state of some bodies of one environment as JSON, with all digits."""
     fields = {key: getattr(state, key) for key in State.__dataclass_fields__}
-    return {
-        name: {key: values[min(item, len(values) - 1), index].tolist() for key, values in fields.items()}
-        for index, name in enumerate(names)
+    found = {
+        names[index]: {key: values[min(item, len(values) - 1), index].tolist() for key, values in fields.items()}
+        for index in bodies
     }
+    return json.dumps(found)

@@ -66,7 +66,7 @@ class Diverged:
     draw: Draw
     """The draw."""
     error: NotConvergedError
-    """Error that names the file of its start."""
+    """Error with its start."""
 
 
 class Simulator:
