@@ -45,7 +45,7 @@ from .sparse_regression import residual_law
 from .verdict import Findings, find
 from .wording import law_warnings, motion_warnings, sentence, unseen_motion
 
-_LESS = "Fewer episodes in the split, or a model with a longer step_s reduce it."
+_LESS = "name a split with fewer episodes, or use a model with a longer step_s."
 
 
 @one_torch_thread()

@@ -12,7 +12,7 @@ from ..runtime.work_budget import Part, motion_doubt, within_budget
 from ..trajectories.state_uncertainty import DAMPINGS, MAX_ITEMS
 from .prediction import SAMPLES, STATE_FIT_ITERATIONS
 
-LESS = "Evaluate shorter episodes ([episodes] start_s and end_s in capture.toml), or a model with a longer step_s."
+LESS = "evaluate shorter episodes ([episodes] start_s and end_s in capture.toml), or a model with a longer step_s."
 _STATE_SIZE = 12
 
 

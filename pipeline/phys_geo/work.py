@@ -11,9 +11,7 @@ from ..runtime.work_budget import Part
 from .tracks.contact_fit import MAX_EPISODES, MAX_SPAN_S
 from .tracks.open_loop_search import ENOUGH_EPISODES, MAX_ROLLOUTS, SEVERAL_EPISODES, default_population
 
-LESS = (
-    "A longer --set phys-geo.step_s, fewer --set phys-geo.generations or a smaller --set phys-geo.population reduce it."
-)
+LESS = "pass a longer --set phys-geo.step_s, or smaller phys-geo.generations or phys-geo.population."
 _SHOOTING_COLUMNS, _SHOOTING_STARTS = 20, (25, 4)
 """Rollouts of the whole motion for a step of multiple shooting, and number of its descents with their line searches,
 for fewer episodes than `SEVERAL_EPISODES` and for more."""

@@ -71,7 +71,7 @@ def within_budget(
 
 
 def _check(parts: Sequence[Part], less: str, out: Path | None, doubt: str, endless_s: float) -> None:
-    todo = f"{doubt} {less}".strip()
+    todo = f"{doubt} Otherwise {less}" if doubt else less
     memory, limit = sum(part.memory_bytes for part in parts), memory_limit()
     if memory > limit:
         heaviest = max(parts, key=lambda part: part.memory_bytes)
@@ -86,7 +86,7 @@ def _check(parts: Sequence[Part], less: str, out: Path | None, doubt: str, endle
         raise UsageError(
             f"{largest.what}: this writes {data_size(disk)} or more.",
             f"what the disk of {out} has free: {data_size(free)}.",
-            f"{todo} Or choose another --out.",
+            f"{todo.removesuffix('.')}, or choose another --out.",
         )
     seconds = sum(part.seconds for part in parts)
     if seconds > endless_s:
@@ -105,12 +105,12 @@ def duration(seconds: float) -> str:
     """Return a duration in the largest unit of which it has one or more.
 
     >>> duration(42), duration(10_900.0), duration(1e12)
-    ('42 s', '3 h', '3.2e+04 years')
+    ('42 s', '3 h', '32,000 years')
     """
     if not math.isfinite(seconds):
         return "forever"
     size, unit = next((size, unit) for size, unit in _UNITS if seconds >= size)
-    return f"{seconds / (size or 1.0):.2g} {unit}"
+    return f"{_rounded(seconds / (size or 1.0))} {unit}"
 
 
 def data_size(count: float) -> str:
@@ -120,13 +120,13 @@ def data_size(count: float) -> str:
     ('1.5 KiB', '27 TiB')
     """
     power = min(max(int(math.log2(max(count, 1.0)) // 10), 0), 6)
-    return f"{count / 1024**power:.2g} {('bytes', 'KiB', 'MiB', 'GiB', 'TiB', 'PiB', 'EiB')[power]}"
+    return f"{_rounded(count / 1024**power)} {('bytes', 'KiB', 'MiB', 'GiB', 'TiB', 'PiB', 'EiB')[power]}"
 
 
 def motion_doubt(durations_s: Sequence[float], longest_plausible_s: float = 60.0) -> str:
     """Return the question whether times are in milliseconds, for recorded motion that lasts long; else nothing."""
     longest = max(durations_s, default=0.0)
-    return f"An episode lasts {duration(longest)}: are the times in ms?" if longest > longest_plausible_s else ""
+    return f"an episode lasts {duration(longest)}: are the times in ms?" if longest > longest_plausible_s else ""
 
 
 def memory_limit() -> float:
@@ -138,6 +138,11 @@ def memory_limit() -> float:
         pass  # no container, or one without a limit ("max")
     soft = resource.getrlimit(resource.RLIMIT_AS)[0]
     return min([*limits, math.inf if soft == resource.RLIM_INFINITY else float(soft)])
+
+
+def _rounded(value: float) -> str:
+    """Return a number with two digits that count."""
+    return f"{float(f'{value:.2g}'):,.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def _physical_bytes() -> float:

@@ -77,7 +77,9 @@ def merge(
             "pass --out DATASET.",
         )
     manifests = [read_manifest(source) for source in sources]
-    with within_budget(_parts(sources, manifests) if hashes else [], "--sizes compares only the sizes of the shards."):
+    with within_budget(
+        _parts(sources, manifests) if hashes else [], "pass --sizes, which compares only the sizes of the shards."
+    ):
         shards, notes = _joined(sources, manifests, hashes)
     manifest = manifests[0].model_copy(update={"shards": tuple(shard.entry for shard in shards), "index": None})
     for source in sources:

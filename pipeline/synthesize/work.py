@@ -11,7 +11,7 @@ from ..physics.rollout_cost import rollout_seconds
 from ..physics.world import World
 from ..runtime.work_budget import Part, duration
 
-LESS = "Fewer --rollouts, or a smaller --set synthesize.duration_s, frame_rate_hz, width or height reduce it."
+LESS = "ask for fewer --rollouts, or a smaller --set synthesize.duration_s, frame_rate_hz, width or height."
 _FRAME_S, _PIXEL_S, _SPHERE_S = 5e-3, 1.5e-7, 5e-6
 """Rendering of a picture on the CPU: each, by pixel and by sphere [s]."""
 _CUDA_FASTER = 30.0
