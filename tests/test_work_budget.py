@@ -28,7 +28,7 @@ def seconds(parts: list[Part]) -> float:
     [
         (Part(what="x", seconds=1.01 * ENDLESS_S), r"about 30 days on this machine: 30 days for x(.|\n)*Next: less"),
         (Part(what="x", memory_bytes=1e18), r"x: this needs 890 PiB of memory(.|\n)*what this machine has"),
-        (Part(what="x", disk_bytes=1e18), r"x: this writes 890 PiB(.|\n)*another --out"),
+        (Part(what="x", disk_bytes=1e18), r"x: this writes 890 PiB(.|\n)*make room there"),
     ],
 )
 def test_what_cannot_be_finished_is_refused_with_its_numbers(part: Part, said: str, tmp_path: Path) -> None:

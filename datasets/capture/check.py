@@ -140,13 +140,20 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
     attempt(_check_cameras, capture, sizes, facts)
     episodes, unturned = listed(capture.episodes), {}
     facts.episodes = len(episodes)
+    normalised: list[str] = []
     for episode in episodes:
+        before = facts.normalised_quaternions
         attempt(_check_tracks, capture, episode, facts, unturned)
+        if facts.normalised_quaternions > before:
+            normalised.append(f"tracks/{episode}.csv")
         for camera in listed(capture.videos, episode):
             attempt(_check_video, capture, camera, episode, facts)
     attempt(_check_consistency, capture, facts, accept_units)
     if facts.normalised_quaternions:
-        facts.warnings.append(f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3).")
+        where = normalised[0] + (f" and {len(normalised) - 1} more files" if len(normalised) > 1 else "")
+        facts.warnings.append(
+            f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3), in {where}."
+        )
     if warning := capture.unturned_warning(unturned):
         facts.warnings.append(warning)
     return facts, faults.found

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
+from tempfile import gettempdir
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from ...schemas import (
     read_toml,
 )
 from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict
+from ..runtime.work_budget import Part, within_budget
 from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, photo_count, photo_labels, search, verdict
 from .markers import detect_markers, dictionary
@@ -40,6 +42,9 @@ from .world_frame import dominant_plane, ground_frame
 CAMERAS_NAME = "cameras.json"
 REPORT_NAME = "calibration.json"
 
+_TEMPORARY = "the photos and COLMAP's database"
+_FEATURE_BYTES = 76
+"""Lower bound of a feature in the database [bytes]: half of its descriptor and place."""
 _MANY_WITHOUT_STRONG = 0.5
 """Share of registered images without a pair of many verified matches above which a warning is given."""
 
@@ -69,7 +74,7 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     capture_root = Path(capture_root)
     capture = _open(capture_root, overwrite)
     require_place(capture_root / CAMERAS_NAME)  # now, not after minutes
-    with temporary_directory("calibrate", "the photos and COLMAP's database") as folder:
+    with _room_for_colmap(capture, config), temporary_directory("calibrate", _TEMPORARY) as folder:
         inputs = gather(capture, folder)
         best, attempts = search(folder, inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)
@@ -85,6 +90,14 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     )
     _write(capture_root, cameras, model, report, overwrite)
     return report
+
+
+def _room_for_colmap(capture: Capture, config: CalibrateConfig) -> AbstractContextManager[None]:
+    """Refuse a temporary folder that is too small for COLMAP, which ends the process if its database cannot grow."""
+    photos = [capture.root / "images" / name for name in capture.photos()]
+    size = sum(photo.stat().st_size for photo in photos) + len(photos) * config.max_features * _FEATURE_BYTES
+    what = f"{_TEMPORARY}, of {len(photos)} photos"
+    return within_budget([Part(what=what, disk_bytes=size)], "set TMPDIR to another folder.", Path(gettempdir()))
 
 
 def _open(root: Path, overwrite: bool) -> Capture:

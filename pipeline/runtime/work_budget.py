@@ -86,7 +86,7 @@ def _check(parts: Sequence[Part], less: str, out: Path | None, doubt: str, endle
         raise UsageError(
             f"{largest.what}: this writes {data_size(disk)} or more.",
             f"what the disk of {out} has free: {data_size(free)}.",
-            f"{todo.removesuffix('.')}, or choose another --out.",
+            f"{todo.removesuffix('.')}, or make room there.",
         )
     seconds = sum(part.seconds for part in parts)
     if seconds > endless_s:
