@@ -4,8 +4,9 @@ The command line (``cgwm --help``) and this package offer the same stages. Heavy
 stage is first used, so that importing :mod:`cgwm` costs milliseconds.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
+
+TYPE_CHECKING = False  # as in typing: the command imports nothing that takes time before it handles signals
 
 _PUBLIC = {
     "CalibrateConfig": ".schemas",
@@ -52,6 +53,8 @@ _PUBLIC = {
 # Installed, all rooms lie in this package; in the source tree they lie next to it.
 # pyright: reportMissingImports=false
 if TYPE_CHECKING:
+    from typing import Any
+
     from .datasets.capture import Capture
     from .datasets.importers.balldrops import import_balldrops
     from .datasets.importers.contactnets import import_contactnets
@@ -144,6 +147,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a public name on first use."""
     if name in _PUBLIC:
+        from importlib import import_module
+
         return getattr(import_module(_PUBLIC[name], __name__), name)
     if name == "__version__":
         return _version()

@@ -1,35 +1,35 @@
-"""Execution of the verbs: signals, errors, exit codes, and a stdout that carries only the result."""
+"""Execution of the verbs: errors, exit codes, and a stdout that carries only the result."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import re
-import signal
 import sys
-import traceback
 from collections.abc import Callable, Iterator
-from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
+from . import interrupts
+from .terminal import escape_logs, print_result, say, say_traceback
+
 if TYPE_CHECKING:
     from ..schemas import FileModel
 
-INTERRUPTED = 130
-REPEAT_S = 0.5
-"""Time between an interrupt and the check whether some code has swallowed it."""
-_interrupted = False
+_said = False
+"""Whether the user was told of an interrupt."""
 _typed: list[str] = []
 _RAY_ADDRESS = re.compile(r"auto|local|ray://.+|[\w.-]+:\d+")
 
 
 def run_command(load_app: Callable[[], Callable[..., Any]], arguments: list[str]) -> NoReturn:
     """Run the application that `load_app` imports with arguments, and end the process with its exit code."""
-    _catch_signals()
     try:
         code = _invoke(load_app, arguments)
+        if code == interrupts.INTERRUPTED and not _said:  # typer makes this code of an interrupt, too
+            _say_interrupted()
+        interrupts.end_work(code)
         sys.stdout.flush()
     except KeyboardInterrupt:
         code = _say_interrupted()
@@ -37,8 +37,9 @@ def run_command(load_app: Callable[[], Callable[..., Any]], arguments: list[str]
         # the reader of our output has closed it ("cgwm ... | head"), so the exit code is the only message
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
-    if _interrupted:
-        _leave(code)
+    interrupts.end_work(code)
+    if interrupts.was_interrupted():
+        interrupts.leave(code)
     sys.exit(code)
 
 
@@ -55,9 +56,11 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
     Raises:
         typer.Exit: With the exit code, if the work failed.
     """
+    interrupts.begin_work()
     watched = _is_watched(quiet, debug)
     if not watched:
         _hush()
+    escape_logs()
     printed: list[str] = []
 
     def emit(result: FileModel, summary: Callable[[Any], str]) -> None:
@@ -68,14 +71,17 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
 
     try:
         with _warnings_kept(discarded=watched or quiet), _stdout_for_results_only(watched):
-            yield emit
+            try:
+                yield emit
+            finally:
+                interrupts.end_work()  # the result stands, and is printed whole
         for text in printed:
-            print(text, flush=True)
+            print_result(text, json)
     except (typer.Exit, BrokenPipeError):
         raise
     except BaseException as error:
         if debug:
-            traceback.print_exc()
+            say_traceback()
         raise typer.Exit(_report(error, debug)) from None
 
 
@@ -83,9 +89,12 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
 def until_interrupted() -> Iterator[None]:
     """Run work that an interrupt ends as it should end, such as a server."""
     try:
+        interrupts.begin_work()
         yield
     except KeyboardInterrupt:
-        _set_alarm(0.0)
+        pass
+    finally:
+        interrupts.end_work()
 
 
 def with_values(arguments: list[str]) -> list[str]:
@@ -117,12 +126,12 @@ def _invoke(load_app: Callable[[], Callable[..., Any]], arguments: list[str]) ->
             raise
         from .usage import explain
 
-        print(explain(error, arguments), file=sys.stderr)
+        say(explain(error, arguments))
         return 2
 
 
 def _report(error: BaseException, debug: bool) -> int:
-    if _interrupted or isinstance(error, KeyboardInterrupt):
+    if interrupts.was_interrupted() or isinstance(error, KeyboardInterrupt):
         # recognised by its name, because the interrupt may have come while cgwm.schemas was imported
         return _say_interrupted(str(error) if type(error).__name__ == "InterruptedWork" else "")
     if isinstance(error, SystemExit):
@@ -130,15 +139,17 @@ def _report(error: BaseException, debug: bool) -> int:
     from ..schemas import CgwmError
 
     if isinstance(error, CgwmError):
-        print(error, file=sys.stderr)
+        say(error)
         return error.exit_code
-    print(_unforeseen(error, debug), file=sys.stderr)
+    say(_unforeseen(error, debug))
     return 1
 
 
 def _unforeseen(error: BaseException, debug: bool) -> str:
     if isinstance(error, OSError) and error.strerror:
-        place = f"{error.filename}: " if error.filename else ""
+        from ..schemas.printable import in_one_line
+
+        place = f"{in_one_line(str(error.filename))}: " if error.filename else ""
         return f"{place}{error.strerror}."
     from ..pipeline.runtime.resources import ran_out_of_memory
 
@@ -151,62 +162,24 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
 
 
 def _say_interrupted(state: str = "") -> int:
-    """Print that the command was interrupted and the state that the work reports; most work leaves no output."""
-    _set_alarm(0.0)
-    state = state or "no output was written."
-    print(f"Interrupted; {state}", file=sys.stderr)
-    return INTERRUPTED
+    """Print that the command was interrupted and the state that the work reports, or which outputs it has completed."""
+    global _said  # noqa: PLW0603  once for each process
+    interrupts.end_work()
+    if not _said:
+        _said = True
+        state = state or _completed()
+        if state:
+            say(f"Interrupted; {state}")
+        else:  # without an import: it may be the import of `say`'s modules that was interrupted
+            print(interrupts.NOTHING_WRITTEN, file=sys.stderr)
+    return interrupts.INTERRUPTED
 
 
-def _catch_signals() -> None:
-    """Make SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, so that unfinished output is cleaned up."""
-    handlers = {"SIGINT": _interrupt, "SIGTERM": _interrupt, "SIGHUP": _interrupt, "SIGALRM": _interrupt_again}
-    for name, handler in handlers.items():
-        number = getattr(signal, name, None)
-        # a signal that the parent process set to be ignored (nohup, a background job) stays ignored
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            with contextlib.suppress(ValueError):  # not in the main thread
-                signal.signal(number, handler)
-
-
-def _leave(code: int) -> NoReturn:
-    """End the process without waiting for threads: a thread whose start was interrupted may never end."""
-    import atexit
-
-    with contextlib.suppress(BaseException):
-        atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(code)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    global _interrupted  # noqa: PLW0603  remembered because a library may convert the exception
-    _interrupted = True
-    _set_alarm(REPEAT_S)
-    raise KeyboardInterrupt
-
-
-def _interrupt_again(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt again if the one before was swallowed, and leave the code that cleans up alone.
-
-    An interrupt is lost where Python cannot raise it (in a finalizer, a weak reference's callback) and where a library
-    catches everything. While it propagates, `finally`, `except` and `__exit__` run with it as the handled exception.
-    """
-    _set_alarm(REPEAT_S)
-    error = sys.exc_info()[1]
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return
-        error = error.__cause__ or error.__context__
-    raise KeyboardInterrupt
-
-
-def _set_alarm(seconds: float) -> None:
-    """Schedule SIGALRM after a number of seconds; zero cancels it. There is no SIGALRM on Windows."""
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+def _completed() -> str:
+    """Return the outputs that an interrupted command has completed, in words; empty for none."""
+    outputs = sys.modules.get("cgwm.datasets.io.outputs")  # imported by what writes outputs
+    names = [str(path) for path in outputs.completed()] if outputs is not None else []
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} complete." if names else ""
 
 
 def _is_watched(quiet: bool, debug: bool) -> bool:
@@ -236,12 +209,14 @@ def _warnings_kept(discarded: bool) -> Iterator[None]:
         return
     import logging
 
+    from ..schemas.printable import printable
+
     handler = logging.Handler(logging.WARNING)
     stderr = os.dup(2)
 
     def emit(record: logging.LogRecord) -> None:
         with contextlib.suppress(OSError):
-            os.write(stderr, f"Warning: {record.getMessage()}\n".encode(errors="backslashreplace"))
+            os.write(stderr, f"Warning: {printable(record.getMessage())}\n".encode(errors="backslashreplace"))
 
     handler.emit = emit  # type: ignore[method-assign]
     logger = logging.getLogger("cgwm")

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from typing import Any, NoReturn
 
-from .execution import run_command
+from .interrupts import caught
+
+TYPE_CHECKING = False  # as in typing; what is imported before signals are handled takes no time
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any, NoReturn
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run `cgwm` with arguments (default: those of the process), and end the process with its exit code."""
-    run_command(_app, sys.argv[1:] if arguments is None else arguments)
+    """Run `cgwm` with arguments, and raise SystemExit with its exit code.
+
+    Args:
+        arguments: The words after `cgwm`; None takes those of the process, which then ends with the command.
+    """
+    with caught(owned=arguments is None):
+        from .execution import run_command
+
+        run_command(_app, sys.argv[1:] if arguments is None else arguments)
 
 
 def _app() -> Callable[..., Any]:
-    # inside the signal handling of `run_command`, so that an interrupt while typer is imported ends cleanly
     from ..datasets.io.processors import use_few_threads
     from .app import app
 

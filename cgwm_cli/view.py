@@ -38,9 +38,9 @@ def view(
 
             viewer = ends.enter_context(open_view(thing, host, port))
             emit(ViewReport(url=viewer.url, showing=str(thing)), _summary)
-        if open_:
-            _open(viewer.url)
         with until_interrupted():
+            if open_:
+                _open(viewer.url)
             viewer.run()
 
 

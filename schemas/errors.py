@@ -8,6 +8,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from .printable import in_one_line
+
 
 class InterruptedWork(KeyboardInterrupt):
     """An interrupt after which something is left; the message says what, and how to go on.
@@ -28,6 +30,7 @@ class CgwmError(Exception):
     exit_code = 1
 
     def __init__(self, found: str, allowed: str = "", todo: str = "") -> None:
+        found, allowed, todo = in_one_line(found), in_one_line(allowed), in_one_line(todo)
         self.found, self.allowed, self.todo = found, allowed, todo
         lines = [found]
         if allowed:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ...schemas import UsageError
 from .free_space import enough_room
-from .outputs import DirectoryKind, FileKind, inside_output, refuse_output, write_record
+from .outputs import DirectoryKind, FileKind, about_to_place, inside_output, refuse_output, write_record
 from .places import require_place
 
 _PARTIAL = "partial"
@@ -54,6 +54,7 @@ def new_directory(path: Path | str, kind: DirectoryKind, overwrite: bool = False
                 yield temporary
             write_record(temporary, kind)
             _sync_tree(temporary)
+            about_to_place(temporary, path)
             _put_in_place(temporary, path, kind, overwrite)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -80,6 +81,7 @@ def new_file(path: Path | str, kind: FileKind, overwrite: bool = False) -> Itera
     with enough_room(path, f"the {kind}"), replaced_file(path) as temporary:
         yield temporary
         refuse_output(path, kind, overwrite)
+        about_to_place(temporary, path)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 from ...schemas import UsageError
 from .places import require_place
@@ -37,6 +37,8 @@ FileKind = Literal[
     "track file", "manifest",
 ]  # fmt: skip
 
+_DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
+
 _SYSTEM_FILES = re.compile(r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|replaced)-.*)")
 _ADDED: Mapping[str, re.Pattern[str]] = {
     "capture": re.compile(r"cameras\.json|calibration\.json|sparse_points(\.\d+)?\.ply|sparse\.\d+/.*"),
@@ -45,6 +47,10 @@ _ADDED: Mapping[str, re.Pattern[str]] = {
 """Files that other commands of cgwm add to an output or rewrite in it, by its kind."""
 
 _INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
+_NESTED: ContextVar[bool] = ContextVar("nested", default=False)
+"""Whether what is written is a part of an unfinished output."""
+_PLACED: list[tuple[Path, int]] = []
+"""Final names that outputs of this process were about to get, with the inodes of these."""
 
 
 P = ParamSpec("P")
@@ -77,11 +83,23 @@ def reads(*names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 @contextmanager
 def inside_output() -> Iterator[None]:
     """Suspend the protection for what is written inside of an output whose name was checked."""
-    token = _INPUTS.set(())
+    token, nested = _INPUTS.set(()), _NESTED.set(True)
     try:
         yield
     finally:
         _INPUTS.reset(token)
+        _NESTED.reset(nested)
+
+
+def about_to_place(temporary: Path, path: Path) -> None:
+    """Note that a complete output is about to get its final name, unless it is a part of another one."""
+    if not _NESTED.get():
+        _PLACED.append((path, temporary.stat().st_ino))
+
+
+def completed() -> list[Path]:
+    """Return the outputs to which this process has given their final names, and which are there."""
+    return [path for path, inode in _PLACED if path.exists() and path.stat().st_ino == inode]
 
 
 @contextmanager
@@ -127,9 +145,6 @@ def write_record(folder: Path, kind: DirectoryKind) -> None:
     files = {name: _digest(folder / name) for name in _names(folder)}
     text = json.dumps({"format": _FORMAT, "kind": kind, "files": files}, indent=0, sort_keys=True)
     (folder / RECORD).write_text(text + "\n", encoding="utf-8")
-
-
-_DIRECTORY_KINDS = frozenset(DirectoryKind.__args__)  # type: ignore[attr-defined]
 
 
 def _with_article(kind: str) -> str:

@@ -1,0 +1,51 @@
+"""The one way from a command to the terminal: messages, results, warnings and logs with control characters escaped."""
+
+from __future__ import annotations
+
+import sys
+from typing import TextIO
+
+
+def say(text: object, stream: TextIO | None = None) -> None:
+    """Print a message, on stderr unless another stream is given."""
+    from ..schemas.printable import printable
+
+    _print(printable(str(text)), stream or sys.stderr)
+
+
+def print_result(text: str, json: bool) -> None:
+    """Print the result of a command on stdout: a summary, or a JSON document."""
+    from ..schemas.printable import printable, printable_json
+
+    _print(printable_json(text) if json else printable(text), sys.stdout)
+
+
+def say_traceback() -> None:
+    """Print the traceback of the exception that is being handled."""
+    import traceback
+
+    say(traceback.format_exc().rstrip("\n"))
+
+
+def escape_logs() -> None:
+    """Escape what loggers and warnings without a handler of their own print."""
+    import logging
+    import warnings
+
+    from ..schemas.printable import printable
+
+    class Escaped(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            return printable(super().format(record))
+
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(Escaped())
+    as_before = warnings.formatwarning
+    warnings.formatwarning = lambda *args, **options: printable(as_before(*args, **options))
+
+
+def _print(text: str, stream: TextIO) -> None:
+    """Write a text in one piece, so that an interrupt leaves no half of it, in the characters that the stream has."""
+    encoding = stream.encoding or "utf-8"
+    stream.write(f"{text}\n".encode(encoding, "backslashreplace").decode(encoding))
+    stream.flush()
