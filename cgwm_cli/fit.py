@@ -58,7 +58,9 @@ def fit(
     refine_poses: Annotated[
         bool | None, typer.Option("--refine-poses", help="Refine the poses of the photos' cameras first.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted fit of MODEL.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted fit of MODEL; keep a finished one.")
+    ] = False,
     collision: Annotated[
         Literal["distilled", "visual"] | None,
         typer.Option(
@@ -79,7 +81,7 @@ def fit(
     """Fit a world model to a capture: shape and appearance (sg-gs), then physics (phys-geo)."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         trust(trust_effects)
-        from ..pipeline.fit import fit as work
+        from ..pipeline.fit import fit_or_keep as work
         from ..schemas import PhysConfig, SplatConfig
         from .settings import StageSettings
 
@@ -95,18 +97,17 @@ def fit(
         motion = {"supervise": supervise, "effects": names}
         splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
         physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, **motion)
-        emit(
-            work(capture, out, stage, parent, split, splats, physics, overwrite, resume, accept_units),
-            lambda model: _summary(model, out),
-        )
+        fitted, kept = work(capture, out, stage, parent, split, splats, physics, overwrite, resume, accept_units)
+        emit(fitted, lambda model: _summary(model, out, kept))
 
 
-def _summary(model: ModelFile, out: Path) -> str:
+def _summary(model: ModelFile, out: Path, kept: bool = False) -> str:
     from .output import table, warnings
 
     bodies = ", ".join(f"{body.name} ({body.motion})" for body in model.bodies)
     state = "with physics" if model.contact else "shape and appearance only, without physics"
-    lines = [f"Fitted {out}: {bodies}; {state}."]
+    verb = "Already complete, kept:" if kept else "Fitted"
+    lines = [f"{verb} {out}: {bodies}; {state}."]
     if model.parameters:
         lines.append(
             table([_row(p) for p in model.parameters], ["parameter", "estimate", "95 % interval", "unit", "state"])

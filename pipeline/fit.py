@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -14,11 +12,10 @@ from typing import Literal
 import numpy as np
 
 from ..datasets.capture.capture import Capture
-from ..datasets.capture.colmap_model import find_colmap_model
-from ..datasets.capture.geometry_maps import KINDS
-from ..datasets.capture.sparse_points import POINTS_NAME
-from ..datasets.io.atomic import sha256
 from ..datasets.io.outputs import reads, refuse_output
+from ..datasets.models.effect_files import effect_file
+from ..datasets.models.finished import finished_model
+from ..datasets.models.fit_inputs import input_hashes, motion_inputs, photo_inputs, versions
 from ..datasets.models.model import Model, read_model, write_model
 from ..schemas import (
     Body,
@@ -38,7 +35,7 @@ from ..schemas import (
 from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
 from .phys_geo.stage import fit_motion
-from .physics.effects.trust import keep_trust
+from .physics.effects.trust import is_trusted, keep_trust
 from .physics.world import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
 from .runtime.device import resolve_device
@@ -76,56 +73,93 @@ def fit(
         splat_config: Settings of sg-gs.
         phys_config: Settings of phys-geo.
         overwrite: Replace an existing model.
-        resume: Continue an interrupted fit of the same model, if there is one.
+        resume: Continue an interrupted fit of the same model, if there is one; keep a finished model that was made of
+            the same inputs with the same settings.
         accept_units: Do not refuse units and frames that the motion contradicts; the model records it.
 
     Returns:
         The content of `model.json`.
 
     Raises:
-        UsageError: If `out` exists, or the split does not.
+        UsageError: If `out` exists, or the split does not; with `resume`, if `out` was made of other inputs.
         InputDataError: If the capture lacks what the stage needs.
         NotConvergedError: If the fit diverges; nothing is written then.
         NotEnoughMemoryError: If there is not enough memory.
     """
+    model, _ = fit_or_keep(
+        capture, out, stage, parent, split, splat_config, phys_config, overwrite, resume, accept_units
+    )
+    return model
+
+
+@reads("capture")
+def fit_or_keep(
+    capture: Path,
+    out: Path,
+    stage: Stage = "all",
+    parent: Path | None = None,
+    split: str = "train",
+    splat_config: SplatConfig | None = None,
+    phys_config: PhysConfig | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    accept_units: bool = False,
+) -> tuple[ModelFile, bool]:
+    """Fit as :func:`fit` does; return the content of `model.json`, and whether it is that of a model that was kept."""
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
-    _refuse_early(out, stage, phys_config, overwrite)
-    splits = (split,) if stage != "sg-gs" else ()
-    opened = Capture.open(capture, splits=splits, accept_units=accept_units or _accepts_units(parent))
+    out = Path(out)
+    finished = resume and (out / "model.json").is_file()
+    if not finished:
+        refuse_output(out, "model", overwrite)
+    _refuse_early(stage, phys_config)
+    accept_units = accept_units or _accepts_units(parent)
+    opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else (), accept_units=accept_units)
     started = time.perf_counter()
     request = _Request(
         capture=opened,
-        out=Path(out),
+        out=out,
         stage=stage,
         parent=parent,
         split=split,
         splat_config=splat_config,
         phys_config=phys_config,
-        accept_units=accept_units or _accepts_units(parent),
+        accept_units=accept_units,
     )
-    checkpoint = Checkpoint.beside(request.out, _inputs(request), resume, overwrite)
+    made_of = {} if stage == "phys-geo" else photo_inputs(opened, splat_config)  # phys-geo alone makes no spheres
+    if stage != "sg-gs":
+        made_of |= motion_inputs(opened, parent if stage == "phys-geo" else None, split, phys_config)
+    provenance = _provenance(request, made_of)
+    if finished and (kept := finished_model(out, provenance, overwrite)) is not None:
+        _complete(request, kept.effects, made_of)
+        return kept, True
+    refuse_output(out, "model", overwrite)
+    checkpoint = Checkpoint.beside(out, made_of, resume, overwrite)
     moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
     # videos that identify nothing are reported before hours of work
     warnings = [*opened.inconsistencies, *_video_warnings(request)] if moves else []
     model = _fitted_model(request, checkpoint, moves, warnings)
-    provenance = _provenance(request, model.file.effects)
+    provenance = provenance.model_copy(update={"input_sha256": _with_sources(provenance, model.file.effects)})
     stages = model.fit.stages | {"total": {"seconds": round(time.perf_counter() - started, 2)}}
     file = model.file.model_copy(update={"provenance": provenance})
     fit_file = FitFile(stages=stages, warnings=file.warnings)
     written = write_model(out, replace(model, file=file, fit=fit_file), overwrite)
-    keep_trust(effect.name for effect in model.file.effects)
-    checkpoint.remove()
-    return written.file
+    _complete(request, model.file.effects, made_of)
+    return written.file, False
 
 
-def _refuse_early(out: Path, stage: Stage, config: PhysConfig, overwrite: bool) -> None:
-    """Refuse what cannot succeed, before hours of work."""
-    refuse_output(out, "model", overwrite)
+def _refuse_early(stage: Stage, config: PhysConfig) -> None:
+    """Refuse effects that cannot be fitted, before hours of work."""
     with_effects((), config.effects)
     if config.effects and stage == "sg-gs":
         raise UsageError(
             "--effects with --stage sg-gs: effects are fitted to motion.", "--stage phys-geo or all.", "leave one out."
         )
+
+
+def _complete(request: _Request, effects: Sequence[EffectModel], made_of: Mapping[str, str]) -> None:
+    """Do what follows the model, which may have been left out if the process was killed between the two."""
+    keep_trust(effect for effect in effects if effect.sha256 is not None and is_trusted(effect.sha256))
+    Checkpoint.remove_of(request.out, made_of)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,17 +191,6 @@ def _accepts_units(parent: Path | None) -> bool:
     return bool(read_json(parent / "model.json", ModelFile).provenance.config.get("accept_units", False))
 
 
-def _inputs(request: _Request) -> dict[str, str]:
-    """Return the fingerprint of all inputs of a fit, against which its checkpoint is checked."""
-    # phys-geo alone makes no spheres, so the photos need not be hashed
-    made_of = {} if request.stage == "phys-geo" else _made_of(request.capture, request.splat_config)
-    if request.stage == "sg-gs":
-        return made_of
-    return made_of | _physics_made_of(
-        request.capture, request.stage, request.parent, request.split, request.phys_config
-    )
-
-
 def _video_warnings(request: _Request) -> list[str]:
     """Return warnings about the videos that are to be fitted."""
     if request.phys_config.supervise == "tracks":
@@ -191,12 +214,13 @@ def _fitted_model(request: _Request, checkpoint: Checkpoint, moves: bool, warnin
     return model
 
 
-def _provenance(request: _Request, effects: Sequence[EffectModel]) -> Provenance:
-    """Return the inputs, settings and versions from which the model was made."""
+def _provenance(request: _Request, made_of: Mapping[str, str]) -> Provenance:
+    """Return the inputs, settings and versions from which the model is made."""
+    effects = tuple(request.phys_config.effects)
     return Provenance(
         capture=request.capture.root.resolve().name,
-        input_sha256=_input_hashes(request.capture, request.split, effects),
-        versions=_versions(),
+        input_sha256=input_hashes(request.capture, request.split, request.parent, effects, made_of),
+        versions=versions(),
         seed=request.phys_config.seed,
         # a relative path stays valid when both models are moved together
         parent=None if request.parent is None else os.path.relpath(request.parent, request.out.parent),
@@ -210,6 +234,12 @@ def _provenance(request: _Request, effects: Sequence[EffectModel]) -> Provenance
     )
 
 
+def _with_sources(provenance: Provenance, effects: Sequence[EffectModel]) -> dict[str, str]:
+    """Return the hashes of the inputs, with those of the effects by their names in the model."""
+    files = {name: digest for name, digest in provenance.input_sha256.items() if effect_file(name) is None}
+    return files | {effect.name: effect.sha256 for effect in effects if effect.sha256 is not None}
+
+
 def _needs(config: SplatConfig | PhysConfig) -> tuple[str, str, str]:
     """Return a stage's sizes that need memory, its device, and the advice for using less."""
     device = resolve_device(config.device).type
@@ -220,34 +250,6 @@ def _needs(config: SplatConfig | PhysConfig) -> tuple[str, str, str]:
         return tried, device, f"fewer spheres ({less}), smaller photos (--set sg-gs.image_size=N)"
     population = "a population of 24 to 96" if config.population is None else f"a population of {config.population}"
     return f"{population}, supervised by {config.supervise}", device, "--set phys-geo.population=N with a smaller N"
-
-
-def _made_of(capture: Capture, config: SplatConfig) -> dict[str, str]:
-    """Return the fingerprint of the inputs of sg-gs: settings, versions and hashes of files."""
-    root, colmap = capture.root, find_colmap_model(capture.root)
-    names = ("images", "masks", *KINDS, "capture.toml", "cameras.json", "transforms.json", POINTS_NAME)
-    shapes = [file for body in capture.manifest.bodies if (file := capture.shape_file(body)) is not None]
-    paths = [root / name for name in names] + ([] if colmap is None else [colmap]) + shapes
-    inputs = {path.relative_to(root).as_posix(): sha256(path) for path in paths if path.exists()}
-    return {"settings": config.model_dump_json(), "versions": json.dumps(_versions()), **inputs}
-
-
-def _physics_made_of(
-    capture: Capture, stage: Stage, parent: Path | None, split: str, config: PhysConfig
-) -> dict[str, str]:
-    """Return the fingerprint of the inputs of phys-geo: settings, parent model and hashes of files."""
-    made = {"physics settings": config.model_dump_json(), "split": split}
-    if stage == "phys-geo" and parent is not None and (parent / "model.json").is_file():
-        made["parent model"] = sha256(parent / "model.json")
-    if config.supervise == "tracks" or split not in capture.manifest.splits:
-        return made
-    for name in ("capture.toml", "cameras.json"):
-        if (capture.root / name).is_file():
-            made[name] = sha256(capture.root / name)
-    for episode in capture.episodes(split):
-        for camera in capture.videos(episode):
-            made[f"video {camera}/{episode}"] = sha256(capture.video_path(camera, episode))
-    return made
 
 
 def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatConfig, checkpoint: Checkpoint) -> Model:
@@ -366,21 +368,6 @@ def _has_motion(capture: Capture, split: str) -> bool:
         return False
     episodes = capture.episodes(split)
     return any(capture.tracks(name) or capture.videos(name) for name in episodes)
-
-
-def _input_hashes(capture: Capture, split: str, effects: Sequence[EffectModel]) -> dict[str, str]:
-    """Return the SHA-256 hashes of manifest, cameras, tracks and effect files, by name."""
-    names = ["capture.toml", "cameras.json"]
-    if split in capture.manifest.splits:
-        names += [f"tracks/{episode}.csv" for episode in capture.episodes(split)]
-    files = {name: capture.root / name for name in names}
-    files |= {effect.name: Path(effect.name.partition(":")[0]) for effect in effects if ".py:" in effect.name}
-    return {name: sha256(path) for name, path in files.items() if path.is_file()}
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of cgwm and its numerical libraries."""
-    return {name: importlib.metadata.version(name) for name in ("cgwm", "torch", "numpy", "scipy")}
 
 
 def _three(vector: np.ndarray) -> tuple[float, float, float]:

@@ -9,8 +9,9 @@ import time
 import numpy as np
 import pytest
 import torch
+from cgwm.datasets.models.fit_inputs import photo_inputs
 from cgwm.datasets.models.model import read_model
-from cgwm.pipeline.fit import _made_of, fit
+from cgwm.pipeline.fit import fit
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs import optimize as descents
@@ -161,11 +162,11 @@ def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
 def test_a_checkpoint_is_made_of_shapes_and_cameras_of_colmap_too(tmp_path):
     capture = make_capture(tmp_path / "capture", shape='shape = { mesh = { path = "ball.obj" } }')
     (capture.root / "ball.obj").write_text("v 0 0 0\n")
-    before = _made_of(capture, CONFIG)
+    before = photo_inputs(capture, CONFIG)
     (capture.root / "ball.obj").write_text("v 0 0 1\n")
     model = capture.root / "sparse" / "0"
     model.mkdir(parents=True)
     for name in ("cameras.txt", "images.txt"):
         (model / name).write_text("# none\n")
-    after = _made_of(capture, CONFIG)
+    after = photo_inputs(capture, CONFIG)
     assert {name for name in after if after[name] != before.get(name)} == {"ball.obj", "sparse/0"}

@@ -107,7 +107,7 @@ def test_consent_is_to_a_model_a_file_or_a_hash(stranger: Path, consent: Callabl
 
 
 def test_a_model_of_ones_own_needs_no_word(stranger: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    keep_trust([f"{stranger / 'effects' / 'lift.py'}:MyEffect"])
+    keep_trust(read_model(stranger).file.effects)
     monkeypatch.setenv(_VARIABLE, "")  # as in a later process
     synthesize(stranger, stranger.parent / "ds", TINY)
     store = stranger.parent / "state" / "cgwm" / "trusted-effects"

@@ -44,7 +44,7 @@ _ADDED: Mapping[str, re.Pattern[str]] = {
     "capture": re.compile(r"cameras\.json|calibration\.json|sparse_points(\.\d+)?\.ply|sparse\.\d+/.*"),
     "dataset": re.compile(r"dataset\.json|index\.h5|rollouts-\d+-of-\d+\.(h5|json)|preview\.(png|webm)"),
 }
-"""Files that other commands of cgwm add to an output or rewrite in it, by its kind."""
+"""Files that other commands of cgwm add to an output or rewrite in it, by its kind; see :func:`_is_added`."""
 
 _INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 _NESTED: ContextVar[bool] = ContextVar("nested", default=False)
@@ -165,9 +165,8 @@ def _refuse_part(path: Path, place: Path) -> None:
         if record is None:
             continue
         kind, name = str(record["kind"]), place.relative_to(folder).as_posix()
-        added = _ADDED.get(kind)
         listed = any(f"{file}/".startswith(f"{name}/") for file in record["files"])
-        if kind != "demo" and listed and not (added is not None and added.fullmatch(name)):
+        if kind != "demo" and listed and not _is_added(folder, kind, name):
             raise UsageError(
                 f"{path} is a part of the {kind} {folder}; --overwrite does not remove it.", todo="choose another name."
             )
@@ -203,15 +202,26 @@ def _directory_fault(path: Path, kind: str) -> str:
     record = _read_record(path)
     if record is None or record.get("kind") != kind:
         return f"holds no {kind}" + ("" if record is None else f" but {_with_article(str(record.get('kind')))}")
-    files, added = record["files"], _ADDED.get(kind)
+    files = record["files"]
     for name in names:
-        if added is not None and added.fullmatch(name):
+        if _is_added(path, kind, name):
             continue
         if name not in files:
             return f"holds {name}, which cgwm did not write"
         if files[name] != _digest(path / name):
             return f"holds {name}, which was changed since cgwm wrote it"
     return ""
+
+
+def _is_added(folder: Path, kind: str, name: str) -> bool:
+    """Return whether another command of cgwm adds this file to such an output or rewrites it there.
+
+    In a capture it is `calibrate`, whose report lies beside the cameras; without it they are the user's own.
+    """
+    added = _ADDED.get(kind)
+    if added is None or not added.fullmatch(name):
+        return False
+    return kind != "capture" or _is_calibrated(folder / "cameras.json")
 
 
 def _read_record(path: Path) -> dict[str, Any] | None:
@@ -272,7 +282,11 @@ def _is_index(path: Path) -> bool:
 
 
 def _is_calibrated(path: Path) -> bool:
-    return _head(b'"cgwm-cameras/')(path) and (path.parent / "calibration.json").is_file()
+    """Return whether cameras are those that `calibrate` wrote, with its report beside them."""
+    report = path.parent / "calibration.json"
+    if not (path.is_file() and report.is_file()):
+        return False
+    return _head(b'"cgwm-cameras/')(path) and _head(b'"cgwm-calibration/')(report)
 
 
 def _is_unchanged(path: Path) -> bool:

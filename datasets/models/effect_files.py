@@ -1,6 +1,8 @@
 """Sources of custom effects in a model directory: `effects/<name>.py`, with their SHA-256 in `model.json`.
 
-In memory an effect is named by the absolute path of its source. Nothing is imported here.
+In memory an effect is named by the absolute path of its source, and its SHA-256 names the content: what is read once
+is kept, so that an edit of the file during a fit changes neither what is run nor what is packed. Nothing is imported
+here.
 """
 
 from __future__ import annotations
@@ -11,8 +13,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ...schemas import EffectModel, InputDataError
+from ...schemas.regular_files import require_regular_file
 
 EFFECTS = "effects"
+_CONTENTS: dict[str, bytes] = {}
+"""Contents of the sources that this process has read, by SHA-256."""
 _PACKED = re.compile(rf"{EFFECTS}/[\w-]+\.py")
 
 
@@ -20,6 +25,34 @@ def effect_file(name: str) -> tuple[Path, str] | None:
     """Return the file of an effect and the rest of its name (`Class`, `Class@group`); None for one without a file."""
     file, _, rest = name.partition(":")
     return (Path(file), rest) if file.endswith(".py") else None
+
+
+def read_source(path: Path) -> str:
+    """Read the source of an effect as it is now, keep its content, and return its SHA-256.
+
+    Raises:
+        InputDataError: If there is no such file.
+    """
+    data = _read(path)
+    digest = hashlib.sha256(data).hexdigest()
+    _CONTENTS[digest] = data
+    return digest
+
+
+def source_content(path: Path, sha256: str | None) -> bytes:
+    """Return the content of the source of an effect: the kept one with this SHA-256, or that of the file.
+
+    Raises:
+        InputDataError: If there is no such file, or it has another content.
+    """
+    found = sha256 if sha256 in _CONTENTS else read_source(path)
+    if sha256 not in (None, found):
+        raise InputDataError(
+            f"{path}: its content has changed since the effect in it was read (SHA-256).",
+            "the file that was read.",
+            "run the command again, and leave the file alone while it runs.",
+        )
+    return _CONTENTS[found or ""]
 
 
 def packed_name(name: str) -> str:
@@ -38,7 +71,7 @@ def pack_effects(effects: Iterable[EffectModel], directory: Path) -> tuple[Effec
     for effect in effects:
         found = effect_file(effect.name)
         if found is not None:
-            data = _read(found[0])
+            data = source_content(found[0], effect.sha256)
             if contents.setdefault(found[0].name, data) != data:
                 raise InputDataError(f"two effects have different files called {found[0].name}.", todo="rename one.")
             (directory / EFFECTS).mkdir(exist_ok=True)
@@ -63,7 +96,7 @@ def unpack_effects(effects: Iterable[EffectModel], root: Path) -> tuple[EffectMo
                 allowed = f"a file of the model, {EFFECTS}/NAME.py:CLASS."
                 raise InputDataError(f"{where}: its file lies outside of the model.", allowed, "fit the model again.")
             path = (root / found[0]).resolve()
-            if hashlib.sha256(_read(path)).hexdigest() != effect.sha256:
+            if read_source(path) != effect.sha256:
                 raise InputDataError(
                     f"{where}: its file has another content than when the model was written (SHA-256).",
                     "the file that the model was fitted with.",
@@ -75,6 +108,6 @@ def unpack_effects(effects: Iterable[EffectModel], root: Path) -> tuple[EffectMo
 
 
 def _read(path: Path) -> bytes:
-    if not path.is_file():
+    if not path.exists():
         raise InputDataError(f"{path}: no such file, though an effect of the model is in it.", todo="bring it back.")
-    return path.read_bytes()
+    return require_regular_file(path).read_bytes()

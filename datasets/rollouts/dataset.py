@@ -16,7 +16,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from ...schemas import DamagedShardError, DatasetManifest, ShardEntry, UsageError, read_json
+from ...schemas import DamagedShardError, DatasetManifest, InputDataError, ShardEntry, UsageError, read_json
 from ..io.atomic import move_into_place, new_directory, replaced_file, scratch_file, sha256
 from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
@@ -118,7 +118,7 @@ def new_dataset(
     if manifest.shard_count == 1:
         with enough_room(path, name), new_directory(path, "dataset", overwrite) as folder:
             yield folder / name, entries
-            shutil.copytree(model, folder / MODEL_FOLDER)
+            _copy_model(model, folder, manifest)
             write_manifest(folder, manifest.model_copy(update={"shards": _stamped(entries, manifest)}))
         return
     home = path.resolve()  # beside the directory itself, so that renaming stays on one file system
@@ -138,7 +138,7 @@ def _publish(
     if not path.exists():
         try:
             with new_directory(path, "dataset") as folder:
-                shutil.copytree(model, folder / MODEL_FOLDER)
+                _copy_model(model, folder, manifest)
                 write_manifest(folder, manifest)
         except (UsageError, OSError):
             if not _appears(path / MANIFEST):  # not the case that another shard was faster
@@ -151,6 +151,18 @@ def _publish(
         return
     write_entry(path, entry)
     move_into_place(temporary, path / entry.file)
+
+
+def _copy_model(model: Path, folder: Path, manifest: DatasetManifest) -> None:
+    """Copy the model into a dataset, which refuses one that is no longer what the rollouts were made of."""
+    copy = folder / MODEL_FOLDER
+    shutil.copytree(model, copy)
+    if sha256(copy) != manifest.model_sha256:
+        raise InputDataError(
+            f"{model}: was changed while its rollouts were made.",
+            "a model that nobody writes to meanwhile.",
+            "run the command again.",
+        )
 
 
 def _appears(file: Path, seconds: float = 10.0) -> bool:

@@ -75,6 +75,13 @@ class Checkpoint:
             )
         return checkpoint
 
+    @staticmethod
+    def remove_of(out: Path, made_of: Mapping[str, str]) -> None:
+        """Remove the checkpoints of a complete model `out`, but not those of a fit that is made of something else."""
+        checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
+        if not checkpoint._differing():
+            checkpoint.remove()
+
     def slot(self, name: str) -> Slot:
         """Return the storage of one descent's state."""
         return Slot(self, name)
@@ -120,12 +127,16 @@ class Checkpoint:
                 todo="remove the file, or pass --overwrite to begin the fit again.",
             ) from None
 
-    def _refuse_others(self) -> None:
+    def _differing(self) -> list[str]:
         try:
             found = json.loads((self.path / _KEY).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             found = {}
-        names = sorted(name for name in {*found, *self._made_of} if found.get(name) != self._made_of.get(name))
+        found = found if isinstance(found, dict) else {}
+        return sorted(name for name in {*found, *self._made_of} if found.get(name) != self._made_of.get(name))
+
+    def _refuse_others(self) -> None:
+        names = self._differing()
         if names:
             raise UsageError(
                 f"{self.path} was made with other {', '.join(names)}.",

@@ -27,6 +27,7 @@ from ...schemas import (
     SynthesizeConfig,
     UsageError,
 )
+from ..physics.effects.trust import trust_effects, trusted_effects
 from ..runtime.processes import in_workers
 from .job import checked_work
 from .stage import shard_indices, synthesize
@@ -162,7 +163,8 @@ def _on_ray(
         # A restarted task may find the shard that it made before its worker died, and keeps it.
         keep = resume or not overwrite
         places = str(model.resolve()), str(out.resolve())
-        pending = {task.remote(*places, part, overwrite, keep, preview): part.shard for part in parts}
+        consent = trusted_effects(model)  # other machines have no record of it
+        pending = {task.remote(*places, part, overwrite, keep, preview, consent): part.shard for part in parts}
         try:
             while pending:
                 ready, _ = ray.wait(list(pending), timeout=1.0)
@@ -177,10 +179,17 @@ def _on_ray(
 
 
 def _task(
-    model: str, out: str, config: SynthesizeConfig, overwrite: bool, resume: bool, preview: bool
+    model: str,
+    out: str,
+    config: SynthesizeConfig,
+    overwrite: bool,
+    resume: bool,
+    preview: bool,
+    consent: Sequence[str] = (),
 ) -> DatasetSummary | CgwmError:
     """Make one shard; return expected errors, because Ray would wrap them and show a traceback."""
     try:
+        trust_effects(consent)
         return synthesize(Path(model), Path(out), config, overwrite, resume, preview)
     except CgwmError as error:
         return error

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from ....datasets.capture.tracks import Episode
-from ....datasets.models.effect_files import effect_file
+from ....datasets.models.effect_files import effect_file, read_source
 from ....schemas import EffectModel, FittedParameter, InputDataError, PhysConfig, UsageError
 from ...physics.effects.registry import effect_of, split_units
 from ...physics.effects.trust import trust_effects
@@ -22,9 +22,7 @@ def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple
     Raises:
         UsageError: If an effect cannot be loaded, or two have one name.
     """
-    wanted = tuple(wanted)
-    trust_effects(found[0] for name in wanted if (found := effect_file(name)) and found[0].is_file())
-    effects = [*present, *(EffectModel(name=_absolute(name, present)) for name in wanted)]
+    effects = [*present, *(_named(name, present) for name in wanted)]
     unique: dict[str, EffectModel] = {}
     for effect in effects:
         short = effect_of(effect).name
@@ -39,17 +37,22 @@ def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple
     return tuple(unique.values())
 
 
-def _absolute(name: str, present: Sequence[EffectModel]) -> str:
-    """Return the name of an effect with its absolute file: the model's copy if that has the same content."""
+def _named(name: str, present: Sequence[EffectModel]) -> EffectModel:
+    """Return an effect that the user names, which is consent to run its file.
+
+    The file is the model's copy if that has the same content; else what it contains now is what is run and packed.
+    """
     found = effect_file(name)
-    if found is None:
-        return name
+    if found is None or not found[0].is_file():
+        return EffectModel(name=name)
     path = found[0].resolve()
+    digest = read_source(path)
+    trust_effects([digest])
     for effect in present:
         own = effect_file(effect.name)
-        if own is not None and path.is_file() and own[0].read_bytes() == path.read_bytes():
+        if own is not None and effect.sha256 == digest:
             path = own[0]
-    return f"{path}:{found[1]}"
+    return EffectModel(name=f"{path}:{found[1]}", sha256=digest)
 
 
 def fitted_effects(

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, cast, get_args
 
+from ....datasets.models.effect_files import effect_file, source_content
 from ....schemas import EffectModel, UsageError, did_you_mean
 from .effect import Effect, EffectConstant, EffectParameter, Need, Phase
 from .trust import require_trust
@@ -83,7 +84,7 @@ def load_effect(spec: str) -> Effect:
     Raises:
         UsageError: If there is no such effect, its file or class is missing or fails, or it is badly declared.
     """
-    return _loaded(spec, consented=True)
+    return _loaded(spec)
 
 
 def effect_of(entry: EffectModel) -> Effect:
@@ -93,21 +94,22 @@ def effect_of(entry: EffectModel) -> Effect:
         UsageError: See :func:`load_effect`.
         InputDataError: If nobody has consented to run its file, see `trust`.
     """
-    return _loaded(entry.name, consented=False)
+    return _loaded(entry.name, entry)
 
 
-def _loaded(spec: str, consented: bool) -> Effect:
+def _loaded(spec: str, entry: EffectModel | None = None) -> Effect:
+    """Load an effect; `entry` is that of the model that names it, None for one that the user names."""
     plain, units = split_units(spec)
     if units is not None:
-        effect = _loaded(plain, consented)
+        effect = _loaded(plain, entry)
         numbers = tuple(replace(number, shared=units) for number in effect.parameters)
         effect.parameters = numbers  # pyright: ignore[reportAttributeAccessIssue]
         return effect
     if spec in BUILT_IN:
         module = importlib.import_module(f".{spec}", __package__)
         found = getattr(module, "".join(word.capitalize() for word in spec.split("_")))
-    elif ".py" in Path(spec.partition(":")[0]).suffixes:
-        found = _from_file(spec, consented)
+    elif effect_file(spec) is not None:
+        found = _from_file(spec, entry)
     else:
         found = _from_package(spec)
     return _checked(found, spec)
@@ -137,13 +139,13 @@ def aliases(name: str) -> list[str]:
     return found
 
 
-def _from_file(spec: str, consented: bool) -> Any:
+def _from_file(spec: str, entry: EffectModel | None) -> Any:
     file, _, name = spec.partition(":")
     path = Path(file)
     if not path.is_file():
         raise UsageError(f"{file}: no such file.", todo="write one with 'cgwm effects new FILE'.")
-    data = path.read_bytes()  # once: what is run is what was compared
-    if not consented:
+    data = source_content(path, None if entry is None else entry.sha256)  # once: what is run is what was compared
+    if entry is not None:
         require_trust(path, data)
     module = _imported(path, data)
     classes = [

@@ -12,17 +12,24 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from ....datasets.models.effect_files import effect_file
-from ....schemas import InputDataError, ModelFile, UsageError, read_json
+from ....datasets.io.atomic import sha256
+from ....schemas import EffectModel, InputDataError, ModelFile, UsageError, read_json
+from ....schemas.regular_files import require_regular_file
 
 _VARIABLE = "CGWM_TRUSTED_EFFECTS"
 """Environment variable with the hashes that this process, and those that it starts, may run."""
 _HASH = re.compile(r"[0-9a-f]{64}")
 
 
-def is_trusted(sha256: str) -> bool:
+def is_trusted(digest: str) -> bool:
     """Return whether a file with this SHA-256 may be run."""
-    return sha256 in os.environ.get(_VARIABLE, "").split() or sha256 in _kept()
+    return digest in os.environ.get(_VARIABLE, "").split() or digest in _kept()
+
+
+def trusted_effects(model: Path) -> tuple[str, ...]:
+    """Return the hashes of the files of a model's effects that may be run here, for workers on other machines."""
+    effects = read_json(model / "model.json", ModelFile).effects
+    return tuple(effect.sha256 for effect in effects if effect.sha256 is not None and is_trusted(effect.sha256))
 
 
 def trust_effects(named: Iterable[str | Path]) -> None:
@@ -40,7 +47,7 @@ def trust_effects(named: Iterable[str | Path]) -> None:
         if _HASH.fullmatch(name.lower()):
             hashes.append(name.lower())
         elif path.suffix == ".py" and path.is_file():
-            hashes.append(hashlib.sha256(path.read_bytes()).hexdigest())
+            hashes.append(sha256(require_regular_file(path)))
         elif (path / "model.json").is_file():
             effects = read_json(path / "model.json", ModelFile).effects
             hashes += [effect.sha256 for effect in effects if effect.sha256 is not None]
@@ -52,9 +59,9 @@ def trust_effects(named: Iterable[str | Path]) -> None:
     os.environ[_VARIABLE] = " ".join(dict.fromkeys((*os.environ.get(_VARIABLE, "").split(), *hashes)))
 
 
-def keep_trust(names: Iterable[str]) -> None:
+def keep_trust(effects: Iterable[EffectModel]) -> None:
     """Keep the consent to the files of effects with which this user has fitted a model on this machine."""
-    hashes = [hashlib.sha256(found[0].read_bytes()).hexdigest() for name in names if (found := effect_file(name))]
+    hashes = [effect.sha256 for effect in effects if effect.sha256 is not None]
     new, file = [one for one in hashes if one not in _kept()], _store()
     if not new:
         return
@@ -73,10 +80,10 @@ def require_trust(path: Path, data: bytes) -> None:
     Raises:
         InputDataError: With the file, its hash, and how to consent.
     """
-    sha256 = hashlib.sha256(data).hexdigest()
-    if not is_trusted(sha256):
+    digest = hashlib.sha256(data).hexdigest()
+    if not is_trusted(digest):
         raise InputDataError(
-            f"{path} is Python code that a model brings along, and nobody has consented to run it (SHA-256 {sha256}).",
+            f"{path} is Python code that a model brings along, and nobody has consented to run it (SHA-256 {digest}).",
             "effects of files that you have read and trust.",
             f"read the file, then add --trust-effects {path}, or its SHA-256.",
         )
