@@ -45,7 +45,10 @@ def escape_logs() -> None:
 
 
 def _print(text: str, stream: TextIO) -> None:
-    """Write a text in one piece, so that an interrupt leaves no half of it, in the characters that the stream has."""
+    """Write a text whole, in the characters that the stream has; signals arrive meanwhile, but interrupt nothing."""
     encoding = stream.encoding or "utf-8"
-    stream.write(f"{text}\n".encode(encoding, "backslashreplace").decode(encoding))
+    rest = memoryview(f"{text}\n".encode(encoding, "backslashreplace"))
+    stream.flush()
+    while rest:  # with PYTHONUNBUFFERED a write that a signal meets takes only a part
+        rest = rest[stream.buffer.write(rest) or 0 :]
     stream.flush()

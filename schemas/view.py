@@ -9,6 +9,6 @@ class ViewReport(FileModel):
     """Where to look."""
 
     url: str
-    """Address of the page."""
+    """Address of the page; it holds the secret without which the server answers nothing."""
     showing: str
     """The dataset or model."""

@@ -1,10 +1,13 @@
 """A command that is interrupted, or killed outright, leaves nothing under its final name and can be run again."""
 
 import os
+import random
 import signal
 import subprocess
 import sys
+import textwrap
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cgwm.cli import main
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Provenance
@@ -162,30 +166,138 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
         assert set(tmp_path.rglob("*")) == before
 
 
-INTERRUPTED_WITHIN = """
-import signal, sys, time
-from cgwm.cli.execution import run_command
+WITHIN = """
+import atexit, os, signal, sys, time
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+from cgwm.cli import interrupts
+from cgwm.cli.execution import run_command, running, typer
 
-def app(*arguments, **options):
-    try:
-        signal.raise_signal(signal.SIGINT)
-    {handler}
-    time.sleep(60)
+class Result:
+    def model_dump_json(self, indent):
+        return "{{}}"
 
-run_command(lambda: app, [])
+def hit():
+    os.kill(os.getpid(), {number})
+
+def verb():
+{body}
+
+app = typer.Typer(pretty_exceptions_enable=False)
+app.command()(verb)
+with interrupts.caught(owned=True):
+    run_command(lambda: app, [])
 """
 
 
+def ended(body: str, number: int = signal.SIGINT) -> tuple[int, str, str]:
+    """Run a command whose function has this body; return exit code, stdout and stderr."""
+    code = WITHIN.format(body=textwrap.indent(textwrap.dedent(body), "    "), number=int(number))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+def working(inside: str = "", last: str = "", after: str = "") -> str:
+    """Return the body of a verb: its work, what follows its result, and what follows its end."""
+    work = textwrap.indent(f"{inside}\nemit(Result(), lambda result: 'the result')\n{last}", "    ")
+    return f"with running() as emit:\n{work}\n{after}"
+
+
+NOTHING = (130, "", "Interrupted; no output was written.\n")
+DONE = (0, "the result\n", "")
+AT_TEARDOWN = "sys.late = type('Late', (), {'__del__': lambda self, hit=hit: hit()})()"
+IN_A_THREAD = "import threading; threading.Thread(target=lambda: (time.sleep(0.2), hit())).start()"
+SWALLOWED = "try: hit()\nexcept BaseException: pass\ntime.sleep(60)"
+
+
+@pytest.mark.parametrize(
+    ("moment", "number", "outcome"),
+    [
+        pytest.param("hit(); time.sleep(60)", signal.SIGINT, NOTHING, id="while it starts"),
+        pytest.param(SWALLOWED, signal.SIGHUP, NOTHING, id="while it starts, in a library that catches everything"),
+        pytest.param(working(inside="hit()"), signal.SIGTERM, NOTHING, id="while it works"),
+        pytest.param(working(last="hit()"), signal.SIGINT, NOTHING, id="before its result is printed"),
+        pytest.param(working(after="hit()"), signal.SIGTERM, DONE, id="after its result"),
+        pytest.param(working(after="atexit.register(hit)"), signal.SIGINT, DONE, id="in a function for the exit"),
+        pytest.param(working(after=IN_A_THREAD), signal.SIGHUP, DONE, id="while a thread ends"),
+        pytest.param(working(after=AT_TEARDOWN), signal.SIGINT, DONE, id="while the interpreter is taken down"),
+    ],
+)
+def test_a_signal_at_every_moment(moment: str, number: signal.Signals, outcome: tuple[int, str, str]) -> None:
+    assert ended(moment, number) == outcome
+
+
+def test_a_result_is_printed_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")  # a write that a signal meets then takes only a part
+    body = """
+        import threading
+        from cgwm.cli import execution
+        def often():
+            for _ in range(100): hit(); time.sleep(0.001)
+        as_before = execution.print_result
+        execution.print_result = lambda *given: (threading.Thread(target=often).start(), as_before(*given))
+        with running() as emit: emit(Result(), lambda result: "x" * 8_000_000)
+    """
+    code, printed, said = ended(body)
+    assert (code, len(printed), said) == (0, 8_000_001, "")
+
+
 def test_an_interrupt_that_a_library_swallows_comes_again() -> None:
-    code = INTERRUPTED_WITHIN.format(handler="except BaseException: pass")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
-    assert (done.returncode, done.stderr) == (130, "Interrupted; no output was written.\n")
+    assert ended(working(inside=SWALLOWED)) == NOTHING
 
 
-def test_an_interrupt_does_not_come_again_while_its_work_is_cleaned_up() -> None:
-    code = INTERRUPTED_WITHIN.format(handler="finally: time.sleep(1.2); print('cleaned up', file=sys.stderr)")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
-    assert (done.returncode, done.stderr) == (130, "cleaned up\nInterrupted; no output was written.\n")
+def test_an_interrupt_does_not_come_again_while_its_work_is_cleaned_up(tmp_path: Path) -> None:
+    cleaned = tmp_path / "cleaned"
+    assert ended(working(f"try: hit()\nfinally:\n    time.sleep(1.2)\n    open({str(cleaned)!r}, 'w')")) == NOTHING
+    assert cleaned.exists()
+
+
+def test_an_interrupted_command_names_the_outputs_that_it_has_completed(tmp_path: Path) -> None:
+    out = tmp_path / "a\x1bpage"
+    write = (
+        "from pathlib import Path\nfrom cgwm.datasets.io.atomic import new_directory\n"
+        f"with new_directory(Path({str(out)!r}), 'model') as folder: (folder / 'x').touch()\nhit()"
+    )
+    assert ended(working(write)) == (130, "", f"Interrupted; {tmp_path}/a\\x1bpage is complete.\n")
+    assert (out / "x").is_file()
+
+
+def test_a_caller_of_the_command_keeps_its_process_and_its_handlers() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ending:
+        main(["--version"])
+    assert (ending.value.code, (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))) == (0, before)
+
+
+MARKED = """
+import os, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from cgwm.cli import interrupts, main
+begin = interrupts.caught.__enter__
+interrupts.caught.__enter__ = lambda self: (begin(self), os.write(1, b"begins\\n"))[0]
+main()
+"""
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("arguments", [["--version"], ["effects", "list"]], ids=" ".join)
+def test_two_hundred_signals_at_random_moments(arguments: list[str]) -> None:
+    """From the first line that cgwm can run; what comes before is Python's start."""
+    command, chance, outcomes = [sys.executable, "-c", MARKED, *arguments], random.Random(0), Counter()
+    began = time.monotonic()
+    whole = subprocess.run(command, capture_output=True, check=True).stdout
+    seconds = time.monotonic() - began
+    for _ in range(100):
+        number = chance.choice([signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+        with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            first = process.stdout.readline()
+            time.sleep(chance.uniform(0, seconds))
+            process.send_signal(number)
+            printed, said = process.communicate(timeout=60)
+        outcomes[(process.returncode, first + printed if first + printed == whole else printed, said)] += 1
+    allowed = {(0, whole, b""), (130, b"", NOTHING[2].encode()), (130, whole, NOTHING[2].encode())}
+    assert set(outcomes) <= allowed and outcomes.total() == 100, outcomes
 
 
 def test_a_killed_command_can_be_run_again(tmp_path: Path) -> None:

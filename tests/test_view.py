@@ -8,8 +8,11 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -20,10 +23,13 @@ from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.pipeline.geometry.viewpoint import look_at
 from cgwm.pipeline.synthesize import synthesize
+from cgwm.pipeline.view import open_view
+from cgwm.pipeline.view import viewer as viewing
+from cgwm.pipeline.view.door import Door
 from cgwm.pipeline.view.motions import can_move, own_motion, recorded_motion, still
 from cgwm.pipeline.view.scene_at import LONGEST_ARROW, background_from, radius_m, scene_at, shapes_of, viewpoint
 from cgwm.pipeline.view.viewer import FIELD_OF_VIEW_RAD
-from cgwm.schemas import Light, SamplingPlan, SynthesizeConfig
+from cgwm.schemas import Light, SamplingPlan, SynthesizeConfig, UsageError
 from small_model import HALF, small_model, write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=2, duration_s=0.5, width=64, height=48, device="cpu", seed=5)
@@ -178,6 +184,89 @@ def test_what_cannot_be_looked_at_is_refused(dataset: Path, tmp_path: Path, capf
     assert f"127.0.0.1, port {port}: " in err and "--port 0" in err
 
 
+# The door
+
+LOCAL = "127.0.0.1:8080"
+
+
+@pytest.mark.parametrize(
+    ("path", "hosts", "origins", "opens"),
+    [
+        ("/SECRET/", [LOCAL], [], True),
+        ("/SECRET", [LOCAL], [f"http://{LOCAL}"], True),
+        ("/SECRET/?websocket=ws://x", ["localhost:9000"], ["http://localhost:9000"], True),  # through an SSH tunnel
+        ("/SECRET/", ["[::1]:8080"], ["http://[::1]:8080"], True),
+        ("/", [LOCAL], [], False),
+        ("/secret/", [LOCAL], [], False),
+        ("/x/SECRET", [LOCAL], [], False),
+        ("/?SECRET", [LOCAL], [], False),
+        ("/\u00e9", [LOCAL], [], False),
+        ("/SECRET/", [LOCAL], ["http://evil.example"], False),
+        ("/SECRET/", [LOCAL], ["null"], False),
+        ("/SECRET/", [LOCAL], ["http://127.0.0.1:9999"], False),  # another server of this machine
+        (
+            "/SECRET/",
+            ["evil.example:8080"],
+            ["http://evil.example:8080"],
+            False,
+        ),  # a name that leads here
+        ("/SECRET/", ["localhost.evil.example"], [], False),
+        ("/SECRET/", [], [], False),
+        ("/SECRET/", [LOCAL, LOCAL], [], False),
+    ],
+)
+def test_only_the_page_itself_gets_an_answer(path: str, hosts: list[str], origins: list[str], opens: bool) -> None:
+    door = Door("127.0.0.1")
+    reason = door.refusal(path.replace("SECRET", door.secret), hosts, origins)
+    assert (reason == "") == opens, reason
+
+
+def test_a_server_for_the_network_answers_to_every_name_but_not_without_the_secret() -> None:
+    door = Door("0.0.0.0")
+    assert door.refusal(f"/{door.secret}/", ["lab.example:8080"], ["http://lab.example:8080"]) == ""
+    assert door.refusal("/", ["lab.example:8080"], ["http://lab.example:8080"])
+    assert door.refusal(f"/{door.secret}/", ["lab.example:8080"], ["http://evil.example"])
+    assert len({Door("0.0.0.0").secret for _ in range(9)}) == 9
+
+
+@needs_viser
+def test_the_scene_is_not_for_other_pages(dataset: Path) -> None:
+    import viser
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    protocol = f"viser-v{viser.__version__}"
+    with open_view(dataset, port=0) as viewer:
+        page = viewer.url.replace("http://", "ws://").rstrip("/")
+        bare = page.rpartition("/")[0]
+        for address, origin in ((bare, None), (f"{bare}/x", None), (page, "http://evil.example"), (bare, bare)):
+            with pytest.raises(InvalidStatus) as refusal:
+                connect(address, origin=origin, subprotocols=[protocol])
+            assert refusal.value.response.status_code == 403
+        own = bare.replace("ws://", "http://")
+        for origin in (None, own):
+            with connect(page, origin=origin, subprotocols=[protocol], max_size=None) as client:
+                assert len(client.recv(timeout=30)) > 0
+        for address, status in ((viewer.url, 200), (own, 403), (f"{viewer.url}../../etc/passwd", 404)):
+            assert http_status(address) == status
+        assert http_status(viewer.url, {"Host": "evil.example"}) == 403
+
+
+def http_status(address: str, headers: dict[str, str] | None = None) -> int:
+    try:
+        with urlopen(Request(address, headers=headers or {}), timeout=30) as answer:
+            return answer.status
+    except HTTPError as error:
+        return error.code
+
+
+@needs_viser
+def test_a_viser_that_cannot_be_guarded_is_not_used(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewing, "guarded", lambda door, host: nullcontext())
+    with pytest.raises(UsageError, match="cannot be kept from showing the scene"):
+        open_view(dataset, port=0)
+
+
 # In the browser
 
 
@@ -199,7 +288,7 @@ def served(tmp_path: Path) -> Iterator[Callable[[Path], str]]:
         started.append(process)
         assert process.stdout is not None and process.stderr is not None
         line = process.stdout.readline()
-        found = re.fullmatch(r"Showing .* at (http://127\.0\.0\.1:\d+) \(Ctrl-C ends it\)\.\n", line)
+        found = re.fullmatch(r"Showing .* at (http://127\.0\.0\.1:\d+/[\w-]{32}/) \(Ctrl-C ends it\)\.\n", line)
         assert found, line + process.stderr.read()
         return found[1]
 

@@ -17,6 +17,7 @@ import numpy as np
 from ...datasets.models.model import Model
 from ...schemas import CgwmError, UsageError
 from ..rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB
+from .door import Door, guarded, require_closed
 from .motions import Motion
 from .scene_at import SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
 from .scene_nodes import (
@@ -80,9 +81,16 @@ class Viewer:
         self._shapes = shapes_of(model)
         self._size_m = radius_m(model, self._shapes)
         self._motion = self._load(next(iter(motions)))
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner; our URL is the one line that is printed
+        door = Door(host)
+        with contextlib.redirect_stdout(io.StringIO()), guarded(door, host):  # its banner is not shown
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-        self.url = f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{self.server.get_port()}"
+        try:
+            require_closed(host, self.server.get_port())
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        place = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        self.url = f"http://{place}:{self.server.get_port()}/{door.secret}/"
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._add_scene(model)
         self._add_controls()
