@@ -1,6 +1,8 @@
 """`--overwrite` replaces an output of cgwm of the same kind, and never an input or anything else of the user's."""
 
 import hashlib
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -118,6 +120,60 @@ def test_an_output_that_the_user_has_touched_stays(things: Path) -> None:
     manifest.write_text(manifest.read_text() + "# a ball of 60 g\n")
     with pytest.raises(UsageError, match=r"capture holds capture\.toml, which was changed since cgwm wrote it"):
         import_csv(things / "csv", capture, overwrite=True)
+
+
+def test_cameras_of_ones_own_in_an_imported_capture_stay(things: Path) -> None:
+    capture = things / "capture"
+    for name, text in (
+        ("cameras.json", '{"format": "cgwm-cameras/1"}'),
+        ("sparse_points.ply", "mine"),
+        ("calibration.json", "{}"),
+    ):
+        (capture / name).write_text(text)
+        before = content(things)
+        with pytest.raises(UsageError, match=r"which cgwm did not write"):
+            import_csv(things / "csv", capture, overwrite=True)
+        assert content(things) == before
+    (capture / "calibration.json").write_text('{"format": "cgwm-calibration/1"}')  # now all of it is `calibrate`'s
+    import_csv(things / "csv", capture, overwrite=True)
+    assert not (capture / "cameras.json").exists()
+
+
+IMPORT = "import sys; from cgwm.cli import main; sys.stdin.readline(); main()"
+
+
+def test_two_commands_that_write_one_output_at_once_do_not_mix_it(things: Path) -> None:
+    other = things / "other"
+    other.mkdir()
+    for file in (things / "csv").iterdir():
+        (other / file.name).write_text(file.read_text().replace(",1,0,0,0", ",0,1,0,0"))
+    want = {}
+    for source in ("csv", "other"):
+        import_csv(things / source, things / f"by_{source}")
+        want[source] = content(things / f"by_{source}")
+    for number, overwrite in enumerate(([], ["--overwrite"], ["--overwrite"])):
+        out = things / f"out{number // 2}"
+        command = [sys.executable, "-c", IMPORT, "import", "csv"]
+        both = {
+            source: subprocess.Popen(
+                [*command, str(things / source), "--out", str(out), *overwrite],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for source in ("csv", "other")
+        }
+        for process in both.values():
+            assert process.stdin is not None
+            process.stdin.write("go\n")
+            process.stdin.flush()
+        ended = {source: (process.communicate(timeout=60)[1], process.returncode) for source, process in both.items()}
+        codes = {source: code for source, (_, code) in ended.items()}
+        assert set(codes.values()) <= {0, 1, 2} and 0 in codes.values(), ended
+        assert all("Internal error" not in said and "Traceback" not in said for said, _ in ended.values())
+        assert content(out) in [want[source] for source, code in codes.items() if code == 0]
+        assert not list(things.glob(".*partial*")) + list(things.glob(".*replaced*"))
 
 
 def test_a_new_output_may_lie_in_the_folder_of_an_input_but_not_among_its_files(things: Path) -> None:

@@ -12,14 +12,21 @@ import pytest
 from cgwm.cli import main
 from cgwm.datasets.io.atomic import sha256
 from cgwm.datasets.models.model import read_model, write_model
-from cgwm.pipeline.physics.effects import trust_effects
-from cgwm.pipeline.physics.effects.trust import _VARIABLE, keep_trust
-from cgwm.pipeline.synthesize import synthesize
+from cgwm.pipeline.phys_geo.effects.requested_effects import with_effects
+from cgwm.pipeline.physics.effects import load_effect, trust_effects
+from cgwm.pipeline.physics.effects.registry import effect_of
+from cgwm.pipeline.physics.effects.trust import _VARIABLE, keep_trust, trusted_effects
+from cgwm.pipeline.synthesize import shards, stage, synthesize
 from cgwm.schemas import EffectModel, InputDataError, SynthesizeConfig, UsageError
 from small_model import small_model
 
 SMALL = ("--set", "synthesize.width=20", "--set", "synthesize.height=16", "--set", "synthesize.duration_s=0.1")
 TINY = SynthesizeConfig(rollouts=2, duration_s=0.1, width=20, height=16)
+
+
+def template() -> str:
+    text = Path(__file__).parents[1].joinpath("pipeline/physics/effects/template.py").read_text(encoding="utf-8")
+    return text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")
 
 
 @pytest.fixture
@@ -29,9 +36,7 @@ def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     source = tmp_path / "author" / "lift.py"
     source.parent.mkdir()
-    text = Path(__file__).parents[1].joinpath("pipeline/physics/effects/template.py").read_text(encoding="utf-8")
-    text = text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")
-    source_text = f"{text}\n\nfrom pathlib import Path\n\nPath({str(tmp_path / 'ran')!r}).touch()\n"
+    source_text = f"{template()}\n\nfrom pathlib import Path\n\nPath({str(tmp_path / 'ran')!r}).touch()\n"
     source.write_text(source_text)
     model = small_model()
     effect = EffectModel(name=f"{source}:MyEffect", parameters={"w": 0.5, "r": 0.2})
@@ -115,6 +120,62 @@ def test_a_model_of_ones_own_needs_no_word(stranger: Path, monkeypatch: pytest.M
     store.chmod(0o666)  # now somebody else could have written it
     with pytest.raises(InputDataError, match="nobody has consented"):
         synthesize(stranger, stranger.parent / "ds2", TINY)
+
+
+def test_an_edit_while_the_work_goes_on_changes_neither_what_is_run_nor_what_is_packed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(_VARIABLE, "")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    source = tmp_path / "pull.py"
+    source.write_text(template())
+    began = sha256(source)
+    effects = with_effects((), [f"{source}:MyEffect"])
+    source.write_text(template().replace("A pull", "Another pull"))
+    assert effect_of(effects[0]).summary.startswith("A pull")
+    model = small_model()
+    write_model(tmp_path / "model", replace(model, file=model.file.model_copy(update={"effects": effects})))
+    assert sha256(tmp_path / "model" / "effects" / "pull.py") == began == effects[0].sha256
+    keep_trust(effects)
+    assert (tmp_path / "state" / "cgwm" / "trusted-effects").read_text() == f"{began}\n"
+    assert load_effect(f"{source}:MyEffect").summary.startswith("Another pull")  # who names a file means what it is now
+
+
+def test_a_source_that_another_process_finds_changed_is_refused(tmp_path: Path) -> None:
+    source = tmp_path / "pull.py"
+    source.write_text(template())
+    effect = EffectModel(name=f"{source}:MyEffect", sha256="0" * 64)
+    with pytest.raises(InputDataError, match="its content has changed since"):
+        effect_of(effect)
+
+
+def test_workers_on_other_machines_get_the_consent(stranger: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert trusted_effects(stranger) == ()
+    trust_effects([str(stranger)])
+    consent = trusted_effects(stranger)
+    assert consent == (hash_of(stranger),)
+    monkeypatch.setenv(_VARIABLE, "")  # as on another machine
+    call = (str(stranger), str(stranger.parent / "ds"), TINY, False, False, False)
+    refused = shards._task(*call)
+    assert isinstance(refused, InputDataError) and not ran(stranger)
+    assert not isinstance(shards._task(*call, consent), InputDataError) and ran(stranger)
+
+
+def test_a_model_that_changes_meanwhile_is_not_packed_with_the_rollouts(
+    stranger: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trust_effects([str(stranger)])
+    count, draw = [0], stage.draw_rollout
+
+    def drawn(*given: object) -> object:
+        count[0] += 1
+        (stranger / "note.txt").write_text(str(count[0]))
+        return draw(*given)
+
+    monkeypatch.setattr(stage, "draw_rollout", drawn)
+    with pytest.raises(InputDataError, match="was changed while its rollouts were made"):
+        synthesize(stranger, stranger.parent / "ds", TINY)
+    assert not (stranger.parent / "ds").exists()
 
 
 def test_another_content_than_the_recorded_one_is_refused(stranger: Path) -> None:
