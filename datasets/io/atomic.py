@@ -54,7 +54,6 @@ def new_directory(path: Path | str, kind: DirectoryKind, overwrite: bool = False
                 yield temporary
             write_record(temporary, kind)
             _sync_tree(temporary)
-            about_to_place(temporary, path)
             _put_in_place(temporary, path, kind, overwrite)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -246,20 +245,57 @@ def _remove(path: Path) -> None:
 
 
 def _put_in_place(temporary: Path, path: Path, kind: DirectoryKind, overwrite: bool) -> None:
-    if not os.path.lexists(path):
-        os.rename(temporary, path)
-        _sync(path.parent)
+    """Give a complete directory its final name, unless another process has just given it to another one."""
+    about_to_place(temporary, path)
+    before = _inode(path)
+    if before is None:
+        _rename_unless_taken(temporary, path)
         return
-    refuse_output(path, kind, overwrite)
+    try:
+        refuse_output(path, kind, overwrite)
+    except (OSError, UsageError):
+        if _inode(path) != before:
+            raise _taken(path) from None
+        raise
     aside = _sibling(path, _REPLACED)
-    os.rename(path, aside)
+    try:
+        try:
+            os.rename(path, aside)
+        except FileNotFoundError:
+            raise _taken(path) from None
+        _rename_unless_taken(temporary, path)
+    except BaseException:
+        if _inode(path) is None and _inode(aside) is not None:
+            os.rename(aside, path)
+        raise
+    finally:
+        if _inode(path) is not None:  # else it is all that is left of the old output
+            _remove(aside)
+
+
+def _rename_unless_taken(temporary: Path, path: Path) -> None:
     try:
         os.rename(temporary, path)
-    except BaseException:
-        os.rename(aside, path)
+    except OSError:
+        if _inode(path) is not None:
+            raise _taken(path) from None
         raise
     _sync(path.parent)
-    _remove(aside)
+
+
+def _taken(path: Path) -> UsageError:
+    return UsageError(
+        f"{path} was written by another command meanwhile, and nothing of this one is kept.",
+        todo="choose another name, or run one of them at a time.",
+    )
+
+
+def _inode(path: Path) -> int | None:
+    """Return the number by which what has a name is told from what had it before; None for nothing."""
+    try:
+        return path.lstat().st_ino
+    except OSError:
+        return None
 
 
 def _sync_tree(directory: Path) -> None:
