@@ -29,18 +29,25 @@ def run_command(load_app: Callable[[], Callable[..., Any]], arguments: list[str]
         code = _invoke(load_app, arguments)
         if code == interrupts.INTERRUPTED and not _said:  # typer makes this code of an interrupt, too
             _say_interrupted()
-        interrupts.end_work(code)
-        sys.stdout.flush()
     except KeyboardInterrupt:
         code = _say_interrupted()
-    except BrokenPipeError:
-        # the reader of our output has closed it ("cgwm ... | head"), so the exit code is the only message
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of our output has closed it ("cgwm ... | head")
         code = 1
     interrupts.end_work(code)
+    code = code if _flushed() else code or 1
     if interrupts.was_interrupted():
         interrupts.leave(code)
     sys.exit(code)
+
+
+def _flushed() -> bool:
+    """Write what is left for stdout; if it cannot be written, drop it, since the exit code is then the only message."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
 
 
 Emit = Callable[["FileModel", Callable[[Any], str]], None]
@@ -120,10 +127,12 @@ def _invoke(load_app: Callable[[], Callable[..., Any]], arguments: list[str]) ->
     _typed[:] = arguments
     try:
         return int(load_app()(with_values(arguments), prog_name="cgwm", standalone_mode=False) or 0)
+    except BrokenPipeError:
+        raise
     except Exception as error:
         # typer's errors are recognised by this method, because their classes are private since 0.26
         if not hasattr(error, "format_message"):
-            raise
+            return _report(error, debug=False)
         from .usage import explain
 
         say(explain(error, arguments))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import TextIO
 
 
@@ -40,8 +41,16 @@ def escape_logs() -> None:
 
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(Escaped())
-    as_before = warnings.formatwarning
-    warnings.formatwarning = lambda *args, **options: printable(as_before(*args, **options))
+    if not hasattr(warnings.formatwarning, "as_before"):  # once, also if a process runs several commands
+        escaped = _escaping(warnings.formatwarning)
+        setattr(escaped, "as_before", warnings.formatwarning)  # noqa: B010
+        warnings.formatwarning = escaped
+
+
+def _escaping(formatted: Callable[..., str]) -> Callable[..., str]:
+    from ..schemas.printable import printable
+
+    return lambda *args, **options: printable(formatted(*args, **options))
 
 
 def _print(text: str, stream: TextIO) -> None:

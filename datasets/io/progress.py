@@ -8,6 +8,8 @@ from collections.abc import Iterable
 
 from tqdm import tqdm
 
+from ...schemas.printable import printable
+
 
 def progress(
     iterable: Iterable | None = None, desc: str = "", total: int | None = None, unit: str = "it", initial: int = 0
@@ -19,7 +21,7 @@ def progress(
     """
     return tqdm(
         iterable,
-        desc=desc,
+        desc=printable(desc),
         total=total,
         unit=unit,
         initial=initial,
@@ -32,7 +34,7 @@ def progress(
 def note(text: str) -> None:
     """Write a line on stderr above the running bars, under the same condition as a bar."""
     if _watched():
-        tqdm.write(text, file=sys.stderr)
+        tqdm.write(printable(text), file=sys.stderr)
 
 
 def _watched() -> bool:
