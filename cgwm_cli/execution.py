@@ -17,8 +17,6 @@ from .terminal import escape_logs, print_result, say, say_traceback
 if TYPE_CHECKING:
     from ..schemas import FileModel
 
-_said = False
-"""Whether the user was told of an interrupt."""
 _typed: list[str] = []
 _RAY_ADDRESS = re.compile(r"auto|local|ray://.+|[\w.-]+:\d+")
 
@@ -27,7 +25,7 @@ def run_command(load_app: Callable[[], Callable[..., Any]], arguments: list[str]
     """Run the application that `load_app` imports with arguments, and end the process with its exit code."""
     try:
         code = _invoke(load_app, arguments)
-        if code == interrupts.INTERRUPTED and not _said:  # typer makes this code of an interrupt, too
+        if code == interrupts.INTERRUPTED:  # typer makes this code of an interrupt, too
             _say_interrupted()
     except KeyboardInterrupt:
         code = _say_interrupted()
@@ -172,10 +170,8 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
 
 def _say_interrupted(state: str = "") -> int:
     """Print that the command was interrupted and the state that the work reports, or which outputs it has completed."""
-    global _said  # noqa: PLW0603  once for each process
     interrupts.end_work()
-    if not _said:
-        _said = True
+    if not interrupts.was_told():
         state = state or _completed()
         if state:
             say(f"Interrupted; {state}")

@@ -41,6 +41,8 @@ class _Command:
     """Whether a signal has interrupted it."""
     late = False
     """Whether a signal came while it ended."""
+    told = False
+    """Whether the user was told of the interrupt."""
     code = INTERRUPTED
     """Exit code of a process that does not end by itself."""
 
@@ -61,7 +63,7 @@ class caught:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        _now.phase, _now.interrupted, _now.late = _STARTS if self._owned else _WORKS, False, False
+        _now.phase, _now.interrupted, _now.late, _now.told = _STARTS if self._owned else _WORKS, False, False, False
         for name, number in _numbers():
             handler = _again if name == "SIGALRM" else _interrupt
             try:
@@ -86,6 +88,12 @@ class caught:
 def was_interrupted() -> bool:
     """Return whether a signal has interrupted the work; a library may have converted its exception."""
     return _now.interrupted
+
+
+def was_told() -> bool:
+    """Return whether this was asked before for this command: its user is told of an interrupt once."""
+    before, _now.told = _now.told, True
+    return before
 
 
 def begin_work() -> None:
