@@ -1,0 +1,34 @@
+"""The tables of what has to be refused and of what has to be accepted, and how they are judged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from . import accepted, oracle, refused, refused_datasets, refused_models
+from .cases import Trial
+from .client import Seen
+from .edits import Row
+
+
+def must_refuse() -> list[Row]:
+    """Return the lines of what has to be refused."""
+    return [*refused.rows(), *refused_models.rows(), *refused_datasets.rows()]
+
+
+def must_accept() -> list[Row]:
+    """Return the lines of what has to be accepted."""
+    return list(accepted.rows())
+
+
+def judged(trial: Trial, row: Row, refuse: bool) -> tuple[Seen, list[tuple[str, str]]]:
+    """Run a line and return what was seen and what is wrong with it."""
+
+    def prepare(root: Path) -> None:
+        row.edit(root)
+
+    seen, found = trial.run_on(row.subject, prepare, row.words)
+    if refuse and seen.code == 0 and not seen.timed_out:
+        found.insert(0, ("accepted", oracle.first(seen.stdout)))
+    if not refuse and seen.code != 0:
+        found.insert(0, ("refused", oracle.first(seen.stderr + seen.stdout)))
+    return seen, found
