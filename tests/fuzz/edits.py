@@ -159,12 +159,12 @@ def rolled(names: str, order: str) -> Callable[[Columns], None]:
 
 
 def array(at: str, change: Callable[[np.ndarray], Any], forged: bool = True) -> Edit:
-    """Change an array of the first demo of a dataset, in place where its shape stays, and its hashes with it."""
+    """Change an array of a demo of a dataset, of the one with the most contacts, and its hashes with it."""
 
     def edit(root: Path) -> None:
         for path in sorted((root / "dataset").glob("rollouts-*.h5")):
             with h5py.File(path, "r+") as file:
-                demo = file["data"][sorted(file["data"])[0]]
+                demo = max(file["data"].values(), key=lambda one: len(one["contacts/mode"]))
                 made = np.asarray(change(np.asarray(demo[at][()])))
                 attributes = dict(demo[at].attrs)
                 del demo[at]

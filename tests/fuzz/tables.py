@@ -27,6 +27,8 @@ def judged(trial: Trial, row: Row, refuse: bool) -> tuple[Seen, list[tuple[str, 
         row.edit(root)
 
     seen, found = trial.run_on(row.subject, prepare, row.words)
+    if row.kind == "outputs":  # a folder that must not be written is named as a folder
+        found = [fault for fault in found if fault[0] != "names only the folder"]
     if refuse and seen.code == 0 and not seen.timed_out:
         found.insert(0, ("accepted", oracle.first(seen.stdout)))
     if not refuse and seen.code != 0:

@@ -1,0 +1,70 @@
+"""Damaged, absurd and malicious inputs of every kind: one message, nothing lost, nothing run; and nothing good refused.
+
+A selection with fixed seeds; `make evidence` runs all of both tables and thousands of cases. By hand, from tests/:
+`python -m fuzz --cases 1000 --seed 1`, `python -m fuzz --table refuse --only plan`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fuzz.__main__ import survey
+from fuzz.cases import Trial
+from fuzz.client import Runner
+from fuzz.edits import Row
+from fuzz.subjects import Library
+from fuzz.tables import judged, must_accept, must_refuse
+
+QUICK = ("tracks", "model", "cameras.json", "plan", "csv", "hdf5", "tum", "jugglebot", "dataset without images")
+CASES, SEED, LIMIT_S = 60, 3, 10.0
+LONG_CASES, LONG_SEED = 3000, 1
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
+    root = tmp_path_factory.mktemp("fuzz")
+    with Runner(root / "home", LIMIT_S) as runner:
+        yield Trial(root / "cases", runner, Library(root / "library"))
+
+
+def every(rows: list[Row], count: int) -> list[Row]:
+    """Return about `count` lines of a table of each kind, evenly spread, none whose command computes for long."""
+    quick = [row for row in rows if row.words[0] not in ("fit", "diagnose", "view", "synthesize")]
+    kinds = list(dict.fromkeys(row.kind for row in quick))
+    groups = [[row for row in quick if row.kind == kind] for kind in kinds]
+    return [row for group in groups for row in group[:: max(1, len(group) // count)]]
+
+
+def test_whatever_the_input_there_is_one_message_and_nothing_is_lost(trial: Trial) -> None:
+    bad = [f"{verdict.case}\n  {verdict.faults}" for verdict in survey(trial, CASES, SEED, QUICK) if verdict.faults]
+    assert not bad, "\n".join(bad)
+
+
+@pytest.mark.parametrize("row", every(must_refuse(), 6), ids=lambda row: row.name)
+def test_what_cannot_be_is_refused(trial: Trial, row: Row) -> None:
+    assert not judged(trial, row, refuse=True)[1]
+
+
+@pytest.mark.parametrize("row", every(must_accept(), 3), ids=lambda row: row.name)
+def test_what_is_legitimate_is_accepted(trial: Trial, row: Row) -> None:
+    assert not judged(trial, row, refuse=False)[1]
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("row", must_refuse(), ids=lambda row: row.name)
+def test_all_that_cannot_be_is_refused(trial: Trial, row: Row) -> None:
+    assert not judged(trial, row, refuse=True)[1]
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("row", must_accept(), ids=lambda row: row.name)
+def test_all_that_is_legitimate_is_accepted(trial: Trial, row: Row) -> None:
+    assert not judged(trial, row, refuse=False)[1]
+
+
+@pytest.mark.evidence
+def test_thousands_of_cases(trial: Trial) -> None:
+    bad = [f"{verdict.case}\n  {verdict.faults}" for verdict in survey(trial, LONG_CASES, LONG_SEED, ()) if verdict.faults]
+    assert not bad, "\n".join(bad)
