@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import itertools
 import random
 import re
 import shutil
@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
+from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
@@ -52,47 +53,65 @@ def main() -> None:
 def chosen(text: str) -> tuple[str, ...]:
     """Return the names of subjects that are named, or whose kind is."""
     names = [name.strip() for name in text.split(",") if name.strip()]
-    return tuple(s.name for s in SUBJECTS.values() if s.name in names or s.kind in names)
+    return tuple(s.name for s in SUBJECTS.values() if s.weight and (s.name in names or s.kind in names))
 
 
 class _Done(BaseException):
     """Ends a survey; no Exception, which hypothesis would take for a failure of the case."""
 
 
+CHUNK = 12
+"""Cases that hypothesis draws in a row: it varies what it has drawn before, so that many in a row are much alike."""
+
+
 def survey(trial: Trial, count: int, number: int, subjects: tuple[str, ...], seconds: float = 0.0) -> list[Verdict]:
     """Run cases and return how all of them went; without stopping at a failure."""
     found: list[Verdict] = []
-    alike: Counter[str] = Counter()
     began = time.monotonic()
+    alike: Counter[str] = Counter()
 
-    @seed(number)
-    @settings(
-        max_examples=6 * count,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(case=cases(trial.library, subjects))
-    def one(case: Case) -> None:
-        if len(found) >= count or (seconds and time.monotonic() - began > seconds):
-            raise _Done
-        # hypothesis varies what it has drawn before, but here what was tried thrice in one place teaches nothing new
-        places = [
-            {key: change.get(key) for key in ("file", "op", "what", "to", "do", "column")} for change in case.changes
-        ]
-        place = f"{case.subject} {case.words} {places} {[change['at'] for change in case.changes if type(change.get('at')) is list]}"
-        alike[place] += 1
-        if alike[place] > 2:
-            return
-        verdict = trial.run(case)
-        found.append(verdict)
-        if verdict.faults:
-            print(f"{len(found):5d} {verdict.seen.seconds:6.1f} s  {verdict.faults}\n      {case}", flush=True)
+    def full() -> bool:
+        return len(found) >= count or bool(seconds and time.monotonic() - began > seconds)
 
-    with contextlib.suppress(_Done):
-        one()
-    return found
+    for chunk in itertools.count(1):
+        if full():
+            return found
+        drawn: list[Case] = []
+
+        @seed(1_000_003 * number + chunk)
+        @settings(**_QUIETLY)
+        @given(case=cases(trial.library, subjects))
+        def draw(case: Case, drawn: list[Case] = drawn) -> None:
+            drawn.append(case)
+
+        draw()
+        for case in drawn[1:]:  # the first is always the simplest
+            place = _place(case)
+            alike[place] += 1
+            if alike[place] > 2 or full():
+                continue
+            verdict = trial.run(case)
+            found.append(verdict)
+            if verdict.faults:
+                print(f"{len(found):5d} {verdict.seen.seconds:6.1f} s  {verdict.faults}\n      {case}", flush=True)
+    raise AssertionError
+
+
+_QUIETLY: dict[str, Any] = {
+    "max_examples": CHUNK,
+    "database": None,
+    "deadline": None,
+    "phases": [Phase.generate],
+    "suppress_health_check": list(HealthCheck),
+}
+
+
+def _place(case: Case) -> str:
+    """Return where a case changes what, without the value: what was tried there teaches little more."""
+    names = ("file", "op", "what", "to", "do", "column")
+    places = [{key: change.get(key) for key in names} for change in case.changes]
+    at = [change["at"] for change in case.changes if isinstance(change.get("at"), list | str)]
+    return f"{case.subject} {case.words} {places} {at}"
 
 
 def report(verdicts: list[Verdict], folder: Path) -> int:

@@ -58,11 +58,11 @@ def field(file: str, at: str, raw: str) -> Edit:
         form = path.suffix[1:]
         tree = documents.parse(path.read_text(), form)
         place: list[Any] = [int(part) if part.isdigit() else part for part in at.split()]
+        if len(place) == 2 and isinstance(place[0], str) and place[0] not in [key for key, _ in tree]:
+            tree.append((place[0], documents.Table()))
         place = [
             str(p) if isinstance(documents.get(tree, place[:k]), documents.Table) else p for k, p in enumerate(place)
         ]
-        if len(place) == 2 and isinstance(place[0], str) and place[0] not in [key for key, _ in tree]:
-            tree.append((place[0], documents.Table()))
         parent = documents.get(tree, place[:-1])
         if isinstance(parent, documents.Table) and place[-1] not in [key for key, _ in parent]:
             parent.append((place[-1], documents.Raw(raw)))

@@ -18,6 +18,8 @@ WHATS = (
     *("shorter", "longer", "flat", "scalar", "empty", "more axes", "huge", "huge chunks", "vast", "group", "delete"),
     *("renamed", "own link", "broken link", "external", "root link", "null", "int8", "float16", "enum", "reference"),
 )
+LARGEST = 1 << 22
+"""An array that a mutation has already made vast is left."""
 JSONS = (
     "{",
     "[1]",
@@ -103,7 +105,7 @@ def _change(file: h5py.File, change: dict[str, Any]) -> None:
     elif what == "group":
         del parent[name]
         parent.create_group(name)
-    elif isinstance(node, h5py.Dataset):
+    elif isinstance(node, h5py.Dataset) and (node.size or 0) < LARGEST:
         _change_array(parent, name, node, change)
 
 
@@ -190,5 +192,5 @@ def refresh(folder: Path) -> None:
         if (folder / "model").is_dir():
             manifest["model_sha256"] = sha256(folder / "model")
         (folder / "dataset.json").write_text(json.dumps(manifest, indent=2))
-    except (ValueError, KeyError, TypeError, OSError, AttributeError):
+    except (ValueError, KeyError, TypeError, OSError, AttributeError, RecursionError):
         return  # the manifest itself was mutated
