@@ -1,4 +1,4 @@
-"""Damaged, absurd and malicious inputs of every kind: one message, nothing lost, nothing run; and nothing good refused.
+"""Damaged, absurd and malicious inputs of every kind: one message, nothing lost, nothing run; nothing good refused.
 
 A selection with fixed seeds; `make evidence` runs all of both tables and thousands of cases. By hand, from tests/:
 `python -m fuzz --cases 1000 --seed 1`, `python -m fuzz --table refuse --only plan`.
@@ -7,7 +7,6 @@ A selection with fixed seeds; `make evidence` runs all of both tables and thousa
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from fuzz.__main__ import survey
@@ -18,8 +17,11 @@ from fuzz.subjects import Library
 from fuzz.tables import judged, must_accept, must_refuse
 
 QUICK = ("tracks", "model", "cameras.json", "plan", "csv", "hdf5", "tum", "jugglebot", "dataset without images")
-CASES, SEED, LIMIT_S = 60, 3, 10.0
-LONG_CASES, LONG_SEED = 3000, 1
+SLOW = {"fit", "diagnose", "view", "synthesize", "compare", "calibrate", "bop", "rosbag"}
+HEAVY = ("merged dataset", "filmed", "video file", "things")
+"""Subjects that take seconds to make; `test_outputs.py` has the table of what `--overwrite` may replace."""
+VERBS = ("validate", "import", "merge")
+CASES, SEED, LIMIT_S = 40, 3, 20.0
 
 
 @pytest.fixture(scope="module")
@@ -31,40 +33,24 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
 
 def every(rows: list[Row], count: int) -> list[Row]:
     """Return about `count` lines of a table of each kind, evenly spread, none whose command computes for long."""
-    quick = [row for row in rows if row.words[0] not in ("fit", "diagnose", "view", "synthesize")]
+    quick = [row for row in rows if not SLOW & {*row.words} and row.subject not in HEAVY]
     kinds = list(dict.fromkeys(row.kind for row in quick))
     groups = [[row for row in quick if row.kind == kind] for kind in kinds]
     return [row for group in groups for row in group[:: max(1, len(group) // count)]]
 
 
 def test_whatever_the_input_there_is_one_message_and_nothing_is_lost(trial: Trial) -> None:
-    bad = [f"{verdict.case}\n  {verdict.faults}" for verdict in survey(trial, CASES, SEED, QUICK) if verdict.faults]
+    bad = [
+        f"{verdict.case}\n  {verdict.faults}" for verdict in survey(trial, CASES, SEED, QUICK, VERBS) if verdict.faults
+    ]
     assert not bad, "\n".join(bad)
 
 
-@pytest.mark.parametrize("row", every(must_refuse(), 6), ids=lambda row: row.name)
+@pytest.mark.parametrize("row", every(must_refuse(), 4), ids=lambda row: row.name)
 def test_what_cannot_be_is_refused(trial: Trial, row: Row) -> None:
     assert not judged(trial, row, refuse=True)[1]
 
 
-@pytest.mark.parametrize("row", every(must_accept(), 3), ids=lambda row: row.name)
+@pytest.mark.parametrize("row", every(must_accept(), 1), ids=lambda row: row.name)
 def test_what_is_legitimate_is_accepted(trial: Trial, row: Row) -> None:
     assert not judged(trial, row, refuse=False)[1]
-
-
-@pytest.mark.evidence
-@pytest.mark.parametrize("row", must_refuse(), ids=lambda row: row.name)
-def test_all_that_cannot_be_is_refused(trial: Trial, row: Row) -> None:
-    assert not judged(trial, row, refuse=True)[1]
-
-
-@pytest.mark.evidence
-@pytest.mark.parametrize("row", must_accept(), ids=lambda row: row.name)
-def test_all_that_is_legitimate_is_accepted(trial: Trial, row: Row) -> None:
-    assert not judged(trial, row, refuse=False)[1]
-
-
-@pytest.mark.evidence
-def test_thousands_of_cases(trial: Trial) -> None:
-    bad = [f"{verdict.case}\n  {verdict.faults}" for verdict in survey(trial, LONG_CASES, LONG_SEED, ()) if verdict.faults]
-    assert not bad, "\n".join(bad)

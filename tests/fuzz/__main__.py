@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis.strategies import SearchStrategy
 
 from .cases import Case, Trial, Verdict, cases
 from .client import Runner
@@ -46,7 +47,7 @@ def main() -> None:
             trial = Trial(root / "cases", runner, library)
             if options.table:
                 sys.exit(table(trial, options.table == "refuse", options.only))
-            verdicts = survey(trial, options.cases, options.seed, chosen(options.subjects), options.seconds)
+            verdicts = survey(trial, options.cases, options.seed, chosen(options.subjects), seconds=options.seconds)
     sys.exit(report(verdicts, options.failures))
 
 
@@ -64,7 +65,14 @@ CHUNK = 12
 """Cases that hypothesis draws in a row: it varies what it has drawn before, so that many in a row are much alike."""
 
 
-def survey(trial: Trial, count: int, number: int, subjects: tuple[str, ...], seconds: float = 0.0) -> list[Verdict]:
+def survey(
+    trial: Trial,
+    count: int,
+    number: int,
+    subjects: tuple[str, ...] = (),
+    verbs: tuple[str, ...] = (),
+    seconds: float = 0.0,
+) -> list[Verdict]:
     """Run cases and return how all of them went; without stopping at a failure."""
     found: list[Verdict] = []
     began = time.monotonic()
@@ -76,16 +84,7 @@ def survey(trial: Trial, count: int, number: int, subjects: tuple[str, ...], sec
     for chunk in itertools.count(1):
         if full():
             return found
-        drawn: list[Case] = []
-
-        @seed(1_000_003 * number + chunk)
-        @settings(**_QUIETLY)
-        @given(case=cases(trial.library, subjects))
-        def draw(case: Case, drawn: list[Case] = drawn) -> None:
-            drawn.append(case)
-
-        draw()
-        for case in drawn[1:]:  # the first is always the simplest
+        for case in _drawn(cases(trial.library, subjects, verbs), 1_000_003 * number + chunk):
             place = _place(case)
             alike[place] += 1
             if alike[place] > 2 or full():
@@ -95,6 +94,20 @@ def survey(trial: Trial, count: int, number: int, subjects: tuple[str, ...], sec
             if verdict.faults:
                 print(f"{len(found):5d} {verdict.seen.seconds:6.1f} s  {verdict.faults}\n      {case}", flush=True)
     raise AssertionError
+
+
+def _drawn(strategy: SearchStrategy[Case], number: int) -> list[Case]:
+    """Draw a few cases from a seed."""
+    drawn: list[Case] = []
+
+    @seed(number)
+    @settings(**_QUIETLY)
+    @given(case=strategy)
+    def draw(case: Case) -> None:
+        drawn.append(case)
+
+    draw()
+    return drawn[1:]  # the first is always the simplest
 
 
 _QUIETLY: dict[str, Any] = {
@@ -122,9 +135,8 @@ def report(verdicts: list[Verdict], folder: Path) -> int:
         by_kind[SUBJECTS[verdict.case.subject].kind].append(verdict)
     for kind, group in sorted(by_kind.items()):
         codes = Counter(v.seen.code for v in group)
-        print(
-            f"  {kind:12s} {len(group):5d} cases, {sum(not v.faults for v in group):5d} as promised, codes {dict(codes)}"
-        )
+        good = sum(not v.faults for v in group)
+        print(f"  {kind:12s} {len(group):5d} cases, {good:5d} as promised, codes {dict(codes)}")
     classes = Counter(kind for v in verdicts for kind in {kind for kind, _ in v.faults})
     for kind, count in classes.most_common():
         print(f"  {count:5d} {kind}")

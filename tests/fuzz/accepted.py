@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .captures import write_toss_capture
 from .edits import FIT, Edit, Row, field, nothing, tracks
-from .subjects import SUBJECTS, write_toss_capture
+from .subjects import SUBJECTS
 
 VALIDATE = ("validate", "capture")
 G = 9.81
@@ -176,15 +177,6 @@ CAPTURES: dict[str, Edit] = {
 NO_FIT = ("1 kHz for 2 min", "a ball at rest", *(f"benchmark of diagnose {k}" for k in range(24) if k % 6))
 """Captures whose fit takes long, or cannot be for a reason of its own."""
 
-EDITS: tuple[tuple[str, Edit], ...] = (
-    ("no ground", lambda root: _without_ground(root)),
-    ("an absolute clock", tracks(lambda columns: columns.update(time_s=columns["time_s"] + 1.7e9))),
-    ("a mass of 1 g", field("capture/capture.toml", "bodies 0 mass_kg", "0.001")),
-    ("a gap of 0.1 s", tracks(lambda columns: _gap(columns))),
-    ("far from the origin", tracks(lambda columns: columns.update(px_m=columns["px_m"] + 120.0))),
-    ("a driven body", field("capture/capture.toml", "bodies 0 motion", '"driven"')),
-)
-
 
 def _without_ground(root: Path) -> None:
     path = root / "capture" / "capture.toml"
@@ -195,3 +187,13 @@ def _gap(columns: dict[str, np.ndarray]) -> None:
     keep = np.r_[0:15, 25 : len(columns["time_s"])]
     for key in columns:
         columns[key] = columns[key][keep]
+
+
+EDITS: tuple[tuple[str, Edit], ...] = (
+    ("no ground", _without_ground),
+    ("an absolute clock", tracks(lambda columns: columns.update(time_s=columns["time_s"] + 1.7e9))),
+    ("a mass of 1 g", field("capture/capture.toml", "bodies 0 mass_kg", "0.001")),
+    ("a gap of 0.1 s", tracks(_gap)),
+    ("far from the origin", tracks(lambda columns: columns.update(px_m=columns["px_m"] + 120.0))),
+    ("a driven body", field("capture/capture.toml", "bodies 0 motion", '"driven"')),
+)

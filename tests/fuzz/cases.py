@@ -80,21 +80,22 @@ SETTINGS = {
 }
 OPTIONS = {
     "fit": ("--seed", "--split", "--effects", "--spheres", "--from", "--supervise", "--config"),
-    "synthesize": ("--seed", "--rollouts", "--shard", "--shards", "--workers", "--plan", "--config", "--trust-effects"),
+    "synthesize": ("--seed", "--rollouts", "--shard", "--shards", "--plan", "--config", "--trust-effects"),
     "validate": ("--sample", "--seed"),
     "eval": ("--split", "--warmup-s", "--trust-effects"),
     "compare": ("--split", "--warmup-s"),
     "diagnose": ("--split", "--candidates", "--throws", "--trust-effects"),
-    "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--seed", "--duration"),
-    "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body", "--up", "--topic"),
+    "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--duration"),
+    "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body"),
     "view": ("--port", "--host"),
     "calibrate": ("--seed",),
 }  # fmt: skip
 
 
-def commands(subject: str) -> st.SearchStrategy[Command]:
+def commands(subject: str, verbs: tuple[str, ...]) -> st.SearchStrategy[Command]:
     """Return a strategy of the commands of a subject, slow ones less often."""
-    weighted = [c for c in SUBJECTS[subject].commands for _ in range(round(10 * c.weight))]
+    allowed = [c for c in SUBJECTS[subject].commands if not verbs or c.words[0] in verbs]
+    weighted = [c for c in allowed for _ in range(round(10 * c.weight))]
     return st.sampled_from(weighted)
 
 
@@ -102,12 +103,12 @@ _mutations = cache(mutations.mutations)
 
 
 @st.composite
-def cases(draw: st.DrawFn, library: Library, subjects: tuple[str, ...] = ()) -> Case:
-    """Draw a case of some subjects (default: all, by their weights)."""
+def cases(draw: st.DrawFn, library: Library, subjects: tuple[str, ...] = (), verbs: tuple[str, ...] = ()) -> Case:
+    """Draw a case of some subjects (default: all, by their weights) and commands (default: all)."""
     names = subjects or tuple(n for n, s in SUBJECTS.items() if s.weight)
     name = draw(st.sampled_from([n for n in names for _ in range(max(1, round(4 * SUBJECTS[n].weight)))]))
     subject = SUBJECTS[name]
-    words = draw(commands(name)).words
+    words = draw(commands(name, verbs)).words
     root = library.built(name)
     files = sorted({p for pattern in subject.files for p in root.glob(pattern) if p.is_file()})
     options = OPTIONS.get(words[0], ())

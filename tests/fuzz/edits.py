@@ -32,8 +32,6 @@ class Row:
     subject: str
     edit: Edit
     words: tuple[str, ...]
-    keep: bool = False
-    """Whether the inputs have to stay as they are, and nothing else is asked: the outcome may be either."""
 
 
 def nothing(root: Path) -> None:
@@ -51,7 +49,7 @@ def several(*edits: Edit) -> Edit:
 
 
 def field(file: str, at: str, raw: str) -> Edit:
-    """Replace a field of a JSON or TOML file, or add it: keys and indices with blanks between, and the value as text."""
+    """Replace or add a field of a JSON or TOML file: keys and indices with blanks between, the value as text."""
 
     def edit(root: Path) -> None:
         path = root / file
@@ -159,19 +157,21 @@ def rolled(names: str, order: str) -> Callable[[Columns], None]:
 
 
 def array(at: str, change: Callable[[np.ndarray], Any], forged: bool = True) -> Edit:
-    """Change an array of a demo of a dataset, of the one with the most contacts, and its hashes with it."""
+    """Change an array of a dataset, and its hashes with it: of the demo with the most contacts, of cameras in all."""
 
     def edit(root: Path) -> None:
-        for path in sorted((root / "dataset").glob("rollouts-*.h5")):
-            with h5py.File(path, "r+") as file:
-                demo = max(file["data"].values(), key=lambda one: len(one["contacts/mode"]))
+        path = sorted((root / "dataset").glob("rollouts-*.h5"))[0]
+        with h5py.File(path, "r+") as file:
+            demos = list(file["data"].values())
+            if not at.startswith(("cameras/", "obs/", "light/")):
+                demos = [max(demos, key=lambda one: len(one["contacts/mode"]))]
+            for demo in demos:
                 made = np.asarray(change(np.asarray(demo[at][()])))
                 attributes = dict(demo[at].attrs)
                 del demo[at]
                 demo[at] = made
                 for key, value in attributes.items():
                     demo[at].attrs[key] = value
-            break
         if forged:
             hdf5.refresh(root / "dataset")
 

@@ -125,7 +125,7 @@ def _change_array(parent: Any, name: str, node: h5py.Dataset, change: dict[str, 
         options = {"shape": (count, *shape[1:]), "dtype": kind, "chunks": (1 << 16, *shape[1:])}
     elif what in ("null", "reference", "enum", "compound", "object"):
         made = {
-            "null": h5py.Empty(kind if kind != object else "f8"),
+            "null": h5py.Empty(kind if kind.kind != "O" else "f8"),
             "reference": np.array([node.parent.ref], h5py.ref_dtype),
             "enum": np.zeros(shape, h5py.enum_dtype({"A": 0, "B": 1})),
             "compound": np.zeros(shape, [("a", "f8"), ("b", "i4")]),

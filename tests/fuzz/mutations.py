@@ -1,11 +1,9 @@
-"""Mutations of inputs: each is a JSON object with an `op` and a `file`, drawn for a file and applied to a copy of it."""
+"""Mutations of inputs: each is a JSON object with an `op` and a `file`, drawn for a file, applied to a copy of it."""
 
 from __future__ import annotations
 
 import base64
-import io
 import os
-import shutil
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -294,16 +292,18 @@ def _change_archive(path: Path, change: Mutation) -> None:
 
         tensor = torch.load(path, weights_only=True)
         made = {
-            "pickled": canary, "text": "a text", "empty": torch.zeros(0), "scalar": torch.tensor(1.0), "complex": tensor * 1j,
-            "huge": tensor[:, :1].expand(1, 10_000_000, tensor.shape[2]), "nan": tensor * float("nan"), "negative": -tensor, "fewer": tensor[..., :5],
+            "pickled": canary, "text": "a text", "empty": torch.zeros(0), "scalar": torch.tensor(1.0),
+            "complex": tensor * 1j, "huge": tensor[:, :1].expand(1, 10_000_000, tensor.shape[2]),
+            "nan": tensor * float("nan"), "negative": -tensor, "fewer": tensor[..., :5],
         }[change["what"]]  # fmt: skip
         torch.save(made, path)
         return
     arrays = dict(np.load(path))
     one = arrays[change["name"]]
     made = {
-        "pickled": np.array([canary], object), "text": np.array(["a", "b"]), "empty": np.zeros(0), "scalar": np.float64(1.0),
-        "complex": one * 1j, "huge": np.zeros(20_000_000, np.uint8), "nan": one * np.nan, "negative": -one, "fewer": one[:-1] if one.ndim else one,
+        "pickled": np.array([canary], object), "text": np.array(["a", "b"]), "empty": np.zeros(0),
+        "scalar": np.float64(1.0), "complex": one * 1j, "huge": np.zeros(20_000_000, np.uint8),
+        "nan": one * np.nan, "negative": -one, "fewer": one[:-1] if one.ndim else one,
     }[change["what"]]  # fmt: skip
     np.savez_compressed(path, **{**arrays, change["name"]: made})
 

@@ -193,6 +193,11 @@ def _vast(root: Path) -> None:
 
 
 _LINE = "\n0.020000,"
+_PUSH = "pushes/dataset/push_a/dynamic_train0.json"
+_PINWM = ("pinwm", "pinwm pushes --train 4")
+_THROWS = ("jugglebot", "jugglebot throws --only b")
+_DROPS = ("balldrops", "balldrops drops")
+_NET = "contactnets tosses --train 2 --test 1"
 IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("csv: times in ms", "csv", "csv csv", lambda root: _csv(root, "t", 1000)),
     ("csv: positions in mm", "csv", "csv csv", lambda root: _csv(root, "xyz", 1000)),
@@ -222,18 +227,18 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("rosbag: no metadata", "rosbag", "rosbag bag", kind_of("bag/metadata.yaml", "removed")),
     ("rosbag: no YAML", "rosbag", "rosbag bag", written("bag/metadata.yaml", "[" * 5000)),
     ("rosbag: a device", "rosbag", "rosbag bag", kind_of("bag/metadata.yaml", "/dev/zero")),
-    ("pinwm: a frequency of text", "pinwm", "pinwm pushes --train 4", text("pushes/dataset/push_a/dynamic_train0.json", '"time": 0.0', '"time": "0"')),
-    ("pinwm: a pose of zeros", "pinwm", "pinwm pushes --train 4", text("pushes/dataset/push_a/dynamic_train0.json", '"c2w": [[1, 0, 0, 0.1]', '"c2w": [[0, 0, 0, 0.1]')),
-    ("pinwm: K of zero", "pinwm", "pinwm pushes --train 4", text("pushes/dataset/push_a/dynamic_train0.json", '"intrinsic": [[50,', '"intrinsic": [[0,')),
-    ("pinwm: no mesh", "pinwm", "pinwm pushes --train 4", kind_of("pushes/envs/asset/cube_t/it.obj", "removed")),
-    ("jugglebot: a frequency of 0", "jugglebot", "jugglebot throws --only b", text("throws/b.json", "300.0", "0.0")),
-    ("jugglebot: a frequency that is negative", "jugglebot", "jugglebot throws --only b", text("throws/b.json", "300.0", "-300.0")),
-    ("jugglebot: a key twice", "jugglebot", "jugglebot throws --only b", text("throws/b.json", '"Frequency": 300.0', '"Frequency": 300.0, "Frequency": 1.0')),
-    ("jugglebot: deep nesting", "jugglebot", "jugglebot throws --only b", written("throws/b.json", DEEP)),
-    ("balldrops: a height of text", "balldrops", "balldrops drops", text("drops/ball_drops.csv", ",48.0,", ",high,")),
-    ("balldrops: a time twice", "balldrops", "balldrops drops", text("drops/ball_drops.csv", "0.06666666666666667", "0.0")),
-    ("contactnets: pickled objects", "contactnets npz", "contactnets tosses --train 2 --test 1", lambda root: _pickled(root / "tosses/a.npz")),
-    ("contactnets: a pickle as .pt", "contactnets pt", "contactnets tosses --train 2 --test 1", lambda root: _pickled(root / "tosses/0.pt")),
+    ("pinwm: a time of text", *_PINWM, text(_PUSH, '"time": 0.0', '"time": "0"')),
+    ("pinwm: a pose of zeros", *_PINWM, text(_PUSH, "[[1, 0, 0, 0.1]", "[[0, 0, 0, 0.1]")),
+    ("pinwm: K of zero", *_PINWM, text(_PUSH, '"intrinsic": [[50,', '"intrinsic": [[0,')),
+    ("pinwm: no mesh", *_PINWM, kind_of("pushes/envs/asset/cube_t/it.obj", "removed")),
+    ("jugglebot: a frequency of 0", *_THROWS, text("throws/b.json", "300.0", "0.0")),
+    ("jugglebot: a frequency that is negative", *_THROWS, text("throws/b.json", "300.0", "-300.0")),
+    ("jugglebot: a key twice", *_THROWS, text("throws/b.json", '{"Frequency"', '{"Frequency": 1.0, "Frequency"')),
+    ("jugglebot: deep nesting", *_THROWS, written("throws/b.json", DEEP)),
+    ("balldrops: a height of text", *_DROPS, text("drops/ball_drops.csv", ",48.0,", ",high,")),
+    ("balldrops: a time twice", *_DROPS, text("drops/ball_drops.csv", "0.06666666666666667", "0.0")),
+    ("contactnets: pickled objects", "contactnets npz", _NET, lambda root: _pickled(root / "tosses/a.npz")),
+    ("contactnets: a pickle as .pt", "contactnets pt", _NET, lambda root: _pickled(root / "tosses/0.pt")),
 )  # fmt: skip
 
 

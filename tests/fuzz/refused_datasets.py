@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .edits import Edit, Row, array, field, kind_of, shard, twice, without
+from .edits import Edit, Row, array, field, kind_of, shard, twice
 from .refused import DEEP, DIGITS
 
 FILE = "dataset/dataset.json"
@@ -30,6 +30,8 @@ def rows() -> Iterator[Row]:
     for name, edit in FILES:
         yield Row(f"{name}: validate", "datasets", "dataset", edit, ("validate", "dataset"))
         yield Row(f"{name}: merge", "datasets", "dataset", edit, ("merge", "dataset", "--out", "OUT.h5"))
+    for name, edit in MANIFEST:
+        yield Row(f"{name}: validate", "datasets", "dataset", edit, ("validate", "dataset"))
 
 
 def _set(index: Any, value: Any) -> Any:
@@ -55,6 +57,11 @@ def _splits(names: list[bytes]) -> Edit:
         file["mask/train"] = np.array(names)
 
     return shard(change)
+
+
+def _linked(file: h5py.File) -> None:
+    del file["data/demo_1"]
+    file["data/demo_1"] = h5py.SoftLink("/data/demo_1")
 
 
 CONTENT: tuple[tuple[str, Edit], ...] = (
@@ -112,7 +119,7 @@ CONTENT: tuple[tuple[str, Edit], ...] = (
     ("a split that names no demo", _splits([b"demo_0", b"demo_99"])),
     ("a split that names a demo twice", _splits([b"demo_0", b"demo_0"])),
     ("a demo that is missing", shard(lambda file: file["data"].__delitem__("demo_1"))),
-    ("a demo that is a link to another", shard(lambda file: _linked(file))),
+    ("a demo that is a link to another", shard(_linked)),
     ("an array that is missing", shard(lambda file: file["data/demo_0/bodies"].__delitem__("vel"))),
     ("an array of 10^12 zeros", shard(lambda file: _vast(file, "bodies/pos", (10**12, 1, 3)))),
     ("images of 10^12 pixels", shard(lambda file: _vast(file, "obs/view0_image", (8, 10**6, 10**6, 3)))),
@@ -125,11 +132,6 @@ CONTENT: tuple[tuple[str, Edit], ...] = (
     ("another format", shard(lambda file: file.attrs.__setitem__("format", "cgwm-rollouts/9"))),
     ("no format", shard(lambda file: file.attrs.__delitem__("format"))),
 )
-
-
-def _linked(file: h5py.File) -> None:
-    del file["data/demo_1"]
-    file["data/demo_1"] = h5py.SoftLink("/data/demo_1")
 
 
 def _vast(file: h5py.File, at: str, shape: tuple[int, ...]) -> None:
@@ -202,8 +204,11 @@ FILES: tuple[tuple[str, Edit], ...] = (
     ("a key twice", twice(FILE, "rollouts", "2")),
     ("deep nesting", field(FILE, "notes", DEEP)),
     ("no shards' table", field(FILE, "shards", "null")),
-    ("no format", without(FILE, "format")),
     ("a manifest that is a named pipe", kind_of(FILE, "fifo")),
+)
+"""What neither `validate` nor `merge` may take."""
+
+MANIFEST: tuple[tuple[str, Edit], ...] = (
     ("bodies of others", field(FILE, "bodies", '["mug"]')),
     ("cameras of others", field(FILE, "cameras", '["nothing"]')),
     ("a model outside", field(FILE, "model", '"../../model"')),

@@ -82,7 +82,7 @@ def _child(request: dict[str, Any]) -> None:
     os.dup2(nothing, 0)
     for name in ("stdin", "stdout", "stderr"):
         number = ("stdin", "stdout", "stderr").index(name)
-        setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
+        setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))
     os.chdir(request["cwd"])
     os.environ.update(request["environment"])
     import tempfile
