@@ -48,6 +48,9 @@ def _flushed() -> bool:
     return True
 
 
+_OUTPUTS = "cgwm.datasets.io.outputs"
+"""Module that knows the outputs, once something that writes them has imported it."""
+
 Emit = Callable[["FileModel", Callable[[Any], str]], None]
 
 
@@ -61,6 +64,8 @@ def running(*, json: bool = False, quiet: bool = False, debug: bool = False) -> 
     Raises:
         typer.Exit: With the exit code, if the work failed.
     """
+    if (outputs := sys.modules.get(_OUTPUTS)) is not None:
+        outputs.forget_completed()
     interrupts.begin_work()
     watched = _is_watched(quiet, debug)
     if not watched:
@@ -182,7 +187,7 @@ def _say_interrupted(state: str = "") -> int:
 
 def _completed() -> str:
     """Return the outputs that an interrupted command has completed, in words; empty for none."""
-    outputs = sys.modules.get("cgwm.datasets.io.outputs")  # imported by what writes outputs
+    outputs = sys.modules.get(_OUTPUTS)
     names = [str(path) for path in outputs.completed()] if outputs is not None else []
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} complete." if names else ""
 

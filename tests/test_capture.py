@@ -304,7 +304,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
         (
             "frame_rate_hz = 20.0",
             "frame_rate_hz = 0",
-            "C/capture.toml, line 13: video.frame_rate_hz: input should be greater than 0 (found 0).\n"
+            "C/capture.toml, line 13: video.frame_rate_hz: input should be greater than or equal to 0.001 (found 0).\n"
             "Next: correct the field.",
         ),
         (

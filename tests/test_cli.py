@@ -180,7 +180,7 @@ def test_an_unknown_option(run: Run) -> None:
         2,
         "",
         "cgwm validate: there is no option '--jsno'.\n"
-        "Allowed: --debug, --json, --quiet, --sample, --seed, --help. Did you mean '--json'?\n"
+        "Allowed: --accept-units, --debug, --json, --quiet, --sample, --seed, --help. Did you mean '--json'?\n"
         "Next: run 'cgwm validate --help'.\n",
     )
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
+from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale, parse
 from ...schemas.cameras import Matrix4
 from ...schemas.documents import parse_json
 from ...schemas.regular_files import read_text_file
@@ -66,7 +66,7 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
         name = file.removeprefix("images/")
         if name in images:
             raise InputDataError(f"{where}: '{frame['file_path']}' stands twice.")
-        images[name] = PosedImage(camera=camera, T_world_cam=_pose(where, frame))
+        images[name] = parse({"camera": camera, "T_world_cam": _pose(where, frame)}, PosedImage, where)
     scale = Scale(kind="metric" if metric else "unscaled", source="transforms.json")
     return CamerasFile(scale=scale, cameras=cameras, images=images)
 

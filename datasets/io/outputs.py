@@ -97,8 +97,13 @@ def about_to_place(temporary: Path, path: Path) -> None:
         _PLACED.append((path, temporary.stat().st_ino))
 
 
+def forget_completed() -> None:
+    """Begin a new command: what was written before is none of its outputs."""
+    _PLACED.clear()
+
+
 def completed() -> list[Path]:
-    """Return the outputs to which this process has given their final names, and which are there."""
+    """Return the outputs to which this command has given their final names, and which are there."""
     return [path for path, inode in _PLACED if path.exists() and path.stat().st_ino == inode]
 
 
