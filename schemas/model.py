@@ -168,10 +168,13 @@ class EffectModel(FileModel):
     """By parameter with own values: their standard deviation from unit to unit, of the prior that ties them."""
 
 
+PositiveGain = Annotated[float, Field(gt=0, le=1000)]
+
+
 class Exposure(FileModel):
     """Colour gain and offset of a camera against the model's colours: image = gain * model + offset."""
 
-    gain_rgb: Colour3 = (1.0, 1.0, 1.0)
+    gain_rgb: tuple[PositiveGain, PositiveGain, PositiveGain] = (1.0, 1.0, 1.0)
     offset_rgb: Colour3 = (0.0, 0.0, 0.0)
 
 

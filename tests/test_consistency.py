@@ -106,7 +106,6 @@ MISTAKES: dict[str, tuple[World, Callable[[Track], Track], str]] = {
     "gravity up": (World(gravity_m_s2=(0, 0, 9.81), ground=Ground()), lambda t: t, "up is +z"),
     "gravity sideways": (World(gravity_m_s2=(9.81, 0, 0), ground=Ground()), lambda t: t, "up is +z"),
     "gravity in cm": (World(gravity_m_s2=(0, 0, -981.0), ground=Ground()), lambda t: t, "gravity is in centimetres"),
-    "gravity in mm": (World(gravity_m_s2=(0, 0, -9810.0), ground=Ground()), lambda t: t, "gravity is in millimetres"),
     "times in ms": (LEVEL, lambda t: changed(t, time=1e3), "the times are in milliseconds"),
     "times in ns": (LEVEL, lambda t: changed(t, time=1e9), "the times are in nanoseconds"),
     "numbers of frames": (LEVEL, lambda t: changed(t, time=120), "numbers of frames, of 120"),

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import CaptureManifest, InputDataError
+from ...schemas import CaptureManifest, Ground, InputDataError
 from .folder import CaptureFolder
-from .tracked_motion import TrackedMotion, tracked_motions
+from .tracked_motion import TrackedMotion, outline_of, tracked_motions
 from .unit_mistakes import LENGTHS, ORDERS, Correction, frame_corrections, ground_correction, unit_corrections
 
 Array = NDArray[np.float64]
@@ -52,6 +52,8 @@ ALIKE = 0.03
 """Difference between corrections, in shares of the motion and of gravity, below which both are named."""
 OFF = 0.1
 """Share of gravity, and of the frames, from which on there is a warning."""
+FARTHEST_COM = 1.5
+"""Largest distance of a centre of mass from the origin of the body frame, in sizes of the shape."""
 SOLID_KG_M3 = (0.05, 23000.0)
 """Mean densities of bodies [kg/m3], from a balloon's skin and the hot air in it to osmium's."""
 
@@ -111,14 +113,14 @@ def check_consistency(capture: CaptureFolder) -> list[str]:
     motions = tracked_motions(capture)
     _check_densities(capture, where)
     if not motions:
-        _check_gravity_alone(manifest, where)
+        check_gravity(manifest.world.gravity_m_s2, manifest.world.ground, where)
         return []
     written = agreement(manifest, motions, AS_WRITTEN)
     found = _better_corrections(manifest, motions, written)
     if found:
         raise _fault(capture, _contradiction(written), found)
     if written.flights < FEWEST:
-        _check_gravity_alone(manifest, where)
+        check_gravity(manifest.world.gravity_m_s2, manifest.world.ground, where)
     wrong_order = _better_order(manifest, motions)
     if wrong_order is not None:
         raise _fault(capture, "a body that lies on the ground reaches into it", [wrong_order])
@@ -265,27 +267,47 @@ def _better_order(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) -
     return None
 
 
-def _check_gravity_alone(manifest: CaptureManifest, where: str) -> None:
-    """Refuse a gravity that points out of the ground, or has the strength of another unit, where no motion tells."""
-    gravity = np.array(manifest.world.gravity_m_s2)
-    strength, ground = float(np.linalg.norm(gravity)), manifest.world.ground
+def check_gravity(gravity_m_s2: Sequence[float], ground: Ground | None, where: str) -> None:
+    """Refuse a gravity that points out of the ground, or has the strength of another unit, where no motion tells.
+
+    Args:
+        gravity_m_s2: Gravity, world frame.
+        ground: The ground, or None.
+        where: File, for the message.
+
+    Raises:
+        InputDataError: If it does.
+    """
+    gravity = np.array(gravity_m_s2)
+    strength = float(np.linalg.norm(gravity))
     for name, factor in LENGTHS.items():
         if strength > 300 and abs(strength * factor / 9.81 - 1) < 0.02:
             raise InputDataError(
-                f"{where}: [world] gravity_m_s2 has {strength:.4g} m/s2, which is that of the Earth in {name}/s2.",
-                *_allowed("correct [world] gravity_m_s2."),
+                f"{where}: gravity_m_s2 has {strength:.4g} m/s2, which is that of the Earth in {name}/s2.",
+                *_allowed("correct gravity_m_s2."),
             )
     if ground is not None and strength and float(gravity @ ground.normal) > 0.2 * strength:
         raise InputDataError(
-            f"{where}: [world] gravity_m_s2 {_shown(gravity)} points out of the ground, whose normal is "
+            f"{where}: gravity_m_s2 {_shown(gravity)} points out of the ground, whose normal is "
             f"{_shown(np.array(ground.normal))}.",
             *_allowed("correct the sign of gravity_m_s2 or of the ground's normal."),
         )
 
 
 def _check_densities(capture: CaptureFolder, where: str) -> None:
-    """Refuse a box or ball of another unit: its given mass in that volume is denser or thinner than any body."""
+    """Refuse a box or ball of another unit: its given mass in that volume is denser or thinner than any body.
+
+    And a centre of mass outside of the shape, beyond what a rounded shape leaves.
+    """
     for body in capture.manifest.bodies:
+        outline = None if body.com_m is None else outline_of(capture, body)
+        if outline is not None and float(np.linalg.norm(body.com_m or ())) > FARTHEST_COM * outline.size_m:
+            raise InputDataError(
+                f"{where}: [[bodies]] '{body.name}': com_m lies {np.linalg.norm(body.com_m or ()):.3g} m from the "
+                f"origin of the body frame; its shape reaches {outline.size_m:.3g} m.",
+                "a centre of mass within the shape, in metres.",
+                "correct com_m or shape.",
+            )
         if body.shape is None or body.mass_kg is None:
             continue
         if body.shape.box is not None:
@@ -317,7 +339,9 @@ def _contradiction(written: Agreement) -> str:
 
 def _fault(capture: CaptureFolder, what: str, found: Sequence[Correction]) -> InputDataError:
     causes = ", or ".join(correction.mistake for correction in found[:3])
-    return InputDataError(f"{capture.root}: {what}. What explains it: {causes}.", *_allowed(found[0].remedy))
+    return InputDataError(
+        f"{capture.root / 'capture.toml'}: {what}. What explains it: {causes}.", *_allowed(found[0].remedy)
+    )
 
 
 def _allowed(remedy: str, allowed: str = "") -> tuple[str, str]:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ...schemas import BodyModel, Correlation, InputDataError, ModelFile
+from ...schemas.model import ContactParameters
+from ..capture.consistency import check_gravity
 from ..shapes.ply import Splats
 
 TOLERANCE = 1e-3
@@ -15,6 +17,10 @@ TOLERANCE = 1e-3
 FARTHEST_COM = 2.0
 """Largest distance of the centre of mass from the middle of a body's spheres, in halves of their bounding box's
 diagonal; of a solid body it is below 1, but spheres may lack a part."""
+
+LARGEST = 2.0
+"""Largest ratio of the reach of a body's spheres to that of its given shape, and of a moment of inertia to that of all
+its mass at that reach."""
 
 
 def require_agreement(file: ModelFile, colliding: Mapping[str, Splats], path: Path) -> None:
@@ -29,6 +35,9 @@ def require_agreement(file: ModelFile, colliding: Mapping[str, Splats], path: Pa
         InputDataError: If a parameter differs from the contact law, body or effect that it is of; correlations are of
             no parameters, or cannot be; a body that can touch has no spheres; or its centre of mass is far from them.
     """
+    if not file.provenance.config.get("accept_units", False):
+        check_gravity(file.gravity_m_s2, file.ground, str(path))
+    _require_contact(file, path)
     for block in file.correlations:
         _require_possible(block, file, path)
     estimates = {parameter.name: parameter.estimate for parameter in file.parameters}
@@ -42,6 +51,17 @@ def require_agreement(file: ModelFile, colliding: Mapping[str, Splats], path: Pa
             )
     for body in file.bodies:
         _require_spheres(body, file, colliding.get(body.name), path)
+
+
+def _require_contact(file: ModelFile, path: Path) -> None:
+    """Refuse a model with parameters of the contact law, but without that law."""
+    names = {parameter.name for parameter in file.parameters} & set(ContactParameters.model_fields)
+    if file.contact is None and names:
+        raise InputDataError(
+            f"{path}: the parameter '{min(names)}' is of the contact law, but contact is null.",
+            "contact with friction, contact_time_s and damping_ratio.",
+            "fit the model again.",
+        )
 
 
 def _values(file: ModelFile) -> Iterator[tuple[str, float, str]]:
@@ -89,6 +109,7 @@ def _require_spheres(body: BodyModel, file: ModelFile, spheres: Splats | None, p
                 "get the model again from where it came, or fit it again.",
             )
         return
+    _require_size(body, spheres, path)
     means, radii = np.asarray(spheres.means, float), np.asarray(spheres.scales, float)[:, None] * body.radius_factor
     low, high = (means - radii).min(0), (means + radii).max(0)
     reach = FARTHEST_COM * 0.5 * float(np.linalg.norm(high - low))
@@ -99,3 +120,36 @@ def _require_spheres(body: BodyModel, file: ModelFile, spheres: Splats | None, p
             f"at most {reach:.3g} m.",
             "correct com_m (body frame, metres).",
         )
+
+
+def _require_size(body: BodyModel, spheres: Splats, path: Path) -> None:
+    """Refuse moments of inertia that no body within the spheres has, and spheres far larger than the given shape."""
+    radii = np.asarray(spheres.scales, float) * body.radius_factor
+    from_com = float((np.linalg.norm(np.asarray(spheres.means, float) - body.com_m, axis=1) + radii).max())
+    xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
+    greatest = float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
+    most = LARGEST * body.mass_kg * from_com**2
+    if greatest > most:
+        raise InputDataError(
+            f"{path}: inertia_kg_m2 of body '{body.name}' has the moment {greatest:.3g} kg m2.",
+            f"at most {most:.3g} kg m2 for {body.mass_kg:g} kg within its spheres.",
+            "correct mass_kg and inertia_kg_m2, or fit the model again.",
+        )
+    size = _size(body)
+    reach = float((np.linalg.norm(np.asarray(spheres.means, float), axis=1) + radii).max())
+    if size is not None and not size / LARGEST <= reach <= LARGEST * size:
+        raise InputDataError(
+            f"{path}: the spheres of body '{body.name}' reach {reach:.3g} m from its origin; its shape reaches "
+            f"{size:.3g} m.",
+            "spheres and shape of one size.",
+            "fit the model again.",
+        )
+
+
+def _size(body: BodyModel) -> float | None:
+    """Return the reach of a given box or ball from the body's origin [m]; None for other shapes."""
+    if body.shape is None:
+        return None
+    if body.shape.sphere is not None:
+        return body.shape.sphere.radius_m
+    return None if body.shape.box is None else float(np.linalg.norm(body.shape.box.half_extents_m))

@@ -311,7 +311,9 @@ def _require_sizes(demo: Node, where: str) -> None:
         for kind in ("image", "depth", "mask", "amodal"):
             item = demo.get(f"obs/{camera}_{kind}")
             if item is not None and item.attrs.get("encoding") != "jpeg" and item.shape[1:3] != size:
+                axes = "(T, H, W, 3)" if kind == "image" else "(T, H, W)"
+                wanted = (item.shape[0], *size, *item.shape[3:])
                 raise InputDataError(
-                    f"{where}/obs/{camera}_{kind}: images of {item.shape[1:3]} px; its camera says {size}.",
+                    f"{where}/obs/{camera}_{kind}: its shape is {item.shape}; {axes} is documented, here {wanted}.",
                     "images of the size of their camera.",
                 )
