@@ -37,7 +37,7 @@ def model() -> Model:
     file = ModelFile(
         ground=Ground(),
         bodies=bodies,
-        parameters=(FittedParameter(name="friction", unit="1", estimate=0.1 + 0.2, interval_95=(0.2, 0.4)),),
+        parameters=(FittedParameter(name="cube.drop_m", unit="1", estimate=0.1 + 0.2, interval_95=(0.2, 0.4)),),
         provenance=Provenance(capture="c", seed=3),
     )
     visual = {"cube": splats(30), "scene": splats(5)}

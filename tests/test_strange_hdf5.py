@@ -180,7 +180,7 @@ STRANGE_SHARDS = {
     "a rollout elsewhere": (put("data/demo_1", h5py.ExternalLink("pipe", "/t")), "a link to another file"),
     "data elsewhere": (put("data", h5py.ExternalLink("pipe", "/t")), "a link to another file"),
     "no rollout": (put("data/other", 1), "no rollout"),
-    "images of another size": (put("data/demo_0/obs/cam_image", np.ones((2, 5, 5, 3))), "its camera says (3, 4)"),
+    "images of another size": (put("data/demo_0/obs/cam_image", np.ones((2, 5, 5, 3))), "its shape is (2, 5, 5, 3)"),
     "an index of anything": (index_of_anything, "an index that looks into '/etc/hostname'"),
     "frames without end": (lambda f: f["data/demo_0"].attrs.modify("num_samples", HUGE), f"num_samples is {HUGE}"),
     "no number of frames": (lambda f: f["data/demo_0"].attrs.pop("num_samples"), "not a readable HDF5 file"),

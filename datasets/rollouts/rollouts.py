@@ -270,7 +270,7 @@ def demo_of(file: h5py.File, name: str) -> Node:
     """
     demo, path = stored_demo(file, name), Path(file.filename)
     with hdf5_faults(path):
-        _require_sizes(demo, f"{path}: data/{name}")
+        _require_sizes(demo, path, name)
     return demo
 
 
@@ -302,10 +302,11 @@ def stored_demo(file: h5py.File, name: str) -> Node:
         return demo
 
 
-def _require_sizes(demo: Node, where: str) -> None:
+def _require_sizes(demo: Node, path: Path, name: str) -> None:
     frames, count = demo["time"].shape, demo.attrs["num_samples"]
     if not isinstance(count, int | np.integer) or frames != (count,):
-        raise InputDataError(f"{where}/time: shape {frames}; num_samples says {count!s:.40}.", "as many frames.")
+        where = f"{path}: data/{name}/time"
+        raise InputDataError(f"{where}: shape {frames}; num_samples says {count!s:.40}.", "as many frames.")
     for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
         size = tuple(int(entry[key][()]) for key in ("height", "width"))
         for kind in ("image", "depth", "mask", "amodal"):
@@ -314,6 +315,7 @@ def _require_sizes(demo: Node, where: str) -> None:
                 axes = "(T, H, W, 3)" if kind == "image" else "(T, H, W)"
                 wanted = (item.shape[0], *size, *item.shape[3:])
                 raise InputDataError(
-                    f"{where}/obs/{camera}_{kind}: its shape is {item.shape}; {axes} is documented, here {wanted}.",
+                    f"{path}, {name}: obs/{camera}_{kind}: its shape is {item.shape}; {axes} is documented, here "
+                    f"{wanted}.",
                     "images of the size of their camera.",
                 )
