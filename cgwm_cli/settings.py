@@ -78,7 +78,11 @@ class StageSettings:
         for part in [stage, *path[:-1]]:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
-                raise UsageError(f"--set {text}: '{part}' is not a table.")
+                raise UsageError(
+                    f"--set {text}: '{part}' is not a table.",
+                    "STAGE.KEY=VALUE, or STAGE.TABLE.KEY=VALUE for a table.",
+                    f"set '{part}' once: as a value, or the keys of a table.",
+                )
         table[path[-1]] = _value(value.strip())
 
 

@@ -29,6 +29,7 @@ _DEEP_KEY = re.compile(
 )
 """A dotted key of more parts than the depth; for one of thousands the TOML parser takes memory by their square."""
 _CORRECT = "correct the value there."
+_CORRECT_SYNTAX = "correct the syntax there; a file that was cut off is to be written again."
 
 
 def parse_json(text: str, path: Path | str) -> Any:
@@ -53,7 +54,9 @@ def parse_json(text: str, path: Path | str) -> Any:
     try:
         data = json.loads(text, object_pairs_hook=table)
     except json.JSONDecodeError as error:
-        raise InputDataError(f"{path}, line {error.lineno}: not valid JSON: {error.msg}.") from None
+        raise InputDataError(
+            f"{path}, line {error.lineno}: not valid JSON: {error.msg}.", todo=_CORRECT_SYNTAX
+        ) from None
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError:
@@ -72,7 +75,7 @@ def parse_toml(text: str, path: Path | str) -> dict[str, Any]:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputDataError(f"{path}: not valid TOML: {shortened(error)}.", todo="correct the syntax there.") from None
+        raise InputDataError(f"{path}: not valid TOML: {shortened(error)}.", todo=_CORRECT_SYNTAX) from None
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError as error:

@@ -21,6 +21,7 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+_CHECK_DISK = "check the disk that it lies on, or copy the file to another."
 
 
 def require_regular_file(path: Path | str) -> Path:
@@ -58,9 +59,11 @@ def read_text_file(path: Path | str, encoding: str = "utf-8") -> str:
     try:
         return path.read_text(encoding=encoding)
     except UnicodeDecodeError:
-        raise InputDataError(f"{path}: not a text file in UTF-8.") from None
+        raise InputDataError(
+            f"{path}: not a text file in UTF-8.", todo="save it as UTF-8, or get the file again."
+        ) from None
     except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.", todo=_CHECK_DISK) from None
 
 
 def read_binary_file(path: Path | str, most_bytes: int = MAX_BYTES) -> bytes:
@@ -76,7 +79,7 @@ def read_binary_file(path: Path | str, most_bytes: int = MAX_BYTES) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputDataError(f"{path}: cannot be read: {error.strerror}.") from None
+        raise InputDataError(f"{path}: cannot be read: {error.strerror}.", todo=_CHECK_DISK) from None
 
 
 def _reason(path: Path, error: OSError) -> str:

@@ -147,7 +147,7 @@ HUGE = {
     "a.ply": (ply("binary_little_endian", "1" + "0" * 12, *FLOATS), read_splats, "cut off"),
     "text.ply": (ply("ascii", "1" + "0" * 12, *FLOATS) + b"1 2 3\n", read_splats, "cut off"),
     "minus.ply": (ply("binary_little_endian", "-1", *FLOATS), read_splats, "'-1' is no number of splats"),
-    "twice.ply": (ply("ascii", "1", *FLOATS, FLOATS[0]), read_splats, "a property stands twice"),
+    "twice.ply": (ply("ascii", "1", *FLOATS, FLOATS[0]), read_splats, "the property 'x' stands twice"),
     "words.ply": (ply("ascii", "1", *FLOATS) + b"a b c\n", read_splats, "a value that is no number"),
     "bare.ply": (ply("binary_little_endian", "5"), read_splats, "no properties"),
     "a.npy": (npy((10**6, 10**6)), lambda path: read_map(path, "depth"), "which is not 0 bytes"),

@@ -124,7 +124,7 @@ def test_faults_leave_nothing_behind(tmp_path: Path) -> None:
     assert fault(tmp_path / "absent") == "T/absent: no such directory."
     assert fault(write_source(tmp_path / "bare", pictures=False)).startswith("T/bare/dataset: no push has its pictures")
     source = write_source(tmp_path / "source")
-    assert fault(source, n_train=6) == "6 frames to fit on; the shortest push with pictures has 6."
+    assert fault(source, n_train=6) == "T/source/dataset: 6 frames to fit on; the shortest push with pictures has 6."
     pictures = source / "dataset" / "push_a" / "train0"
     (pictures / "m_0_3.png").unlink()
     assert fault(source, n_train=4) == "T/source/dataset/push_a/train0/m_0_3.png: no such file."

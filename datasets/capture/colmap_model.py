@@ -9,15 +9,20 @@ Source of the layout: COLMAP documentation, "Output format", and `scripts/python
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage, Scale
 from ...schemas.cameras import Matrix4
+from ...schemas.documents import shortened
 from ...schemas.regular_files import read_binary_file, read_text_file
+from ..io.cells import number_of, shown
 from .files import optional_file
 from .transforms import matrix4
 
@@ -38,6 +43,14 @@ _MODELS: dict[int, tuple[str, int]] = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
 }
+_PARAMETERS = dict(_MODELS.values())
+_LAYOUT = {
+    "cameras.txt": "lines of number, model, width, height and the model's parameters.",
+    "images.txt": "pairs of lines: number, quaternion (w first), translation, camera and name; then its 2D points.",
+    "cameras.bin": "COLMAP's binary cameras, complete.",
+    "images.bin": "COLMAP's binary images, complete.",
+}
+_EXPORT = "export it again with COLMAP (colmap model_converter), or take the original."
 _READABLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
@@ -67,20 +80,44 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     cameras: dict[str, CameraIntrinsics] = {}
     images: dict[str, PosedImage] = {}
-    try:
-        for number, model, width, height, params in (_cameras_bin if binary else _cameras_txt)(camera_path):
+    with _faults(camera_path) as place:
+        for number, model, width, height, params in (_cameras_bin if binary else _cameras_txt)(place):
             if not all(map(math.isfinite, params)):
-                raise InputDataError(f"{camera_path}: camera {number} has parameters that are not finite: {params}.")
-            cameras[f"camera{number}"] = _intrinsics(camera_path, number, model, width, height, params)
-        for name, camera, quat_wxyz, translation in (_images_bin if binary else _images_txt)(image_path):
+                raise ValueError(f"camera {number} has parameters that are not finite: {params}")
+            cameras[f"camera{number}"] = _intrinsics(f"{place}", number, model, width, height, params)
+    with _faults(image_path) as place:
+        for name, camera, quat_wxyz, translation in (_images_bin if binary else _images_txt)(place):
             if not all(map(math.isfinite, (*quat_wxyz, *translation))) or not any(quat_wxyz):
-                raise InputDataError(f"{image_path}: image '{name}' has a pose that is not finite, or no rotation.")
+                raise ValueError(f"image '{name}' has a pose that is not finite, or no rotation")
+            if f"camera{camera}" not in cameras:
+                raise ValueError(f"image '{name}' is of the camera {camera}, which {camera_path.name} does not have")
             pose = _world_from_camera(np.array(quat_wxyz), np.array(translation))
             images[name.removeprefix("images/")] = PosedImage(camera=f"camera{camera}", T_world_cam=pose)
-        scale = Scale(kind="metric" if metric else "unscaled", source="COLMAP model")
-        return CamerasFile(scale=scale, cameras=cameras, images=images)
-    except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise InputDataError(f"{folder}: not a COLMAP model that can be read: {error}.") from None
+    scale = Scale(kind="metric" if metric else "unscaled", source="COLMAP model")
+    return CamerasFile(scale=scale, cameras=cameras, images=images)
+
+
+class _Place:
+    """Where a reader of one file stands, for messages: a line, or the number of an entry."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.at = path, ""
+
+    def __str__(self) -> str:
+        return f"{self.path}, {self.at}" if self.at else f"{self.path}"
+
+
+@contextmanager
+def _faults(path: Path) -> Iterator[_Place]:
+    """Turn what is raised in the block into one message with the file and the place in it."""
+    place = _Place(path)
+    try:
+        yield place
+    except (struct.error, IndexError, OverflowError):
+        raise InputDataError(f"{place}: cut off, or damaged.", _LAYOUT[path.name], _EXPORT) from None
+    except ValueError as error:
+        found = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        raise InputDataError(f"{place}: {shortened(found)}.", _LAYOUT[path.name], _EXPORT) from None
 
 
 def _world_from_camera(quat_wxyz: np.ndarray, translation: np.ndarray) -> Matrix4:
@@ -95,20 +132,22 @@ def _world_from_camera(quat_wxyz: np.ndarray, translation: np.ndarray) -> Matrix
 
 
 def _intrinsics(
-    path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]
+    where: str, number: int, model: str, width: int, height: int, params: tuple[float, ...]
 ) -> CameraIntrinsics:
     if model not in _READABLE or any(params[9:]):
         raise InputDataError(
-            f"{path}: camera {number} has the model {model}.",
+            f"{where}: camera {number} has the model {model}.",
             ", ".join(_READABLE[:-1]) + ".",
             "undistort the photos (colmap image_undistorter), or calibrate with --camera_model OPENCV.",
         )
+    if len(params) != _PARAMETERS[model]:
+        raise ValueError(f"{len(params)} parameters for the model {model}, which has {_PARAMETERS[model]}")
     single_focal = model.startswith("SIMPLE") or model == "RADIAL"
     fx, fy, cx, cy, *rest = (params[0], *params) if single_focal else params
     # COLMAP's FULL_OPENCV continues k1, k2, p1, p2, k3; the radial models have no p1, p2.
     distortion = (*rest, 0.0, 0.0, 0.0, 0.0)[:4] if len(rest) < 5 or not rest[4] else tuple(rest[:5])
     return CameraIntrinsics.of_lens(
-        f"{path}: camera {number}", width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
+        f"{where}: camera {number}", width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
     )
 
 
@@ -116,45 +155,65 @@ CameraRecord = tuple[int, str, int, int, tuple[float, ...]]
 ImageRecord = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(path: Path) -> list[tuple[int, str]]:
     # A line of 2D points may be empty and counts, so that only comments are dropped.
-    return [line for line in read_text_file(path).splitlines() if not line.startswith("#")]
+    lines = enumerate(read_text_file(path).splitlines(), 1)
+    return [(number, line) for number, line in lines if not line.startswith("#")]
 
 
-def _cameras_txt(path: Path) -> Iterator[CameraRecord]:
-    for line in _lines(path):
+def _cameras_txt(place: _Place) -> Iterator[CameraRecord]:
+    for number, line in _lines(place.path):
         if line.strip():
-            number, model, width, height, *params = line.split()
-            yield int(number), model, int(width), int(height), tuple(map(float, params))
+            place.at = f"line {number}"
+            words = line.split()
+            if len(words) < 5:
+                raise ValueError(f"{len(words)} words for a camera")
+            yield _whole(words[0]), words[1], _whole(words[2]), _whole(words[3]), tuple(map(number_of, words[4:]))
 
 
-def _images_txt(path: Path) -> Iterator[ImageRecord]:
-    for line in _lines(path)[::2]:
+def _images_txt(place: _Place) -> Iterator[ImageRecord]:
+    for number, line in _lines(place.path)[::2]:
         if line.strip():
-            _, *pose, camera, name = line.split(maxsplit=9)
-            values = tuple(map(float, pose))
-            yield name.strip(), int(camera), values[:4], values[4:]
+            place.at = f"line {number}"
+            words = line.split(maxsplit=9)
+            if len(words) < 10:
+                raise ValueError(f"{len(words)} words for an image")
+            values = tuple(map(number_of, words[1:8]))
+            yield words[9].strip(), _whole(words[8]), values[:4], values[4:]
 
 
-def _cameras_bin(path: Path) -> Iterator[CameraRecord]:
-    data, offset = read_binary_file(path), 8
-    for _ in range(struct.unpack_from("<Q", data)[0]):
+def _whole(word: str) -> int:
+    if not re.fullmatch(r"[+-]?[0-9]{1,18}", word):
+        raise ValueError(f"no whole number: {shown(word)}")
+    return int(word)
+
+
+def _cameras_bin(place: _Place) -> Iterator[CameraRecord]:
+    data, offset = read_binary_file(place.path), 8
+    for entry in range(struct.unpack_from("<Q", data)[0]):
+        place.at = f"camera {entry}, counted from 0"
         number, model, width, height = struct.unpack_from("<iiQQ", data, offset)
         offset += 24
         if model not in _MODELS:
-            raise InputDataError(f"{path}: camera {number} has the unknown model number {model}.")
+            raise ValueError(f"camera {number} has the unknown model number {model}")
         name, count = _MODELS[model]
         yield number, name, width, height, struct.unpack_from(f"<{count}d", data, offset)
         offset += 8 * count
 
 
-def _images_bin(path: Path) -> Iterator[ImageRecord]:
-    data, offset = read_binary_file(path), 8
-    for _ in range(struct.unpack_from("<Q", data)[0]):
+def _images_bin(place: _Place) -> Iterator[ImageRecord]:
+    data, offset = read_binary_file(place.path), 8
+    for entry in range(struct.unpack_from("<Q", data)[0]):
+        place.at = f"image {entry}, counted from 0"
         _, *pose, camera = struct.unpack_from("<i7di", data, offset)
         offset += 64
-        end = data.index(b"\0", offset)
-        name = data[offset:end].decode("utf-8")
+        end = data.find(b"\0", offset)
+        if end < 0:
+            raise IndexError
+        try:
+            name = data[offset:end].decode("utf-8")
+        except UnicodeDecodeError:
+            raise ValueError("its name is no text in UTF-8") from None
         (points,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * points
         yield name, camera, tuple(pose[:4]), tuple(pose[4:])

@@ -339,9 +339,8 @@ def _contradiction(written: Agreement) -> str:
 
 def _fault(capture: CaptureFolder, what: str, found: Sequence[Correction]) -> InputDataError:
     causes = ", or ".join(correction.mistake for correction in found[:3])
-    return InputDataError(
-        f"{capture.root / 'capture.toml'}: {what}. What explains it: {causes}.", *_allowed(found[0].remedy)
-    )
+    where = f"{capture.root / 'capture.toml'} and its tracks"
+    return InputDataError(f"{where}: {what}. What explains it: {causes}.", *_allowed(found[0].remedy))
 
 
 def _allowed(remedy: str, allowed: str = "") -> tuple[str, str]:

@@ -56,7 +56,7 @@ def entries_of(folder: Path) -> list[Path]:
     try:
         found = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
-        raise InputDataError(f"{folder}: cannot be listed: {error.strerror}.") from None
+        raise InputDataError(f"{folder}: cannot be listed: {error.strerror}.", todo="check its permissions.") from None
     for path in found:
         require_printable(path.name, f"{folder}: the name")
     return sorted(found)

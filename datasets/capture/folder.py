@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
+from ...schemas.documents import shortened
 from ...schemas.regular_files import require_regular_file
 from .cameras import Camera, camera_of
 from .files import entries_of, files_under, has_folder, optional_file
@@ -208,7 +209,11 @@ class CaptureFolder:
         folder = self.root / "videos" / camera
         videos = _videos_in(folder) if camera in self.video_cameras() else {}
         if episode not in videos:
-            raise InputDataError(f"{folder}: no video of episode '{episode}'.{did_you_mean(episode, videos)}")
+            raise InputDataError(
+                f"{folder}: no video of episode '{episode}'.",
+                f"{shortened(', '.join(videos)) or 'none: the folder has no video'}.{did_you_mean(episode, videos)}",
+                "name a camera and an episode of which there is a video.",
+            )
         return videos[episode]
 
     def video_info(self, camera: str, episode: str) -> VideoInfo:

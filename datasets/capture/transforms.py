@@ -31,6 +31,7 @@ _INTRINSICS = (
     "camera_angle_x",
     "camera_angle_y",
 )
+_EXPORT = "correct it there, or write it again with the tool that made it."
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
@@ -50,13 +51,13 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
     """
     data = parse_json(read_text_file(path), path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
-        raise InputDataError(f"{path}: no list 'frames' with at least one frame.")
+        raise InputDataError(f"{path}: no list 'frames' with at least one frame.", todo=_EXPORT)
     cameras: dict[str, CameraIntrinsics] = {}
     images: dict[str, PosedImage] = {}
     for k, frame in enumerate(data["frames"]):
         where = f"{path}: frames[{k}]"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise InputDataError(f"{where}: no 'file_path'.")
+            raise InputDataError(f"{where}: no 'file_path'.", "the path of its photo, a text.", _EXPORT)
         file = _image_file(path.parent, frame["file_path"])
         intrinsics = _intrinsics(where, {**data, **frame}, path.parent / file)
         camera = next((name for name, known in cameras.items() if known == intrinsics), None)
@@ -65,7 +66,9 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
             cameras[camera] = intrinsics
         name = file.removeprefix("images/")
         if name in images:
-            raise InputDataError(f"{where}: '{frame['file_path']}' stands twice.")
+            raise InputDataError(
+                f"{where}: '{frame['file_path']}' stands twice.", "one frame for each photo.", "remove one."
+            )
         images[name] = parse({"camera": camera, "T_world_cam": _pose(where, frame)}, PosedImage, where)
     scale = Scale(kind="metric" if metric else "unscaled", source="transforms.json")
     return CamerasFile(scale=scale, cameras=cameras, images=images)
@@ -100,7 +103,8 @@ def _pose(where: str, frame: dict[str, Any]) -> Matrix4:
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputDataError(f"{where}: 'transform_matrix' is no 4x4 matrix of finite numbers.")
+        allowed = "four rows of four numbers, the pose camera to world."
+        raise InputDataError(f"{where}: 'transform_matrix' is no 4x4 matrix of finite numbers.", allowed, _EXPORT)
     return matrix4(opencv_from_opengl(matrix))
 
 
@@ -142,12 +146,16 @@ def _focal_lengths(where: str, values: dict[str, float], width: int, height: int
 
 def _focal(where: str, values: dict[str, float], name: str, size_px: int) -> float:
     if not 0 < values.get(name, 0.0) < math.pi:
-        raise InputDataError(f"{where}: neither a focal length 'fl_x' nor an angle 'camera_angle_x'.")
+        raise InputDataError(
+            f"{where}: neither a focal length 'fl_x' nor an angle '{name}'.",
+            "fl_x [px] above 0, or an angle of view between 0 and pi [rad].",
+            _EXPORT,
+        )
     return size_px / (2 * math.tan(values[name] / 2))
 
 
 def _number(where: str, fields: dict[str, Any], name: str) -> float:
     value = fields[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputDataError(f"{where}: '{name}' is {value!r:.40}, no finite number.")
+        raise InputDataError(f"{where}: '{name}' is {value!r:.40}, no finite number.", "a number.", _EXPORT)
     return float(value)

@@ -52,7 +52,10 @@ def frame_files(folder: Path) -> list[Path]:
             raise InputDataError(f"{file}: the name is no frame number.", "000000.png, 000001.png, ...")
         number = int(file.stem)
         if number in numbered:
-            raise InputDataError(f"{file}: frame {number} is there twice, also as {numbered[number].name}.")
+            raise InputDataError(
+                f"{file}: frame {number} is there twice, also as {numbered[number].name}.",
+                todo="remove one of the two.",
+            )
         numbered[number] = file
     missing = next((k for k in range(len(numbered)) if k not in numbered), None)
     if missing is not None:

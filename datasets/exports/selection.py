@@ -53,7 +53,10 @@ class Selection:
         self.manifest = read_manifest(path)
         self.reader = RolloutReader(path, split)
         if len(self.reader) == 0:
-            raise InputDataError(f"{path}: no rollout{f' in the split {split!r}' if split else ''}.")
+            raise InputDataError(
+                f"{path}: no rollout{f' in the split {split!r}' if split else ''}.",
+                todo="leave --split out, or name another." if split else "synthesize it again.",
+            )
         if every < 1:
             raise UsageError(f"--every {every}: no step from frame to frame.", "1 or more.")
         self.every = every
@@ -91,7 +94,11 @@ class Selection:
         steps = np.diff(self.reader.read(number, "time"))
         step = float(np.median(steps))
         if np.abs(steps - step).max() > 1e-6 * max(1.0, step):
-            raise InputDataError(f"{self.path}: the frames of rollout {number} are not evenly spaced in time.")
+            raise InputDataError(
+                f"{self.path}: the frames of rollout {number} are not evenly spaced in time.",
+                "one frame rate in a rollout, which the format needs.",
+                f"'cgwm validate {self.path}' shows more; synthesize it again.",
+            )
         return 1 / (step * self.every)
 
     def bodies(self, number: int = 0) -> list[str]:

@@ -140,9 +140,12 @@ def _read_pt(files: list[Path]) -> _Tosses:
             tensor = torch.load(require_regular_file(file), weights_only=True, map_location="cpu")
         except InputDataError:
             raise
-        except Exception as error:  # torch raises whatever its readers raise
-            reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
-            raise InputDataError(f"{file}: not a tensor that can be read safely: {reason}") from None
+        except Exception:  # torch raises whatever its readers raise, and advises to read without the precaution
+            raise InputDataError(
+                f"{file}: not a tensor that can be read safely: it is damaged, or holds more than numbers.",
+                "a tensor alone, as torch.save writes it; objects of Python are refused: reading them could run code.",
+                "take the original, or save the tensor alone.",
+            ) from None
         if not isinstance(tensor, torch.Tensor) or tensor.shape[-1:] != (_COLUMNS,) or tensor.dim() not in (2, 3):
             shape = tuple(tensor.shape) if isinstance(tensor, torch.Tensor) else type(tensor).__name__
             raise InputDataError(f"{file}: {shape} where a toss was expected.", f"a tensor (1, T, {_COLUMNS}).")
@@ -185,7 +188,11 @@ def _track(where: str, rows: Array, rate_hz: float) -> Track:
     """Return the track of rows (T, >= 13) in SI units: position, quaternion, velocity, angular velocity, ..."""
     rows = np.asarray(rows, np.float64)
     if len(rows) < 2 or not np.isfinite(rows).all():
-        raise InputDataError(f"{where}: {len(rows)} samples, {np.count_nonzero(~np.isfinite(rows))} values not finite.")
+        raise InputDataError(
+            f"{where}: {len(rows)} samples, {np.count_nonzero(~np.isfinite(rows))} values not finite.",
+            "2 samples or more, all finite.",
+            "remove this toss, or take the original.",
+        )
     return Track(
         time_s=np.arange(len(rows)) / rate_hz,
         position_m=rows[:, _POSITION],

@@ -194,8 +194,9 @@ def _read_json(path: Path) -> list[tuple[Array, Array]]:
                 positions.append(1e-3 * values)
             throws.append((np.concatenate(times), np.concatenate(positions)))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else "its entries have another form"
         raise InputDataError(
-            f"{path}: not an export of Qualisys' tracks: {type(error).__name__}: {error}.",
+            f"{path}: not an export of Qualisys' tracks: {reason}.",
             "Timebase.Frequency, and Markers with Parts of Range.Start and Values in mm.",
             _TODO,
         ) from None

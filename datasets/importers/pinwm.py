@@ -247,7 +247,9 @@ def _require_enough_frames(source: Path, recordings: list[_Recording], n_train: 
     shortest = min(len(recording.frames) for recording in filmed)
     if not 3 <= n_train < shortest:
         raise InputDataError(
-            f"{n_train} frames to fit on; the shortest push with pictures has {shortest}.", f"3 to {shortest - 1}."
+            f"{source / 'dataset'}: {n_train} frames to fit on; the shortest push with pictures has {shortest}.",
+            f"3 to {shortest - 1}.",
+            "set --train.",
         )
 
 

@@ -101,7 +101,11 @@ class Units:
         if len(time) < 2:
             raise InputDataError(f"{where}: {len(time)} samples with a pose.", "at least 2.")
         if not np.isfinite(time).all():
-            raise InputDataError(f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.")
+            raise InputDataError(
+                f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.",
+                "a finite time for each sample.",
+                "remove these samples, or take the original.",
+            )
         self._check(where, time, position)
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
         track = Track(time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat)

@@ -104,8 +104,12 @@ def _track(path: Path, topic: str | None) -> Track:
     except InputDataError:
         raise
     except Exception as error:  # the readers raise what their parsers raise: of struct, yaml, sqlite, their own
-        reason = str(error)[:160] or type(error).__name__
-        raise InputDataError(f"{path}: not a ROS bag that can be read: {reason}.") from None
+        reason = str(error)[:160].rstrip(".") or type(error).__name__
+        raise InputDataError(
+            f"{path}: not a ROS bag that can be read: {reason}.",
+            "a whole .bag or .mcap, or a directory with metadata.yaml and the files that it names.",
+            "record or copy it again; 'rosbag reindex' or 'ros2 bag reindex' mends one that was cut off.",
+        ) from None
     if not rows:
         shown = f" of '{frame}'" if frame else ""
         raise InputDataError(f"{path}: no poses{shown} on {name}.", todo="choose another: --topic NAME.")

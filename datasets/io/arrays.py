@@ -58,11 +58,9 @@ def _parsed(where: str, data: bytes) -> NDArray[Any]:
     """Return the array of the bytes of a .npy file."""
     stream = io.BytesIO(data)
     try:
-        version = np.lib.format.read_magic(stream)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read_header(stream)
+        shape, fortran, dtype = _read_header(stream)
         if dtype.hasobject:
-            raise ValueError("objects of Python")
+            raise ValueError("it holds objects of Python, and reading them could run code")
         body = data[stream.tell() :]
         count = 1
         for length in shape:
@@ -71,5 +69,19 @@ def _parsed(where: str, data: bytes) -> NDArray[Any]:
             raise ValueError(f"it declares {dtype} {shape}, which is not {len(body)} bytes")
         array = np.frombuffer(body, dtype, count).reshape(shape, order="F" if fortran else "C")
     except (ValueError, TypeError, EOFError, OverflowError, SyntaxError, RecursionError, MemoryError) as error:
-        raise InputDataError(f"{where}: no array that can be read: {str(error)[:160]}.", "a .npy array.") from None
+        raise InputDataError(
+            f"{where}: no array that can be read: {str(error)[:160]}.",
+            "an array of numbers, as numpy.save writes it.",
+            "write it again, or take the original.",
+        ) from None
     return array.copy()
+
+
+def _read_header(stream: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return the shape, the order and the type that the header of a .npy file declares."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        return read(stream)
+    except ValueError:  # NumPy's words advise to trust the file
+        raise ValueError("its header is no .npy header, or is damaged") from None

@@ -25,6 +25,7 @@ MOST_CHUNK_BYTES = 1 << 30
 """Largest chunk, which HDF5 unpacks as a whole [bytes]."""
 NEEDS_NO_PROOF_BYTES = 64 << 20
 """Size up to which an array may be stored in part [bytes]."""
+_WRITE = "write it again, or take the original."
 _ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)
 """What h5py raises for damaged files and for what is no HDF5."""
 
@@ -40,7 +41,7 @@ def hdf5_faults(path: Path) -> Iterator[None]:
         yield
     except _ERRORS as error:
         reason = (str(error).splitlines() or [""])[0][:160] or type(error).__name__
-        raise InputDataError(f"{path}: not a readable HDF5 file: {reason}.") from None
+        raise InputDataError(f"{path}: not a readable HDF5 file: {reason}.", todo=_WRITE) from None
 
 
 def open_hdf5(path: Path, **options: Any) -> h5py.File:
@@ -142,7 +143,7 @@ def require_stored(
         InputDataError: If it is such an array.
     """
     if item.shape is None:
-        raise InputDataError(f"{where}: an array without a shape.")
+        raise InputDataError(f"{where}: an array without a shape.", "arrays of numbers.", "write it, or remove it.")
     made = item.id.get_create_plist()
     if made.get_external_count():
         raise InputDataError(
@@ -187,7 +188,11 @@ def _require_sources(item: h5py.Dataset, where: str, files: Mapping[str, Callabl
         else:
             _require_source(files[source.file_name](), source.dset_name, taken, where, files, depth)
     if covered < math.prod(item.shape):
-        raise InputDataError(f"{where}: declares {item.shape}, of which {covered} numbers have a source.")
+        raise InputDataError(
+            f"{where}: declares {item.shape}, of which {covered} numbers have a source.",
+            "a virtual array whose sources cover it.",
+            _WRITE,
+        )
 
 
 def _require_source(
@@ -197,8 +202,12 @@ def _require_source(
     place: Any = file
     for part in name.strip("/").split("/"):
         if not is_own_link(place, part, f"{where}: its source {name}"):
-            raise InputDataError(f"{where}: its source {name} is a link.")
+            raise InputDataError(f"{where}: its source {name} is a link.", "an array in the file itself.", _WRITE)
         place = place[part]
     if not isinstance(place, h5py.Dataset) or place.shape is None or (place.size or 0) < taken:
-        raise InputDataError(f"{where}: its source {name} is no array of {taken} numbers.")
+        raise InputDataError(
+            f"{where}: its source {name} is no array of {taken} numbers.",
+            "an array that is written completely.",
+            _WRITE,
+        )
     require_stored(place, where, files, depth + 1)

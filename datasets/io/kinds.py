@@ -31,7 +31,11 @@ def refuse_other_kind(path: Path, wanted: Kind) -> None:
     if not path.exists():
         raise InputDataError(f"{path}: no such {wanted}.", todo="check the path.")
     if not path.is_dir():
-        raise InputDataError(f"{path} is a file; a {wanted} is a directory with {_MARKS[wanted]}.")
+        raise InputDataError(
+            f"{path} is a file.",
+            f"a {wanted}, which is a directory with {_MARKS[wanted]}.",
+            "pass the directory that holds it.",
+        )
     if found is not None:
         raise InputDataError(
             f"{path} is a {found} (it holds {_MARKS[found]}), not a {wanted}.",

@@ -51,6 +51,11 @@ class Model:
         return next(body for body in self.file.bodies if body.name == name)
 
     @property
+    def place(self) -> str:
+        """Return what the model is called in messages: its `model.json`, where it was read from one."""
+        return "the model" if self.root is None else str(self.root / "model.json")
+
+    @property
     def accepts_units(self) -> bool:
         """Whether the model was fitted with `--accept-units`: its captures' units are right whatever their motion."""
         return bool(self.file.provenance.config.get("accept_units", False))

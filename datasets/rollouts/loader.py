@@ -55,7 +55,10 @@ def shard_files(path: Path) -> list[Path]:
         return [path / INDEX]
     files = sorted(path.glob("rollouts-*-of-*.h5"))
     if not files:
-        raise InputDataError(f"{path}: no shard (rollouts-<i>-of-<n>.h5) in it.")
+        raise InputDataError(
+            f"{path}: no shard (rollouts-<i>-of-<n>.h5) in it.",
+            todo="bring them back, or synthesize the dataset again.",
+        )
     return files
 
 
@@ -167,7 +170,10 @@ class RolloutReader:
         """Return `length` frames of arrays with a time axis: successive ones, or every `every`-th."""
         frames, stop = self.rollouts[number].frames, start + (length - 1) * every + 1
         if start < 0 or length < 1 or every < 1 or stop > frames:
-            raise UsageError(f"frames {start} to {stop} of rollout {number}, which has {frames}.")
+            raise UsageError(
+                f"frames {start} to {stop} of rollout {number}, which has {frames}.",
+                f"length and every of 1 or more, and a window within the frames 0 to {frames - 1}.",
+            )
         return {key: self.read(number, key, start, stop)[::every] for key in keys}
 
 

@@ -18,6 +18,8 @@ from ..io.cells import number_of
 
 Array = NDArray[np.float64]
 
+_EXPORT = "export the mesh again, or take the original."
+
 MOST_BYTES = 8 << 30
 """Largest size of the file of a mesh [bytes]."""
 
@@ -69,11 +71,11 @@ def read_mesh(path: Path | str, merge: bool = True) -> Mesh:
         if merge or path.suffix.lower() == ".stl":
             mesh = _merged(mesh)
     except (ValueError, IndexError, OverflowError) as error:
-        raise InputDataError(f"{path}: no mesh that can be read: {str(error)[:200]}.") from None
+        raise InputDataError(f"{path}: no mesh that can be read: {str(error)[:200]}.", todo=_EXPORT) from None
     if len(mesh.faces) == 0:
-        raise InputDataError(f"{path}: the mesh has no triangles.")
+        raise InputDataError(f"{path}: the mesh has no triangles.", "a mesh with faces, not points alone.", _EXPORT)
     if not np.isfinite(mesh.vertices).all():
-        raise InputDataError(f"{path}: the mesh has vertices that are not finite.")
+        raise InputDataError(f"{path}: the mesh has vertices that are not finite.", todo=_EXPORT)
     return mesh
 
 

@@ -20,6 +20,12 @@ SH_C0 = 0.28209479177387814
 
 MOST_BYTES = 16 << 30
 """Largest size of a file [bytes]; of a splat with all harmonics, 248 bytes."""
+_AGAIN = "write it again, or take the original."
+_REMOVE = "remove these splats, or write it again."
+_HEADER = (
+    "format ascii or binary_little_endian 1.0, then 'element vertex <count>' with 'property <type> <name>' lines, each "
+    "name once."
+)
 _OPACITY_MARGIN = 1e-6
 _HIGHER_TERMS = (3, 8, 15)
 """Harmonics from degree 1 up to degree 1, 2 and 3."""
@@ -169,7 +175,9 @@ def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, NDArray[
     for name, values in table.items():
         bad = int(np.count_nonzero(~np.isfinite(values)))
         if bad:
-            raise InputDataError(f"{path}: '{name}' is not finite in {bad} of {len(values)} splats.")
+            raise InputDataError(
+                f"{path}: '{name}' is not finite in {bad} of {len(values)} splats.", "finite numbers.", _REMOVE
+            )
     return table
 
 
@@ -182,7 +190,8 @@ def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:
         raise InputDataError(f"{path}: {count} properties 'f_rest_*'.", "9, 24 or 45 of them, of degree 1, 2 or 3.")
     values = np.stack([np.asarray(columns[f"f_rest_{k}"], np.float64) for k in range(count)], axis=1)
     if not np.isfinite(values).all():
-        raise InputDataError(f"{path}: 'f_rest_*' is not finite in {int((~np.isfinite(values)).any(1).sum())} splats.")
+        bad = int((~np.isfinite(values)).any(1).sum())
+        raise InputDataError(f"{path}: 'f_rest_*' is not finite in {bad} splats.", "finite numbers.", _REMOVE)
     return values.reshape(-1, 3, count // 3).transpose(0, 2, 1) if values.any() else None
 
 
@@ -201,14 +210,16 @@ def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
     data = read_binary_file(path, MOST_BYTES)
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
-        raise InputDataError(f"{path}: no .ply file.")
+        raise InputDataError(
+            f"{path}: no .ply file.", "a file that begins with 'ply' and a header up to 'end_header'.", _AGAIN
+        )
     body = data.find(b"\n", end) + 1
     kind, count, properties, comments = _parse_header(path, data[:end].decode("ascii", "replace"))
     if kind == "ascii":
         try:
             words = np.array(data[body:].split()[: count * len(properties)], np.float64)
         except ValueError as error:
-            raise InputDataError(f"{path}: a value that is no number: {str(error)[:80]}.") from None
+            raise InputDataError(f"{path}: a value that is no number: {str(error)[:80]}.", todo=_AGAIN) from None
         if len(words) < count * len(properties):
             raise _cut_off(path, count)
         rows = words.reshape(count, len(properties))
@@ -222,7 +233,7 @@ def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
 
 
 def _cut_off(path: Path, count: int) -> InputDataError:
-    return InputDataError(f"{path}: cut off: it holds fewer than the {count} splats of its header.")
+    return InputDataError(f"{path}: cut off: it holds fewer than the {count} splats of its header.", todo=_AGAIN)
 
 
 def _count(word: str) -> int:
@@ -252,8 +263,13 @@ def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]
         if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
             raise ValueError(f"its format is '{kind}'")
         names = [name for name, _ in properties]
-        if not names or len(set(names)) < len(names):
-            raise ValueError("a property stands twice" if names else "its splats have no properties")
+        if not names:
+            raise ValueError("its splats have no properties")
+        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+        if twice is not None:
+            raise ValueError(f"the property '{twice}' stands twice")
     except (ValueError, KeyError, IndexError) as error:
-        raise InputDataError(f"{path}: the .ply header cannot be read: {error}.") from None
+        reason = f"the type {error} is unknown" if isinstance(error, KeyError) else error
+        reason = "a line ends too early" if isinstance(error, IndexError) else reason
+        raise InputDataError(f"{path}: the .ply header cannot be read: {reason}.", _HEADER, _AGAIN) from None
     return kind, count, properties, comments

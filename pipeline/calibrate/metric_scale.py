@@ -117,7 +117,11 @@ def from_camera_distance(model: SfmModel, known: KnownCameraDistance) -> MetricF
     offset = model.center(known.images[1]) - model.center(known.images[0])
     length = float(np.linalg.norm(offset))
     if length == 0.0:
-        raise InputDataError("capture.toml: calibration.known_camera_distance names the same place twice.")
+        raise InputDataError(
+            "capture.toml: calibration.known_camera_distance names the same place twice.",
+            "two photos from different places.",
+            "name two photos between whose cameras you measured the distance.",
+        )
     noise = max(model.reprojection_error_px, CORNER_NOISE_PX)
     stds = [center_std(model, name, offset / length, noise) for name in known.images]
     source = f"known distance of {known.distance_m:g} m between the cameras of {known.images[0]} and {known.images[1]}"

@@ -188,7 +188,10 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
         reader.close()
     episodes, warnings = _usable(model, found)
     if not episodes:
-        raise InputDataError(f"{dataset}: its rollouts have no free body with two frames or more.")
+        raise InputDataError(
+            f"{dataset}: its rollouts have no free body with two frames or more.",
+            todo="synthesize longer ones: --duration.",
+        )
     none = [np.zeros(0)] * len(episodes)
     predictions = _predict(model, world, episodes, DATASET_NOISE, warmup_s, none)
     return _evaluation(predictions, lambda _: (), warnings)
@@ -227,7 +230,11 @@ def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], l
     """Return the episodes in which every moving body has a track, and messages on the others."""
     moving = [body.name for body in model.file.bodies if body.motion != "fixed"]
     if not any(body.motion == "free" for body in model.file.bodies):
-        raise InputDataError("none of the model's bodies is free, so there is no motion to predict.")
+        raise InputDataError(
+            f"{model.place}: none of its bodies is free, so there is no motion to predict.",
+            'a body with the motion "free".',
+            "take a model with one, or fit one.",
+        )
     usable, warnings = [], []
     for name, tracks in episodes:
         lacking = [body for body in moving if body not in tracks]

@@ -24,7 +24,11 @@ def read_mesh(path: Path) -> Mesh:
         raise InputDataError(f"{path}: no such file.", todo="correct the path of the mesh in capture.toml.")
     mesh = meshes.read_mesh(path, merge=False)
     if mesh.faces.shape[0] < 4:
-        raise InputDataError(f"{path}: no closed mesh; found {mesh.faces.shape[0]} triangles.")
+        raise InputDataError(
+            f"{path}: no closed mesh; found {mesh.faces.shape[0]} triangles.",
+            "a closed mesh, of 4 triangles or more.",
+            "export the whole surface of the body.",
+        )
     _check_closed(mesh, path)
     # triangles of a mesh that is inside out are flipped
     return mesh if _signed_volume(mesh) > 0 else Mesh(mesh.vertices, mesh.faces[:, ::-1])

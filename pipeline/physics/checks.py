@@ -31,42 +31,42 @@ def require_physical(world: World) -> None:
     for body in world.bodies:
         if not body.free:
             continue
-        _require(plain(body.mass) > 0, plain(body.mass), f"body '{body.name}': mass", "kg", "above 0 kg")
+        place = world.called(f"body '{body.name}'")
+        _require(plain(body.mass) > 0, plain(body.mass), f"{place}: mass", "kg", "above 0 kg")
         _require(
             torch.isfinite(plain(body.inertia)).flatten(1).all(-1),
             plain(body.inertia).flatten(1).sum(-1),
-            f"body '{body.name}': the sum of its inertia",
+            f"{place}: the sum of its inertia",
             "kg m2",
             "finite",
         )
         moments = torch.linalg.eigvalsh(plain(body.inertia))
-        _require(
-            moments[..., 0] > 0, moments[..., 0], f"body '{body.name}': smallest moment of inertia", "kg m2", "above 0"
-        )
+        _require(moments[..., 0] > 0, moments[..., 0], f"{place}: smallest moment of inertia", "kg m2", "above 0")
         excess = moments[..., 2] - moments[..., 0] - moments[..., 1]
         _require(
             excess <= TRIANGLE_TOLERANCE * moments[..., 2],
             moments[..., 2],
-            f"body '{body.name}': largest moment of inertia",
+            f"{place}: largest moment of inertia",
             "kg m2",
             "at most the sum of the two smaller ones: no distribution of mass has more",
         )
-        _require(
-            (plain(body.radii) > 0).all(-1), plain(body.radii).amin(-1), f"body '{body.name}': radius", "m", "above 0"
-        )
+        _require((plain(body.radii) > 0).all(-1), plain(body.radii).amin(-1), f"{place}: radius", "m", "above 0")
     law = world.contact
-    _require(plain(law.friction) >= 0, plain(law.friction), "friction", "1", "0 or more")
+    _require(plain(law.friction) >= 0, plain(law.friction), world.called("friction"), "1", "0 or more")
     if isinstance(law, ContactLaw):
         time, ratio = plain(law.contact_time_s), plain(law.damping_ratio)
-        _require(time > 0, time, "contact_time_s", "s", "above 0 s")
-        _require(ratio >= 0, ratio, "damping_ratio", "1", "0 or more")
+        _require(time > 0, time, world.called("contact_time_s"), "s", "above 0 s")
+        _require(ratio >= 0, ratio, world.called("damping_ratio"), "1", "0 or more")
     else:
-        _require(plain(law.stiffness_n_m) > 0, plain(law.stiffness_n_m), "stiffness", "N/m", "above 0 N/m")
-        _require(plain(law.damping_n_s_m) >= 0, plain(law.damping_n_s_m), "damping", "N s/m", "0 or more")
+        _require(
+            plain(law.stiffness_n_m) > 0, plain(law.stiffness_n_m), world.called("stiffness"), "N/m", "above 0 N/m"
+        )
+        _require(plain(law.damping_n_s_m) >= 0, plain(law.damping_n_s_m), world.called("damping"), "N s/m", "0 or more")
     bound = largest_step(world)
     if not 0 < world.step_s <= bound:
         raise InputDataError(
-            f"the step of {1e3 * world.step_s:g} ms is beyond the bound of its contacts, {1e3 * bound:.3g} ms.",
+            f"{world.called('the step')} of {1e3 * world.step_s:g} ms is beyond the bound of its contacts, "
+            f"{1e3 * bound:.3g} ms.",
             f"a step above 0 and up to {1e3 * bound:.3g} ms.",
             "take a smaller step (--set phys-geo.step_s=...), or a softer contact.",
         )
@@ -122,7 +122,7 @@ def require_apart(world: World, state: State, name: str | None = None) -> None:
         limit = float(DEEPEST_SHARE * size[deepest])
         if float(depth[deepest]) > limit:
             raise InputDataError(
-                f"{name or f'environment {deepest}'}: body '{overlap.body}' begins "
+                f"{name or world.called(f'environment {deepest}')}: body '{overlap.body}' begins "
                 f"{1e3 * float(depth[deepest]):.1f} mm deep inside {overlap.other}.",
                 f"up to {1e3 * limit:.1f} mm; deeper, the contact would throw them apart.",
                 "check the start's poses, the ground's height and the sizes of the bodies.",

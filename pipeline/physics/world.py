@@ -83,6 +83,12 @@ class World:
     """
     own_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Group- or episode-specific values of effects' parameters: by episode, then by `effect.parameter`."""
+    source: str = ""
+    """File of the model that it was built from, for messages; empty where there is none."""
+
+    def called(self, what: str) -> str:
+        """Return what messages call a part of the world: with the file that it comes from."""
+        return f"{self.source}: {what}" if self.source else what
 
     @property
     def body_names(self) -> list[str]:
@@ -147,7 +153,7 @@ class World:
         file = model.file
         if file.contact is None:
             raise InputDataError(
-                f"{model.root}: the model has no fitted physics, only the scene.",
+                f"{model.place}: the model has no fitted physics, only the scene.",
                 todo="run 'cgwm fit CAPTURE --stage phys-geo --from MODEL --out NEW' first.",
             )
 
@@ -170,7 +176,10 @@ class World:
             contact=law,
             step_s=file.solver.step_s,
             iterations=file.solver.sweeps,
-            effects=tuple(_active(effect, _place(model, effect), tensor(0.0)) for effect in file.effects),
+            effects=tuple(
+                _active(effect, f"{model.place}: effect '{effect.name}'", tensor(0.0)) for effect in file.effects
+            ),
+            source="" if model.root is None else model.place,
         )
 
     def with_body(self, index: int, **changes: Tensor) -> World:
@@ -235,11 +244,6 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         place=place,
         on_plane=on_plane,
     )
-
-
-def _place(model: Model, effect: EffectModel) -> str:
-    file = "the model" if model.root is None else f"{model.root / 'model.json'}"
-    return f"{file}: effect '{effect.name}'"
 
 
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:

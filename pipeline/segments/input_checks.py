@@ -56,7 +56,7 @@ def check_units_and_geometry(world: World, episodes: Sequence[Episode], where: s
         InputDataError: What is wrong, and what to check.
     """
     free = [world.bodies[k].name for k in world.free]
-    refuse_slow_times([t[b] for _, t in episodes for b in free if b in t], where)
+    refuse_slow_times(episodes, free, where)
     for index in world.free:
         _check_mass(world.bodies[index], where)
     _check_depth(world, episodes, where)

@@ -82,7 +82,11 @@ def _background_seeds(stage: Stage, count: int, bodies: Spheres | None) -> Spher
         stage.warnings += [warning] if warning not in stage.warnings else []
     centers, scales = scene_seeds(stage.train, stage.ground, stage.points, count, stage.config.seed)
     if len(scales) == 0:
-        raise InputDataError(f"{stage.capture.root}: the photos show no background to fit.")
+        raise InputDataError(
+            f"{stage.capture.root}: the photos show no background to fit.",
+            "photos in which some pixels belong to no body.",
+            "check that the masks are white on the bodies alone.",
+        )
     spheres = to_spheres(centers, scales, 0.9 if stage.config.spheres is None else 0.5, stage.device)
     colors = mean_colors(behind(bodies, spheres), [stage.exposures.even(view) for view in stage.train])
     return replace(spheres, colors=colors if bodies is None else colors[len(bodies) :])

@@ -96,7 +96,10 @@ def carve(silhouettes: Sequence[Silhouette], ground: Ground | None, name: str = 
     field, origin, pitch = _refined(coarse, inside, origin, pitch, views, fields, ground)
     solid = largest_component(field > 0)
     if solid is None:
-        raise InputDataError(f"body '{name}': the masks leave nothing larger than {1e3 * pitch:.2g} mm.")
+        raise InputDataError(
+            f"body '{name}': the masks leave nothing larger than {1e3 * pitch:.2g} mm.",
+            todo="check that the masks show the whole body, and fit the cameras: 'cgwm validate' reprojects them.",
+        )
     field = np.where(solid, field, np.minimum(field, -1e-3 * pitch))
     surface = crossings(field, origin, pitch)
     tips = _tips(surface, pitch, lambda points: _field(points, views, fields, ground))

@@ -125,7 +125,9 @@ def require_admissible(file: ModelFile, replaced: Mapping[str, Distribution], so
                 ModelFile.model_validate(with_parameter(file, name, end).model_dump())
             except ValidationError as error:
                 fault = error.errors()[0]["msg"]
-                raise InputDataError(f"{source}: [parameters] {name} reaches {end:g}: {fault}.") from None
+                raise InputDataError(
+                    f"{source}: [parameters] {name} reaches {end:g}: {fault}.", todo="narrow the distribution."
+                ) from None
 
 
 def settable(file: ModelFile) -> list[str]:
@@ -239,7 +241,10 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
         InputDataError: If the model has no such parameter.
     """
     if not can_vary(file, name):
-        raise InputDataError(f"the model has no physical parameter '{name}'.")
+        legal = settable(file)
+        raise InputDataError(
+            f"the model has no physical parameter '{name}'.", f"{', '.join(legal)}.{did_you_mean(name, legal)}"
+        )
     if name == "ground_offset_m" and file.ground is not None:
         return file.model_copy(update={"ground": file.ground.model_copy(update={"offset_m": value})})
     if file.contact is not None and name in type(file.contact).model_fields:

@@ -60,7 +60,11 @@ def resolve_plan(model: Model, plan: SamplingPlan) -> SamplingPlan:
     file = model.file
     radii = [extent(model, body).radius_m for body in file.bodies if body.motion == "free"]
     if not radii:
-        raise InputDataError("the model has no free body, so there is nothing to simulate.")
+        raise InputDataError(
+            f"{model.place}: no body is free, so there is nothing to simulate.",
+            'a body with the motion "free".',
+            "take a model with one, or fit one.",
+        )
     radius = max(radii)
     gravity = float(np.linalg.norm(file.gravity_m_s2)) or GRAVITY_M_S2
     speed = math.sqrt(2 * gravity * 3 * radius)
@@ -69,7 +73,9 @@ def resolve_plan(model: Model, plan: SamplingPlan) -> SamplingPlan:
         start = "rest" if any(body.motion == "driven" for body in file.bodies) else "throw"
     if start == "slide" and file.ground is None:
         raise InputDataError(
-            'the plan\'s start is "slide", and the model has no ground.', '"throw", "rest".', "choose another start."
+            f'{plan.source}: start is "slide", and {model.place} has no ground.',
+            '"throw", "rest".',
+            "choose another start.",
         )
     defaults: dict[str, object] = {
         "height_m": (0.5 * radius, 3.0 * radius),
@@ -79,7 +85,8 @@ def resolve_plan(model: Model, plan: SamplingPlan) -> SamplingPlan:
         "spin_rad_s": (0.0, 0.5 * speed / radius),
     }
     left_out = {name: value for name, value in defaults.items() if getattr(plan, name) is None}
-    return SamplingPlan(**{**plan.model_dump(), **left_out, "start": start})
+    resolved = SamplingPlan(**{**plan.model_dump(), **left_out, "start": start})
+    return plan.model_copy(update=dict(resolved))  # a copy keeps where the plan comes from
 
 
 @dataclass(frozen=True, kw_only=True)

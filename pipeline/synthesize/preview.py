@@ -139,7 +139,7 @@ def _shots(reader: RolloutReader) -> tuple[list[_Shot], float]:
     numbers = range(min(ROLLOUTS, len(reader)))
     cameras = reader.cameras(0)
     if not cameras:
-        raise InputDataError(f"{reader.path}: the rollouts have no images.")
+        raise InputDataError(f"{reader.path}: the rollouts have no images.", todo="synthesize it with images.")
     impulses = {number: np.linalg.norm(reader.read(number, "contacts/impulse_world"), axis=-1) for number in numbers}
     largest = max((float(values.max()) for values in impulses.values() if len(values)), default=0.0)
     pairs = [(number, name) for name in cameras for number in numbers][:ROLLOUTS]

@@ -160,8 +160,9 @@ def shard_indices(config: SynthesizeConfig) -> range:
     """
     if config.shards > config.rollouts:
         raise UsageError(
-            f"{config.shards} shards for {config.rollouts} rollouts: some would be empty.",
+            f"--shards, --rollouts: {config.shards} shards for {config.rollouts} rollouts: some would be empty.",
             f"1 to {config.rollouts} shards.",
+            "take fewer shards, or more rollouts.",
         )
     return shard_range(config.rollouts, config.shards, config.shard)
 

@@ -95,7 +95,7 @@ def _place_apart(
         if all(np.linalg.norm(centers[a] - centers[b]) > extents[a].radius_m + extents[b].radius_m for a, b in pairs):
             return
     raise NotConvergedError(
-        f"no start without overlap in {MAX_PLACEMENTS} draws for {len(free)} free bodies.",
+        f"{plan.source}: no start without overlap in {MAX_PLACEMENTS} draws for {len(free)} free bodies.",
         todo="raise offset_m and height_m in the sampling plan.",
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -241,21 +241,29 @@ def track_episodes(capture: Capture, split: str) -> list[Episode]:
             "tracks/<episode>.csv with rows for a body whose motion is 'free'.",
             "add tracks, or fit from the videos: --supervise images.",
         )
-    refuse_slow_times([t[b] for _, t in usable for b in free if b in t], str(capture.root))
+    refuse_slow_times(usable, free, str(capture.root))
     return usable
 
 
-def refuse_slow_times(tracks: Sequence[Track], where: str) -> None:
+def refuse_slow_times(episodes: Sequence[Episode], bodies: Collection[str], where: str) -> None:
     """Refuse tracks whose frames are too far apart to show a flight.
+
+    Args:
+        episodes: The episodes.
+        bodies: Names of the bodies whose tracks are looked at.
+        where: The capture, for messages, which name the slowest of its episodes.
 
     Raises:
         InputDataError: If they are: times are probably in milliseconds.
     """
-    step = float(np.median(np.concatenate([np.diff(track.time_s) for track in tracks]))) if tracks else 0.0
+    steps = {name: [np.diff(tracks[body].time_s) for body in bodies if body in tracks] for name, tracks in episodes}
+    steps = {name: np.concatenate(found) for name, found in steps.items() if found}
+    step = float(np.median(np.concatenate(list(steps.values())))) if steps else 0.0
     if step > LONGEST_STEP_S:
+        slowest = max(steps, key=lambda name: float(np.median(steps[name])))
         raise InputDataError(
-            f"{where}: the tracks have a frame every {step:.3g} s; if these are milliseconds, they do "
-            "not match the column time_s.",
+            f"{where}/tracks/{slowest}.csv: the tracks have a frame every {step:.3g} s; if these are milliseconds, "
+            "they do not match the column time_s.",
             f"at most {LONGEST_STEP_S:g} s.",
             "write time_s in seconds.",
         )

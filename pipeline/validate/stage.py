@@ -57,7 +57,7 @@ def validate_capture(path: Path | str, accept_units: bool = False) -> Validation
         raise faults[0]
     if faults:
         listed = "\n".join(f"{number}. {fault}" for number, fault in enumerate(faults, 1))
-        raise InputDataError(f"{path}: {len(faults)} faults.\n{listed}")
+        raise InputDataError(f"{path}: {len(faults)} faults.\n{listed}", todo="correct them, and validate it again.")
     return ValidationReport(path=str(path), kind="capture", facts=dataclasses.asdict(facts))
 
 

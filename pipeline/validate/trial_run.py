@@ -51,7 +51,8 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
             _require_own_values(model, file, world)
             result = _simulated(world, state)
     except CgwmError as error:
-        return [f"model.json: it cannot be simulated: {error.found}"], facts
+        found = error.found.removeprefix(f"{model.place}: ")
+        return [f"model.json: it cannot be simulated: {found}"], facts
     if result.times_s[-1] < LENGTH_S:
         facts["simulated_s"] = f"{float(result.times_s[-1]):.3g}"
     fault = _fault(world, state, result)

@@ -45,7 +45,7 @@ def _dataset(path: Path, host: str, port: int) -> Viewer:
     model = read_model(path / read_manifest(path).model)
     reader = RolloutReader(path)
     if not len(reader):
-        raise InputDataError(f"{path}: no rollout in it.")
+        raise InputDataError(f"{path}: no rollout in it.", todo="synthesize it again, or view its model.")
     motions = {info.demo: partial(recorded_motion, reader, number) for number, info in enumerate(reader.rollouts)}
     return Viewer(f"dataset {path.resolve().name}", model, motions, host, port)
 
