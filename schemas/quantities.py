@@ -22,7 +22,9 @@ Mass = Annotated[float, Field(ge=1e-12, le=1e9)]
 """[kg]."""
 Instant = Annotated[float, Field(ge=-1e11, le=1e11)]
 """A time on any clock [s], also seconds since 1970."""
-Duration = Annotated[float, Field(ge=1e-6, le=3600)]
+MOST_DURATION_S = 3600.0
+"""Longest simulated motion [s]."""
+Duration = Annotated[float, Field(ge=1e-6, le=MOST_DURATION_S)]
 """Length of a simulated motion [s]."""
 Step = Annotated[float, Field(ge=1e-6, le=1)]
 """Time step of a simulation [s]."""
@@ -38,7 +40,9 @@ ContactTime = Annotated[float, Field(ge=1e-7, le=10)]
 """Natural contact time [s]."""
 DampingRatio = Annotated[float, Field(ge=0, le=100)]
 """Of a contact [1]; from about 10 on nothing bounces measurably."""
-Seed = Annotated[int, Field(ge=0, le=2**62)]
+MOST_SEED = 2**62
+"""Largest seed; sums of a seed and a small number stay within 64 bits."""
+Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Side = Annotated[int, Field(ge=16, le=16384)]
 """Side of a picture that is drawn [px]."""
 Steps = Annotated[int, Field(ge=1, le=10_000_000)]

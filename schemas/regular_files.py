@@ -46,6 +46,14 @@ def require_regular_file(path: Path | str) -> Path:
     return path
 
 
+def real_path(path: Path | str) -> Path:
+    """Return the absolute path with all links followed; of links in circles, as far as they can be followed.
+
+    `Path.resolve` raises RuntimeError for such links, which are to be refused where the file is opened.
+    """
+    return Path(os.path.realpath(path))
+
+
 def read_text_file(path: Path | str, encoding: str = "utf-8") -> str:
     """Return the text of a file.
 

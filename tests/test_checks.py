@@ -139,3 +139,9 @@ ABOUT_INPUT = ("InputDataError", "UsageError", "DamagedShardError")
 
 def test_every_error_about_an_input_says_what_is_allowed_or_what_to_do_next() -> None:
     assert raised_with_what_was_found_alone() == []
+
+
+def test_messages_about_a_world_name_the_file_of_its_model() -> None:
+    world = replace(world_of(box_body(mass=-0.4)), source="m/model.json")
+    with pytest.raises(InputDataError, match=r"^m/model.json: body 'box': mass is -0.4 kg"):
+        simulate(world, HIGH, times(0.02))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from cgwm.schemas import InputDataError
-from cgwm.schemas.regular_files import read_text_file, require_regular_file
+from cgwm.schemas.regular_files import read_text_file, real_path, require_regular_file
 
 
 def _broken_link(path: Path) -> None:
@@ -51,3 +51,10 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(b"\xff\xfe{}")
     with pytest.raises(InputDataError, match="not a text file in UTF-8"):
         read_text_file(tmp_path / "a.json")
+
+
+def test_the_real_path_of_a_link_to_itself_is_no_fault(tmp_path: Path) -> None:
+    _circle(tmp_path / "circle")
+    (tmp_path / "link").symlink_to(tmp_path)
+    assert real_path(tmp_path / "circle") == tmp_path.resolve() / "circle"
+    assert real_path(tmp_path / "link" / "file") == tmp_path.resolve() / "file"

@@ -346,7 +346,9 @@ def test_bad_arguments_are_refused_with_what_is_allowed(tmp_path: Path) -> None:
         make_scene("fal", tmp_path / "x")
     with pytest.raises(UsageError, match=r"unknown renderer 'gl'.\nAllowed: raycast."):
         make_scene("fall", tmp_path / "x", renderer="gl")
-    with pytest.raises(UsageError, match=r"the seed is -1.\nAllowed: integers >= 0."):
+    with pytest.raises(UsageError, match=f"the seed is {2**63}"):
+        plan_scene("fall", 2**63)
+    with pytest.raises(UsageError, match=r"the seed is -1.\nAllowed: integers from 0 to 4611686018427387904."):
         make_scene("fall", tmp_path / "x", seed=-1)
     (tmp_path / "there").mkdir()
     with pytest.raises(UsageError, match="exists"):

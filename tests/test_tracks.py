@@ -165,7 +165,9 @@ def test_files_that_are_no_tracks(tmp_path: Path) -> None:
     (tmp_path / "empty.csv").touch()
     assert message(tmp_path / "empty.csv").startswith("T: the file is empty.\nAllowed: a header line of time_s, ")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00\x01")
-    assert message(tmp_path / "bytes.csv") == "T: not a text file in UTF-8."
+    assert message(tmp_path / "bytes.csv") == (
+        "T: not a text file in UTF-8.\nNext: save it as UTF-8, or get the file again."
+    )
 
 
 def test_fifty_thousand_rows_are_read_in_seconds(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
 from ...schemas.documents import shortened
-from ...schemas.regular_files import require_regular_file
+from ...schemas.regular_files import real_path, require_regular_file
 from .cameras import Camera, camera_of
 from .files import entries_of, files_under, has_folder, optional_file
 from .geometry_maps import GeometryMaps, read_maps
@@ -69,7 +69,7 @@ class CaptureFolder:
             return None
         path = self.root / shape.path
         where = f"{self.root / 'capture.toml'}: [[bodies]] '{body.name}': shape path '{shape.path}'"
-        if not path.resolve().is_relative_to(self.root.resolve()):
+        if not real_path(path).is_relative_to(real_path(self.root)):
             raise InputDataError(
                 f"{where} lies outside the capture.", "a file of the capture directory.", "copy the file into it."
             )

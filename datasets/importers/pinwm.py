@@ -40,7 +40,7 @@ from ...schemas import (
 from ...schemas.base import FileModel
 from ...schemas.capture import FileShape, Video
 from ...schemas.imports import ImportResult
-from ...schemas.regular_files import require_regular_file
+from ...schemas.regular_files import real_path, require_regular_file
 from ..capture.cameras import Camera, to_intrinsics
 from ..capture.files import entries_of, optional_file
 from ..capture.images import image_size, read_alpha, read_rgb, write_image
@@ -262,7 +262,7 @@ def _number(file: Path, frame: _Frame) -> int:
 
 def _require_inside(path: Path, folder: Path, where: str) -> None:
     """Refuse a file that another file names outside the data."""
-    if not path.resolve().is_relative_to(folder.resolve()):
+    if not real_path(path).is_relative_to(real_path(folder)):
         raise InputDataError(f"{where}: names {path}, which lies outside the data.", f"files in {folder}.", _TODO)
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 from ...schemas import UsageError
+from ...schemas.regular_files import real_path
 from .places import require_place
 
 RECORD = ".cgwm-output.json"
@@ -109,7 +110,7 @@ def completed() -> list[Path]:
 
 @contextmanager
 def _reading(inputs: Iterable[Path | str]) -> Iterator[None]:
-    token = _INPUTS.set((*_INPUTS.get(), *(Path(path).resolve() for path in inputs)))
+    token = _INPUTS.set((*_INPUTS.get(), *(real_path(path) for path in inputs)))
     try:
         yield
     finally:
@@ -128,7 +129,7 @@ def refuse_output(path: Path, kind: DirectoryKind | FileKind, overwrite: bool) -
     exists = os.path.lexists(path)
     if exists and not overwrite:
         raise UsageError(f"{path} exists.", todo="choose another name or pass --overwrite.")
-    place = path.resolve()
+    place = real_path(path)
     if exists:
         _refuse_protected(path, place)
         _refuse_part(path, place)

@@ -8,12 +8,13 @@ here.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from ...schemas import EffectModel, InputDataError
-from ...schemas.regular_files import require_regular_file
+from ...schemas.regular_files import real_path, require_regular_file
 
 EFFECTS = "effects"
 _CONTENTS: dict[str, bytes] = {}
@@ -95,19 +96,18 @@ def unpack_effects(effects: Iterable[EffectModel], root: Path) -> tuple[EffectMo
             if not _PACKED.fullmatch(found[0].as_posix()):
                 allowed = f"a file of the model, {EFFECTS}/NAME.py:CLASS."
                 raise InputDataError(f"{where}: its file lies outside of the model.", allowed, "fit the model again.")
-            path = (root / found[0]).resolve()
-            if read_source(path) != effect.sha256:
+            if read_source(root / found[0]) != effect.sha256:
                 raise InputDataError(
                     f"{where}: its file has another content than when the model was written (SHA-256).",
                     "the file that the model was fitted with.",
                     "get the model again from where it came, or fit it again with the new file.",
                 )
-            effect = effect.model_copy(update={"name": f"{path}:{found[1]}"})  # noqa: PLW2901
+            effect = effect.model_copy(update={"name": f"{real_path(root / found[0])}:{found[1]}"})  # noqa: PLW2901
         entries.append(effect)
     return tuple(entries)
 
 
 def _read(path: Path) -> bytes:
-    if not path.exists():
+    if not os.path.lexists(path):
         raise InputDataError(f"{path}: no such file, though an effect of the model is in it.", todo="bring it back.")
     return require_regular_file(path).read_bytes()

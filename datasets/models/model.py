@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ...schemas import BodyModel, CamerasFile, FitFile, InputDataError, ModelFile, read_json
+from ...schemas.regular_files import real_path
 from ..capture.cameras import require_rigid
 from ..capture.tracks import Track, read_tracks, write_tracks
 from ..io.atomic import new_directory
@@ -152,6 +153,6 @@ def _free_name(body: str, suffix: str, taken: set[str]) -> str:
 
 def _inside(root: Path, name: str) -> Path:
     path = root / name
-    if not path.resolve().is_relative_to(root.resolve()):
+    if not real_path(path).is_relative_to(real_path(root)):
         raise InputDataError(f"{root / 'model.json'}: '{name}' lies outside the model.", "files of its directory.")
     return path

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ...schemas import DamagedShardError, DatasetManifest, InputDataError, ShardEntry, UsageError, read_json
+from ...schemas.regular_files import real_path
 from ..io.atomic import move_into_place, new_directory, replaced_file, scratch_file, sha256
 from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
@@ -121,7 +122,7 @@ def new_dataset(
             _copy_model(model, folder, manifest)
             write_manifest(folder, manifest.model_copy(update={"shards": _stamped(entries, manifest)}))
         return
-    home = path.resolve()  # beside the directory itself, so that renaming stays on one file system
+    home = real_path(path)  # beside the directory itself, so that renaming stays on one file system
     if path.exists():
         refuse_other_dataset(path, manifest)
         if (path / name).exists() and not overwrite:

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from ...schemas import ROLLOUTS_FORMAT, Exposure, InputDataError, Light
-from ...schemas.regular_files import require_regular_file
+from ...schemas.regular_files import real_path, require_regular_file
 from ..capture.cameras import Camera
 from ..io.hdf5_files import hdf5_faults, is_own_link, open_hdf5, own_objects, require_stored
 from .chunks import require_zstd
@@ -226,7 +226,7 @@ def _refuse_lost(path: Path, shards: Node) -> None:
         if isinstance(item, h5py.Dataset):
             require_stored(item, f"{path}: {SHARDS}/{place}")
     for name, size in zip(_shard_files(path, shards), shards["bytes"][()].tolist(), strict=True):
-        shard = path.resolve().parent / name
+        shard = real_path(path).parent / name
         there = os.path.lexists(shard) and require_regular_file(shard).stat().st_size
         if there != size:
             raise InputDataError(
@@ -292,7 +292,7 @@ def stored_demo(file: h5py.File, name: str) -> Node:
 
             @cache
             def opened(shard: str) -> h5py.File:
-                return stack.enter_context(open_hdf5(path.resolve().parent / shard))
+                return stack.enter_context(open_hdf5(real_path(path).parent / shard))
 
             shards = _shard_files(path, file[SHARDS]) if SHARDS in file else ()
             files = {shard: partial(opened, shard) for shard in shards}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...schemas import UsageError, did_you_mean
+from ...schemas.quantities import MOST_SEED
 from ..io.atomic import new_directory
 from .truth import TRUTH_FILE, TRUTH_MESH, TruthFile, read_truth
 
@@ -82,7 +83,7 @@ def plan_scene(name: str, seed: int = 0) -> ScenePlan:
 
     Args:
         name: One of `SCENES`.
-        seed: Any integer >= 0.
+        seed: Any integer from 0 to `MOST_SEED`.
 
     Raises:
         UsageError: If the name or the seed is not allowed.
@@ -94,6 +95,6 @@ def plan_scene(name: str, seed: int = 0) -> ScenePlan:
     planners: dict[str, Callable[[int], ScenePlan]] = {"fall": plan_fall, "push": plan_push}
     if name not in planners:
         raise UsageError(f"unknown scene '{name}'.", ", ".join(SCENES) + "." + did_you_mean(name, SCENES))
-    if seed < 0:
-        raise UsageError(f"the seed is {seed}.", "integers >= 0.")
+    if not 0 <= seed <= MOST_SEED:
+        raise UsageError(f"the seed is {seed}.", f"integers from 0 to {MOST_SEED}.", "pass another --seed.")
     return planners[name](seed)

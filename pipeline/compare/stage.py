@@ -15,6 +15,7 @@ from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note, progress
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
+from ...schemas.regular_files import real_path
 from ..evaluate.prediction import STATE_FIT_EPISODES
 from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
 from ..evaluate.work import LESS, evaluation_parts
@@ -201,7 +202,7 @@ def _checked_work(models: Sequence[tuple[str, Model]], capture: Capture, split: 
 
 
 def _refuse_twice(models: Sequence[Path]) -> None:
-    places = [path.resolve() for path in models]
+    places = [real_path(path) for path in models]
     twice = next((path for k, path in enumerate(models) if places[k] in places[:k]), None)
     if twice is not None:
         raise UsageError(f"{twice}: this model is given twice.", "each model once.")

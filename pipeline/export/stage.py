@@ -25,12 +25,15 @@ from ...datasets.io.outputs import DirectoryKind, FileKind, reads, refuse_output
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
+from ...schemas.quantities import MOST_DURATION_S
 from .soundness import require_sound, require_sound_files
 
 DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio")
 MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "ply", "colmap", "glb")
 SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "glb": ".glb"}
 """Suffixes of the formats that are single files."""
+LEAST_DURATION_S = 0.02
+"""Shortest motion that is compared with MuJoCo [s]: two of its frames."""
 
 LEROBOT_NOTES = (
     "videos are lossy; keep the HDF5 files as the original",
@@ -167,6 +170,8 @@ def _selected(thing: Path, options: ExportOptions) -> Selection:
 def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
     from .mujoco_check import AFTER_CONTACT_S, keyframe_of, resimulate, start_of
 
+    if not LEAST_DURATION_S <= options.duration_s <= MOST_DURATION_S:
+        raise UsageError(f"--duration {options.duration_s:g} s.", f"{LEAST_DURATION_S:g} to {MOST_DURATION_S:g} s.")
     model = _simulated(thing)
     start = start_of(model, options.seed, options.duration_s)
     text = write_mjcf(model, keyframe=keyframe_of(start), source=f"cgwm, of {model.file.provenance.capture}")

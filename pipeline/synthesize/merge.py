@@ -28,6 +28,7 @@ from ...datasets.rollouts.dataset import (
 from ...datasets.rollouts.index import INDEX, index_fault, write_index
 from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, span, tidied
 from ...schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
+from ...schemas.regular_files import real_path
 from ..runtime.work_budget import Part, data_size, within_budget
 
 SHOWN_FAULTS = 20
@@ -83,7 +84,7 @@ def merge(
         shards, notes = _joined(sources, manifests, hashes)
     manifest = manifests[0].model_copy(update={"shards": tuple(shard.entry for shard in shards), "index": None})
     for source in sources:
-        notes += [f"left unfinished by a process that may be running: {file}" for file in tidied(source.resolve())]
+        notes += [f"left unfinished by a process that may be running: {file}" for file in tidied(real_path(source))]
     with enough_room(out or sources[0], "the index"):
         if out is None:
             index, kept = _index_inside(sources[0], manifest, manifests[0], shards, overwrite)
@@ -238,7 +239,7 @@ def _dataset_of_links(out: Path, manifest: DatasetManifest, shards: Sequence[_Sh
         shutil.copytree(shards[0].root / manifest.model, folder / MODEL_FOLDER)
         linked: list[_Shard] = []
         for shard in shards:
-            target = os.path.relpath(shard.file.resolve(), out.resolve())
+            target = os.path.relpath(real_path(shard.file), real_path(out))
             (folder / shard.entry.file).symlink_to(target)
             linked.append(_Shard(folder, shard.entry))
         _write(folder / INDEX, folder / INDEX, linked, False)
@@ -249,14 +250,14 @@ def _dataset_of_links(out: Path, manifest: DatasetManifest, shards: Sequence[_Sh
 
 def _write(path: Path, final: Path, shards: Sequence[_Shard], overwrite: bool) -> None:
     """Write an index with paths relative to the folder of `final`."""
-    folder = final.parent.resolve()
+    folder = real_path(final.parent)
     named = [(shard.file, _relative(shard.file, folder), shard.entry) for shard in shards]
     with new_file(path, "index", overwrite) as temporary:
         write_index(temporary, named)
 
 
 def _relative(file: Path, folder: Path) -> str:
-    return Path(os.path.relpath(file.parent.resolve() / file.name, folder)).as_posix()
+    return Path(os.path.relpath(real_path(file.parent) / file.name, folder)).as_posix()
 
 
 def _entry(path: Path) -> IndexEntry:

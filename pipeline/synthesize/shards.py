@@ -27,6 +27,7 @@ from ...schemas import (
     SynthesizeConfig,
     UsageError,
 )
+from ...schemas.regular_files import real_path
 from ..physics.effects.trust import trust_effects, trusted_effects
 from ..runtime.processes import in_workers
 from .job import checked_work
@@ -162,7 +163,7 @@ def _on_ray(
         task = ray.remote(_task).options(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)
         # A restarted task may find the shard that it made before its worker died, and keeps it.
         keep = resume or not overwrite
-        places = str(model.resolve()), str(out.resolve())
+        places = str(real_path(model)), str(real_path(out))
         consent = trusted_effects(model)  # other machines have no record of it
         pending = {task.remote(*places, part, overwrite, keep, preview, consent): part.shard for part in parts}
         try:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ....schemas import HiddenEffect, InputDataError, SealedFile, UsageError, read_json
 from ....schemas.documents import parse_json
+from ....schemas.quantities import MOST_SEED
 from .case import Case
 from .record import make_capture
 from .things import Kind
@@ -39,10 +40,10 @@ def draw_mystery(seed: int) -> Case:
     """Return the case of a seed: a body with one effect or none; six episodes for training, four for testing.
 
     Raises:
-        UsageError: If the seed is negative.
+        UsageError: If the seed is negative or larger than `MOST_SEED`.
     """
-    if seed < 0:
-        raise UsageError(f"the seed is {seed}.", "integers >= 0.")
+    if not 0 <= seed <= MOST_SEED:
+        raise UsageError(f"the seed is {seed}.", f"integers from 0 to {MOST_SEED}.", "pass another --seed.")
     rng = np.random.default_rng([seed, *b"mystery"])
     nothing = rng.random() < NOTHING
     thing, effect = CHOICES[int(rng.integers(len(CHOICES)))]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ....schemas import Body, BoxShape, CaptureManifest, Ground, Shape, World
 from ....schemas.capture import Measurement, SphereShape
+from ....schemas.regular_files import real_path
 from ...capture.manifest import write_manifest
 from ...capture.tracks import Track, tracks_csv
 from ...io.atomic import new_directory, new_file
@@ -43,7 +44,7 @@ def make_capture(directory: Path | str, case: Case, truth: Path | str | None = N
     """
     directory = Path(directory)
     path = Path(truth) if truth is not None else directory.with_name(f"{directory.name}.truth.json")
-    if path.resolve().is_relative_to(directory.resolve()):
+    if real_path(path).is_relative_to(real_path(directory)):
         raise ValueError(f"the truth {path} would lie in the capture {directory}")
     if case.engine not in ENGINES:
         raise ValueError(f"no engine '{case.engine}'; there are {', '.join(ENGINES)}")
