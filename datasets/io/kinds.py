@@ -32,9 +32,7 @@ def refuse_other_kind(path: Path, wanted: Kind) -> None:
         raise InputDataError(f"{path}: no such {wanted}.", todo="check the path.")
     if not path.is_dir():
         raise InputDataError(
-            f"{path} is a file.",
-            f"a {wanted}, which is a directory with {_MARKS[wanted]}.",
-            "pass the directory that holds it.",
+            f"{path} is a file; a {wanted} is a directory with {_MARKS[wanted]}.", todo="pass that directory."
         )
     if found is not None:
         raise InputDataError(
