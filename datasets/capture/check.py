@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +14,7 @@ from ..shapes.meshes import mass_properties, read_mesh
 from ..shapes.ply import read_splats
 from .cameras import pose_count
 from .consistency import check_consistency
+from .faults import Faults
 from .files import files_under, has_folder
 from .folder import CaptureFolder
 from .geometry_maps import KINDS, map_names, read_map
@@ -70,28 +69,6 @@ class CaptureFacts:
     """What gravity, ground, shapes and motion disagree about, without a fault."""
 
 
-class _Faults:
-    """The faults found so far, each once: a directory that cannot be listed is met by several checks."""
-
-    def __init__(self) -> None:
-        self.found: list[InputDataError] = []
-        self._told: set[str] = set()
-
-    def attempt(self, check: Callable[..., Any], *arguments: object) -> Any:
-        """Return what a check returns; None, and its fault is added, if it refuses."""
-        try:
-            return check(*arguments)
-        except InputDataError as fault:
-            if str(fault) not in self._told:
-                self.found.append(fault)
-            self._told.add(str(fault))
-            return None
-
-    def listed(self, names: Callable[..., list[str]], *arguments: object) -> list[str]:
-        """Return the names that a function returns; none if it refuses."""
-        return self.attempt(names, *arguments) or []
-
-
 def check_capture(capture: CaptureFolder, accept_units: bool = False) -> CaptureFacts:
     """Check a capture and return its facts.
 
@@ -116,7 +93,7 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
     facts = CaptureFacts(
         bodies=capture.body_names, splits={name: len(names) for name, names in capture.manifest.splits.items()}
     )
-    faults = _Faults()
+    faults = Faults()
     attempt, listed = faults.attempt, faults.listed
     attempt(_check_names, capture)
     for body in capture.manifest.bodies:
@@ -214,7 +191,7 @@ def _listed(names: list[str], noun: str) -> str:
     return f"{shown}, ... ({len(names)} {noun})." if len(names) > 8 else f"{shown}."
 
 
-def _check_files(capture: CaptureFolder, faults: _Faults) -> None:
+def _check_files(capture: CaptureFolder, faults: Faults) -> None:
     """Refuse what would be silently passed over: files in other formats, and what is no file at all."""
     for folder in dict.fromkeys((*_UNREAD, "video_masks", *KINDS)):
         found = [capture.root / folder / name for name in faults.listed(files_under, capture.root / folder)]

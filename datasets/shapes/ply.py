@@ -243,25 +243,14 @@ def _count(word: str) -> int:
 
 
 def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]], list[str]]:
-    kind, count, comments = "", 0, []
-    properties: list[tuple[str, str]] = []
-    element = ""
+    """Return the format, the number of splats, their properties (name and numpy's type), and the comments."""
+    lines = [line.split() for line in text.splitlines()[1:] if line.split()]
+    comments = [" ".join(rest) for word, *rest in lines if word == "comment"]
     try:
-        for line in text.splitlines()[1:]:
-            word, *rest = line.split() or [""]
-            if word == "comment":
-                comments.append(" ".join(rest))
-            elif word == "format":
-                kind = rest[0]
-            elif word == "element":
-                if not element and rest[0] != "vertex":
-                    raise ValueError(f"its first element is '{rest[0]}', not 'vertex'")
-                element = rest[0]
-                count = _count(rest[1]) if element == "vertex" else count
-            elif word == "property" and element == "vertex":
-                properties.append((rest[1], _PLY_TYPES[rest[0]]))
+        kind = next((rest[0] for word, *rest in reversed(lines) if word == "format"), "")
         if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
             raise ValueError(f"its format is '{kind}'")
+        count, properties = _vertices(lines)
         names = [name for name, _ in properties]
         if not names:
             raise ValueError("its splats have no properties")
@@ -269,7 +258,26 @@ def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]
         if twice is not None:
             raise ValueError(f"the property '{twice}' stands twice")
     except (ValueError, KeyError, IndexError) as error:
-        reason = f"the type {error} is unknown" if isinstance(error, KeyError) else error
-        reason = "a line ends too early" if isinstance(error, IndexError) else reason
-        raise InputDataError(f"{path}: the .ply header cannot be read: {reason}.", _HEADER, _AGAIN) from None
+        raise InputDataError(f"{path}: the .ply header cannot be read: {_reason(error)}.", _HEADER, _AGAIN) from None
     return kind, count, properties, comments
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, KeyError):
+        return f"the type {error} is unknown"
+    return "a line ends too early" if isinstance(error, IndexError) else str(error)
+
+
+def _vertices(lines: list[list[str]]) -> tuple[int, list[tuple[str, str]]]:
+    """Return the number and the properties of the element 'vertex', which has to be the first."""
+    count, element = 0, ""
+    properties: list[tuple[str, str]] = []
+    for word, *rest in lines:
+        if word == "element":
+            if not element and rest[0] != "vertex":
+                raise ValueError(f"its first element is '{rest[0]}', not 'vertex'")
+            element = rest[0]
+            count = _count(rest[1]) if element == "vertex" else count
+        elif word == "property" and element == "vertex":
+            properties.append((rest[1], _PLY_TYPES[rest[0]]))
+    return count, properties

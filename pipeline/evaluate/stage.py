@@ -29,6 +29,7 @@ from ..runtime.resources import enough_memory, one_torch_thread
 from ..segments.group_parameters import group_parameters, with_known_groups
 from ..segments.random_effects import with_fitted_groups
 from ..trajectories.track_noise import Noise, estimate_noise
+from .episode_errors import episode_errors, video_mean, within
 from .image_errors import VideoComparison, VideoErrors
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, EpisodePrediction, predict
 from .work import checked_work
@@ -314,7 +315,7 @@ def _evaluation(
             warnings.append(f"episode '{prediction.episode}' is left out: no measured frame follows the warm-up.")
             continue
         videos = compare(prediction)
-        episodes.append(EpisodeEvaluation(prediction, videos, _episode_errors(prediction, videos)))
+        episodes.append(EpisodeEvaluation(prediction, videos, episode_errors(prediction, videos)))
     if not episodes:
         raise InputDataError(
             "in none of the episodes does a measured frame follow the warm-up.",
@@ -352,57 +353,19 @@ def _result(episodes: Sequence[EpisodeEvaluation], warnings: Sequence[str]) -> E
 
 def _figures(episodes: Sequence[EpisodeEvaluation], method: str) -> dict[str, Any]:
     """Return the summaries over episodes for one method."""
-    moved = [_within(e.prediction, e.prediction.translation_error_m(method)) for e in episodes]
-    turned = [_within(e.prediction, e.prediction.rotation_error_deg(method)) for e in episodes]
+    moved = [within(e.prediction, e.prediction.translation_error_m(method)) for e in episodes]
+    turned = [within(e.prediction, e.prediction.rotation_error_deg(method)) for e in episodes]
     return {
         "translation_error_m": _summary([mean for mean, _ in moved], [last for _, last in moved]),
         "rotation_error_deg": _summary([mean for mean, _ in turned], [last for _, last in turned]),
-        "psnr_db": _summary([_video_mean(e.videos, "psnr_db", method) for e in episodes]),
-        "psnr_object_db": _summary([_video_mean(e.videos, "psnr_object_db", method) for e in episodes]),
-        "ssim": _summary([_video_mean(e.videos, "ssim", method) for e in episodes]),
+        "psnr_db": _summary([video_mean(e.videos, "psnr_db", method) for e in episodes]),
+        "psnr_object_db": _summary([video_mean(e.videos, "psnr_object_db", method) for e in episodes]),
+        "ssim": _summary([video_mean(e.videos, "ssim", method) for e in episodes]),
     }
 
 
 def _plain(figures: dict[str, ErrorSummary | None]) -> dict[str, Any]:
     return {name: None if summary is None else summary.model_dump() for name, summary in figures.items()}
-
-
-def _episode_errors(prediction: EpisodePrediction, videos: Sequence[VideoComparison]) -> EpisodeErrors:
-    moved, moved_last = _within(prediction, prediction.translation_error_m())
-    turned, turned_last = _within(prediction, prediction.rotation_error_deg())
-    if moved is None or moved_last is None:
-        raise ValueError(f"episode '{prediction.episode}': no measured frame follows the warm-up.")
-    after = prediction.seen.any(1) & ~prediction.warmup
-    return EpisodeErrors(
-        episode=prediction.episode,
-        frames=int(after.sum()),
-        duration_s=float(prediction.time_s[-1] - prediction.time_s[0]),
-        translation_error_m=moved,
-        translation_final_m=moved_last,
-        rotation_error_deg=turned,
-        rotation_final_deg=turned_last,
-        psnr_db=_video_mean(videos, "psnr_db", MODEL),
-        psnr_object_db=_video_mean(videos, "psnr_object_db", MODEL),
-        ssim=_video_mean(videos, "ssim", MODEL),
-        state_fitted_residual_m=prediction.state_fitted_m,
-        state_noise_floor_m=prediction.noise_floor_m,
-    )
-
-
-def _within(prediction: EpisodePrediction, error: Array) -> tuple[float | None, float | None]:
-    """Return mean and last value of an error (T, nf) after the warm-up; None without measurements there."""
-    after = error[~prediction.warmup]
-    measured = np.flatnonzero(np.isfinite(after).any(1))
-    if len(measured) == 0:
-        return None, None
-    return float(np.nanmean(after)), float(np.nanmean(after[measured[-1]]))
-
-
-def _video_mean(videos: Sequence[VideoComparison], figure: str, method: str) -> float | None:
-    """Return the mean over all frames of all cameras; None without frames."""
-    values = np.concatenate([getattr(video, figure)[method] for video in videos]) if videos else np.zeros(0)
-    values = values[np.isfinite(values)]
-    return float(values.mean()) if len(values) else None
 
 
 def _summary(means: Sequence[float | None], finals: Sequence[float | None] = ()) -> ErrorSummary | None:

@@ -147,12 +147,15 @@ def _names(found: _Found, dataset: Dataset, faults: list[Fault]) -> tuple[list[s
     if cameras != listed:
         text = f"cameras: {', '.join(map(shown, cameras)) or 'none'}; dataset.json has "
         faults.append(_schema(f"{text}{', '.join(map(shown, listed)) or 'none'}."))
-    for place, given in (("bodies/names", names), ("cameras", cameras)):
-        for name in given:
-            fault = name_fault(name) or ("is there twice" if given.count(name) > 1 else None)
-            if fault:
-                faults.append(_schema(f"{place}: the name '{shown(name)}' {fault}."))
+    faults += [*_name_faults("bodies/names", names), *_name_faults("cameras", cameras)]
     return names, cameras
+
+
+def _name_faults(place: str, names: list[str]) -> Iterator[Fault]:
+    for name in names:
+        fault = name_fault(name) or ("is there twice" if names.count(name) > 1 else None)
+        if fault:
+            yield _schema(f"{place}: the name '{shown(name)}' {fault}.")
 
 
 def _expected(found: _Found, attributes: Attributes, cameras: list[str]) -> Iterator[_Expected]:
@@ -208,9 +211,7 @@ def _shape_faults(array: _Expected, found: _Found, symbols: dict[str, int]) -> I
         yield _schema(f"{name}: this array is missing.")
         return
     kinds = entry.dtype.split()
-    if item.dtype.kind not in {kind[0] for kind in kinds} or (
-        kinds != ["S"] and f"{item.dtype.kind}{item.dtype.itemsize}" not in kinds
-    ):
+    if not _is_of(item.dtype, kinds):
         yield _schema(f"{name}: its type is {item.dtype}; {' or '.join(kinds)} is documented.")
         return
     camera = array.words.get("camera", "")
@@ -222,6 +223,12 @@ def _shape_faults(array: _Expected, found: _Found, symbols: dict[str, int]) -> I
         return
     if not item.is_virtual and _stored_share(item) < 1:
         yield Fault(check="readable", text=f"{name}: not all of its numbers are in the file.")
+
+
+def _is_of(dtype: np.dtype, kinds: list[str]) -> bool:
+    """Return whether a type is among kinds such as `f4`, or `S` for texts of any length."""
+    sized = kinds == ["S"] or f"{dtype.kind}{dtype.itemsize}" in kinds
+    return sized and dtype.kind in {kind[0] for kind in kinds}
 
 
 def _stored_share(item: Any) -> float:
@@ -258,11 +265,7 @@ def _value_faults(
         first: First frame of the block.
     """
     entry, name = array.entry, shown(array.name)
-    if entry.words:
-        for word in values.tolist():
-            text = word.decode("utf-8", "backslashreplace")
-            if text not in entry.words:
-                yield _schema(f"{name}: '{shown(text)}'; {', '.join(entry.words)} are documented.")
+    yield from _word_faults(array, values)
     if values.dtype.kind == "S" or not values.size:
         return
 
@@ -279,22 +282,37 @@ def _value_faults(
     if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
         yield fault("finite", ~finite, "contains numbers that are not finite.", None, None)
         return
+    for outside, worst, limit, here in _outside(array, values, symbols):
+        text = f"{worst:g} is not among what is documented, {entry.values_text}{here}."
+        yield fault("values", outside, text, worst, limit)
+    if entry.unit_norm:
+        errors = np.abs(np.linalg.norm(values, axis=-1) - 1)
+        if (long := errors > NORM_TOLERANCE).any():
+            text = f"a norm differs from 1 by {errors.max():.2g}; {NORM_TOLERANCE:g} is allowed."
+            yield fault("norms", long, text, float(errors.max()), NORM_TOLERANCE)
+
+
+def _word_faults(array: _Expected, values: np.ndarray) -> Iterator[Fault]:
+    """Check that texts are among the documented ones, where these are listed."""
+    for word in values.tolist() if array.entry.words else ():
+        text = word.decode("utf-8", "backslashreplace")
+        if text not in array.entry.words:
+            yield _schema(f"{shown(array.name)}: '{shown(text)}'; {', '.join(array.entry.words)} are documented.")
+
+
+def _outside(
+    array: _Expected, values: np.ndarray, symbols: Mapping[str, int]
+) -> Iterator[tuple[np.ndarray, float, float, str]]:
+    """Yield for each bound that is broken where it is, the worst value, the bound, and the bound in words."""
     slack = BOUND_TOLERANCE if values.dtype.kind == "f" else 0
-    for term, sign in ((entry.low, -1), (entry.high, 1)):
+    for term, sign in ((array.entry.low, -1), (array.entry.high, 1)):
         limit = value_of(term, symbols) if term else None
         if limit is None:
             continue
         outside = values > limit + slack if sign > 0 else values < limit - slack
         if outside.any():
             worst = float(values.max() if sign > 0 else values.min())
-            here = "" if term.lstrip("-").isdigit() else f", here at most {limit}"
-            text = f"{worst:g} is not among what is documented, {entry.values_text}{here}."
-            yield fault("values", outside, text, worst, float(limit))
-    if entry.unit_norm:
-        errors = np.abs(np.linalg.norm(values, axis=-1) - 1)
-        if (long := errors > NORM_TOLERANCE).any():
-            text = f"a norm differs from 1 by {errors.max():.2g}; {NORM_TOLERANCE:g} is allowed."
-            yield fault("norms", long, text, float(errors.max()), NORM_TOLERANCE)
+            yield outside, worst, float(limit), "" if term.lstrip("-").isdigit() else f", here at most {limit}"
 
 
 def _picture_faults(array: _Expected, item: Any, symbols: Mapping[str, int]) -> Iterable[Fault]:

@@ -191,14 +191,19 @@ def _check_shard(
         except InputDataError as error:
             findings.add(shard.file, name, Fault(check="schema", text=error.found))
             continue
-        try:
-            for fault in _check_demo(demo, name, dataset, findings):
-                findings.add(shard.file, name, fault)
-        except OSError as error:
-            text = f"a block cannot be read: {str(error).splitlines()[0]}."
-            findings.add(shard.file, name, Fault(check="readable", text=text))
-        except InputDataError as error:  # of the model's effects with the values of this rollout
-            findings.add(shard.file, name, Fault(check="effects", text=error.found))
+        for fault in _readable_faults(_check_demo(demo, name, dataset, findings)):
+            findings.add(shard.file, name, fault)
+
+
+def _readable_faults(faults: Iterator[Fault]) -> Iterator[Fault]:
+    """Yield faults, and as the last one what cannot be read or computed while they are looked for."""
+    try:
+        yield from faults
+    except OSError as error:
+        text = f"a block cannot be read: {str(error).splitlines()[0]}."
+        yield Fault(check="readable", text=text)
+    except InputDataError as error:  # of the model's effects with the values of this rollout
+        yield Fault(check="effects", text=error.found)
 
 
 def _check_demo(demo: Node, name: str, dataset: Dataset, findings: _Findings) -> Iterator[Fault]:

@@ -187,10 +187,10 @@ def _split_faults(file: Node, demos: set[str]) -> Iterator[str]:
             yield f"mask: the name '{shown(split)}' {fault}."
             continue
         item = own_member(group, split, h5py.Dataset)
-        if item is None or item.ndim != 1 or item.dtype.kind not in "SO" or len(item) > 10 * len(demos) + 10:
+        if item is None or not _may_list(item, len(demos)):
             yield f"mask/{split}: is no list of the file's {len(demos)} rollouts."
             continue
-        names = [name.decode("utf-8", "backslashreplace") if isinstance(name, bytes) else str(name) for name in item]
+        names = _texts(item)
         unknown = [name for name in names if name not in demos]
         if unknown:
             yield f"mask/{split} names '{shown(unknown[0])}', which is no rollout of this file."
@@ -201,3 +201,12 @@ def _split_faults(file: Node, demos: set[str]) -> Iterator[str]:
     shared = sorted(set.intersection(*(members.get(split, set()) for split in EXCLUSIVE)), key=len)
     if shared:
         yield f"mask: '{shown(shared[0])}' is in {' and in '.join(EXCLUSIVE)}."
+
+
+def _may_list(item: h5py.Dataset, demos: int) -> bool:
+    """Return whether an array can be a list of a file's rollouts, by its type and size."""
+    return item.ndim == 1 and item.dtype.kind in "SO" and len(item) <= 10 * demos + 10
+
+
+def _texts(item: h5py.Dataset) -> list[str]:
+    return [name.decode("utf-8", "backslashreplace") if isinstance(name, bytes) else str(name) for name in item]
