@@ -135,6 +135,27 @@ def test_faults_leave_nothing_behind(tmp_path: Path) -> None:
     assert "ee.urdf: cannot be read" in fault(source, n_train=4)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("time", "0", "image_datas.3.time: input should be a valid number"),
+        ("c2w", [[0, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.9]], "image_datas.3.c2w: the pose is no rotation"),
+        ("c2w", [[-1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.9]], "it mirrors"),
+        ("intrinsic", [[0, 0, 16], [0, 50, 12], [0, 0, 1]], "r_0_2.png': the focal lengths in K are 0 and 50 px"),
+        ("intrinsic", [[50, 0, 16], [0, 50, 12], [0, 0, 2]], "r_0_2.png': K is not of the form"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused(tmp_path: Path, key: str, value: object, message: str) -> None:
+    file = write_source(tmp_path / "source") / "dataset" / "push_a" / "dynamic_train0.json"
+    data = json.loads(file.read_text())
+    data["image_datas"][3][key] = value
+    file.write_text(json.dumps(data))
+    with pytest.raises(InputDataError) as caught:
+        import_pinwm(tmp_path / "source", tmp_path / "out", n_train=4)
+    assert caught.value.found.startswith(str(file)) and message in caught.value.found
+    assert not (tmp_path / "out").exists()
+
+
 def test_options_of_another_format_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     source = write_source(tmp_path / "source")
     with pytest.raises(SystemExit) as ended:

@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from ...schemas import (
     Body,
@@ -41,6 +41,7 @@ from ...schemas.base import FileModel
 from ...schemas.capture import FileShape, Video
 from ...schemas.imports import ImportResult
 from ...schemas.regular_files import real_path, require_regular_file
+from ..capture.camera_faults import intrinsics_fault, pose_fault
 from ..capture.cameras import Camera, to_intrinsics
 from ..capture.files import entries_of, optional_file
 from ..capture.images import image_size, read_alpha, read_rgb, write_image
@@ -68,11 +69,21 @@ _TODO = "get dataset/ and envs/ of github.com/daihangpku/pin-wm."
 
 
 class _Frame(FileModel, extra="ignore"):
-    """A picture of a push: its file and its camera pose (OpenGL axes)."""
+    """A picture of a push: its file, its time and its camera pose (OpenGL axes)."""
 
     file_path: str
+    time: float | None = None
+    """Time in the push [s]; the number in the file's name counts."""
     c2w: tuple[Row, Row, Row]
     intrinsic: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+    @field_validator("c2w")
+    @classmethod
+    def _rigid(cls, rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+        fault = pose_fault(np.array([*rows, (0.0, 0.0, 0.0, 1.0)]))
+        if fault is not None:
+            raise ValueError(fault)
+        return rows
 
 
 class _Push(FileModel, extra="ignore"):
@@ -236,7 +247,19 @@ def _frames(file: Path, push: _Push) -> tuple[_Frame, ...]:
             "one a pose, or none.",
             _TODO,
         )
+    if frames:
+        _require_lenses(file, push.image_datas, image_size(file.parent / frames[0].file_path))
     return frames
+
+
+def _require_lenses(file: Path, listed: tuple[_Frame, ...], size: tuple[int, int]) -> None:
+    """Refuse intrinsics that no camera of pictures of this size (width, height) has."""
+    for frame in listed:
+        fault = intrinsics_fault(np.array(frame.intrinsic), np.zeros(0), *size)
+        if fault is not None:
+            raise InputDataError(
+                f"{file}: intrinsic of '{frame.file_path}': {fault}.", "fx, 0, cx; 0, fy, cy; 0, 0, 1 [px].", _TODO
+            )
 
 
 def _require_enough_frames(source: Path, recordings: list[_Recording], n_train: int) -> None:
