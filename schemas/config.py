@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from .base import FileModel
+from .model import repeated
 from .plan import SamplingPlan
 from .quantities import Duration, FrameRate, RadiusFactor, Seed, Side, Step, Steps
 
@@ -86,6 +87,20 @@ class PhysConfig(FileModel):
     mass_distribution: bool = False
     """Fit where the mass of free bodies is, too: its centre and second moments, from 8 tracked episodes or more. What
     the capture gives of them is then only the start."""
+
+    @field_validator("effects")
+    @classmethod
+    def _once(cls, specs: tuple[str, ...]) -> tuple[str, ...]:
+        twice = repeated(map(_without_units, specs))
+        if twice is not None:
+            raise ValueError(f"the effect '{twice}' stands twice; each can be added once, with one grouping")
+        return specs
+
+
+def _without_units(spec: str) -> str:
+    """Return an effect as the user names it without @group or @episode; an @ in the path of its file is none."""
+    plain, _, units = spec.rpartition("@")
+    return plain if plain and "/" not in units else spec
 
 
 class SynthesizeConfig(FileModel):

@@ -304,3 +304,21 @@ def test_settings_and_plans_are_named(tmp_path: Path) -> None:
             StageSettings({"synthesize": SynthesizeConfig}, None, [text]).configure("synthesize", SynthesizeConfig)
     file.write_text("height_m = 0.5\n")
     assert read_plan(file).source == str(file) and read_plan(file).model_copy().source == str(file)
+
+
+@pytest.mark.parametrize(
+    ("effects", "twice"),
+    [
+        (("quadratic_drag", "wind", "quadratic_drag"), "quadratic_drag"),
+        (("quadratic_drag@group", "quadratic_drag"), "quadratic_drag"),
+        (("quadratic_drag@group", "quadratic_drag@episode"), "quadratic_drag"),
+        (("a@b/lift.py:Lift", "a@b/lift.py:Lift@group"), "a@b/lift.py:Lift"),
+        (("a@b/lift.py:Lift", "a@c/lift.py:Drag", "wind", "spin_drag@group"), None),
+    ],
+)
+def test_an_effect_is_added_once(effects: tuple[str, ...], twice: str | None) -> None:
+    if twice is None:
+        assert PhysConfig(effects=effects).effects == effects
+        return
+    with pytest.raises(InputDataError, match=f"the effect '{twice}' stands twice"):
+        parse({"effects": list(effects)}, PhysConfig, "settings.toml")

@@ -298,6 +298,7 @@ OPTIONS = (
     ("tracks", "diagnose model capture --split nothing"),
     ("tracks", "diagnose model capture --split look --candidates nothing"),
     ("tracks", "fit capture --out OUT --effects quadratic_drag,quadratic_drag --from model"),
+    ("tracks", "fit capture --out OUT --effects quadratic_drag@group,quadratic_drag --from model"),
     ("tracks", "fit capture --out OUT --effects nothing --from model"),
     ("tracks", "fit capture --out OUT --split nothing"),
     ("tracks", "fit capture --out OUT --from nowhere"),
