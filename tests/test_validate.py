@@ -115,6 +115,14 @@ def pulling_contact(demo: h5py.Group) -> None:
     impulse[...] = -impulse[()]
 
 
+def far_contact(demo: h5py.Group) -> None:
+    demo["contacts/distance"][4] += 0.5
+
+
+def buried_contact(demo: h5py.Group) -> None:
+    demo["contacts/distance"][4] -= 0.5
+
+
 def lost_contacts(demo: h5py.Group) -> None:
     demo["contacts/offsets"][-1] -= 1
 
@@ -257,6 +265,8 @@ def other_settings(demo: h5py.Group) -> None:
         (other_impulses, "contacts/impulse_world: body 'cube', frame"),
         (other_mass, "contacts/impulse_world: body 'cube', frame"),
         (pulling_contact, "a contact pulls by"),
+        (far_contact, "m; where the bodies are, spheres of 'cube' miss that by 0."),
+        (buried_contact, "m; where the bodies are, spheres of 'cube' miss that by 0."),
         (lost_contacts, "contacts/offsets: they do not divide"),
         (wild_body, "contacts/body_b: frame 4: 7 is not among what is documented, -1 to B - 1, here at most 0"),
         (crooked_normal, "contacts/normal_world: frame 4: a norm differs from 1 by 0.1"),

@@ -16,6 +16,7 @@ from ...datasets.rollouts.dataset import check_hashes, read_manifest, settings_t
 from ...datasets.rollouts.rollouts import Node, demo_names, open_shard, stored_demo
 from ...datasets.rollouts.shards import ranges, shard_range
 from ...schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
+from .contacts import check_contacts
 from .faults import Fault
 from .newton import MotionFindings, check_motion, motion_facts
 from .reprojection import PictureFindings, check_pictures, picture_facts
@@ -217,7 +218,7 @@ def _check_demo(demo: Node, name: str, dataset: Dataset, findings: _Findings) ->
         return
     yield from _check_parameters(rollout)
     if has_usable_contacts(rollout):
-        yield from _check_pulls(rollout)
+        yield from check_contacts(rollout)
         yield from check_motion(rollout, findings.motion)
     crooked = {fault.camera for fault in faults if fault.check == "cameras"}
     if dataset.model is not None:
@@ -235,16 +236,3 @@ def _check_parameters(rollout: Rollout) -> Iterator[Fault]:
         if not low <= value <= high:
             text = f"parameters/{listed.name}: {value:g} {listed.unit}; {low:g} to {high:g} is allowed."
             yield Fault(check="parameters", text=text, value=value, limit=low if value < low else high)
-
-
-def _check_pulls(rollout: Rollout) -> Iterator[Fault]:
-    """Check that contacts do not pull; effects may add forces that do."""
-    contacts = rollout.part("contacts")
-    rows = len(contacts["body_a"])
-    pulls = (contacts["impulse_world"] * contacts["normal_world"]).sum(-1)
-    scale = float(np.abs(contacts["impulse_world"]).max()) if rows else 0.0
-    if rows and pulls.min() < -1e-6 * scale and not rollout.attributes.effects:
-        row = int(pulls.argmin())
-        frame = int(np.searchsorted(contacts["offsets"], row, side="right")) - 1
-        text = f"contacts/impulse_world: frame {frame}: a contact pulls by {-pulls.min():.2g} N s; contacts only push."
-        yield Fault(check="contacts", text=text, frame=frame, value=float(pulls.min()), limit=0.0)
