@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ..datasets.capture.capture import Capture
+from ..datasets.io.neighbours import clean_stale
 from ..datasets.io.outputs import reads, refuse_output
 from ..datasets.models.effect_files import effect_file
 from ..datasets.models.finished import finished_model
@@ -108,6 +109,7 @@ def fit_or_keep(
     """Fit as :func:`fit` does; return the content of `model.json`, and whether it is that of a model that was kept."""
     splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
     out = Path(out)
+    clean_stale(out)
     finished = resume and (out / "model.json").is_file()
     if not finished:
         refuse_output(out, "model", overwrite)

@@ -10,9 +10,7 @@ import errno
 import hashlib
 import os
 import re
-import secrets
 import shutil
-import socket
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,11 +18,10 @@ from pathlib import Path
 
 from ...schemas import UsageError
 from .free_space import enough_room
+from .neighbours import PARTIAL, REPLACED, alive, clean_stale, host, remove, sibling
 from .outputs import DirectoryKind, FileKind, about_to_place, inside_output, refuse_output, write_record
 from .places import require_place
 
-_PARTIAL = "partial"
-_REPLACED = "replaced"
 _LOST = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Errors of a flush after which the written bytes are lost."""
 
@@ -44,7 +41,7 @@ def new_directory(path: Path | str, kind: DirectoryKind, overwrite: bool = False
     """
     path = Path(path)
     require_place(path)
-    _clean_stale(path)
+    clean_stale(path)
     refuse_output(path, kind, overwrite)
     with enough_room(path, f"the {kind}"):
         temporary = _temporary(path)
@@ -53,7 +50,7 @@ def new_directory(path: Path | str, kind: DirectoryKind, overwrite: bool = False
             with inside_output():
                 yield temporary
             write_record(temporary, kind)
-            _sync_tree(temporary)
+            sync_tree(temporary)
             _put_in_place(temporary, path, kind, overwrite)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -97,7 +94,7 @@ def replaced_file(path: Path | str) -> Iterator[Path]:
     require_place(path)
     if path.is_dir():
         raise UsageError(f"{path} is a directory; a file is written here.", todo="choose another name.")
-    _clean_stale(path)
+    clean_stale(path)
     with enough_room(path, "it"):
         temporary = _temporary(path, path.suffix)
         try:
@@ -120,7 +117,7 @@ def scratch_file(path: Path) -> Iterator[Path]:
         NotEnoughSpaceError: If the disk is full.
     """
     require_place(path)
-    _clean_stale(path)
+    clean_stale(path)
     with enough_room(path, "it"):
         temporary = _temporary(path, path.suffix)
         try:
@@ -143,7 +140,7 @@ def temporary_directory(purpose: str, content: str) -> Iterator[Path]:
         NotEnoughSpaceError: If the disk of the temporary folder is full.
     """
     path = Path(tempfile.gettempdir()) / f"cgwm-{purpose}"
-    _clean_stale(path)
+    clean_stale(path)
     todo = "make room there, or set TMPDIR to another folder, and run the command again."
     with enough_room(path.parent, content, todo):
         temporary = _temporary(path)
@@ -161,6 +158,13 @@ def move_into_place(temporary: Path, path: Path) -> None:
     _sync(path.parent)
 
 
+def remove_directory(directory: Path, path: Path) -> None:
+    """Remove a hidden neighbour of `path`; what a kill leaves of it is an unfinished output, and never half of it."""
+    aside = sibling(path, PARTIAL)
+    os.rename(directory, aside)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
 def leftovers(folder: Path, names: re.Pattern[str]) -> tuple[list[Path], list[Path]]:
     """Find unfinished outputs in a folder whose names match: those of dead processes, and those that may be alive.
 
@@ -168,10 +172,10 @@ def leftovers(folder: Path, names: re.Pattern[str]) -> tuple[list[Path], list[Pa
     """
     dead: list[Path] = []
     unknown: list[Path] = []
-    for entry in sorted(folder.glob(f".*.{_PARTIAL}-*")):
-        match = re.fullmatch(rf"\.(.+)\.{_PARTIAL}-(\d+)-([0-9a-f]{{8}})-[^-]*", entry.name)
+    for entry in sorted(folder.glob(f".*.{PARTIAL}-*")):
+        match = re.fullmatch(rf"\.(.+)\.{PARTIAL}-(\d+)-([0-9a-f]{{8}})-[^-]*", entry.name)
         if match is not None and names.fullmatch(match[1]):
-            (dead if match[3] == _host() and not _alive(int(match[2])) else unknown).append(entry)
+            (dead if match[3] == host() and not alive(int(match[2])) else unknown).append(entry)
     return dead, unknown
 
 
@@ -191,57 +195,7 @@ def sha256(path: Path | str) -> str:
 
 def _temporary(path: Path, suffix: str = "") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    return _sibling(path, _PARTIAL, suffix)
-
-
-def _sibling(path: Path, kind: str, suffix: str = "") -> Path:
-    name = path.name or path.resolve().name
-    return path.parent / f".{name}.{kind}-{os.getpid()}-{_host()}-{secrets.token_hex(4)}{suffix}"
-
-
-def _host() -> str:
-    """Return the scope in which process numbers are unique: the machine, and the container if it has its own."""
-    try:
-        counted = os.readlink("/proc/self/ns/pid")
-    except OSError:
-        counted = ""
-    return hashlib.sha256(f"{socket.gethostname()} {counted}".encode()).hexdigest()[:8]
-
-
-def _clean_stale(path: Path) -> None:
-    """Remove unfinished outputs of dead processes of this machine for `path`, and restore a displaced old output."""
-    name = path.name or path.resolve().name
-    pattern = re.compile(rf"\.{re.escape(name)}\.({_PARTIAL}|{_REPLACED})-(\d+)-(?:([0-9a-f]{{8}})-)?[^-]*")
-    for entry in sorted(path.parent.glob(f".{_glob_escape(name)}.*-*")):
-        match = pattern.fullmatch(entry.name)
-        # On a shared file system the process may live on another machine, where its number says nothing here.
-        if match is None or _alive(int(match[2])) or match[3] not in (None, _host()):
-            continue
-        if match[1] == _REPLACED and not os.path.lexists(path):
-            os.rename(entry, path)
-        else:
-            _remove(entry)
-
-
-def _glob_escape(name: str) -> str:
-    return re.sub(r"([*?[])", r"[\1]", name)
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+    return sibling(path, PARTIAL, suffix)
 
 
 def _put_in_place(temporary: Path, path: Path, kind: DirectoryKind, overwrite: bool) -> None:
@@ -257,7 +211,7 @@ def _put_in_place(temporary: Path, path: Path, kind: DirectoryKind, overwrite: b
         if _inode(path) != before:
             raise _taken(path) from None
         raise
-    aside = _sibling(path, _REPLACED)
+    aside = sibling(path, REPLACED)
     try:
         try:
             os.rename(path, aside)
@@ -270,7 +224,7 @@ def _put_in_place(temporary: Path, path: Path, kind: DirectoryKind, overwrite: b
         raise
     finally:
         if _inode(path) is not None:  # else it is all that is left of the old output
-            _remove(aside)
+            remove(aside)
 
 
 def _rename_unless_taken(temporary: Path, path: Path) -> None:
@@ -298,7 +252,8 @@ def _inode(path: Path) -> int | None:
         return None
 
 
-def _sync_tree(directory: Path) -> None:
+def sync_tree(directory: Path) -> None:
+    """Flush a directory and all that is in it to the disk."""
     for entry in directory.rglob("*"):
         if entry.is_file() or entry.is_dir():
             _sync(entry)

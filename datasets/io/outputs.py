@@ -21,6 +21,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 from ...schemas import UsageError
 from ...schemas.regular_files import real_path
+from .neighbours import clean_stale
 from .places import require_place
 
 RECORD = ".cgwm-output.json"
@@ -40,7 +41,9 @@ FileKind = Literal[
 
 _DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
 
-_SYSTEM_FILES = re.compile(r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|replaced)-.*)")
+_SYSTEM_FILES = re.compile(
+    r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|pending|replaced)-.*)"
+)
 _ADDED: Mapping[str, re.Pattern[str]] = {
     "capture": re.compile(r"cameras\.json|calibration\.json|sparse_points(\.\d+)?\.ply|sparse\.\d+/.*"),
     "dataset": re.compile(r"dataset\.json|index\.h5|rollouts-\d+-of-\d+\.(h5|json)|preview\.(png|webm)"),
@@ -120,12 +123,15 @@ def _reading(inputs: Iterable[Path | str]) -> Iterator[None]:
 def refuse_output(path: Path, kind: DirectoryKind | FileKind, overwrite: bool) -> None:
     """Raise an error for an output that exists and may not be replaced, or that would damage an input.
 
+    What a killed command left of this output is removed before.
+
     Raises:
         UsageError: If it exists and `overwrite` is not set or it is no output of cgwm of this kind; if it is, holds or
             lies among the inputs of the command; or if it is or holds the home or working directory, or a git work
             tree; or if nothing can be written under that name.
     """
     require_place(path)
+    clean_stale(path)  # which may give an old output, that a killed command was replacing, its name back
     exists = os.path.lexists(path)
     if exists and not overwrite:
         raise UsageError(f"{path} exists.", todo="choose another name or pass --overwrite.")

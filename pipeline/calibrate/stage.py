@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -13,7 +13,8 @@ import numpy as np
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import check_capture
 from ...datasets.capture.sparse_points import POINTS_NAME, write_points
-from ...datasets.io.atomic import new_file, replaced_file, temporary_directory
+from ...datasets.io.atomic import temporary_directory
+from ...datasets.io.file_set import new_files, settle_files
 from ...datasets.io.kinds import refuse_other_kind
 from ...datasets.io.places import require_place
 from ...datasets.io.progress import progress
@@ -101,6 +102,7 @@ def _room_for_colmap(capture: Capture, config: CalibrateConfig) -> AbstractConte
 
 
 def _open(root: Path, overwrite: bool) -> Capture:
+    settle_files(root / CAMERAS_NAME)
     if overwrite:
         # The old cameras may name deleted photos: that is a reason to replace them, not an error.
         refuse_other_kind(root, "capture")
@@ -276,12 +278,9 @@ def _ground_check(capture: Capture, model: SfmModel, scale: Scale) -> tuple[floa
 
 
 def _write(root: Path, cameras: CamerasFile, model: SfmModel, report: CalibrationReport, overwrite: bool) -> None:
-    """Write the three files; `cameras.json` is renamed last, so its presence means that all are complete."""
-    with ExitStack() as stack:
-        cameras_path = stack.enter_context(new_file(root / CAMERAS_NAME, "calibration", overwrite))
-        report_path = stack.enter_context(replaced_file(root / REPORT_NAME))
-        points_path = stack.enter_context(replaced_file(root / POINTS_NAME))
-        cameras_path.write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        report_path.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    """Write the three files; `cameras.json` is there only with the others, and never with those of other cameras."""
+    with new_files(root / CAMERAS_NAME, (REPORT_NAME, POINTS_NAME), "calibration", overwrite) as folder:
+        (folder / CAMERAS_NAME).write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        (folder / REPORT_NAME).write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
         unit = "metre" if cameras.scale.kind == "metric" else "arbitrary"
-        write_points(points_path, model.points, model.colors, unit)
+        write_points(folder / POINTS_NAME, model.points, model.colors, unit)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import time
 import zipfile
@@ -30,6 +31,8 @@ Array = NDArray[Any]
 
 _KEY = "made_of.json"
 """File that names what the fit is made of."""
+_OWN = re.compile(r"[\w-]*-[0-9a-f]{8}\.npz|\..*\.partial-.*")
+"""Names of the other files of a checkpoint, and of unfinished ones."""
 
 
 class Checkpoint:
@@ -59,6 +62,9 @@ class Checkpoint:
         path = checkpoint.path
         if not path.exists():
             return checkpoint
+        if checkpoint._is_torn():
+            shutil.rmtree(path)
+            return checkpoint
         if not (path / _KEY).is_file():
             raise UsageError(
                 f"{path} is in the way: checkpoints go there, and it holds none.",
@@ -79,7 +85,9 @@ class Checkpoint:
     def remove_of(out: Path, made_of: Mapping[str, str]) -> None:
         """Remove the checkpoints of a complete model `out`, but not those of a fit that is made of something else."""
         checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
-        if not checkpoint._differing():
+        if checkpoint._is_torn():
+            shutil.rmtree(checkpoint.path)
+        elif not checkpoint._differing():
             checkpoint.remove()
 
     def slot(self, name: str) -> Slot:
@@ -126,6 +134,12 @@ class Checkpoint:
                 f"{path}: the checkpoint cannot be read ({type(error).__name__}).",
                 todo="remove the file, or pass --overwrite to begin the fit again.",
             ) from None
+
+    def _is_torn(self) -> bool:
+        """Return whether the directory is what a process left that was killed while it made or removed it."""
+        if not self.path.is_dir() or (self.path / _KEY).exists():
+            return False
+        return all(_OWN.fullmatch(entry.name) for entry in self.path.iterdir())
 
     def _differing(self) -> list[str]:
         try:
