@@ -126,6 +126,23 @@ def test_a_folder_of_that_name_that_is_no_checkpoint_stays(tmp_path):
     assert (folder / "mine.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    "left", [[], [".made_of.json.partial-999999999-11111111-0a.json"], ["ball-colours-0a1b2c3d.npz"]]
+)
+def test_what_a_kill_left_of_checkpoints_is_no_obstacle(tmp_path, left):
+    """A process may die while it makes the folder, or while it removes it."""
+    for finished in (False, True):
+        folder = tmp_path / "model.checkpoint"
+        folder.mkdir()
+        for name in left:
+            (folder / name).touch()
+        if finished:
+            Checkpoint.remove_of(tmp_path / "model", MADE_OF)
+        else:
+            Checkpoint.beside(tmp_path / "model", MADE_OF, resume=True, overwrite=False)
+        assert not folder.exists()
+
+
 @pytest.mark.evidence
 def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
     out = tmp_path / "model"
