@@ -62,6 +62,7 @@ def test_a_kill_at_every_operation(old: bool, tmp_path: Path, monkeypatch: pytes
         assert NAMES[0] in seen or not old
         settle_files(folder / NAMES[0])
         settled = found(folder)
+        assert not [name for name in os.listdir(folder) if name.startswith(".")]
         if old:
             assert len(settled) == 3 and len(set(settled.values())) == 1, f"{moment}: {seen}, then {settled}"
         else:

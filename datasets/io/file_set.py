@@ -14,7 +14,7 @@ from pathlib import Path
 
 from .atomic import move_into_place, remove_directory, sha256, sync_tree
 from .free_space import enough_room
-from .neighbours import PARTIAL, is_left_behind, sibling
+from .neighbours import PARTIAL, clean_stale, is_left_behind, sibling
 from .outputs import FileKind, about_to_place, refuse_output
 from .places import require_place
 
@@ -71,6 +71,7 @@ def settle_files(first: Path) -> None:
     for pending in sorted(first.parent.glob(f".*.{_PENDING}-*")):
         if is_left_behind(pending, first, _PENDING):
             _settle(pending, first)
+    clean_stale(first)
 
 
 def _place(pending: Path, first: Path, others: Sequence[str]) -> None:
