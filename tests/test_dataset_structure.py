@@ -13,6 +13,7 @@ from cgwm.datasets.rollouts.array_entry import ArrayEntry
 from cgwm.datasets.rollouts.array_table import ARRAYS, JPEG, table_rows
 from cgwm.datasets.rollouts.dataset import read_manifest, shard_name
 from cgwm.pipeline.synthesize import synthesize
+from cgwm.pipeline.validate.mjcf_text import mjcf_fault
 from cgwm.pipeline.validate.rollout import Dataset
 from cgwm.pipeline.validate.structure import check_file, check_structure, listing_fault
 from cgwm.schemas import SynthesizeConfig
@@ -123,6 +124,10 @@ def test_each_array_is_compared_with_its_entry(
 
     found = faults(made, edit)
     assert [name for name in names if not any(message.format(name=name) in fault for fault in found)] == [], found
+
+
+def including(demo: h5py.Group) -> None:
+    demo.attrs["model_file"] = "<mujoco><include file='/etc/passwd'/></mujoco>"
 
 
 def other_state(demo: h5py.Group) -> None:
@@ -272,6 +277,7 @@ def stray_demo(demo: h5py.Group) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
+        (including, "the attribute model_file includes a file."),
         (other_state, "states: frame 2: differs from the times and the free bodies' poses and velocities"),
         (
             pixels_shifted_in_next_obs,
@@ -315,6 +321,29 @@ def test_each_contradiction_is_found(
     found = faults(made, edit)
     assert any(message in fault for fault in found), found
     assert all("\x1b" not in fault and not fault.startswith("demo_0") for fault in found), found
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco", "is no XML: unclosed token"),
+        ("", "is no XML: no element found"),
+        ("<mujoco/><mujoco/>", "is no XML: junk after document element"),
+        ("<mujoco>" * 200_000, "is no XML: no element found"),
+        ("<mujoco a='\udcff'/>", "is no XML: it holds what is no character"),
+        ("<robot/>", "is XML with another root than mujoco"),
+        ("<!DOCTYPE m [<!ENTITY a 'b'>]><mujoco>&a;</mujoco>", "declares a document type"),
+        ("<mujoco><worldbody><include file='x.xml'/></worldbody></mujoco>", "includes a file"),
+        ("<mujoco><compiler meshdir='/etc'/></mujoco>", "names the file /etc, which lies outside"),
+        ("<mujoco><mesh file='a/../../b.obj'/></mujoco>", "names the file a/../../b.obj, which"),
+        ("<mujoco><texture fileup='C:\\b.png'/></mujoco>", "names the file C:\\b.png, which"),
+        ("<mujoco><mesh file='meshes/b..c.obj'/></mujoco>", None),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_a_model_file_stands_alone(text: str, message: str | None) -> None:
+    found = mjcf_fault(text)
+    assert found is None if message is None else found is not None and message in found, found
 
 
 def test_what_is_not_documented_is_no_fault(made: tuple[Dataset, bytes]) -> None:

@@ -19,6 +19,7 @@ from ...datasets.rollouts.array_table import names_in
 from ...datasets.rollouts.rollouts import Node
 from ...schemas import DatasetManifest
 from .faults import Fault
+from .mjcf_text import mjcf_fault
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +128,9 @@ def read_attributes(group: Node, name: str, dataset: Dataset) -> tuple[Attribute
     faults: list[Fault] = []
     numbers = {key: _integer(group, key, faults) for key in ("num_samples", "episode_index", "seed", "attempt")}
     texts = {key: _text(group, key, faults) for key in ("model_file", "params_json", "effects_json")}
+    fault = None if texts["model_file"] is None else mjcf_fault(texts["model_file"])
+    if fault is not None:
+        faults.append(_fault(f"the attribute model_file {shown(fault)}."))
     parameters, effects = (_object(key, texts[key], faults) for key in ("params_json", "effects_json"))
     faults += _number_faults(numbers, name, dataset)
     values = None if parameters is None else _parameters(parameters, faults)
