@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from .base import FileModel
+from .model import repeated
 from .plan import SamplingPlan
 
 DATASET_FORMAT = "cgwm-dataset/1"
@@ -14,10 +16,30 @@ ROLLOUTS_FORMAT = "cgwm-rollouts/1"
 Count = Annotated[int, Field(ge=0, le=10**15)]
 
 
+def _inside(path: str) -> str:
+    parts = PureWindowsPath(path).parts
+    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).anchor
+    if not parts or rooted or ".." in parts or not path.isprintable():
+        raise ValueError("a path within the dataset is relative and has no '..'")
+    return path
+
+
+def _plain(name: str) -> str:
+    if len(PureWindowsPath(_inside(name)).parts) != 1:
+        raise ValueError("a file of a dataset lies in its folder; its name has no '/'")
+    return name
+
+
+PathInside = Annotated[str, AfterValidator(_inside)]
+"""Path of a folder within a dataset."""
+FileName = Annotated[str, AfterValidator(_plain)]
+"""Name of a file in the folder of a dataset."""
+
+
 class ShardEntry(FileModel):
     """One HDF5 file of a dataset."""
 
-    file: str
+    file: FileName
     index: Annotated[int, Field(ge=0, le=1_000_000)]
     sha256: str
     bytes: Count
@@ -37,7 +59,7 @@ class ShardEntry(FileModel):
 class IndexEntry(FileModel):
     """The file that `cgwm merge` writes: all shards as one, by HDF5 virtual datasets."""
 
-    file: str
+    file: FileName
     sha256: str
     bytes: Count
 
@@ -46,7 +68,7 @@ class DatasetManifest(FileModel):
     """`dataset.json`, the side manifest: what may differ between equal runs stands here."""
 
     format: Literal["cgwm-dataset/1"] = DATASET_FORMAT
-    model: str = "model"
+    model: PathInside = "model"
     """Folder with a copy of the model that made the dataset."""
     model_sha256: str
     config: dict[str, Any]
@@ -61,6 +83,23 @@ class DatasetManifest(FileModel):
     cameras: tuple[str, ...] = ()
     versions: dict[str, str] = {}
     notes: tuple[str, ...] = ()
+
+    @field_validator("shards")
+    @classmethod
+    def _once(cls, shards: tuple[ShardEntry, ...]) -> tuple[ShardEntry, ...]:
+        for what, names in (("number", (str(s.index) for s in shards)), ("file", (s.file for s in shards))):
+            twice = repeated(names)
+            if twice is not None:
+                raise ValueError(f"two shards have the {what} {twice}")
+        return shards
+
+    @model_validator(mode="after")
+    def _counted(self) -> DatasetManifest:
+        beyond = next((shard for shard in self.shards if shard.index >= self.shard_count), None)
+        if beyond is not None:
+            last = self.shard_count - 1
+            raise ValueError(f"'{beyond.file}' is shard {beyond.index}; the shards are numbered 0 to {last}")
+        return self
 
 
 class DatasetSummary(FileModel):

@@ -4,6 +4,7 @@ import errno
 import json
 import multiprocessing
 import os
+import re
 import resource
 import shlex
 import shutil
@@ -111,6 +112,18 @@ def test_any_split_gives_the_same_demos(whole: Path, made: Path) -> None:
     assert check_hashes(made, read_manifest(made)) == []
 
 
+@pytest.mark.parametrize("rollouts", [4, 6, 10**12])
+def test_shards_hold_the_rollouts_that_were_promised(made: Path, tmp_path: Path, rollouts: int) -> None:
+    copy = shutil.copytree(made, tmp_path / "copy")
+    manifest = read_manifest(made).model_copy(update={"rollouts": rollouts})
+    (copy / "dataset.json").write_text(manifest.model_dump_json())
+    promise = f"dataset.json promises {rollouts} rollouts in its 3 of 3 shards; they are listed with 5."
+    assert check_hashes(copy, read_manifest(copy)) == [promise]
+    with pytest.raises(InputDataError, match=re.escape(promise)):
+        merge([copy], tmp_path / "index.h5")
+    assert not (tmp_path / "index.h5").exists()
+
+
 def publish(out: Path, source: Path, number: int, start: object) -> None:
     manifest = read_manifest(source).model_copy(update={"shards": ()})
     start.wait()  # pyright: ignore[reportAttributeAccessIssue]
@@ -123,7 +136,7 @@ def test_shards_that_end_together_lose_no_entry(made: Path, tmp_path: Path) -> N
     count, processes = 12, multiprocessing.get_context("fork")
     source = shutil.copytree(made, tmp_path / "source")
     (source / "dataset.json").write_text(
-        read_manifest(made).model_copy(update={"shard_count": count, "shards": ()}).model_dump_json()
+        read_manifest(made).model_copy(update={"shard_count": count, "rollouts": count, "shards": ()}).model_dump_json()
     )
     for file in source.glob("rollouts-*"):
         file.unlink()

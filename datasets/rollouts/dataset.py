@@ -22,7 +22,7 @@ from ..io.atomic import move_into_place, new_directory, replaced_file, scratch_f
 from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
 from .index import index_fault
-from .shards import SHARD, gathered, shard_fault, shard_name, tidied, write_entry
+from .shards import SHARD, gathered, promise_fault, shard_fault, shard_name, tidied, write_entry
 
 MANIFEST = "dataset.json"
 MODEL_FOLDER = "model"
@@ -270,6 +270,8 @@ def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] |
     ]
     if count > LISTED_MISSING:
         faults.append(f"and {count - LISTED_MISSING} more shards are missing.")
+    promise = promise_fault(manifest)
+    faults += [] if promise is None else [promise]
     found = (shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards)
     faults += [fault for fault in found if fault is not None]
     listed = {shard.file for shard in manifest.shards}

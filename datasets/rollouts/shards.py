@@ -104,6 +104,20 @@ def shard_fault(file: Path, entry: ShardEntry, hashes: bool = True) -> str | Non
     return f"{file.name}: its sha256 differs from dataset.json: {how}"
 
 
+def promise_fault(manifest: DatasetManifest) -> str | None:
+    """Return one sentence if the shards that are there do not hold the rollouts that they stand for, or None.
+
+    None is left out: a rollout that diverges is drawn again, and after too many draws its shard is not written.
+    """
+    present = [shard for shard in manifest.shards if shard.index < manifest.shard_count]
+    shares = [len(shard_range(manifest.rollouts, manifest.shard_count, shard.index)) for shard in present]
+    if all(shard.rollouts == share for shard, share in zip(present, shares, strict=True)):
+        return None
+    where = f"its {len(present)} of {manifest.shard_count} shards"
+    held = sum(shard.rollouts for shard in present)
+    return f"dataset.json promises {sum(shares)} rollouts in {where}; they are listed with {held}."
+
+
 def unreadable_block(file: Path) -> str | None:
     """Return the first array whose blocks fail their checksum or cannot be unpacked, with its frames, or None."""
     found: list[str] = []
@@ -162,7 +176,7 @@ def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_js
             yield f"{file.name}: made with other settings (its attribute config_json)."
         found = [int(name.removeprefix("demo_")) for name in demo_names(handle)]
     wanted = shard_range(manifest.rollouts, manifest.shard_count, entry.index)
-    if not all(number in wanted for number in found):  # fewer are right: rollouts that diverge are left out
+    if not all(number in wanted for number in found):
         yield f"{file.name}: holds the rollouts {ranges(found)}; its number stands for {span(wanted)}."
     if len(found) != entry.rollouts:
         yield f"{file.name}: holds {len(found)} rollouts; its entry says {entry.rollouts}."

@@ -26,7 +26,16 @@ from ...datasets.rollouts.dataset import (
     write_manifest,
 )
 from ...datasets.rollouts.index import INDEX, index_fault, write_index
-from ...datasets.rollouts.shards import entry_file, foreign, ranges, shard_fault, shard_name, span, tidied
+from ...datasets.rollouts.shards import (
+    entry_file,
+    foreign,
+    promise_fault,
+    ranges,
+    shard_fault,
+    shard_name,
+    span,
+    tidied,
+)
 from ...schemas import DatasetManifest, IndexEntry, InputDataError, MergeSummary, ShardEntry, UsageError
 from ...schemas.regular_files import real_path
 from ..runtime.work_budget import Part, data_size, within_budget
@@ -119,7 +128,9 @@ def _joined(
     """Return the checked shards of all sources in the order of their numbers, and notes for the user."""
     shards, notes, doubled = _by_number(sources, manifests)
     faults = [*_differing(sources, manifests), *doubled]
-    faults += [*_shard_faults(shards, manifests[0], hashes), *_missing(shards, manifests[0])]
+    joined = manifests[0].model_copy(update={"shards": tuple(shard.entry for shard in shards)})
+    promise = promise_fault(joined)
+    faults += [*_shard_faults(shards, manifests[0], hashes), *_missing(joined), *([promise] if promise else [])]
     if faults:
         where = ", ".join(str(source) for source in sources[:3]) + (", ..." if len(sources) > 3 else "")
         more = [f"and {len(faults) - SHOWN_FAULTS} more"] if len(faults) > SHOWN_FAULTS else []
@@ -150,10 +161,9 @@ def _by_number(
     return [found[index] for index in sorted(found)], notes, faults
 
 
-def _missing(shards: Sequence[_Shard], manifest: DatasetManifest) -> list[str]:
+def _missing(joined: DatasetManifest) -> list[str]:
     """Return one fault that lists the missing shards; empty if none is missing."""
-    joined = manifest.model_copy(update={"shards": tuple(shard.entry for shard in shards)})
-    gaps, lacking, count = missing_shards(joined), missing_count(joined), manifest.shard_count
+    gaps, lacking, count = missing_shards(joined), missing_count(joined), joined.shard_count
     if not lacking:
         return []
     first = islice(chain.from_iterable(gaps), 3)

@@ -14,7 +14,7 @@ from ...datasets.io.progress import progress
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.dataset import check_hashes, read_manifest, settings_text
 from ...datasets.rollouts.rollouts import Node, demo_names, open_shard, stored_demo
-from ...datasets.rollouts.shards import ranges, shard_range
+from ...datasets.rollouts.shards import shard_range, span
 from ...schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
 from .contacts import check_contacts
 from .faults import Fault
@@ -181,7 +181,7 @@ def _check_shard(
     wanted = shard_range(manifest.rollouts, manifest.shard_count, shard.index)
     strange = [name for name in names if int(name.removeprefix("demo_")) not in wanted]
     if strange:
-        findings.faults.append(f"{shard.file}: holds {strange[0]}; its number stands for {ranges(wanted)}.")
+        findings.faults.append(f"{shard.file}: holds {strange[0]}; its number stands for {span(wanted)}.")
     if file.attrs.get("config_json") != settings_text(manifest):
         findings.faults.append(f"{shard.file}: its attribute config_json differs from the settings in dataset.json.")
     findings.faults += [f"{shard.file}: {text}" for text in check_file(file)]
