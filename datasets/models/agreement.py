@@ -37,7 +37,6 @@ def require_agreement(file: ModelFile, colliding: Mapping[str, Splats], path: Pa
     """
     if not file.provenance.config.get("accept_units", False):
         check_gravity(file.gravity_m_s2, file.ground, str(path))
-    _require_contact(file, path)
     for block in file.correlations:
         _require_possible(block, file, path)
     estimates = {parameter.name: parameter.estimate for parameter in file.parameters}
@@ -53,8 +52,12 @@ def require_agreement(file: ModelFile, colliding: Mapping[str, Splats], path: Pa
         _require_spheres(body, file, colliding.get(body.name), path)
 
 
-def _require_contact(file: ModelFile, path: Path) -> None:
-    """Refuse a model with parameters of the contact law, but without that law."""
+def require_contact(file: ModelFile, path: Path) -> None:
+    """Refuse a model with parameters of the contact law, but without that law.
+
+    Raises:
+        InputDataError: If it has; whatever needs the law says so by itself, so only `validate` asks.
+    """
     names = {parameter.name for parameter in file.parameters} & set(ContactParameters.model_fields)
     if file.contact is None and names:
         raise InputDataError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import find_faults
 from ...datasets.io.kinds import kind_of
+from ...datasets.models.agreement import require_contact
 from ...datasets.models.model import read_model
 from ...schemas import InputDataError, UsageError
 from ...schemas.validation import ValidationReport
@@ -64,6 +65,7 @@ def validate_capture(path: Path | str, accept_units: bool = False) -> Validation
 def validate_model(path: Path | str) -> ValidationReport:
     """Check the files of a model, and that its world can be simulated (`trial_run`)."""
     model = read_model(path)
+    require_contact(model.file, Path(path) / "model.json")
     facts = {
         "bodies": [body.name for body in model.file.bodies],
         "visual_spheres": {name: len(splats) for name, splats in model.body_splats.items()},
