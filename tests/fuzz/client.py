@@ -40,7 +40,8 @@ class Runner:
         self._server: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Runner:
-        path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+        # An empty entry would mean the working directory, whose folder cgwm/ is not the package.
+        path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
         threads = {"OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1", "PYTHONPATH": path}
         self._server = subprocess.Popen(
             [sys.executable, "-m", "fuzz.server"],
