@@ -15,7 +15,7 @@ from cgwm.pipeline.runtime import work_budget
 from cgwm.pipeline.runtime.work_budget import ENDLESS_S, Part, motion_doubt, within_budget
 from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.pipeline.synthesize.stage import synthesize
-from cgwm.schemas import InputDataError, PhysConfig, RejectionRules, SamplingPlan, SynthesizeConfig, UsageError
+from cgwm.schemas import InputDataError, PhysConfig, SynthesizeConfig, UsageError
 from small_model import small_model, write_small_model
 
 
@@ -99,13 +99,6 @@ def test_an_absurd_number_of_shards_is_refused(tmp_path: Path) -> None:
     config = SynthesizeConfig(device="cpu").model_copy(update={"rollouts": 10**9, "shards": 10**9})
     with pytest.raises(UsageError, match=r"1e\+09 shards"):
         synthesize_shards(model, tmp_path / "out", config)
-
-
-def test_attempts_without_end_are_refused(tmp_path: Path) -> None:
-    model = write_small_model(tmp_path / "model")
-    plan = SamplingPlan(reject=RejectionRules().model_copy(update={"attempts": 10**10}))
-    with pytest.raises(UsageError, match=r"reject\.attempts"):
-        synthesize(model, tmp_path / "out", SynthesizeConfig(device="cpu", rollouts=1, plan=plan))
 
 
 def test_no_rollout_has_more_steps_than_can_be_counted() -> None:
