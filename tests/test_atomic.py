@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from cgwm.datasets import new_directory, new_file, sha256
+from cgwm.datasets.io.atomic import copy_files
 from cgwm.datasets.io.outputs import RECORD, signed
 from cgwm.schemas import UsageError
 
@@ -176,3 +177,16 @@ def test_every_public_name_exists() -> None:
     for name in cgwm.datasets.__all__:
         assert getattr(cgwm.datasets, name) is not None
     assert set(cgwm.datasets.__all__) == set(cgwm.datasets._PUBLIC)
+
+
+def test_a_copy_has_the_files_that_the_hash_counts(tmp_path: Path) -> None:
+    source = tmp_path / "model"
+    (source / "tracks").mkdir(parents=True)
+    (source / "tracks" / "a.csv").write_text("1")
+    (source / "linked").symlink_to("tracks/a.csv")
+    (source / "broken").symlink_to("nowhere")
+    os.mkfifo(source / "pipe")
+    copy_files(source, tmp_path / "copy")
+    assert sorted(path.name for path in (tmp_path / "copy").rglob("*")) == ["a.csv", "linked", "tracks"]
+    assert not (tmp_path / "copy" / "linked").is_symlink()
+    assert sha256(tmp_path / "copy") == sha256(source)

@@ -407,7 +407,7 @@ def test_mask_with_colours_and_mask_without_photo(root: Path) -> None:
 def test_cameras_for_images_that_are_not_there(root: Path) -> None:
     write_cameras(root, ("walk/0.jpg", "walk/7.jpg", "walk/8.jpg"))
     assert fault(root) == (
-        "C: 2 of 3 cameras are for photos that are not in images/, such as 'walk/7.jpg'.\n"
+        "C/cameras.json: 2 of 3 cameras are for photos that are not in images/, such as 'walk/7.jpg'.\n"
         "Allowed: names relative to images/. Did you mean 'walk/2.jpg'?\n"
         "Next: add the photos, or remove the cameras."
     )

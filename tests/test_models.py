@@ -245,6 +245,17 @@ def test_a_body_that_touches_needs_spheres(tmp_path: Path) -> None:
         read_model(path.parent)
 
 
+def test_a_sphere_that_lies_beyond_every_body_is_refused(tmp_path: Path) -> None:
+    whole = small_model()
+    name = next(iter(whole.collision))
+    far = whole.collision[name].means.copy()
+    far[-1] = (0.0, 5e10, 0.0)  # what a damaged byte of a .ply file makes
+    moved = replace(whole.collision[name], means=far)
+    write_model(tmp_path / "m", replace(whole, collision=whole.collision | {name: moved}))
+    with pytest.raises(InputDataError, match=rf"spheres of body '{name}' reach 5e\+10 m"):
+        read_model(tmp_path / "m")
+
+
 @pytest.mark.parametrize("value", [None, "absent"])
 def test_fields_that_are_null_or_missing_never_break_the_reader(tmp_path: Path, value: str | None) -> None:
     path, document = real(tmp_path)

@@ -140,16 +140,20 @@ def read_cameras(root: Path | str, metric: bool = False) -> CamerasFile | None:
         InputDataError: If the file is wrong, uses a camera model that cannot be represented, or contains a pose
             that is not a rotation and a translation.
     """
-    root = Path(root)
-    if (path := optional_file(root / "cameras.json")) is not None:
-        cameras = read_json(path, CamerasFile)
-    elif (path := optional_file(root / "transforms.json")) is not None:
-        cameras = read_transforms(path, metric)
-    elif (model := find_colmap_model(root)) is not None:
-        path, cameras = model, read_colmap_model(model, metric)
-    else:
+    path = find_cameras(Path(root))
+    if path is None:
         return None
-    return require_rigid(path, cameras)
+    if path.name == "cameras.json":
+        return require_rigid(path, read_json(path, CamerasFile))
+    return require_rigid(path, (read_transforms if path.name == "transforms.json" else read_colmap_model)(path, metric))
+
+
+def find_cameras(root: Path) -> Path | None:
+    """Return the file of a capture's cameras, or the directory of its COLMAP model; None if there are no cameras."""
+    for name in ("cameras.json", "transforms.json"):
+        if optional_file(root / name) is not None:
+            return root / name
+    return find_colmap_model(root)
 
 
 def require_rigid(path: Path, cameras: CamerasFile) -> CamerasFile:

@@ -12,7 +12,7 @@ from ...schemas import InputDataError, did_you_mean
 from ...schemas.regular_files import require_regular_file
 from ..shapes.meshes import mass_properties, read_mesh
 from ..shapes.ply import read_splats
-from .cameras import pose_count
+from .cameras import find_cameras, pose_count
 from .consistency import check_consistency
 from .faults import Faults
 from .files import files_under, has_folder
@@ -301,7 +301,8 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
     absent = [name for name in cameras.images if name not in photos]
     if absent:
         raise InputDataError(
-            f"{capture.root}: {len(absent)} of {len(cameras.images)} cameras are for photos that are not in images/, "
+            f"{find_cameras(capture.root)}: {len(absent)} of {len(cameras.images)} cameras are for photos that are not "
+            f"in images/, "
             f"such as '{absent[0]}'.",
             "names relative to images/." + did_you_mean(absent[0], sorted(photos)),
             "add the photos, or remove the cameras.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,8 +88,3 @@ def _fits(track: Track, length: int) -> tuple[NDArray[np.int64], Array, Array, A
     rms = np.sqrt(np.square(residual).sum(axis=(1, 2)) / (3 * freedom))
     scale = 2 / np.square(half[:, 0])
     return first, square * scale[:, None], rms, scale / np.abs(last), np.linalg.norm(square, axis=1)
-
-
-def spread_evenly(count: int, most: int) -> Sequence[int]:
-    """Return at most `most` of the indices below `count`, evenly spread."""
-    return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist())) if count else []

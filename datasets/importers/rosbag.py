@@ -85,9 +85,11 @@ def _bags(source: Path) -> list[Path]:
     bags = [source] if there and is_bag(source) else []
     bags = bags or [path for path in (entries_of(source) if source.is_dir() else ()) if is_bag(path)]
     if not bags:
-        what = "no ROS bags" if there else "no such file or directory"
+        messages = next((p for p in (entries_of(source) if source.is_dir() else ()) if p.suffix == ".db3"), None)
+        what = f"no ROS bags{f', but {messages} without metadata.yaml' if messages else ''}"
         raise InputDataError(
-            f"{source}: {what}.", "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them."
+            f"{source}: {what if there else 'no such file or directory'}.",
+            "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them.",
         )
     return bags
 

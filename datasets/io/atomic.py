@@ -184,13 +184,26 @@ def sha256(path: Path | str) -> str:
     path = Path(path)
     digest = hashlib.sha256()
     if path.is_dir():
-        for file in sorted(p for p in path.rglob("*") if p.is_file()):
-            digest.update(f"{file.relative_to(path).as_posix()}\0{sha256(file)}\n".encode())
+        for name in _files(path):
+            digest.update(f"{name.as_posix()}\0{sha256(path / name)}\n".encode())
         return digest.hexdigest()
     with path.open("rb") as stream:
         while block := stream.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
+
+
+def copy_files(source: Path, target: Path) -> None:
+    """Copy the files of a directory, those that :func:`sha256` counts, into a new one: no broken link, no pipe."""
+    target.mkdir()
+    for name in _files(source):
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source / name, target / name)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Return the relative names of the files in a directory and below, sorted."""
+    return [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
 def _temporary(path: Path, suffix: str = "") -> Path:

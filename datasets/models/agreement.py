@@ -18,6 +18,8 @@ FARTHEST_COM = 2.0
 """Largest distance of the centre of mass from the middle of a body's spheres, in halves of their bounding box's
 diagonal; of a solid body it is below 1, but spheres may lack a part."""
 
+LARGEST_BODY_M = 1e4
+"""Largest reach of a body's spheres from its origin [m]; rollouts start from heights of several such lengths."""
 LARGEST = 2.0
 """Largest ratio of the reach of a body's spheres to that of its given shape, and of a moment of inertia to that of all
 its mass at that reach."""
@@ -128,6 +130,13 @@ def _require_spheres(body: BodyModel, file: ModelFile, spheres: Splats | None, p
 def _require_size(body: BodyModel, spheres: Splats, path: Path) -> None:
     """Refuse moments of inertia that no body within the spheres has, and spheres far larger than the given shape."""
     radii = np.asarray(spheres.scales, float) * body.radius_factor
+    reach = float((np.linalg.norm(np.asarray(spheres.means, float), axis=1) + radii).max())
+    if reach > LARGEST_BODY_M:
+        raise InputDataError(
+            f"{path}: the spheres of body '{body.name}' reach {reach:.3g} m from its origin.",
+            f"at most {LARGEST_BODY_M:g} m.",
+            "get the model again from where it came, or fit it again.",
+        )
     from_com = float((np.linalg.norm(np.asarray(spheres.means, float) - body.com_m, axis=1) + radii).max())
     xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
     greatest = float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
@@ -139,7 +148,6 @@ def _require_size(body: BodyModel, spheres: Splats, path: Path) -> None:
             "correct mass_kg and inertia_kg_m2, or fit the model again.",
         )
     size = _size(body)
-    reach = float((np.linalg.norm(np.asarray(spheres.means, float), axis=1) + radii).max())
     if size is not None and not size / LARGEST <= reach <= LARGEST * size:
         raise InputDataError(
             f"{path}: the spheres of body '{body.name}' reach {reach:.3g} m from its origin; its shape reaches "

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from typing import Any
 
 from ...schemas import DamagedShardError, DatasetManifest, InputDataError, ShardEntry, UsageError, read_json
 from ...schemas.regular_files import real_path
-from ..io.atomic import move_into_place, new_directory, replaced_file, scratch_file, sha256
+from ..io.atomic import copy_files, move_into_place, new_directory, replaced_file, scratch_file, sha256
 from ..io.free_space import enough_room
 from ..io.kinds import refuse_other_kind
 from .index import index_fault
@@ -157,7 +156,7 @@ def _publish(
 def _copy_model(model: Path, folder: Path, manifest: DatasetManifest) -> None:
     """Copy the model into a dataset, which refuses one that is no longer what the rollouts were made of."""
     copy = folder / MODEL_FOLDER
-    shutil.copytree(model, copy)
+    copy_files(model, copy)
     if sha256(copy) != manifest.model_sha256:
         raise InputDataError(
             f"{model}: was changed while its rollouts were made.",

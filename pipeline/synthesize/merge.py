@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 
-from ...datasets.io.atomic import new_directory, new_file, sha256
+from ...datasets.io.atomic import copy_files, new_directory, new_file, sha256
 from ...datasets.io.free_space import enough_room
 from ...datasets.io.outputs import reads
 from ...datasets.io.processors import processors
@@ -246,7 +245,7 @@ def _index_alone(out: Path, shards: Sequence[_Shard], overwrite: bool) -> Path:
 
 def _dataset_of_links(out: Path, manifest: DatasetManifest, shards: Sequence[_Shard], overwrite: bool) -> Path:
     with new_directory(out, "dataset", overwrite) as folder:
-        shutil.copytree(shards[0].root / manifest.model, folder / MODEL_FOLDER)
+        copy_files(shards[0].root / manifest.model, folder / MODEL_FOLDER)
         linked: list[_Shard] = []
         for shard in shards:
             target = os.path.relpath(real_path(shard.file), real_path(out))

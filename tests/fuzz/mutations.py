@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import os
 import socket
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -298,7 +299,10 @@ def _change_archive(path: Path, change: Mutation) -> None:
         }[change["what"]]  # fmt: skip
         torch.save(made, path)
         return
-    arrays = dict(np.load(path))
+    try:
+        arrays = dict(np.load(path))
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return  # an earlier change has damaged it
     one = arrays[change["name"]]
     made = {
         "pickled": np.array([canary], object), "text": np.array(["a", "b"]), "empty": np.zeros(0),
