@@ -108,7 +108,12 @@ def test_what_was_interrupted_is_neither_lost_nor_mixed(tmp_path):
         Checkpoint.beside(out, MADE_OF | {"settings": "c"}, resume=True, overwrite=False)
     again = Checkpoint.beside(out, MADE_OF, resume=True, overwrite=False)
     assert again.read("background", torch.device("cpu")) == {"k": 1}
-    next(again.path.glob("*.npz")).write_bytes(b"PK")
+    stored = next(again.path.glob("*.npz"))
+    for frame in ("", "{}", '{"dict": 1}', '{"tensor": []}', "[" * 10**6, '{"dict": [[[], 1]]}'):
+        np.savez(stored, frame=np.array(frame))
+        with pytest.raises(InputDataError, match="cannot be read"):
+            again.read("background", torch.device("cpu"))
+    stored.write_bytes(b"PK")
     with pytest.raises(InputDataError, match="cannot be read"):
         again.read("background", torch.device("cpu"))
     Checkpoint.beside(out, MADE_OF, resume=False, overwrite=True)

@@ -129,7 +129,7 @@ class Checkpoint:
         try:
             with np.load(path, allow_pickle=False) as stored:
                 return _put_together(json.loads(str(stored["frame"])), stored, device)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, TypeError, KeyError, EOFError, RecursionError, zipfile.BadZipFile) as error:
             raise InputDataError(
                 f"{path}: the checkpoint cannot be read ({type(error).__name__}).",
                 todo="remove the file, or pass --overwrite to begin the fit again.",
