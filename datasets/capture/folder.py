@@ -17,6 +17,7 @@ from .cameras import Camera, camera_of
 from .files import entries_of, files_under, has_folder, optional_file
 from .geometry_maps import GeometryMaps, read_maps
 from .images import IMAGE_SUFFIXES, read_label, read_rgb
+from .spin import require_told_spin
 from .tracks import Track, read_tracks
 from .video import VIDEO_SUFFIXES, VideoInfo, read_video, read_video_labels, video_info
 
@@ -165,6 +166,7 @@ class CaptureFolder:
                     f"correct [episodes] '{episode}' in capture.toml; the track lasts from "
                     f"{tracks[name].time_s[0]:g} s to {tracks[name].time_s[-1]:g} s.",
                 )
+            require_told_spin(path, name, track)
         return CheckedTracks(windowed, normalised, tuple(unturned))
 
     def unturned_warning(self, episodes: Mapping[str, Sequence[str]]) -> str:

@@ -92,6 +92,33 @@ def quat_log(quat_wxyz: Tensor) -> Tensor:
     return factor * vector
 
 
+def continuous_turns(times_s: Tensor, quat_wxyz: Tensor, known: Tensor, reference: Tensor) -> Tensor:
+    """Return rotation vectors (..., T, 3) [rad] from one orientation of a motion to each, also beyond half a turn.
+
+    The logarithm of a rotation is at most half a turn, so that a fast spin seems to slow down, stop and reverse. Turns
+    between neighbouring frames do not: their mean is a spin, and the logarithm is that of the rotation which this spin
+    leaves. Its derivative at the reference is the angular velocity in the body frame. Motions whose neighbouring turns
+    add up to less than half a turn have the plain logarithm.
+
+    Args:
+        times_s: Times of the frames, shape (..., T) [s].
+        quat_wxyz: Orientations (body to world), shape (..., T, 4).
+        known: 1 where the orientation was measured, 0 elsewhere, shape (..., T).
+        reference: Index of the frame from which the rotations are, where it is known, shape (...).
+    """
+    both = known[..., 1:] * known[..., :-1]
+    steps = quat_log(quat_multiply(quat_conjugate(quat_wxyz[..., :-1, :]), quat_wxyz[..., 1:, :])) * both[..., None]
+    span = (times_s.diff(dim=-1) * both).sum(-1, keepdim=True).clamp_min(1e-12)
+    spin, speed = steps.sum(-2) / span, steps.norm(dim=-1).sum(-1, keepdim=True) / span
+    base = quat_wxyz.gather(-2, reference[..., None, None].expand(*reference.shape, 1, 4))
+    since = times_s - times_s.gather(-1, reference[..., None])
+    turned = quat_multiply(quat_conjugate(base), quat_wxyz)
+    even = spin[..., None, :] * since[..., None]
+    left = even + quat_log(quat_multiply(quat_exp(-even), turned))
+    far = (speed * since.abs() * known).amax(-1) > torch.pi
+    return torch.where(far[..., None, None], left, quat_log(turned))
+
+
 def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:
     """Rotate vectors (..., 3) by unit quaternions (..., 4)."""
     axis = quat_wxyz[..., 1:]

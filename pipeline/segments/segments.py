@@ -9,7 +9,7 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..geometry.rotation import continuous_turns, quat_exp, quat_multiply
 from ..physics.contact_law import ContactLaw
 from ..physics.engine import rollout as rolled_out
 from ..physics.engine import rollouts_at_once
@@ -274,7 +274,7 @@ def line_state(segments: Segments, frames: int) -> State:
         at = turned.argmax(1)  # the first measured orientation
         item = torch.arange(len(at))
         base = seen.quat_wxyz[item, at, column]
-        turn = quat_log(quat_multiply(quat_conjugate(base[:, None]), seen.quat_wxyz[:, :frames, column]))
+        turn = continuous_turns(t, seen.quat_wxyz[:, :frames, column], turned, at)
         angle, omega = _line(t, turn, turned)
         known = (turned.sum(1) >= 2)[:, None]
         fields[1][:, body] = torch.where(known, quat_multiply(base, quat_exp(angle)), base)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ..geometry.rotation import continuous_turns
 from .observations import Observations
 from .segmentation import Segment
 from .track_noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, Noise, moves
@@ -202,7 +202,9 @@ def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind:
         values = _positions(whole, episode, column, frames)
     else:
         quat = whole.quat_wxyz[episode, frames, column]
-        values = quat_log(quat_multiply(quat_conjugate(quat[len(quat) // 2]), quat)).numpy()
+        times = whole.times_s[episode, frames]
+        middle = torch.tensor(len(quat) // 2)
+        values = continuous_turns(times, quat, torch.ones_like(times), middle).numpy()
     scaled = (t - t.mean()) / (t[-1] - t[0])
     q, _ = np.linalg.qr(np.vander(scaled, DEGREE + 1))
     left = 1 - (q * q).sum(1)

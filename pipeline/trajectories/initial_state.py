@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..physics.smooth_distance import union_distance
 from ..physics.world import World
@@ -119,7 +119,7 @@ def _information(world: World, warm: Observations, noise: Noise) -> Tensor:
                 continue
             t = warm.times_s[item, at] - warm.times_s[item, 0]
             measured = warm.quat_wxyz[item, at, column]
-            turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
+            turn = continuous_turns(t, measured, torch.ones_like(t), at.new_zeros(()))
             rows = torch.stack([warm.position_m[item, at, column] / noise.position_m, turn / noise.rotation_rad])
             lines = [straight_line(t, values) for values in rows]
             away = torch.stack([v - (a + t[:, None] * b) for v, (a, b) in zip(rows, lines, strict=True)])

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode, Track
 from ...schemas import InputDataError
-from ..geometry.rotation import matrix_to_quat, quat_conjugate, quat_log, quat_multiply
+from ..geometry.rotation import continuous_turns, matrix_to_quat
 from ..physics.kinematic import Drive
 from ..physics.parameters import with_own
 from ..physics.world import State, World
@@ -199,7 +199,7 @@ def first_state(world: World, observations: Observations) -> State:
             position[item, body], velocity[item, body] = straight_line(t, observations.position_m[item, at, column])
             if bool(observations.has_orientation[item, at, column].all()):
                 measured = observations.quat_wxyz[item, at, column]
-                turn = quat_log(quat_multiply(quat_conjugate(measured[:1]), measured))
+                turn = continuous_turns(t, measured, torch.ones_like(t), at.new_zeros(()))
                 quat[item, body], omega[item, body] = measured[0], straight_line(t, turn)[1]
     return State(position, quat, velocity, omega)
 

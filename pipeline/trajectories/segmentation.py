@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..physics.world import Body, World
 from .initial_state import FLIGHT_MARGIN_M, clearance
 from .observations import Observations
@@ -158,8 +158,11 @@ def without_rest(whole: Observations, items: Sequence[Segment], noise: Noise) ->
 
 def _turns(whole: Observations, item: Segment) -> Tensor:
     """Return the rotation vectors (T, nf, 3) from the first frame of a segment to each."""
-    quat = whole.quat_wxyz[item.episode, item.first : item.last + 1]
-    return quat_log(quat_multiply(quat_conjugate(quat[:1]), quat))
+    frames = slice(item.first, item.last + 1)
+    quat = whole.quat_wxyz[item.episode, frames].movedim(1, 0)
+    known = whole.has_orientation[item.episode, frames].movedim(1, 0)
+    times = whole.times_s[item.episode, frames].expand(len(quat), -1)
+    return continuous_turns(times, quat, known, torch.zeros(len(quat), dtype=torch.long)).movedim(0, 1)
 
 
 def _stretches(times: Tensor) -> list[tuple[int, int]]:

@@ -1,0 +1,50 @@
+"""How far a tracked body turns between neighbouring frames: beyond a limit the sense of its spin cannot be told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...schemas import InputDataError
+from .tracks import Track
+
+MOST_TURN_RAD = 0.8 * np.pi
+"""Largest rotation between neighbouring frames [rad]: from half a turn on, a spin looks like one in the other sense;
+the margin is for changes of the spin and for noise."""
+STEPS_IN_A_ROW = 3
+"""Number of such rotations in a row that is refused; single ones are errors of the tracking."""
+GAP = 1.5
+"""Time between neighbouring frames, in units of its median, beyond which they are not neighbours."""
+
+
+def require_told_spin(path: Path, body: str, track: Track) -> None:
+    """Refuse a track whose orientation turns too far from frame to frame.
+
+    Args:
+        path: Its file, for messages.
+        body: Name of the body.
+        track: The track.
+
+    Raises:
+        InputDataError: If several neighbouring rotations in a row exceed `MOST_TURN_RAD`, with the frame rate needed.
+    """
+    if track.quat_wxyz is None or len(track) < STEPS_IN_A_ROW + 1:
+        return
+    cosine = np.abs((track.quat_wxyz[:-1] * track.quat_wxyz[1:]).sum(1)).clip(0.0, 1.0)
+    turn, step = 2 * np.arccos(cosine), np.diff(track.time_s)
+    far = (turn > MOST_TURN_RAD) & (step <= GAP * np.median(step))
+    rows = np.lib.stride_tricks.sliding_window_view(far, STEPS_IN_A_ROW).all(1)
+    if not rows.any():
+        return
+    first = int(rows.argmax())
+    rate_hz = 1 / float(np.median(step))
+    # what is seen as an angle a may be a turn of 2 pi - a in the other sense
+    needed_hz = rate_hz * (2 * np.pi - float(turn[first : first + STEPS_IN_A_ROW].min())) / MOST_TURN_RAD
+    raise InputDataError(
+        f"{path}: body '{body}' turns by {np.degrees(turn[first]):.0f} deg from one frame to the next at "
+        f"{track.time_s[first]:.3f} s, so that at {rate_hz:.0f} frames/s the sense of its spin cannot be told.",
+        f"turns of at most {np.degrees(MOST_TURN_RAD):.0f} deg between frames.",
+        f"record at {np.ceil(needed_hz):.0f} frames/s or more; if the orientation was not measured, leave the columns "
+        "qw, qx, qy, qz out.",
+    )
