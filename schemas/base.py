@@ -221,7 +221,8 @@ def _legal_fields(model: Any, parent: tuple) -> list[str]:
 def _step_into(model: Any, part: Any) -> Any:
     fields = getattr(model, "model_fields", None)
     if fields is not None:
-        return _concrete(fields[part].annotation) if part in fields else None
+        named = {field.alias or name: field for name, field in fields.items()}
+        return _concrete(named[part].annotation) if part in named else None
     arguments = [argument for argument in get_args(model) if argument is not Ellipsis]
     return _concrete(arguments[-1]) if arguments and get_origin(model) in (dict, list, tuple) else None
 

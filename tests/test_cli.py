@@ -428,3 +428,12 @@ def test_tables_align_words_left_and_numbers_right() -> None:
 def test_quantities() -> None:
     assert quantity(float("nan"), "m") == "-"
     assert quantity(1234.5678, digits=6) == "1234.57"
+
+
+@pytest.mark.parametrize(
+    ("setting", "nearest"), [("phys-geo.popluation=4", "population"), ("sg-gs.imag_size=64", "image_size")]
+)
+def test_an_unknown_setting_of_a_stage_names_the_nearest(run: Run, tmp_path: Path, setting: str, nearest: str) -> None:
+    code, _, err = run("fit", "capture", "--out", tmp_path / "model", "--set", setting)
+    allowed = next(line for line in err.splitlines() if line.startswith("Allowed: "))
+    assert code == 2 and nearest in allowed.split(", ") and allowed.endswith(f" Did you mean '{nearest}'?")
