@@ -140,5 +140,8 @@ def _named(text: str) -> dict[str, str]:
 
 
 def _summary(result: ImportResult) -> str:
+    from .output import warnings
+
     splits = ", ".join(f"{name} {count}" for name, count in result.splits.items())
-    return f"Wrote {result.capture}: {result.episodes} episodes ({splits}) with {result.samples} poses."
+    wrote = f"Wrote {result.capture}: {result.episodes} episodes ({splits}) with {result.samples} poses."
+    return "\n".join([wrote, *warnings(result.warnings)])

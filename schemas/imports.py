@@ -15,3 +15,5 @@ class ImportResult(FileModel):
     """Number of poses in all tracks."""
     splits: dict[str, int]
     """Number of episodes by split."""
+    warnings: tuple[str, ...] = ()
+    """What the files have and the capture has not."""

@@ -91,6 +91,18 @@ def test_csv_columns_by_their_names(tmp_path: Path, header: str, scale: float, c
     np.testing.assert_allclose(track.quat_wxyz, QUATS, atol=1e-9)
 
 
+def test_columns_that_are_not_read_are_named(tmp_path: Path) -> None:
+    for k in range(3):
+        extra = np.full((len(TIMES), 1 + (k == 1)), 7.0)
+        write_csv(tmp_path / "in" / f"{k}.csv", "t,x,y,z,vx" + ",mood" * (k == 1), TIMES, POSITIONS, extra)
+    result = import_csv(tmp_path / "in", tmp_path / "out")
+    assert [text.partition(". ")[0] for text in result.warnings] == [
+        "columns that were not read: 'vx', 'mood' (in 1 of 3 files)"
+    ]
+    write_csv(tmp_path / "all" / "0.csv", "t,x,y,z", TIMES, POSITIONS)
+    assert import_csv(tmp_path / "all", tmp_path / "whole").warnings == ()
+
+
 def test_csv_gaps_bodies_and_splits(tmp_path: Path) -> None:
     for k in range(10):
         write_csv(tmp_path / "in" / f"{k}.csv", "t,x,y,z", 1000 * TIMES, POSITIONS)
@@ -165,6 +177,9 @@ def test_csv_faults(tmp_path: Path) -> None:
     assert fault(tmp_path, import_csv, tmp_path / "absent").startswith("T/absent: no such file or directory.")
     assert said("").startswith("T/a.csv: no column for 'time' among none.")
     assert said("t,x,y\n0,1,2\n").startswith("T/a.csv: no column for 'pz' among t, x, y.")
+    assert said("0,1,2,3\n0.1,1,2,3\n").startswith(
+        "T/a.csv: the first line holds numbers, so that nothing says what the 4"
+    )
     assert said("t,x,y,z,qw\n").startswith("T/a.csv: no column for 'qx'")
     assert said("t,x,y,z\n").startswith("T/a.csv: no samples.")
     assert said("t,x,y,z\n0,1,2,3\n0.1,1,2\n").startswith("T/a.csv, line 3: 3 values under 4 columns.")

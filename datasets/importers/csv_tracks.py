@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,8 +80,10 @@ def import_csv(
                     f"{', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}",
                 )
         files = track_files(Path(source), (".csv",))
-        tracks = (_tracks(path, columns or {}, units, body) for path in files)
-        return write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
+        left_out: Counter[str] = Counter()
+        tracks = (_tracks(path, columns or {}, units, body, left_out) for path in files)
+        result = write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
+    return result.model_copy(update={"warnings": _left_out_warnings(left_out, len(files))})
 
 
 @dataclass(frozen=True)
@@ -93,13 +96,26 @@ class _Header:
     """Units from the column names."""
 
 
-def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> dict[str, Track]:
+def _left_out_warnings(left_out: Counter[str], files: int) -> tuple[str, ...]:
+    """Return one warning that names the columns that were not read, by how many of the files have them."""
+    if not left_out:
+        return ()
+    places = {name: "" if count == files else f" (in {count} of {files} files)" for name, count in left_out.items()}
+    named = ", ".join(f"{shown(name)}{place}" for name, place in places.items())
+    return (f"columns that were not read: {named}. Read are time, body, px, py, pz and qw, qx, qy, qz.",)
+
+
+def _tracks(
+    path: Path, columns: Mapping[str, str], units: Units, body: str, left_out: Counter[str]
+) -> dict[str, Track]:
+    """Return the tracks of a file, and count its columns that are not read in `left_out`."""
     text = read_text(path)
     first, _, _ = text.partition("\n")
     separator = max(",;\t", key=first.count)
     rows = csv_rows(path, text, separator)
     names = next(rows, (0, []))[1]
     header = _header(path, names, columns, units)
+    left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
     by_body: dict[str, list[list[float]]] = {}
     wanted = [name for name in COLUMNS if name in header.index and name != "body"]
     for line, row in rows:
@@ -125,9 +141,23 @@ def _tracks(path: Path, columns: Mapping[str, str], units: Units, body: str) -> 
 
 def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Units) -> _Header:
     names = [name.strip() for name in found]
+    if names and all(map(_is_number, names)):
+        raise InputDataError(
+            f"{path}: the first line holds numbers, so that nothing says what the {len(names)} columns are.",
+            "a first line with the names of the columns, such as time,px,py,pz,qw,qx,qy,qz.",
+            f"put such a line first, for example: sed -i '1i time,px,py,pz' '{path}'",
+        )
     index = {key: k for key in COLUMNS if (k := _place(path, names, key, columns)) is not None}
     _require_columns(path, names, index)
     return _Header(index, _units(path, names, index, units))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number_of(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _require_columns(path: Path, names: list[str], index: Mapping[str, int]) -> None:
