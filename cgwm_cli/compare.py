@@ -23,7 +23,17 @@ def compare(
     ],
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture with tracks.", show_default=False)],
     split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes to predict.")] = "test",
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The page to write.")] = Path("compare.html"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="The page to write (compare-MODEL-....html beside the first model; one of the same models and capture "
+            "is replaced).",
+            show_default=False,
+        ),
+    ] = None,
     warmup_s: Annotated[
         float, typer.Option("--warmup-s", help="Length of the start that the models may see [s].")
     ] = 0.1,
@@ -43,7 +53,11 @@ def compare(
 
         if not warmup_s > 0:
             raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
-        emit(work(models, capture, split, out, warmup_s, device, overwrite, accept_units), _summary)
+        from ..pipeline.compare.page_file import default_page, shows_the_same
+
+        page = out or default_page(models)
+        overwrite = overwrite or (out is None and shows_the_same(page, models, capture))
+        emit(work(models, capture, split, page, warmup_s, device, overwrite, accept_units), _summary)
 
 
 def _summary(result: CompareResult) -> str:

@@ -28,6 +28,11 @@ def explain(error: Any, arguments: list[str]) -> str:
         verb = next((word for word in arguments[before:] if not word.startswith("-")), "")
         found = f"{command}: there is no command '{verb}'."
         return str(UsageError(found, f"{', '.join(verbs)}.{did_you_mean(verb, verbs)}", todo))
+    parameter = getattr(error, "param", None)
+    if context and type(error).__name__ == "MissingParameter" and getattr(parameter, "nargs", 1) == -1:
+        # of "MODEL... CAPTURE" a single path is taken for the last, although the first was meant
+        needed = [str(one.metavar or one.name) for one in context.command.params if one.param_type_name == "argument"]
+        return str(UsageError(f"{command}: {' and '.join(needed)} are needed; one of them is missing.", todo=todo))
     return str(UsageError(f"{command}: {message}{_nearest_choice(message)}", todo=todo))
 
 

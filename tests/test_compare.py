@@ -11,9 +11,10 @@ import torch
 from cgwm.cli import main
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.tracks import Track, write_tracks
-from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.io.atomic import new_directory, sha256
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.pipeline.compare.error_ladder import Rung, ladder_svg
+from cgwm.pipeline.compare.page_file import default_page, shows_the_same
 from cgwm.pipeline.compare.paired_difference import LEAST_EPISODES, paired_difference
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.compare.stage import Comparison, compare, compare_models
@@ -290,7 +291,7 @@ def refused(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> str:
 def test_bad_input_is_refused(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture, slippery, true = folder / "capture", folder / "slippery", folder / "true"
     out = ["--out", tmp_path / "page.html"]
-    assert "Missing argument" in refused([slippery], capsys)
+    assert "MODEL... and CAPTURE are needed" in refused([slippery], capsys)
     twice = refused([slippery, true, f"{slippery}/", capture, *out], capsys)
     assert "this model is given twice" in twice and "Allowed: each model once." in twice
     assert "no split 'tset'" in refused([slippery, capture, "--split", "tset", *out], capsys)
@@ -320,6 +321,40 @@ def test_an_existing_page_is_told_before_the_work(folder: Path, tmp_path: Path) 
     with pytest.raises(UsageError, match="no page of cgwm, or was changed; --overwrite does not remove it"):
         compare([folder / "nothing"], folder / "capture", out=tmp_path / "page.html", overwrite=True)
     assert (tmp_path / "page.html").read_text() == "mine"
+
+
+def test_the_page_is_beside_the_models_and_in_no_output(folder: Path, tmp_path: Path) -> None:
+    assert default_page([folder / "slippery", folder / "true"]) == folder / "compare-slippery-true.html"
+    assert default_page([Path("m0")]) == Path("compare-m0.html")
+    with new_directory(tmp_path / "dataset", "dataset") as made:
+        (made / "model").mkdir()
+    assert default_page([tmp_path / "dataset" / "model"]) == tmp_path / "compare-model.html"
+    assert default_page([Path("a/m"), Path("b/m")]) == Path("a/compare-a-m-b-m.html")
+
+
+def test_a_page_of_the_same_comparison_is_replaced_without_asking_and_nothing_else(
+    page: Path, folder: Path, tmp_path: Path
+) -> None:
+    models = [folder / "slippery", folder / "true"]
+    assert shows_the_same(page, models, folder / "capture")
+    assert not shows_the_same(page, models[:1], folder / "capture")
+    assert not shows_the_same(page, models[::-1], folder / "capture")
+    assert not shows_the_same(page, models, folder / "another")
+    assert not shows_the_same(tmp_path / "none.html", models, folder / "capture")
+    assert not shows_the_same(tmp_path, models, folder / "capture")
+
+
+def test_the_command_can_be_typed_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = write_capture(tmp_path / "capture", episodes=1)
+    write_model(tmp_path / "m0", truth())
+    page = tmp_path / "compare-m0.html"
+    for _ in range(2):
+        with pytest.raises(SystemExit) as ended:
+            main(["compare", str(tmp_path / "m0"), str(capture), "--quiet"])
+        assert ended.value.code == 0 and page.is_file()
+    page.write_text("mine")
+    assert "exists" in refused([tmp_path / "m0", capture], capsys)
+    assert page.read_text() == "mine"
 
 
 def test_the_summary(result: CompareResult) -> None:

@@ -79,7 +79,7 @@ REWORDED: Mapping[str, str] = {
     r"\.json.*\.(faults\.\d+|failures\.\d+\.text)$": "the faults that `validate` names",
     r"^diagnose\d\.stdout\.json\.sentence$": "the verdict of `diagnose`",
     r"^compare\.stdout\.json\.verdict$": "the verdict of `compare`",
-    r"^compare\.html text in <p\b": "the paragraphs of the comparison page",
+    r"^compare\.html text in <(p|title)\b": "the paragraphs and the title of the comparison page",
 }
 """Texts (a pattern of the place) whose words may differ, with the reason; their numbers may not."""
 ROUNDED: Sequence[tuple[str, float, str]] = (

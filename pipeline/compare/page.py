@@ -11,6 +11,7 @@ from ..report.page import facts, fixed, number, page, paragraph, section, table,
 from ..trajectories.segmentation import CONTACT_S, FLIGHT_S
 from .error_ladder import LADDER_WORDS, error_ladder
 from .model_comparison import ComparedModel
+from .page_file import page_title
 from .paired_difference import LEAST_EPISODES
 from .player import REPLAY_SCRIPT, REPLAY_STYLE, Replay, replay_of
 from .short_horizon_errors import FREEDOMS
@@ -57,7 +58,7 @@ def comparison_html(
         _provenance(result, models),
         f'<script type="application/json" id="replay-data">{_embedded(data)}</script>',
     ]
-    return page(f"cgwm compare: {', '.join(names)}", [part for part in body if part], REPLAY_STYLE, REPLAY_SCRIPT)
+    return page(page_title(names, result.capture), [part for part in body if part], REPLAY_STYLE, REPLAY_SCRIPT)
 
 
 def _embedded(data: object) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from ..segments.release_detection import after_release
 from .frames import footage_of
 from .model_comparison import ComparedModel
 from .page import comparison_html
+from .page_file import short_names
 from .paired_difference import paired_difference
 from .residual_wrenches import wrench_points
 from .short_horizon_errors import short_errors
@@ -162,9 +162,9 @@ def _with_short_predictions(
         prepared: The same episodes, cut into segments once for all models.
         bodies: Names of the free bodies of the first model.
     """
-    compared = []
+    compared, shown = [], short_names([name for name, _ in models])
     with one_torch_thread(), progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
-        for (name, model), short_name, evaluation in zip(models, _short_names(models), evaluations, strict=True):
+        for (name, model), short_name, evaluation in zip(models, shown, evaluations, strict=True):
             # group-specific parameters come from the fit or from the same frames as the fitted states
             world = World.from_model(model)
             flown = after_release(episodes, prepared.released_s)
@@ -216,20 +216,6 @@ def _check(name: str, model: Model, capture: Capture) -> None:
     except InputDataError as error:
         found = error.found if error.found.startswith(name) else f"{name}: {error.found}"
         raise InputDataError(found, error.allowed, error.todo) from None
-
-
-def _short_names(models: Sequence[tuple[str, Model]]) -> list[str]:
-    """Return the shortest ends of the models' paths that distinguish them.
-
-    >>> _short_names([("a/m0", None), ("b/m1", None)]), _short_names([("a/m", None), ("b/m", None)])
-    (['m0', 'm1'], ['a/m', 'b/m'])
-    """
-    parts = [os.path.normpath(name).split(os.sep) for name, _ in models]
-    for length in range(1, max(map(len, parts))):
-        ends = ["/".join(part[-length:]) for part in parts]
-        if len(set(ends)) == len(ends):
-            return ends
-    return [name for name, _ in models]
 
 
 def _pairs(models: Sequence[ComparedModel]) -> list[PairedDifference]:
