@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -116,19 +116,7 @@ def _tracks(
     names = next(rows, (0, []))[1]
     header = _header(path, names, columns, units)
     left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
-    by_body: dict[str, list[list[float]]] = {}
-    wanted = [name for name in COLUMNS if name in header.index and name != "body"]
-    for line, row in rows:
-        if not any(cell.strip() for cell in row):
-            continue
-        if len(row) != len(names):
-            raise InputDataError(
-                f"{path}, line {line}: {len(row)} values under {len(names)} columns.", todo="correct the line."
-            )
-        name = row[header.index["body"]].strip() if "body" in header.index else body
-        if name not in by_body:
-            require_name(name, f"{path}, line {line}" if "body" in header.index else "--body")
-        by_body.setdefault(name, []).append([_number(path, line, row, header, key) for key in wanted])
+    by_body = _samples(path, header, len(names), rows, body)
     if not by_body:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
     tracks = {}
@@ -137,6 +125,26 @@ def _tracks(
         quat = table[:, 4:8] if table.shape[1] > 4 else None
         tracks[name] = header.units.track(f"{path}: {name}", table[:, 0], table[:, 1:4], quat)
     return tracks
+
+
+def _samples(
+    path: Path, header: _Header, width: int, rows: Iterable[tuple[int, list[str]]], body: str
+) -> dict[str, list[list[float]]]:
+    """Return the numbers of the lines by body, in the order of `COLUMNS`; every line has `width` cells."""
+    wanted = [name for name in COLUMNS if name in header.index and name != "body"]
+    by_body: dict[str, list[list[float]]] = {}
+    for line, row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != width:
+            raise InputDataError(
+                f"{path}, line {line}: {len(row)} values under {width} columns.", todo="correct the line."
+            )
+        name = row[header.index["body"]].strip() if "body" in header.index else body
+        if name not in by_body:
+            require_name(name, f"{path}, line {line}" if "body" in header.index else "--body")
+        by_body.setdefault(name, []).append([_number(path, line, row, header, key) for key in wanted])
+    return by_body
 
 
 def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Units) -> _Header:
