@@ -514,7 +514,9 @@ def test_validate_lists_every_fault(root: Path) -> None:
     lines = str(caught.value).replace(str(root), "C").splitlines()
     assert lines[0] == "C: 2 faults."
     assert lines[1].startswith("1. C/images/z.png: the image does not decode")
-    assert any(line.startswith("2. C/tracks/000.csv, line 2: body 'cube', column 'pz_m' is nan.") for line in lines)
+    second = next(k for k, line in enumerate(lines) if line.startswith("2. "))
+    assert lines[second] == "2. C/tracks/000.csv, line 2: body 'cube', column 'pz_m' is nan."
+    assert lines[second + 1].startswith("   Allowed: ") and lines[second + 2].startswith("   Next: ")
 
 
 def test_what_is_no_capture(root: Path, tmp_path: Path) -> None:

@@ -57,7 +57,8 @@ def validate_capture(path: Path | str, accept_units: bool = False) -> Validation
     if len(faults) == 1:
         raise faults[0]
     if faults:
-        listed = "\n".join(f"{number}. {fault}" for number, fault in enumerate(faults, 1))
+        texts = (str(fault).replace("\n", "\n   ") for fault in faults)
+        listed = "\n".join(f"{number}. {text}" for number, text in enumerate(texts, 1))
         raise InputDataError(f"{path}: {len(faults)} faults.\n{listed}", todo="correct them, and validate it again.")
     return ValidationReport(path=str(path), kind="capture", facts=dataclasses.asdict(facts))
 
