@@ -7,6 +7,8 @@ PIP := $(BIN)/python -m pip
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 FILES := $(sort $(shell find cgwm cgwm_cli datasets pipeline schemas -name '*.py' -o -name py.typed -o -name '*.cuh' -o -name '*.js' -o -name '*.css'))
 
+CHECKS = $(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/pyright
+
 .PHONY: help install demo test lint same graph docs results evidence clean force
 
 help:
@@ -28,13 +30,17 @@ demo: install
 	$(BIN)/cgwm demo $(OUT) --overwrite
 
 # One thread a worker: the tensors of tests are too small to share out, and the workers share the cores.
-test: lint
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
+# The checks of the text run meanwhile, one after the other; what they print is shown after the tests.
+test: install
+	@mkdir -p build && rm -f build/lint.log
+	@{ $(CHECKS); } > build/lint.log 2>&1 & checks=$$!; \
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder; tests=$$?; \
+	wait $$checks; checks=$$?; cat build/lint.log; \
+	[ $$tests = 0 ] || echo 'make test: pytest failed' >&2; [ $$checks = 0 ] || echo 'make test: ruff or pyright failed' >&2; \
+	[ $$tests = 0 ] && [ $$checks = 0 ]
 
 lint: install
-	$(BIN)/ruff check
-	$(BIN)/ruff format --check
-	$(BIN)/pyright
+	$(CHECKS)
 
 same: install
 	$(BIN)/python tools/same.py

@@ -6,13 +6,14 @@ The lanes of an environment are fibres that take turns: each runs to its next ex
 from __future__ import annotations
 
 import ctypes
+import platform
 import shutil
 import subprocess
-import tempfile
 from functools import cache
 from pathlib import Path
 
 from cgwm.pipeline.physics.fused.structure import Structure
+from cgwm.pipeline.runtime import kernel_build
 from torch import Tensor
 
 COMPILER = shutil.which("g++")
@@ -106,22 +107,28 @@ extern "C" void run(PARAMETERS) {
 """
 
 
+WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-Wno-clobbered", "-Wno-unused-function")
+# g++ does not see that only pairs of two bodies are faced
+WARNINGS += ("-Wno-unused-parameter", "-Wno-unused-variable", "-Wno-array-bounds")
+
+
 @cache
 def library(structure: Structure, flags: tuple[str, ...] = ("-O2",)) -> ctypes.CDLL:
-    """Build the kernel of a structure."""
+    """Return the kernel of a structure, built now or, of the same source and compiler, by an earlier run of tests."""
     assert COMPILER is not None
-    folder = Path(tempfile.mkdtemp(prefix="fused"))
-    (folder / "rollout.cpp").write_text(SHIM + structure.source(host=True) + ENTRY)
-    command = [COMPILER, "-std=c++17", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]
-    command += ["-Wno-clobbered", "-Wno-unused-function", "-Wno-unused-parameter", "-Wno-unused-variable"]
-    command += ["-Wno-array-bounds", *flags]  # g++ does not see that only pairs of two bodies are faced
-    done = subprocess.run(
-        [*command, "rollout.cpp", "-o", "rollout.so"], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    loaded = ctypes.CDLL(str(folder / "rollout.so"))
-    shutil.rmtree(folder)
-    return loaded
+    source = SHIM + structure.source(host=True) + ENTRY
+    command = [COMPILER, "-std=c++17", "-shared", "-fPIC", *WARNINGS, *flags]
+
+    def build(folder: Path) -> Path:
+        (folder / "rollout.cpp").write_text(source)
+        done = subprocess.run(
+            [*command, "rollout.cpp", "-o", "rollout.so"], cwd=folder, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return folder / "rollout.so"
+
+    recipe = "\n".join((*command, platform.machine(), str(Path(COMPILER).stat().st_mtime_ns), source))
+    return kernel_build.built(recipe, ".so", build, lambda file: ctypes.CDLL(str(file)))
 
 
 def run(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
