@@ -1,0 +1,234 @@
+"""Runs of tests on mutants: copies of the tree, processes, results and the report."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from changes import FOLDERS, Mutant, applied, sample
+from line_map import environment_of
+
+TEST_START_S, PATIENCE = 60.0, 8.0
+"""A run may take so long [s], and so many times what its tests took when they were mapped."""
+PRELOADED = (
+    "torch",
+    "numpy",
+    "scipy.optimize",
+    "scipy.spatial",
+    "mujoco",
+    "cv2",
+    "h5py",
+    "pydantic",
+    "typer",
+    "pytest",
+)
+"""Imported once, before the processes of the mutants are forked."""
+
+
+class Slot:
+    """A copy of the tree in which one mutant at a time is tested."""
+
+    def __init__(self, root: Path, folder: Path) -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        self.folder, self.tree = folder, folder / "tree"
+        skipped = shutil.ignore_patterns(".git", ".venv", "build", "out", "__pycache__", ".links", ".*_cache")
+        shutil.copytree(root, self.tree, ignore=skipped, symlinks=True)
+        (self.tree / ".venv").symlink_to(Path(sys.prefix))
+        if (root.parent / "shared").exists():
+            (folder / "shared").symlink_to((root.parent / "shared").resolve())
+        self.environment = environment_of(self.tree)
+        self.pid, self.count, self.began, self.limit = 0, 0, 0.0, 0.0
+        self.mutant: Mutant | None = None
+        self.before = b""
+
+    def begin(self, mutant: Mutant | None, tests: Sequence[str], limit: float) -> None:
+        """Apply a mutant, and run tests in a process of its own until the first fails."""
+        if mutant is not None:
+            path = self.tree / mutant.path
+            self.before = path.read_bytes()
+            path.write_bytes(applied(self.before, mutant))
+        self.mutant, self.count, self.began, self.limit = mutant, len(tests), time.monotonic(), limit
+        stop = ["-x"] if mutant is not None else []
+        self.words = ["-q", *stop, "-p", "no:cacheprovider", "-p", "no:xdist", f"--rootdir={self.tree}", *tests]
+        self.words += [f"--basetemp={self.folder / 'tmp'}", "-rfE", "--tb=no", "-W", "ignore"]
+        self.words += ["-c", str(self.tree / "pyproject.toml")]
+        self.pid = os.fork()
+        if self.pid == 0:
+            self.child()
+
+    def child(self) -> None:
+        """Run pytest in the forked process; the test's own processes belong to its group."""
+        code = 70
+        try:
+            os.setsid()
+            os.environ.update(self.environment)
+            os.chdir(self.tree)
+            sys.path[:0] = [str(self.tree / ".links")]
+            sys.dont_write_bytecode = True
+            log = os.open(self.folder / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(log, 1), os.dup2(log, 2)
+            import pytest
+
+            code = int(pytest.main(self.words))
+            sys.stdout.flush()
+        finally:
+            os._exit(code)
+
+    def ended(self) -> tuple[int | None, float] | None:
+        """Return exit code (None after the time limit) and seconds of a run that is over; None while it goes on."""
+        pid, status = os.waitpid(self.pid, os.WNOHANG)
+        seconds = time.monotonic() - self.began
+        if not pid and seconds < self.limit:
+            return None
+        try:
+            os.killpg(self.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        if not pid:
+            os.waitpid(self.pid, 0)
+        if self.mutant is not None:
+            (self.tree / self.mutant.path).write_bytes(self.before)
+        self.pid = 0
+        return (os.waitstatus_to_exitcode(status) if pid else None), seconds
+
+    def failures(self) -> list[str]:
+        """Return the tests that the log names as failed."""
+        text = (self.folder / "log").read_text(errors="replace")
+        return re.findall(r"^(?:FAILED|ERROR) (tests/.+?)(?: - .*)?$", text, re.MULTILINE)
+
+
+def chosen(tests: dict[str, Any], covering: Sequence[str], done: set[str], budget: float) -> list[str]:
+    """Return the quickest tests of a line that have not run yet, of at most so many seconds, and one at least."""
+    found, total = [], 0.0
+    for name in sorted((name for name in covering if name not in done), key=lambda name: tests[name]["seconds"]):
+        total += tests[name]["seconds"] + 0.05
+        if found and (total > budget or len(found) >= 80):
+            break
+        found.append(name)
+    return found
+
+
+def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Test the mutants of the sample that have no result yet, and write the report."""
+    tests = json.loads((work / "map.json").read_text())
+    by_line: dict[tuple[str, int], list[str]] = defaultdict(list)
+    for name, entry in tests.items():
+        for path, lines in entry["lines"].items():
+            for line in lines:
+                by_line[path, line].append(name)
+    mutants = sample(root, options.count, options.seed, options.folders)
+    kept = work / f"results-{options.seed}.json"
+    results: dict[str, dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else {}
+    slots = [Slot(root, work / "slots" / str(k)) for k in range(options.jobs)]
+    for name in PRELOADED:
+        __import__(name)
+    bad: set[str] = set(options.without)
+    while True:
+        test_all(mutants, results, (tests, by_line, bad), slots, options)
+        kept.write_text(json.dumps(results, indent=1))
+        wrong = control(results, tests, slots) - bad
+        if not wrong:
+            break
+        print(f"fail without any mutant, and no longer count: {sorted(wrong)}", flush=True)
+        bad |= wrong
+        results = {key: value for key, value in results.items() if value.get("killer") not in wrong}
+    shutil.rmtree(work / "slots", ignore_errors=True)
+    return report(mutants, results, work)
+
+
+def key_of(mutant: Mutant) -> str:
+    """Return what tells a mutant apart from all others of the same code."""
+    return f"{mutant.path}:{mutant.line}:{mutant.name}:{mutant.begin}"
+
+
+def test_all(
+    mutants: Sequence[Mutant],
+    results: dict[str, dict[str, Any]],
+    known: tuple[dict[str, Any], dict[tuple[str, int], list[str]], set[str]],
+    slots: Sequence[Slot],
+    options: argparse.Namespace,
+) -> None:
+    """Fill in the results that are missing, or of which tests are left that the budget allows now."""
+    tests, by_line, bad = known
+    waiting = []
+    for mutant in mutants:
+        entry = results.setdefault(key_of(mutant), asdict(mutant) | {"state": "new", "seconds": 0.0, "ran": []})
+        covering = [name for name in by_line.get((mutant.path, mutant.line), ()) if name not in bad]
+        spent = sum(tests[name]["seconds"] for name in entry["ran"] if name in tests)
+        names = chosen(tests, covering, set(entry["ran"]), options.budget - spent)
+        if not covering:
+            entry["state"] = "not run by a test"
+        elif entry["state"] == "new" or (entry["state"] == "survived" and names and spent < 0.9 * options.budget):
+            waiting.append((mutant, names))
+    began, total = time.monotonic(), len(waiting)
+    while waiting or any(slot.pid for slot in slots):
+        for slot in slots:
+            if slot.pid and (over := slot.ended()) is not None:
+                assert slot.mutant is not None
+                take(results[key_of(slot.mutant)], over, slot)
+            if not slot.pid and waiting:
+                mutant, names = waiting.pop(0)
+                expected = sum(tests[name]["seconds"] for name in names)
+                results[key_of(mutant)]["ran"] += names
+                slot.begin(mutant, names, TEST_START_S + PATIENCE * expected)
+                if len(waiting) % 20 == 0:
+                    print(f"{total - len(waiting)} of {total} begun, {time.monotonic() - began:.0f} s", flush=True)
+        time.sleep(0.02)
+
+
+def take(entry: dict[str, Any], over: tuple[int | None, float], slot: Slot) -> None:
+    """Write down how a run of tests ended."""
+    code, seconds = over
+    entry["seconds"] = round(entry["seconds"] + seconds, 2)
+    entry["state"] = {None: "timeout", 0: "survived"}.get(code, "killed")
+    if entry["state"] == "killed":  # where the file of tests cannot be read at all, the first that should have run
+        entry["killer"] = next((name for name in slot.failures() if name in entry["ran"]), entry["ran"][-slot.count])
+
+
+def control(results: dict[str, dict[str, Any]], tests: dict[str, Any], slots: Sequence[Slot]) -> set[str]:
+    """Run the tests that killed on the unchanged code; return those that fail there, too."""
+    killers = sorted({entry["killer"] for entry in results.values() if entry.get("killer") in tests})
+    parts = [killers[k :: len(slots)] for k in range(len(slots))]
+    busy = [(slot, part) for slot, part in zip(slots, parts, strict=True) if part]
+    for slot, part in busy:
+        slot.begin(None, part, TEST_START_S + PATIENCE * sum(tests[name]["seconds"] for name in part))
+    wrong: set[str] = set()
+    for slot, _ in busy:
+        while slot.ended() is None:
+            time.sleep(0.05)
+        wrong |= set(slot.failures())
+    return wrong
+
+
+def report(mutants: Sequence[Mutant], results: dict[str, dict[str, Any]], work: Path) -> dict[str, Any]:
+    """Write and print the share killed by folder, and the survivors."""
+    entries = [results[key_of(mutant)] for mutant in mutants]
+    by_folder: dict[str, Counter[str]] = defaultdict(Counter)
+    for entry in entries:
+        folder = next(f for f in FOLDERS if entry["path"].startswith(f + "/"))
+        by_folder[folder][entry["state"]] += 1
+        by_folder["all"][entry["state"]] += 1
+    table = {
+        name: dict(states) | {"share_killed": round((states["killed"] + states["timeout"]) / states.total(), 3)}
+        for name, states in sorted(by_folder.items())
+    }
+    alive = [entry for entry in entries if entry["state"] not in ("killed", "timeout")]
+    found = {"mutants": len(entries), "folders": table, "alive": alive}
+    found["cpu_minutes"] = round(sum(entry["seconds"] for entry in entries) / 60, 1)
+    (work / "report.json").write_text(json.dumps(found, indent=1))
+    for name, line in table.items():
+        print(f"{name}: {line}")
+    for entry in alive:
+        print(f"{entry['state']}: {entry['path']}:{entry['line']}: {entry['name']}")
+    return found
