@@ -25,6 +25,7 @@ from worlds import ball_body, box_body, state_of, world_of
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TESTS = ("001", "002")
 NAMES = {"tasks": ("fall",), "objects": ("box",), "materials": ("wood",)}
+pytestmark = pytest.mark.evidence
 FEW = {"generations": 3, "population": 16, "iterations": 2}
 
 
@@ -94,7 +95,6 @@ def frozen(bench, blind, judge):
     return errors(judge, bench.zeros.Frozen().fit(blind, None))
 
 
-@pytest.mark.evidence
 def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, judge, frozen, monkeypatch):
     monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 2)
     fitted = bench.cgwm_default.Cgwm("cgwm", FEW).fit(blind, None)
@@ -107,7 +107,6 @@ def test_cgwm_beats_what_does_not_learn_without_tracks_or_truth(bench, blind, ju
     assert set(judge.parameter_errors(fitted.record["parameters"])) >= {"friction"}
 
 
-@pytest.mark.evidence
 @pytest.mark.parametrize("which", ["mujoco", "pinwm", "paper"])
 def test_rivals_learn_from_images_alone(bench, blind, judge, frozen, poses, monkeypatch, which):
     for module in (bench.cem_mujoco, bench.pinwm, bench.paper):

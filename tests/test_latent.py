@@ -30,7 +30,7 @@ try:
 finally:
     sys.path.remove(str(BENCHMARKS))
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.evidence]
 FRAMES, RATE = 5, 30.0
 SIZE = (64, 48)
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -9,9 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 from cgwm.datasets import Capture, sha256, synthetic
+from cgwm.datasets.synthetic import fall as fall_scene
 from cgwm.datasets.synthetic import make_scene, plan_scene, read_truth
 from cgwm.datasets.synthetic.dynamics import GRAVITY, STEPS_PER_S, matrix_from_quat, rest_pose, simulate, smooth_path
 from cgwm.datasets.synthetic.objects import FAMILIES, facet_normals, make_object, resting_down, volume_moments
+from cgwm.datasets.synthetic.plan import ScenePlan
 from cgwm.datasets.synthetic.record import Set, build_set, frame_of
 from cgwm.datasets.synthetic.sensor import READ_NOISE, SHOT_NOISE, expose
 from cgwm.schemas import CaptureManifest, UsageError, read_toml
@@ -19,8 +20,12 @@ from cgwm.schemas import CaptureManifest, UsageError, read_toml
 SMALL = {"photo_size": (160, 120), "video_size": (96, 72), "photos": 4}
 
 
-planned = cache(plan_scene)
-"""A plan takes ten seconds: tests share those of the scenes fall 2 and push 1."""
+@cache
+def planned(name: str, seed: int) -> ScenePlan:
+    """Plan a scene, once for all tests; the first toss that stays in view will do, where a search takes 15 s."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fall_scene, "unpredictability", lambda *_: 0.0)
+        return plan_scene(name, seed)
 
 
 def made(name: str, directory: Path, seed: int) -> Path:
@@ -102,7 +107,7 @@ def test_truth_slides_by_coulombs_law_in_an_oblique_impact(along_m_s: float) -> 
     "seed", [2, *(pytest.param(seed, marks=pytest.mark.evidence) for seed in range(len(FAMILIES)) if seed != 2)]
 )
 def test_truth_flies_as_gravity_says_before_contact(seed: int) -> None:
-    plan = planned("fall", seed)
+    plan = planned("fall", seed) if seed == 2 else plan_scene("fall", seed)
     for episode in plan.episodes:
         motion = episode.motion
         assert motion.first_contact is not None and 0.1 < motion.first_contact < 0.3
@@ -148,18 +153,21 @@ def test_tests_are_longer_end_near_rest_and_differ(fall: Path) -> None:
             assert abs(starts[i] @ starts[j]) < np.cos(np.radians(35) / 2)
 
 
-def test_capture_opens_and_manifest_validates(fall: Path, push: Path) -> None:
-    for path in (fall, push):
-        capture = Capture.open(path)
-        assert capture.manifest == read_toml(path / "capture.toml", CaptureManifest)
-        assert capture.episodes("train") == ["000"]
-        assert capture.episodes("test") == ["001", "002", "003"]
-        assert len(capture.photos()) == 4 and capture.photo("000.jpg").shape == (120, 160, 3)
-        assert all(body.shape is None for body in capture.manifest.bodies if body.motion == "free")
-        for camera in ("left", "right"):
-            assert capture.video_frames(camera, "000").shape == (15, 72, 96, 3)
-    assert Capture.open(push).body("fingertip").motion == "driven"
-    assert not (fall / "cameras.json").exists()
+@pytest.mark.parametrize("name", ["fall", pytest.param("push", marks=pytest.mark.evidence)])
+def test_capture_opens_and_manifest_validates(name: str, request: pytest.FixtureRequest) -> None:
+    path = request.getfixturevalue(name)
+    capture = Capture.open(path)
+    assert capture.manifest == read_toml(path / "capture.toml", CaptureManifest)
+    assert capture.episodes("train") == ["000"]
+    assert capture.episodes("test") == ["001", "002", "003"]
+    assert len(capture.photos()) == 4 and capture.photo("000.jpg").shape == (120, 160, 3)
+    assert all(body.shape is None for body in capture.manifest.bodies if body.motion == "free")
+    for camera in ("left", "right"):
+        assert capture.video_frames(camera, "000").shape == (15, 72, 96, 3)
+    assert [body.name for body in capture.manifest.bodies if body.motion == "driven"] == ["fingertip"] * (
+        name == "push"
+    )
+    assert not (path / "cameras.json").exists()
 
 
 def test_measured_tracks_scatter_about_the_truth_as_stated(fall: Path) -> None:
@@ -179,6 +187,7 @@ def test_measured_tracks_scatter_about_the_truth_as_stated(fall: Path) -> None:
     assert (np.array(angles) / 2).std() == pytest.approx(stated.rotation_std_rad, rel=0.1)
 
 
+@pytest.mark.evidence
 def test_push_moves_turns_and_releases_the_object(push: Path) -> None:
     truth, capture = read_truth(push), Capture.open(push)
     for name, motion in truth.episodes.items():
@@ -283,6 +292,7 @@ def test_a_frame_drawn_in_its_window_equals_one_drawn_whole(film_set: Set) -> No
     np.testing.assert_allclose(color, np.mean([view.color for view in views], axis=0), atol=1e-5)
 
 
+@pytest.mark.evidence
 def test_photos_have_features_and_markers_where_the_manifest_says(film_set: Set) -> None:
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
     seen, errors = 0, []
@@ -303,15 +313,15 @@ def test_photos_have_features_and_markers_where_the_manifest_says(film_set: Set)
     assert np.median(np.linalg.norm(offsets, axis=1)) < 1.0
 
 
-@pytest.mark.parametrize("make", [made, pytest.param(make_scene, marks=pytest.mark.evidence)])
-def test_same_arguments_same_bytes(fall: Path, tmp_path: Path, make: Callable[..., Path]) -> None:
-    """From one plan, and from one that is planned anew."""
-    assert sha256(make("fall", tmp_path / "again", seed=2, **(SMALL if make is make_scene else {}))) == sha256(fall)
+def test_same_arguments_same_bytes(fall: Path, tmp_path: Path) -> None:
+    """From one plan; `test_a_plan_repeats_itself` has the plan."""
+    assert sha256(made("fall", tmp_path / "again", seed=2)) == sha256(fall)
 
 
-def test_a_plan_repeats_itself(push: Path) -> None:
-    again = plan_scene("push", 1)
-    for one, other in zip(planned("push", 1).episodes, again.episodes, strict=True):
+@pytest.mark.parametrize("name", ["fall", pytest.param("push", marks=pytest.mark.evidence)])
+def test_a_plan_repeats_itself(name: str) -> None:
+    again = planned.__wrapped__(name, 2)
+    for one, other in zip(planned(name, 2).episodes, again.episodes, strict=True):
         np.testing.assert_array_equal(one.motion.qpos, other.motion.qpos)
 
 
@@ -319,7 +329,7 @@ def test_the_truth_is_that_of_the_plan_and_seeds_differ(fall: Path) -> None:
     plan, truth = planned("fall", 2), read_truth(fall)
     assert truth.object.mass_kg == plan.solid.mass
     np.testing.assert_allclose(truth.episodes["002"].position_m[0], plan.episodes[2].motion.qpos[30, :3])
-    assert planned("push", 1).contact != plan.contact
+    assert planned("fall", 0).contact != plan.contact
 
 
 def test_noise_has_the_stated_variance() -> None:

@@ -11,7 +11,7 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.rendering.render import render
 from cgwm.pipeline.sg_gs import bodies
-from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.depth_refinement import Refinement, refine
 from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.schemas import InputDataError, SplatConfig
 
@@ -110,8 +110,20 @@ def capture(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def result(capture):
-    return fit_scene(capture, CONFIG)
+def refined():
+    """The refined hulls of the fit to `capture`."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(capture, refined):
+    def keep(*arguments):
+        refined.append(refine(*arguments))
+        return refined[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bodies, "refine", keep)
+        return fit_scene(capture, CONFIG)
 
 
 def test_the_fit_shows_photos_that_it_did_not_see(capture, result):
@@ -155,7 +167,8 @@ def test_geometry_comes_first_on_request_or_where_maps_are(capture, result, tmp_
     assert with_maps.record["ball"]["joint"] is False
 
 
-def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result):
+def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result, refined, monkeypatch):
+    monkeypatch.setattr(bodies, "refine", lambda *_: refined[0])  # of the same photos, which `result` has compared
     config = CONFIG.model_copy(update={"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1})
     adapted = fit_scene(capture, config)
     scene = adapted.scene

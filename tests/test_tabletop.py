@@ -18,6 +18,7 @@ from cgwm.schemas import InputDataError, UsageError
 from scipy.spatial import ConvexHull
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+pytestmark = pytest.mark.evidence
 SMALL = {"tests": 1, "video_size": (96, 72), "photo_size": (96, 72), "photos": 4}
 
 

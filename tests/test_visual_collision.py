@@ -11,7 +11,7 @@ from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
-from test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, write_manifest
+from test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, quick, write_manifest  # noqa: F401 (a fixture)
 
 VISUAL = CONFIG.model_copy(update={"collision": "visual", "iterations": 8})
 
@@ -37,7 +37,7 @@ def test_the_visual_spheres_are_the_colliding_ones(model):
     assert "to_visual" not in record
 
 
-def test_a_distilled_set_is_compared_with_what_is_seen(tmp_path):
+def test_a_distilled_set_is_compared_with_what_is_seen(tmp_path, quick):  # noqa: F811
     result = fit_scene(make_capture(tmp_path / "tiny"), VISUAL.model_copy(update={"collision": "distilled"}))
     ball, record = result.bodies["ball"], result.record["ball"]["collision"]
     assert record["set"] == "distilled"
@@ -64,7 +64,7 @@ def test_without_photos_there_is_nothing_visual_to_collide(tmp_path):
         fit_scene(Capture.open(tmp_path / "tracks_only", check=False), VISUAL)
 
 
-def test_nothing_stands_before_a_body_whose_surroundings_are_unknown(tmp_path):
+def test_nothing_stands_before_a_body_whose_surroundings_are_unknown(tmp_path, quick):  # noqa: F811
     make_capture(tmp_path / "tiny")
     (tmp_path / "tiny" / "capture.toml").write_text('format = "cgwm-capture/1"\n[[bodies]]\nname = "ball"\n')
     result = fit_scene(Capture.open(tmp_path / "tiny", check=False), VISUAL)
