@@ -125,7 +125,10 @@ def test_few_frames_tell_nothing() -> None:
     assert estimate_noise_model(prepared.observations, []) == (WHITE, (None, None))
 
 
-@pytest.mark.parametrize("change", [lasting(0.8, 5), smoothed], ids=["lasting", "smoothed"])
+@pytest.mark.parametrize(
+    "change",
+    [pytest.param(lasting(0.8, 5), id="lasting", marks=pytest.mark.evidence), pytest.param(smoothed, id="smoothed")],
+)
 def test_they_are_no_effect_and_hide_none(change: Callable[[Track], Track]) -> None:
     prepared, world = ready("ball", {}, change)
     assert prepared.noise_model != WHITE

@@ -15,6 +15,7 @@ from cgwm.pipeline.physics.effects.catalogue import list_effects, new_effect, sh
 from cgwm.pipeline.physics.effects.registry import BUILT_IN, FLIGHT_ALIASES
 from cgwm.schemas import UsageError
 from cgwm.schemas.effects import EffectCard, EffectList
+from commands import cgwm
 from worlds import ball_body, batch, state_of, times, world_of
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "effects.md"
@@ -163,14 +164,8 @@ def quoted(text: str) -> list[str]:
 # The command
 
 
-def cgwm(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "cgwm", "effects", *map(str, arguments)], capture_output=True, text=True, check=False
-    )
-
-
 def test_the_list_has_every_effect() -> None:
-    done = cgwm("list", "--json")
+    done = cgwm("effects", "list", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     found = EffectList.model_validate_json(done.stdout)
     assert tuple(card.name for card in found.effects) == BUILT_IN
@@ -178,7 +173,7 @@ def test_the_list_has_every_effect() -> None:
 
 
 def test_an_effect_is_shown_with_what_it_can_be_mistaken_for() -> None:
-    done = cgwm("show", "ground_magnet")
+    done = cgwm("effects", "show", "ground_magnet")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines() == [
         "ground_magnet: An attraction by the ground, magnetic or electrostatic, that fades with the height.",
@@ -193,7 +188,7 @@ def test_an_effect_is_shown_with_what_it_can_be_mistaken_for() -> None:
         "  in free flight the same as  no other effect",
         "  source                      a stand-in with one range for the fields of magnets and charges",
     ]
-    card = EffectCard.model_validate_json(cgwm("show", "wind", "--json").stdout)
+    card = EffectCard.model_validate_json(cgwm("effects", "show", "wind", "--json").stdout)
     assert card.aliases == (
         "at a fixed drag: gravity_tilt",
         "at a fixed drag: frame_tilt",
@@ -204,7 +199,7 @@ def test_an_effect_is_shown_with_what_it_can_be_mistaken_for() -> None:
 
 
 def test_an_unknown_effect_ends_the_command_with_2() -> None:
-    done = cgwm("show", "winde", "--json")
+    done = cgwm("effects", "show", "winde", "--json")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("there is no effect 'winde'.\n")
     assert "Did you mean 'wind'?" in done.stderr
@@ -212,7 +207,7 @@ def test_an_unknown_effect_ends_the_command_with_2() -> None:
 
 def test_the_template_runs_as_it_stands(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
-    done = cgwm("new", path)
+    done = cgwm("effects", "new", path)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == f"Wrote {path}.\nNext: edit it, then cgwm effects show {path}:MyEffect\n"
     assert show_effect(f"{path}:MyEffect").phase == "flight"

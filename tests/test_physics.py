@@ -121,7 +121,7 @@ def test_rollouts_of_a_batch_do_not_see_each_other() -> None:
     for other in (((0, 0, 0.2), UP, (0, 0, 0), (0, 0, 0)), ((0, 0, 0.03), UP, (0.5, 0, 0), (0, 0, 0))):
         b = state_of(other)
         both = State.joined(a, b)
-        alone, together = (simulate(world_of(box_body()), start, times(0.6)).position_m for start in (a, both))
+        alone, together = (simulate(world_of(box_body()), start, times(0.25)).position_m for start in (a, both))
         torch.testing.assert_close(together[:1], alone, atol=1e-12, rtol=0)
 
 
