@@ -2,7 +2,7 @@
 
     python benchmarks/render_results.py                 # writes docs/results.md
     python benchmarks/render_results.py record tests --figure "CUDA tests passed" --value "73 of 73" --target all
-        --met yes --command "pytest tests/test_fused.py" --machine "H100, 16 cores"
+        --met yes --command "pytest tests/pipeline/physics/fused/test_fused.py" --machine "H100, 16 cores"
 
 Each claim is a file CLAIM.jsonl with one line for each figure; `results/claims.toml` gives their order, titles and
 explanations. A figure stays valid until it is measured again: `record` then replaces the line of the same name and

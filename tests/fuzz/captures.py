@@ -41,7 +41,7 @@ def tracks(root: Path) -> None:
     """Write a capture of three throws of a cube, and a model of it."""
     from cgwm.datasets.capture.tracks import write_tracks
     from cgwm.datasets.models.model import write_model
-    from thrown_cube import measured, thrown, truth
+    from helpers.thrown_cube import measured, thrown, truth
 
     capture = root / "capture"
     (capture / "tracks").mkdir(parents=True)
@@ -86,8 +86,8 @@ def photographed(root: Path) -> None:
     from cgwm.datasets.models.model import write_model
     from cgwm.pipeline.rendering.label_renderer import LabelRenderer
     from cgwm.schemas import CamerasFile, PosedImage, Scale
-    from small_model import HALF
-    from tiny_capture import camera, tiny_model
+    from helpers.small_model import HALF
+    from helpers.tiny_capture import camera, tiny_model
 
     capture = root / "capture"
     views = {f"walk/{k}.png": camera(60.0 * k) for k in range(6)}
@@ -167,7 +167,7 @@ def with_colmap(root: Path, binary: bool = False) -> None:
 
 def filmed(root: Path) -> None:
     """Write a capture of a cube that two cameras film, with masks, and a model to fit from."""
-    from tiny_capture import thrown, with_tracks, write_tiny_capture
+    from helpers.tiny_capture import thrown, with_tracks, write_tiny_capture
 
     write_tiny_capture(root / "capture")
     with_tracks(root / "capture", thrown())
@@ -192,9 +192,10 @@ def video_file(root: Path) -> None:
 
 def shaped(root: Path) -> None:
     """Write captures whose bodies have their shape in files: .obj, .stl and .ply."""
-    import test_meshes
     from cgwm.datasets.shapes.ply import write_splats
-    from small_model import collision_splats
+    from helpers.small_model import collision_splats
+
+    from datasets.shapes import test_meshes
 
     tracks(root)
     capture = root / "capture"
@@ -234,7 +235,7 @@ def write_toss_capture(
     from cgwm.datasets.capture.tracks import Track, write_tracks
     from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
     from cgwm.pipeline.physics import State, simulate
-    from worlds import F64, box_body, law, world_of
+    from helpers.worlds import F64, box_body, law, world_of
 
     rng, half, count = np.random.default_rng(3), 0.05 * size, 6
     normal = np.array([np.sin(np.radians(ramp_deg)), 0.0, np.cos(np.radians(ramp_deg))])

@@ -13,7 +13,7 @@ def model(root: Path) -> None:
     """Write a model with two bodies, an effect, correlations, a light and an exposure."""
     from cgwm.datasets.models.model import write_model
     from cgwm.schemas import Correlation, EffectModel, Exposure, Light, Solver
-    from small_model import small_model, table_splats
+    from helpers.small_model import small_model, table_splats
 
     made = small_model(driven=True)
     change = {
@@ -34,7 +34,7 @@ def custom(root: Path) -> None:
     """Write a stranger's model with an effect of its own, which leaves a witness when it is run."""
     from cgwm.datasets.models.model import write_model
     from cgwm.schemas import EffectModel
-    from small_model import small_model
+    from helpers.small_model import small_model
 
     text = Path(__file__).parents[2].joinpath("pipeline/physics/effects/template.py").read_text(encoding="utf-8")
     text = text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")
@@ -64,7 +64,7 @@ def merged(root: Path) -> None:
     from cgwm.pipeline.synthesize import merge
     from cgwm.pipeline.synthesize.shards import synthesize_shards
     from cgwm.schemas import SynthesizeConfig
-    from small_model import write_small_model
+    from helpers.small_model import write_small_model
 
     write_small_model(root / "model")
     config = SynthesizeConfig(rollouts=2, duration_s=0.2, width=48, height=36, shards=2)
@@ -76,7 +76,7 @@ def synthesize_small(root: Path, small: bool) -> None:
     """Write a model and a dataset of two rollouts of it; small: without images."""
     from cgwm.pipeline.synthesize import synthesize
     from cgwm.schemas import SynthesizeConfig
-    from small_model import write_small_model
+    from helpers.small_model import write_small_model
 
     write_small_model(root / "model", visible=not small)
     synthesize(root / "model", root / "dataset", SynthesizeConfig(rollouts=2, duration_s=0.2, width=48, height=36))

@@ -14,7 +14,7 @@ from .models import synthesize_small
 
 
 def _motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    from thrown_cube import measured, thrown
+    from helpers.thrown_cube import measured, thrown
 
     track = measured(*thrown(0), 0)
     assert track.quat_wxyz is not None
@@ -60,14 +60,14 @@ def hdf5(root: Path) -> None:
 
 def rosbag(root: Path) -> None:
     """Write a ROS bag of poses."""
-    import test_track_importers
+    from datasets.importers import test_track_importers
 
     test_track_importers.write_bag(root / "bag", {"/pose": "geometry_msgs/msg/PoseStamped"})
 
 
 def contactnets_npz(root: Path) -> None:
     """Write tosses as one .npz."""
-    import test_contactnets
+    from datasets.importers import test_contactnets
 
     (root / "tosses").mkdir()
     test_contactnets.write_npz(root / "tosses" / "a.npz", [0, 1, 2])
@@ -75,21 +75,21 @@ def contactnets_npz(root: Path) -> None:
 
 def contactnets_pt(root: Path) -> None:
     """Write tosses as .pt files."""
-    import test_contactnets
+    from datasets.importers import test_contactnets
 
     test_contactnets.write_pt(root / "tosses", [0, 1, 2])
 
 
 def pinwm(root: Path) -> None:
     """Write pushes as PIN-WM publishes them."""
-    import test_pinwm
+    from datasets.importers import test_pinwm
 
     test_pinwm.write_source(root / "pushes")
 
 
 def jugglebot(root: Path) -> None:
     """Write throws in both of Jugglebot's formats."""
-    import test_track_importers
+    from datasets.importers import test_track_importers
 
     made = [test_track_importers.thrown(seed) for seed in (0, 1)]
     rows = np.concatenate([np.c_[time + 1 / 300, position] for time, position in made])
@@ -105,7 +105,7 @@ def jugglebot(root: Path) -> None:
 
 def balldrops(root: Path) -> None:
     """Write falling balls as they were published."""
-    import test_track_importers
+    from datasets.importers import test_track_importers
 
     test_track_importers.write_drops(root / "drops")
 
@@ -113,7 +113,8 @@ def balldrops(root: Path) -> None:
 def calibration(root: Path) -> None:
     """Write nine photos of a floor with markers."""
     import cv2
-    import test_calibrate as scene
+
+    from pipeline.calibrate import test_calibrate as scene
 
     folder = root / "capture" / "images"
     folder.mkdir(parents=True)

@@ -135,7 +135,7 @@ class Changes(ast.NodeVisitor):
     def visit_BoolOp(self, node: ast.BoolOp) -> None:
         old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
         if len(node.values) == 2:
-            self.between(node, "condition", *node.values, old, new)
+            self.between(node, "condition", node.values[0], node.values[1], old, new)
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:

@@ -77,7 +77,8 @@ class Slot:
             sys.path[:0] = [str(self.tree / ".links")]
             sys.dont_write_bytecode = True
             log = os.open(self.folder / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(log, 1), os.dup2(log, 2)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
             import pytest
 
             code = int(pytest.main(self.words))

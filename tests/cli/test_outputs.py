@@ -1,0 +1,190 @@
+"""`--overwrite` replaces an output of cgwm of the same kind, and never an input or anything else of the user's."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from cgwm.datasets.importers.csv_tracks import import_csv
+from cgwm.datasets.importers.hdf5_tracks import import_hdf5
+from cgwm.datasets.models.model import write_model
+from cgwm.pipeline.compare import compare
+from cgwm.pipeline.demo import run_demo, run_mystery
+from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.export import export
+from cgwm.pipeline.fit import fit
+from cgwm.pipeline.physics.effects.catalogue import new_effect
+from cgwm.pipeline.synthesize import merge, synthesize
+from cgwm.pipeline.synthesize.shards import synthesize_shards
+from cgwm.schemas import CgwmError, SynthesizeConfig, UsageError
+from helpers.small_model import small_model
+
+TINY = SynthesizeConfig(rollouts=2, duration_s=0.1, width=20, height=16)
+
+
+@pytest.fixture
+def things(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with one of everything: recordings, a capture, a model, datasets, exports, and the user's own."""
+    root = tmp_path / "data"
+    (root / "csv").mkdir(parents=True)
+    for name in ("a", "b", "c"):
+        rows = [f"{t:.3f},0,0,{1 - 4.9 * t * t:.6f},1,0,0,0" for t in np.arange(0, 0.3, 0.01)]
+        (root / "csv" / f"{name}.csv").write_text("\n".join(["time_s,x_m,y_m,z_m,qw,qx,qy,qz", *rows]) + "\n")
+    with h5py.File(root / "poses.h5", "w") as file:
+        file["time_s"], file["position_m"] = np.arange(5) / 10, np.zeros((5, 3))
+        file["quat_wxyz"] = np.tile([1.0, 0, 0, 0], (5, 1))
+    import_csv(root / "csv", root / "capture")
+    write_model(root / "model", small_model())
+    synthesize(root / "model", root / "dataset", TINY)
+    synthesize_shards(root / "model", root / "shards", TINY.model_copy(update={"shards": 2}))
+    merge([root / "shards"])
+    (root / "docs").mkdir()
+    (root / "docs" / "thesis.txt").write_text("years of work")
+    (root / "notes.html").write_text("<!doctype html>mine")
+    (root / "mine.py").write_text("mine")
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    yield root
+
+
+def content(root: Path) -> dict[str, str]:
+    found = {}
+    for path in sorted(root.rglob("*")):
+        name = path.relative_to(root).as_posix()
+        found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "a folder"
+    return found
+
+
+COMMANDS: dict[str, tuple[Callable[[Path, Path], object], set[str]]] = {
+    "fit": (lambda root, out: fit(root / "capture", out, overwrite=True), {"model"}),
+    "import csv": (lambda root, out: import_csv(root / "csv", out, overwrite=True), {"capture"}),
+    "import csv of a capture": (lambda root, out: import_csv(root / "capture" / "tracks", out, overwrite=True), set()),
+    "import hdf5": (lambda root, out: import_hdf5(root / "poses.h5", out, overwrite=True), {"capture"}),
+    "synthesize": (lambda root, out: synthesize(root / "model", out, TINY, overwrite=True), {"dataset", "shards"}),
+    "compare": (lambda root, out: compare([root / "model"], root / "capture", out=out, overwrite=True), set()),
+    "diagnose": (lambda root, out: diagnose(root / "model", root / "capture", save_law_to=out, overwrite=True), set()),
+    "merge": (lambda root, out: merge([root / "shards"], out, overwrite=True), {"dataset", "shards/index.h5"}),
+    "merge inside": (lambda root, out: merge([root / "shards"], overwrite=True), set()),
+    "demo": (lambda root, out: run_demo(out, overwrite=True), set()),
+    "mystery": (lambda root, out: run_mystery(out, overwrite=True), set()),
+    "effects new": (lambda root, out: new_effect(out, overwrite=True), set()),
+    "export ply": (lambda root, out: export(root / "model", "ply", out, overwrite=True), set()),
+    "export mjcf": (lambda root, out: export(root / "model", "mjcf", out, overwrite=True), set()),
+    "export glb": (lambda root, out: export(root / "model", "glb", out, overwrite=True), set()),
+    "export colmap": (lambda root, out: export(root / "model", "colmap", out, overwrite=True), set()),
+    "export bop": (lambda root, out: export(root / "dataset", "bop", out, overwrite=True), set()),
+    "export nerfstudio": (lambda root, out: export(root / "dataset", "nerfstudio", out, overwrite=True), set()),
+    "export lerobot": (lambda root, out: export(root / "dataset", "lerobot", out, overwrite=True), set()),
+}
+"""A call of each command that writes, and the outputs of its own kind among `things`, which it may replace."""
+FAST = {"import csv", "import hdf5"}
+"""Commands that are quick enough to replace an output of their kind here."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_only_an_output_of_the_same_kind_is_replaced(things: Path, command: str) -> None:
+    call, own = COMMANDS[command]
+    before = content(things)
+    tried = 0
+    for name in [*before, "."]:
+        out = things / name
+        if (name in own and command not in FAST) or not out.exists():
+            continue
+        try:
+            call(things, out)
+        except CgwmError as error:
+            assert error.exit_code in (1, 2), error
+            after = content(things)
+            assert after == before, f"{command} --out {name}: {error}"
+        else:
+            if command == "merge inside":
+                break  # it has one output, of its own
+            assert name in own, f"{command} --out {name} was taken"
+            before = content(things)
+        tried += 1
+    assert tried > 20 or command == "merge inside"
+
+
+def test_an_output_that_the_user_has_touched_stays(things: Path) -> None:
+    capture = things / "capture"
+    import_csv(things / "csv", capture, overwrite=True)
+    (capture / "photo.jpg").write_bytes(b"mine")
+    with pytest.raises(UsageError, match=r"capture holds photo\.jpg, which cgwm did not write"):
+        import_csv(things / "csv", capture, overwrite=True)
+    (capture / "photo.jpg").unlink()
+    manifest = capture / "capture.toml"
+    manifest.write_text(manifest.read_text() + "# a ball of 60 g\n")
+    with pytest.raises(UsageError, match=r"capture holds capture\.toml, which was changed since cgwm wrote it"):
+        import_csv(things / "csv", capture, overwrite=True)
+
+
+def test_cameras_of_ones_own_in_an_imported_capture_stay(things: Path) -> None:
+    capture = things / "capture"
+    for name, text in (
+        ("cameras.json", '{"format": "cgwm-cameras/1"}'),
+        ("sparse_points.ply", "mine"),
+        ("calibration.json", "{}"),
+    ):
+        (capture / name).write_text(text)
+        before = content(things)
+        with pytest.raises(UsageError, match=r"which cgwm did not write"):
+            import_csv(things / "csv", capture, overwrite=True)
+        assert content(things) == before
+    (capture / "calibration.json").write_text('{"format": "cgwm-calibration/1"}')  # now all of it is `calibrate`'s
+    import_csv(things / "csv", capture, overwrite=True)
+    assert not (capture / "cameras.json").exists()
+
+
+IMPORT = "import sys; from cgwm.cli import main; sys.stdin.readline(); main()"
+
+
+def test_two_commands_that_write_one_output_at_once_do_not_mix_it(things: Path) -> None:
+    other = things / "other"
+    other.mkdir()
+    for file in (things / "csv").iterdir():
+        (other / file.name).write_text(file.read_text().replace(",1,0,0,0", ",0,1,0,0"))
+    want = {}
+    for source in ("csv", "other"):
+        import_csv(things / source, things / f"by_{source}")
+        want[source] = content(things / f"by_{source}")
+    for number, overwrite in enumerate(([], ["--overwrite"], ["--overwrite"])):
+        out = things / f"out{number // 2}"
+        command = [sys.executable, "-c", IMPORT, "import", "csv"]
+        both = {
+            source: subprocess.Popen(
+                [*command, str(things / source), "--out", str(out), *overwrite],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for source in ("csv", "other")
+        }
+        for process in both.values():
+            assert process.stdin is not None
+            process.stdin.write("go\n")
+            process.stdin.flush()
+        ended = {source: (process.communicate(timeout=60)[1], process.returncode) for source, process in both.items()}
+        codes = {source: code for source, (_, code) in ended.items()}
+        assert set(codes.values()) <= {0, 1, 2} and 0 in codes.values(), ended
+        assert all("Internal error" not in said and "Traceback" not in said for said, _ in ended.values())
+        assert content(out) in [want[source] for source, code in codes.items() if code == 0]
+        assert not list(things.glob(".*partial*")) + list(things.glob(".*replaced*"))
+
+
+def test_a_new_output_may_lie_in_the_folder_of_an_input_but_not_among_its_files(things: Path) -> None:
+    export(things / "model", "ply", things / "model" / "splats")
+    with pytest.raises(UsageError, match="would lie among the files of an input"):
+        export(things / "model", "glb", things / "model" / "splats" / "all.glb")
+    with pytest.raises(UsageError, match="holds an input of this command"):
+        import_csv(things / "capture" / "tracks", things / "capture", overwrite=True)
+
+
+def test_a_link_to_an_input_is_an_input(things: Path) -> None:
+    (things / "link").symlink_to(things / "model")
+    with pytest.raises(UsageError, match="is an input of this command"):
+        synthesize(things / "model", things / "link", TINY, overwrite=True)

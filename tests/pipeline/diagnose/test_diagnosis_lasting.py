@@ -1,0 +1,171 @@
+"""Errors that last from frame to frame: they are told, and are not taken for something that is missing."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.verdict import find
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
+from cgwm.pipeline.physics.effects.registry import BUILT_IN, load_effect
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.prepare import SMEARED, Prepared, prepare
+from cgwm.pipeline.trajectories.correlated_noise import (
+    WHITE,
+    CorrelatedNoise,
+    NoiseModel,
+    estimate_noise_model,
+    innovations,
+)
+from helpers.diagnosis_data import NOISE, tosses, world_with
+from scipy.signal import savgol_filter
+
+LIBRARY = [Candidate(name, load_effect(name)) for name in BUILT_IN]
+Episodes = list[tuple[str, dict[str, Track]]]
+
+
+def lasting(rho: float, seed: int) -> Callable[[Track], Track]:
+    """Add errors of which the next frame has a share left."""
+    rng = np.random.default_rng(seed)
+
+    def change(track: Track) -> Track:
+        errors = rng.standard_normal((len(track.time_s), 6))
+        for k in range(1, len(errors)):
+            errors[k] = rho * errors[k - 1] + np.sqrt(1 - rho**2) * errors[k]
+        turn = quat_exp(torch.as_tensor(NOISE[1] * errors[:, 3:]))
+        quat = quat_multiply(torch.as_tensor(track.quat_wxyz), turn).numpy()
+        return replace(track, position_m=track.position_m + NOISE[0] * errors[:, :3], quat_wxyz=quat)
+
+    return change
+
+
+def smoothed(track: Track) -> Track:
+    quat = np.array(track.quat_wxyz)
+    quat[1:] *= np.cumprod(np.sign((quat[1:] * quat[:-1]).sum(1)))[:, None]
+    quat = savgol_filter(quat, 7, 2, axis=0)
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return replace(track, position_m=savgol_filter(track.position_m, 7, 2, axis=0), quat_wxyz=quat)
+
+
+def changed(episodes: Episodes, change: Callable[[Track], Track]) -> Episodes:
+    return [(name, {body: change(track) for body, track in tracks.items()}) for name, tracks in episodes]
+
+
+def ready(body: str, effects: dict, change: Callable[[Track], Track] | None, seed: int = 1) -> tuple[Prepared, object]:
+    noise = NOISE if change in (None, smoothed) else (1e-9, 1e-8)
+    episodes = tosses(world_with(body, effects), seed, count=6, duration_s=0.8, noise=noise, height_m=(0.4, 0.7))
+    world = world_with(body)
+    return prepare(world, episodes if change is None else changed(episodes, change)), world
+
+
+def test_innovations_are_what_the_inverse_of_the_covariance_says() -> None:
+    rng = np.random.default_rng(0)
+    times = torch.as_tensor(np.sort(rng.uniform(0, 0.3, (2, 12)), axis=1))
+    mask = torch.ones(2, 12, dtype=torch.float64)
+    mask[0, [3, 4, 9]] = 0  # not measured, a gap among them
+    rows = torch.as_tensor(rng.standard_normal((2, 12, 5))) * mask[..., None]
+    for share in (1.0, 0.6):
+        found = innovations(rows, times, mask, CorrelatedNoise(share, 0.05, 2.0))
+        for k in range(2):
+            kept = mask[k] > 0
+            t = times[k, kept]
+            covariance = share * torch.exp(-(t[:, None] - t).abs() / 0.05) + (1 - share) * torch.eye(len(t)).double()
+            known = torch.linalg.solve_triangular(torch.linalg.cholesky(4 * covariance), rows[k, kept], upper=False)
+            torch.testing.assert_close(found[k, kept], known, rtol=1e-10, atol=1e-12)
+        assert not found[mask == 0].any()
+
+
+@pytest.mark.parametrize("body", ["cube", "ball"])
+def test_errors_that_last_are_measured(body: str) -> None:
+    prepared, _ = ready(body, {}, lasting(0.7, 3))
+    for one, std, true in zip(prepared.noise_model, prepared.noise, NOISE, strict=True):
+        # what is new in each frame is told well; how much lasts is not, and rather too much of it is taken
+        kept = np.exp(-0.01 / one.time_s)
+        fresh = (one.size * std / true) ** 2 * (1 - one.share * kept**2)
+        assert kept >= 0.6 and one.share > 0.5 and fresh == pytest.approx(1 - 0.7**2, rel=0.25)
+        assert 0.7 < std / true < 3
+    assert any("are correlated in time" in warning for warning in prepared.warnings)
+
+
+@pytest.mark.parametrize(
+    ("body", "effects"),
+    [("ball", {}), ("cube", {"com_offset": {"d_x": 0.008}}), ("ball", {"ground_magnet": {"A": 12.0}})],
+)
+def test_errors_that_do_not_last_are_not_taken_for_such(body: str, effects: dict) -> None:
+    prepared, _ = ready(body, effects, None)
+    assert prepared.noise_model == WHITE
+    assert prepared.flight is not None and prepared.flight.noise_model == WHITE
+
+
+def test_rounding_does_not_last() -> None:
+    world = world_with("ball", {"linear_drag": {"c": 0.3}})
+    exact = tosses(world, 1, count=4, duration_s=0.5, noise=(1e-14, 1e-14))
+    prepared = prepare(world_with("ball"), exact, NOISE)
+    assert prepared.noise_model == WHITE and prepared.noise == NOISE
+
+
+@pytest.mark.parametrize("body", ["ball", "box"])
+def test_an_orientation_that_never_changes_tells_nothing_of_noise(body: str) -> None:
+    unturned = [
+        (
+            name,
+            {key: replace(track, quat_wxyz=np.tile([1.0, 0, 0, 0], (len(track), 1))) for key, track in own.items()},
+        )
+        for name, own in tosses(world_with(body), 1, count=4, duration_s=0.5)
+    ]
+    prepared = prepare(world_with(body), unturned, NOISE)
+    assert prepared.noise_model == WHITE and prepared.noise == NOISE
+
+
+def test_few_frames_tell_nothing() -> None:
+    prepared, _ = ready("ball", {}, lasting(0.9, 3))
+    assert estimate_noise_model(prepared.observations, [prepared.flight.items[0]]) == (WHITE, (None, None))  # pyright: ignore
+    assert estimate_noise_model(prepared.observations, []) == (WHITE, (None, None))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [pytest.param(lasting(0.8, 5), id="lasting", marks=pytest.mark.evidence), pytest.param(smoothed, id="smoothed")],
+)
+def test_they_are_no_effect_and_hide_none(change: Callable[[Track], Track]) -> None:
+    prepared, world = ready("ball", {}, change)
+    assert prepared.noise_model != WHITE
+    assert find(prepared, world, LIBRARY).verdict == "none_missing"  # pyright: ignore[reportArgumentType]
+    blind = replace(prepared, noise_model=NoiseModel())
+    assert prepared.flight is not None
+    items = prepared.flight.items
+    slow = [p.segments("flight", world, items) for p in (prepared, blind)]  # pyright: ignore[reportArgumentType]
+    assert slow[0].noise_model != WHITE and slow[1].noise_model == WHITE
+    prepared, world = ready("ball", {"linear_drag": {"c": 0.6}}, change)
+    found = find(prepared, world, LIBRARY)  # pyright: ignore[reportArgumentType]
+    assert [one.evidence.name for one in found.chosen] == ["linear_drag"]
+
+
+def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
+    sharp, _ = ready("ball", {}, None)
+    smeared, _ = ready("ball", {}, smoothed)
+    seen = sharp.observations.seen.amax(-1) > 0
+    for episode in range(len(sharp.names)):
+        contact = np.flatnonzero((~sharp.airborne & seen)[episode].numpy())
+        near = {int(k) + d for k in contact for d in range(-SMEARED, SMEARED + 1)}
+        flies = set(np.flatnonzero(smeared.airborne[episode].numpy()).tolist())
+        # what smoothing lifts above the ground may move the contact by a frame
+        assert len(flies & near) <= 2 * max(1, len(contact))
+        assert contact.size == 0 or len(flies) < int(sharp.airborne[episode].sum())
+
+
+def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cgwm.pipeline.segments.prepare.SMEARED", 200)
+    prepared, _ = ready("ball", {}, lasting(0.8, 5))
+    assert prepared.noise_model != WHITE and prepared.least_force_m_s2 > 0
+    touched = {item.episode for item in prepared.contact_items}
+    assert prepared.flight is None or not touched & {item.episode for item in prepared.flight.items}
+
+
+def test_a_box_without_orientation_has_no_contact_though_errors_last() -> None:
+    change = lasting(0.8, 5)
+    prepared, _ = ready("cube", {}, lambda track: replace(change(track), quat_wxyz=None))
+    assert prepared.noise_model != WHITE and not prepared.has_orientation
+    assert prepared.contact_items == ()

@@ -1,0 +1,147 @@
+"""Bad input: each gets a statement of what is wrong and what to do, and no verdict."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.compare.model_comparison import ComparedModel
+from cgwm.pipeline.compare.short_horizon_errors import short_errors
+from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.fit import fit
+from cgwm.pipeline.geometry.rotation import quat_multiply, quat_to_matrix
+from cgwm.pipeline.physics import World
+from cgwm.pipeline.segments.input_checks import check_observability, check_units_and_geometry
+from cgwm.pipeline.segments.prepare import prepare
+from cgwm.pipeline.trajectories.initial_state import clearance
+from cgwm.pipeline.trajectories.segmentation import whole_episodes
+from cgwm.schemas import InputDataError
+from helpers.diagnosis_data import NOISE, tosses, world_with, write_capture
+
+Episodes = list[tuple[str, dict[str, Track]]]
+
+
+def changed(episodes: Episodes, change: Callable[[Track], Track]) -> Episodes:
+    return [(name, {body: change(track) for body, track in tracks.items()}) for name, tracks in episodes]
+
+
+def shaped(world: World, factor: float) -> World:
+    """The world with a body of another size."""
+    body = world.bodies[0]
+    return world.with_body(0, centers=factor * body.centers, radii=factor * body.radii)
+
+
+def test_episodes_that_are_one_motion_prove_nothing() -> None:
+    world, rng = world_with("ball"), np.random.default_rng(0)
+    one = tosses(world, 3, count=1, duration_s=0.4)[0][1]["ball"]
+
+    def shake(track: Track) -> Track:
+        return replace(track, position_m=track.position_m + rng.normal(0, NOISE[0], track.position_m.shape))
+
+    episodes = changed([(f"{k}", {"ball": one}) for k in range(4)], shake)
+    with pytest.raises(InputDataError, match="are one motion"):
+        check_observability(world, prepare(world, episodes), "here")
+    others = tosses(world, 3, count=4, duration_s=0.4)
+    check_observability(world, prepare(world, others), "here")
+
+
+def test_noise_that_hides_everything_is_told() -> None:
+    world = world_with("ball")
+    episodes = tosses(world, 3, count=4, duration_s=0.3, noise=(0.3, 0.5), height_m=(3.0, 4.0))
+    with pytest.raises(InputDataError, match=r"noise of \d+ mm.*could be detected"):
+        check_observability(world, prepare(world, episodes), "here")
+
+
+def test_a_body_that_never_moves_is_told() -> None:
+    world, rng = world_with("ball"), np.random.default_rng(0)
+    place = np.array([0, 0, 0.04]) + rng.normal(0, 5e-4, (40, 3))
+    still = Track(np.arange(40) / 100, place, np.tile([1.0, 0, 0, 0], (40, 1)))
+    with pytest.raises(InputDataError, match="nothing moves"):
+        check_observability(world, prepare(world, [(f"{k}", {"ball": still}) for k in range(3)]), "here")
+
+
+def test_a_body_of_another_shape_is_told() -> None:
+    world = world_with("cube")
+    episodes = tosses(world, 3, count=3, duration_s=1.0)
+    check_units_and_geometry(world, episodes, "here")
+    with pytest.raises(InputDataError, match="under the ground"):
+        check_units_and_geometry(shaped(world, 3.0), episodes, "here")
+    small = shaped(world, 0.3)
+    with pytest.raises(InputDataError, match="above the ground and does not fall"):
+        check_observability(small, prepare(small, episodes), "here")
+
+
+def test_a_tilted_frame_is_no_other_shape() -> None:
+    """Three degrees of tilt put a body a quarter of a metre away 13 mm under the ground: that is for the diagnosis."""
+    world = world_with("cube")
+    episodes = tosses(world, 3, count=4, duration_s=1.0)
+    name = world.bodies[0].name
+    turn = torch.tensor([np.cos(0.026), 0.0, np.sin(0.026), 0.0])
+    matrix = quat_to_matrix(turn).numpy()
+
+    def seen(track: Track, sideways: float, lower: float) -> Track:
+        position = (track.position_m + np.array([sideways, 0, 0])) @ matrix.T - [0, 0, lower]
+        quat = quat_multiply(turn, torch.tensor(track.quat_wxyz)).numpy()
+        return replace(track, position_m=position, quat_wxyz=quat)
+
+    away = [(n, {name: seen(t[name], 0.2 + 0.1 * k, 0.0)}) for k, (n, t) in enumerate(episodes)]
+    assert float(clearance(world, whole_episodes(world, away)).min()) < -0.012
+    check_units_and_geometry(world, away, "here")
+    lower = [(n, {name: seen(t[name], 0.2 + 0.1 * k, 0.03)}) for k, (n, t) in enumerate(episodes)]
+    with pytest.raises(InputDataError, match="under the ground"):
+        check_units_and_geometry(world, lower, "here")
+
+
+def test_a_mass_and_an_inertia_that_no_such_body_has_are_told() -> None:
+    world = world_with("cube")
+    body, episodes = world.bodies[0], tosses(world, 3, count=3, duration_s=0.3)
+    with pytest.raises(InputDataError, match="osmium"):
+        check_units_and_geometry(world.with_body(0, mass=1e6 * body.mass, inertia=1e6 * body.inertia), episodes, "here")
+    with pytest.raises(InputDataError, match="moments of inertia"):
+        check_units_and_geometry(world.with_body(0, inertia=100 * body.inertia), episodes, "here")
+
+
+def test_one_kind_of_motion_alone_is_said_in_the_verdict(tmp_path: Path) -> None:
+    truth = world_with("ball", {"magnus_lift": {"s": 0.04}})
+    model = write_capture(tmp_path / "high", truth, tosses(truth, 3, count=5, duration_s=0.35, height_m=(2.0, 3.0)))
+    found = diagnose(model, tmp_path / "high")
+    assert found.sentence.endswith("Only flight was measured, so the verdict does not cover contact.")
+
+
+def test_milliseconds_are_told_before_a_fit_as_well(tmp_path: Path) -> None:
+    world = world_with("ball")
+    slow = changed(tosses(world, 3, count=4, duration_s=0.3), lambda track: replace(track, time_s=1e3 * track.time_s))
+    write_capture(tmp_path / "slow", world, slow)
+    with pytest.raises(InputDataError, match="milliseconds"):
+        fit(tmp_path / "slow", tmp_path / "model")
+
+
+def test_a_noise_that_was_given_is_not_talked_down() -> None:
+    world = world_with("ball")
+    episodes = tosses(world, 3, count=4, duration_s=0.4)
+    told = prepare(world, episodes, (10 * NOISE[0], 10 * NOISE[1]))
+    assert told.noise == (10 * NOISE[0], 10 * NOISE[1])
+    assert any("The given value is used" in warning for warning in told.warnings)
+    # what is more than was given is measured
+    assert prepare(world, episodes, (0.1 * NOISE[0], None)).noise[0] == pytest.approx(NOISE[0], rel=0.2)
+
+
+def test_what_was_not_measured_is_no_degree_of_freedom() -> None:
+    world = world_with("ball", ground=False)
+
+    def heights_only(track: Track) -> Track:
+        return replace(track, position_m=track.position_m * [0.0, 0.0, 1.0], quat_wxyz=None)
+
+    episodes = changed(tosses(world, 3, count=3, duration_s=0.3), heights_only)
+    prepared = prepare(world, episodes)
+    assert prepared.flight is not None
+    assert prepared.flight.dof.tolist() == [len(episodes[0][1]["ball"]) - 2] * 3
+    short = short_errors(world, episodes, prepared, ["ball"]).errors["000"]
+    assert np.isfinite(short.sigmas[:, 0]).any(0).tolist() == [False, False, True, False, False, False]
+    one = ComparedModel(
+        name="m", short_name="m", model=None, evaluation=None, noise=prepared.noise, short={"000": short}
+    )  # pyright: ignore[reportArgumentType]
+    assert one.episode_chi2("000") == pytest.approx(1.0, abs=0.6)

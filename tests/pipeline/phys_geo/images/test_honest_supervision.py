@@ -1,0 +1,95 @@
+"""`--supervise images` looks at images: tracks, the true mass and the truth beside them change nothing of the model."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.fit import ASSUMED_DENSITY_KG_M3, fit
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
+from cgwm.schemas import PhysConfig, SplatConfig
+from helpers.small_model import HALF, MASS
+from helpers.tiny_capture import model_of, thrown, with_manifest, with_tracks, write_tiny_capture
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CONFIG = PhysConfig(supervise="images", device="cpu", step_s=0.003, population=8, generations=2, iterations=1)
+FRAMES = 7
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few steps of the shooting: each of many would add to what is but rounding."""
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
+
+
+def told(tmp_path: Path, masks: bool = True) -> Path:
+    """Write a capture that tells everything: tracks, noise, mass and truth."""
+    track = thrown()
+    assert track.quat_wxyz is not None
+    short = Track(track.time_s[:FRAMES], track.position_m[:FRAMES], track.quat_wxyz[:FRAMES])
+    root = write_tiny_capture(tmp_path / "told", short, masks)
+    with_manifest(root, "[video]", "[measurement]\nposition_std_m = 0.0001\nrotation_std_rad = 0.001\n[video]")
+    with_tracks(root, short)
+    truth = {"friction": 0.4, "states": {"000": track.position_m[0].tolist()}}
+    (root / "truth.json").write_text(json.dumps(truth))
+    return root
+
+
+def contents(model: Path) -> dict[str, bytes]:
+    """Return what a model is made of by file, without what it was made from and how long that took."""
+    file = json.loads((model / "model.json").read_text())
+    del file["provenance"]
+    record = json.loads((model / "fit.json").read_text())
+    kept = {"model.json": file, "fit.json": _timeless(record)}
+    files = [*sorted(model.glob("*.ply")), *sorted(model.glob("pose_tracks/*.csv"))]
+    found = {path.relative_to(model).as_posix(): path.read_bytes() for path in files}
+    return found | {name: json.dumps(value).encode() for name, value in kept.items()}
+
+
+def _timeless(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    return {key: _timeless(part) for key, part in value.items() if not key.startswith("seconds")}
+
+
+@pytest.mark.parametrize("masks", [True, pytest.param(False, marks=pytest.mark.evidence)])
+def test_what_is_not_in_the_images_is_not_looked_at(tmp_path: Path, masks: bool) -> None:
+    root = told(tmp_path, masks)
+    fit(root, tmp_path / "a", "phys-geo", model_of(root), phys_config=CONFIG)
+    stripped = tmp_path / "stripped"
+    shutil.copytree(root, stripped)
+    shutil.rmtree(stripped / "tracks")
+    (stripped / "truth.json").unlink()
+    with_manifest(stripped, f"mass_kg = {MASS}\n", "")
+    with_manifest(stripped, "[measurement]\nposition_std_m = 0.0001\nrotation_std_rad = 0.001\n", "")
+    fit(stripped, tmp_path / "b", "phys-geo", model_of(root), phys_config=CONFIG)
+    a, b = contents(tmp_path / "a"), contents(tmp_path / "b")
+    spheres = {"cube.ply", "cube.collision.ply", "scene.ply"}
+    assert set(a) == set(b) == {*spheres, "pose_tracks/000.csv", "model.json", "fit.json"}
+    assert [name for name in a if a[name] != b[name]] == []
+
+
+def test_contact_does_not_depend_on_the_mass_of_a_body_on_the_ground(tmp_path: Path) -> None:
+    """Fitted without photos, to masks and the shape, so that the mass is the manifest's or an assumed density's."""
+    root = told(tmp_path)
+    found = []
+    for name in ("weighed", "unknown"):
+        if name == "unknown":
+            with_manifest(root, f"mass_kg = {MASS}\n", "")
+        splats = SplatConfig(max_collision_spheres=8)
+        fit(root, tmp_path / name, "phys-geo", splat_config=splats, phys_config=CONFIG)
+        found.append(read_model(tmp_path / name))
+    ratio = found[1].file.bodies[0].mass_kg / MASS
+    assert ratio == pytest.approx(ASSUMED_DENSITY_KG_M3 * 8 * HALF**3 / MASS) and ratio != 1.0
+    numbers = [{p.name: p for p in one.file.parameters} for one in found]
+    for name in ("friction", "contact_time_s", "damping_ratio", "restitution"):
+        values = [(one[name].estimate, *(one[name].interval_95 or ())) for one in numbers]
+        np.testing.assert_allclose(values[0], values[1], rtol=1e-6, err_msg=name)
+    for name in ("stiffness_n_m", "damping_n_s_m"):  # of a contact that carries this mass
+        assert numbers[1][name].estimate == pytest.approx(ratio * numbers[0][name].estimate, rel=1e-6)
+    assert any(text.startswith("photometric part left out") for text in found[0].file.warnings)
+    assert found[0].fit.stages["phys-geo"]["image_loss"]["photometric"] is False

@@ -1,0 +1,153 @@
+"""Where a body's mass is: any second moments are those of a body, and a hidden weight is found from impacts."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets import Track
+from cgwm.datasets.capture.manifest import write_manifest
+from cgwm.datasets.capture.tracks import tracks_csv
+from cgwm.pipeline.fit import fit
+from cgwm.pipeline.phys_geo.tracks import contact_shooting
+from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
+from cgwm.pipeline.physics import simulate
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
+from cgwm.pipeline.synthesize.parameters import draw_parameters
+from cgwm.pipeline.trajectories.track_noise import Noise
+from cgwm.schemas import (
+    Body,
+    BoxShape,
+    CaptureManifest,
+    Ground,
+    InputDataError,
+    PhysConfig,
+    Shape,
+    UsageError,
+    World,
+)
+from helpers.worlds import batch, box_body, law, state_of, times, world_of
+from scipy.spatial.transform import Rotation
+
+NOISE = Noise(0.0003, 0.003)
+STEP_S = 0.002
+COM_M = (0.003, -0.002, 0.006)
+MOMENTS = (1.4, 1.2, 1.8)
+CONTACT = list(zip(CONTACT_PARAMETERS, (0.2, 0.003, 0.5), strict=True))
+
+
+def weighted_world():
+    """A box with a weight off its centre, which nobody has told of."""
+    parameters = mass_distribution("box", 0.07)
+    return apply_parameters(world_of(box_body(), contact=law(), step_s=STEP_S), parameters, batch((*COM_M, *MOMENTS)))
+
+
+def tosses(count: int) -> list[tuple[str, dict[str, Track]]]:
+    rng = np.random.default_rng(0)
+    episodes = []
+    for number in range(count):
+        quat, spin = rng.standard_normal(4), 8 * rng.standard_normal(3)
+        start = state_of(((0, 0, 0.11), tuple(quat), (0.5, 0.2, -0.7), tuple(spin)))
+        rollout = simulate(weighted_world(), start, times(0.2, 120))
+        position = rollout.position_m[0, :, 0].numpy()
+        turned = Rotation.from_quat(rollout.quat_wxyz[0, :, 0].numpy(), scalar_first=True)
+        turned = turned * Rotation.from_rotvec(NOISE[1] * rng.standard_normal(position.shape))
+        noisy = position + NOISE[0] * rng.standard_normal(position.shape)
+        track = Track(rollout.times_s.numpy(), noisy, turned.as_quat(scalar_first=True))
+        episodes.append((str(number), {"box": track}))
+    return episodes
+
+
+def test_second_moments_scale_as_those_of_a_stretched_box() -> None:
+    """A box that is s times longer along x, at equal mass, has s^2 times the second moment along x and no other."""
+    short, long = box_body((0.05, 0.04, 0.03)), box_body((0.10, 0.04, 0.03))
+    scaled = scaled_inertia(short.inertia, batch((4.0, 1.0, 1.0)))
+    torch.testing.assert_close(scaled, long.inertia, rtol=1e-12, atol=0.0)
+
+
+def test_any_factors_give_an_inertia_that_a_body_can_have() -> None:
+    """Principal moments are positive, and none is larger than the other two together."""
+    rng = np.random.default_rng(1)
+    turn = torch.as_tensor(Rotation.random(rng=rng).as_matrix())
+    inertia = turn @ box_body().inertia @ turn.T
+    factors = torch.as_tensor(10 ** rng.uniform(-1, 1, (500, 3)))
+    principal = torch.linalg.eigvalsh(scaled_inertia(inertia, factors))
+    assert float(principal.min()) > 0
+    assert bool((principal[:, 2] <= principal[:, :2].sum(-1) * (1 + 1e-12)).all())
+
+
+def test_a_hidden_weight_is_found_from_tosses() -> None:
+    found = fit_mass_distribution(world_of(box_body(), step_s=STEP_S), tosses(10), CONTACT, NOISE)
+    numbers = {parameter.name: parameter for parameter in found.parameters}
+    truth = {f"box.com_{axis}_m": value for axis, value in zip("xyz", COM_M, strict=True)}
+    truth |= {f"box.moment_{axis}": value for axis, value in zip("xyz", MOMENTS, strict=True)}
+    assert set(numbers) == set(truth)
+    for name, value in truth.items():
+        parameter = numbers[name]
+        assert parameter.std_error is not None
+        assert abs(parameter.estimate - value) < 4 * parameter.std_error + (5e-4 if name.endswith("_m") else 0.05)
+    expected = weighted_world().bodies[0]
+    torch.testing.assert_close(found.world.bodies[0].inertia, expected.inertia, rtol=0.1, atol=1e-5)
+
+
+def test_few_episodes_and_centroids_are_refused() -> None:
+    with pytest.raises(InputDataError, match="7 of 7 episodes"):
+        fit_mass_distribution(world_of(box_body()), tosses(7), CONTACT, NOISE)
+    centroids = [(name, {"box": replace(tracks["box"], quat_wxyz=None)}) for name, tracks in tosses(8)]
+    with pytest.raises(InputDataError, match="0 of 8 episodes"):
+        fit_mass_distribution(world_of(box_body()), centroids, CONTACT, NOISE)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("weighted") / "capture"
+    (root / "tracks").mkdir(parents=True)
+    episodes = tosses(8)
+    for name, tracks in episodes:
+        (root / "tracks" / f"{name}.csv").write_text(tracks_csv(tracks), encoding="utf-8")
+    box = Body(name="box", mass_kg=0.4, shape=Shape(box=BoxShape(half_extents_m=(0.05, 0.04, 0.03))))
+    manifest = CaptureManifest(
+        format="cgwm-capture/1",
+        world=World(ground=Ground()),
+        bodies=(box,),
+        splits={"train": tuple(name for name, _ in episodes)},
+    )
+    write_manifest(root / "capture.toml", manifest)
+    return root
+
+
+def test_a_model_holds_the_mass_distribution_that_was_fitted(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)  # the mass is fitted before
+    config = PhysConfig(population=8, generations=2, iterations=1, step_s=STEP_S, mass_distribution=True)
+    file = fit(capture, tmp_path / "model", phys_config=config)
+    numbers = {parameter.name: parameter for parameter in file.parameters}
+    assert file.bodies[0].com_m == tuple(numbers[f"box.com_{axis}_m"].estimate for axis in "xyz")
+    np.testing.assert_allclose(file.bodies[0].com_m, COM_M, atol=2e-3)
+    assert {numbers[f"box.{name}"].state for name in ("com_z_m", "moment_z")} == {"fitted"}
+    np.testing.assert_allclose(file.bodies[0].inertia_kg_m2[:3], _diagonal(weighted_world()), rtol=0.2)
+    contact, mass = file.correlations
+    assert contact.parameters[:3] == ("friction", "contact_time_s", "damping_ratio")
+    names = {f"box.com_{axis}_m" for axis in "xyz"} | {f"box.moment_{axis}" for axis in "xyz"}
+    assert set(mass.parameters) == names
+    for block in file.correlations:
+        matrix = np.array(block.matrix)
+        np.testing.assert_allclose(np.diag(matrix), 1, rtol=1e-9)
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-9)
+        assert np.linalg.eigvalsh(matrix).min() > -1e-9 and np.abs(matrix - np.eye(len(matrix))).max() > 0.01
+    drawn, entries = draw_parameters(file, 1.0, np.random.default_rng(0))  # all of it varies in rollouts
+    assert drawn.bodies[0].inertia_kg_m2 != file.bodies[0].inertia_kg_m2
+    assert all(entry.value != entry.estimate for entry in entries if entry.name in mass.parameters)
+
+
+def test_images_do_not_show_where_the_mass_is(capture: Path, tmp_path: Path) -> None:
+    config = PhysConfig(supervise="both", mass_distribution=True)
+    with pytest.raises(UsageError, match="mass_distribution with --supervise both"):
+        fit(capture, tmp_path / "model", phys_config=config)
+    assert not (tmp_path / "model").exists()
+
+
+def _diagonal(world) -> np.ndarray:
+    return world.bodies[0].inertia[0].diagonal().numpy()

@@ -1,0 +1,147 @@
+"""Worlds, starts and rollouts that cannot be right are refused by name and number."""
+
+import ast
+import json
+import math
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from cgwm.pipeline.physics import PaperLaw, State, World, simulate
+from cgwm.pipeline.physics.checks import largest_step, require_apart
+from cgwm.pipeline.physics.effects import ActiveEffect, Effect, EffectParameter, Values
+from cgwm.pipeline.physics.rollout import require_finite
+from cgwm.schemas import InputDataError, NotConvergedError
+from helpers.worlds import F64, ball_body, box_body, law, state_of, times, world_of
+
+UP = (1.0, 0.0, 0.0, 0.0)
+HIGH = state_of(((0, 0, 1), UP, (0, 0, 0), (0, 0, 0)))
+
+
+def values(*numbers: float) -> torch.Tensor:
+    return torch.tensor(numbers, dtype=F64)
+
+
+@pytest.mark.parametrize(
+    ("world", "found"),
+    [
+        (world_of(box_body(mass=-0.4)), r"body 'box': mass is -0.4 kg"),
+        (world_of(replace(box_body(), mass=values(1.0, math.nan, 1.0))), r"mass is nan kg in environment 1"),
+        (
+            world_of(replace(box_body(), inertia=torch.diag(values(1e-3, 1e-3, 3e-3))[None])),
+            r"largest moment of inertia is 0.003 kg m2(.|\n)*the sum of the two smaller ones",
+        ),
+        (
+            world_of(replace(box_body(), inertia=torch.diag(values(1e-3, 1e-3, -1e-3))[None])),
+            r"smallest moment of inertia is -0.001",
+        ),
+        (world_of(replace(box_body(), radii=0 * box_body().radii)), r"body 'box': radius is 0 m"),
+        (world_of(box_body(), contact=law(friction=-0.1)), r"friction is -0.1 1(.|\n)*0 or more"),
+        (world_of(box_body(), contact=law(contact_time_s=0.0)), "contact_time_s is 0 s"),
+        (world_of(box_body(), contact=law(damping_ratio=-1.0)), "damping_ratio is -1"),
+        (world_of(box_body(), step_s=0.02), r"step of 20 ms is beyond the bound of its contacts, 13.2 ms"),
+        (
+            world_of(
+                box_body(),
+                contact=PaperLaw(friction=values(0.3), stiffness_n_m=values(2e5), damping_n_s_m=values(10.0)),
+            ),
+            r"step of 1 ms is beyond the bound of its contacts, 0.8 ms",
+        ),
+    ],
+)
+def test_a_world_that_cannot_be_simulated_is_refused(world, found) -> None:
+    with pytest.raises(InputDataError, match=found):
+        simulate(world, HIGH, times(0.02))
+
+
+def test_a_start_that_is_not_finite_is_refused_with_its_place() -> None:
+    start = State(*(x.repeat(3, 1, 1) for x in vars(HIGH).values()))
+    start.velocity_m_s[2, 0, 1] = math.nan
+    with pytest.raises(InputDataError, match="environment 2: velocity_m_s of body 'box' is not finite"):
+        simulate(world_of(box_body()), start, times(0.02))
+
+
+def test_bodies_that_begin_deep_inside_each_other_are_refused_with_the_depth() -> None:
+    world = world_of(ball_body(name="a"), ball_body(name="b"))
+    apart = state_of(((0, 0, 0.04), UP, (0, 0, 0), (0, 0, 0)), ((0.0795, 0, 0.04), UP, (0, 0, 0), (0, 0, 0)))
+    require_apart(world, apart)
+    inside = state_of(((0, 0, 0.04), UP, (0, 0, 0), (0, 0, 0)), ((0.05, 0, 0.04), UP, (0, 0, 0), (0, 0, 0)))
+    with pytest.raises(InputDataError, match=r"body 'a' begins 30.0 mm deep inside body 'b'(.|\n)*up to 10.0 mm"):
+        require_apart(world, inside)
+    sunk = state_of(((0, 0, 0.3), UP, (0, 0, 0), (0, 0, 0)), ((0.2, 0, 0.02), UP, (0, 0, 0), (0, 0, 0)))
+    with pytest.raises(InputDataError, match=r"body 'b' begins 20.0 mm deep inside the ground"):
+        require_apart(world, sunk)
+
+
+def test_a_rollout_that_diverges_names_environment_step_and_start_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    world = world_of(ball_body(), ground=False)
+    start = State(*(x.repeat(2, 1, 1) for x in vars(HIGH).values()))
+    start.velocity_m_s[1] = 1e308
+    rollout = simulate(world, start, times(10.0, 1.0))
+    with pytest.raises(NotConvergedError, match=r"environment 1 diverged by step 1000") as caught:
+        require_finite(rollout, world, start)
+    told = json.loads(caught.value.found.split("Its start: ")[1].removesuffix("."))
+    assert told["ball"]["velocity_m_s"] == [1e308] * 3 and told["ball"]["quat_wxyz"] == [1.0, 0.0, 0.0, 0.0]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("zeta", [0.05, 0.5])
+def test_the_default_law_is_stable_up_to_its_bound(zeta: float) -> None:
+    """At almost the largest step a box that falls and rests ends at rest, without a gain of energy."""
+    contact = law(damping_ratio=zeta)
+    world = world_of(box_body(), contact=contact)
+    world = replace(world, step_s=0.98 * largest_step(world))
+    rollout = simulate(world, state_of(((0, 0, 0.05), (0.99, 0.1, 0.05, 0), (0.1, 0, 0), (0, 0, 0))), times(6.0, 5.0))
+    assert float(rollout.position_m[..., 2].max()) <= 0.0501
+    assert float(rollout.velocity_m_s[0, -1].norm()) < 0.02
+
+
+class Emptied(Effect):
+    """A mass that loses more than there is: what a user's effect may do by mistake."""
+
+    name = summary = formula = reveals = source = "emptied"
+    parameters = (EffectParameter(name="m", unit="kg", scale=0.1, limit=10.0),)
+    phase = "flight"
+
+    def world(self, values: Values, world: World) -> World:
+        return world.with_body(0, mass=world.bodies[0].mass - values["m"])
+
+
+def test_a_body_that_an_effect_makes_impossible_is_refused() -> None:
+    world = replace(world_of(box_body()), effects=(ActiveEffect.of(Emptied(), {"m": 1.0}),))
+    with pytest.raises(InputDataError, match=r"body 'box': mass is -0.6 kg"):
+        simulate(world, HIGH, times(0.02))
+
+
+ROOT = Path(__file__).parents[3]
+
+
+def raised_with_what_was_found_alone() -> list[str]:
+    """Return the places where an error about an input is made without saying what is allowed or what to do next."""
+    bare = []
+    for folder in ("schemas", "datasets", "pipeline", "cgwm_cli"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ABOUT_INPUT:
+                    unpacked = any(isinstance(argument, ast.Starred) for argument in node.args)
+                    if len(node.args) + len(node.keywords) < 2 and not unpacked:
+                        bare.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    return bare
+
+
+ABOUT_INPUT = ("InputDataError", "UsageError", "DamagedShardError")
+
+
+def test_every_error_about_an_input_says_what_is_allowed_or_what_to_do_next() -> None:
+    assert raised_with_what_was_found_alone() == []
+
+
+def test_messages_about_a_world_name_the_file_of_its_model() -> None:
+    world = replace(world_of(box_body(mass=-0.4)), source="m/model.json")
+    with pytest.raises(InputDataError, match=r"^m/model.json: body 'box': mass is -0.4 kg"):
+        simulate(world, HIGH, times(0.02))

@@ -1,0 +1,96 @@
+"""Which spheres touch: the broad phase leaves out nothing that would have had an impulse."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from cgwm.pipeline.geometry.rotation import quat_to_matrix
+from cgwm.pipeline.physics import State, simulate
+from cgwm.pipeline.physics.contact_detection import PAIR_SMOOTHING_M, Placed, body_points
+from cgwm.pipeline.physics.smooth_distance import union_distance
+from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
+from cgwm.schemas import BoxShape, Shape
+from helpers.worlds import F64, ball_body, batch, box_body, state_of, times, world_of
+
+UP = (1.0, 0.0, 0.0, 0.0)
+
+
+def cube(count: int, name: str = "cube"):
+    spheres, _ = shape_to_spheres(Shape(box=BoxShape(half_extents_m=(0.05, 0.05, 0.05))), Path(), count)
+    return replace(
+        box_body((0.05, 0.05, 0.05)), name=name, centers=batch(spheres.means), radii=batch(2 * spheres.scales)
+    )
+
+
+def placed(body, count: int, seed: int, spread: float) -> Placed:
+    generator = torch.Generator().manual_seed(seed)
+    quat = torch.randn(count, 4, generator=generator, dtype=F64)
+    where = spread * torch.randn(count, 3, generator=generator, dtype=F64)
+    motion = torch.randn(2, count, 3, generator=generator, dtype=F64)
+    return Placed(
+        body=body,
+        reference=where,
+        rotation=quat_to_matrix(quat / quat.norm(dim=-1, keepdim=True)),
+        velocity=motion[0],
+        omega=motion[1],
+    )
+
+
+def test_all_that_touches_is_found_both_ways_with_the_smooth_distance_of_all_spheres() -> None:
+    a, b = placed(cube(60), 40, 0, 0.05), placed(cube(50, "other"), 40, 1, 0.05)
+    step = torch.full((40,), 0.001, dtype=F64)
+    points = body_points(a, b, step)
+    assert points is not None
+    count = b.body.radii.shape[-1]
+    onto_a, normal_a = union_distance(b.centers(), a.centers(), a.radii().expand(40, -1), PAIR_SMOOTHING_M)
+    onto_b, normal_b = union_distance(a.centers(), b.centers(), b.radii().expand(40, -1), PAIR_SMOOTHING_M)
+    full = torch.cat((onto_a - b.radii(), onto_b - a.radii()), 1)
+    normals = torch.cat((-normal_a, normal_b), 1)
+    kept = torch.zeros_like(full, dtype=torch.bool).scatter(1, points.slot, True)
+    assert bool(kept[full < 0].all()) and int((full < 0).sum()) > 100
+    assert float(kept.to(F64).mean()) < 0.75
+    torch.testing.assert_close(points.gap, full.gather(1, points.slot), atol=1e-12, rtol=0)
+    index = points.slot[..., None].expand(-1, -1, 3)
+    torch.testing.assert_close(points.normal, normals.gather(1, index), atol=1e-9, rtol=0)
+    assert bool((points.slot[:, 0] < count).all()) and int(points.slot.max()) >= count
+
+
+def test_bodies_that_are_far_apart_cost_nothing_and_near_ones_little() -> None:
+    """500 spheres over 500: a resting cube on a cube, against the same with the upper one out of reach."""
+    worlds = world_of(cube(500, "low"), cube(500, "high"))
+    spent = []
+    for height in (0.1501, 1.0):
+        start = state_of(((0, 0, 0.05), UP, (0, 0, 0), (0, 0, 0)), ((0, 0, height), UP, (0, 0, 0), (0, 0, 0)))
+        begun = time.process_time()
+        simulate(worlds, start, times(0.05))
+        spent.append(time.process_time() - begun)
+    assert spent[0] < 12 * spent[1] + 1.0
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_plate_rests_on_a_ball_bigger_than_itself_and_on_two_small_ones(first: int) -> None:
+    """Contacts are sought both ways: a large sphere meets the plate at several of its spheres."""
+    plate = replace(cube(8, "plate"), centers=0.3 * cube(8).centers)
+    ball = replace(ball_body(0.4, 1.0), motion="fixed")
+    bodies = (plate, ball) if first == 0 else (ball, plate)
+    rows = [((0, 0, 0.4 + 0.03), UP, (0, 0, 0), (0, 0, 0)), ((0, 0, 0), UP, (0, 0, 0), (0, 0, 0))]
+    rollout = simulate(world_of(*bodies, ground=False), state_of(*(rows if first == 0 else rows[::-1])), times(1.0, 5))
+    end = rollout.position_m[0, -1, first]
+    assert float(end[:2].norm()) < 1e-3 and 0.40 < float(end[2]) < 0.44
+    assert float(rollout.velocity_m_s[0, -1, first].norm()) < 1e-3
+
+
+def test_items_that_do_not_touch_change_nothing_for_those_that_do() -> None:
+    """Most of a batch in flight: the few that touch are picked out, and move as they would alone."""
+    touching = state_of(((0, 0, 0.08), (0.9, 0.3, -0.2, 0.1), (0.5, 0.2, -0.5), (2.0, -3.0, 1.0)))
+    flying = state_of(((0, 0, 9.0), UP, (0, 0, 0), (0, 0, 0)), count=9)
+    both = State(*(torch.cat((getattr(flying, k), getattr(touching, k))) for k in vars(flying)))
+    world = world_of(box_body())
+    alone = simulate(world, touching, times(0.3), record_contacts=True)
+    among = simulate(world, both, times(0.3), record_contacts=True)
+    torch.testing.assert_close(among.position_m[9:], alone.position_m, atol=1e-13, rtol=0)
+    assert alone.contacts is not None and among.contacts is not None
+    torch.testing.assert_close(among.contacts.impulse_n_s[9:], alone.contacts.impulse_n_s, atol=1e-13, rtol=0)
+    assert float(among.contacts.impulse_n_s[:9].abs().max()) == 0.0
