@@ -21,7 +21,7 @@ SLOW = {"fit", "diagnose", "view", "synthesize", "compare", "calibrate", "bop", 
 HEAVY = ("merged dataset", "filmed", "video file", "things")
 """Subjects that take seconds to make; `test_outputs.py` has the table of what `--overwrite` may replace."""
 VERBS = ("validate", "import", "merge")
-CASES, SEED, LIMIT_S = 40, 3, 20.0
+CASES, SEED, LIMIT_S = 24, 3, 20.0
 
 
 @pytest.fixture(scope="module")

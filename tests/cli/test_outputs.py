@@ -1,9 +1,10 @@
 """`--overwrite` replaces an output of cgwm of the same kind, and never an input or anything else of the user's."""
 
 import hashlib
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -26,10 +27,10 @@ from helpers.small_model import small_model
 TINY = SynthesizeConfig(rollouts=2, duration_s=0.1, width=20, height=16)
 
 
-@pytest.fixture
-def things(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one of everything: recordings, a capture, a model, datasets, exports, and the user's own."""
-    root = tmp_path / "data"
+    root = tmp_path_factory.mktemp("things") / "data"
     (root / "csv").mkdir(parents=True)
     for name in ("a", "b", "c"):
         rows = [f"{t:.3f},0,0,{1 - 4.9 * t * t:.6f},1,0,0,0" for t in np.arange(0, 0.3, 0.01)]
@@ -46,9 +47,15 @@ def things(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (root / "docs" / "thesis.txt").write_text("years of work")
     (root / "notes.html").write_text("<!doctype html>mine")
     (root / "mine.py").write_text("mine")
+    return root
+
+
+@pytest.fixture
+def things(originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of `originals`, and a home directory beside it."""
     (tmp_path / "home").mkdir()
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    yield root
+    return shutil.copytree(originals, tmp_path / "data", symlinks=True)
 
 
 def content(root: Path) -> dict[str, str]:

@@ -83,6 +83,7 @@ def test_free_flight_is_a_parabola_with_a_constant_spin() -> None:
     assert np.abs(rotation - turned).max() < 1e-8
 
 
+@pytest.mark.evidence
 def test_linear_drag_decays_exponentially() -> None:
     times, position, _, start, values = high(silent("cube", "linear_drag"))
     c = values["c"]
@@ -93,6 +94,7 @@ def test_linear_drag_decays_exponentially() -> None:
     assert np.abs(position - expected).max() < 1e-4
 
 
+@pytest.mark.evidence
 def test_quadratic_drag_of_a_ball_and_of_a_box() -> None:
     for thing, tolerance in (("ball", 0.005), ("cube", 0.35)):  # a box's drag depends on which way it flies
         times, position, _, start, values = high(silent(thing, "quadratic_drag"), 0.002)
@@ -102,6 +104,7 @@ def test_quadratic_drag_of_a_ball_and_of_a_box() -> None:
         assert np.linalg.norm(deceleration - expected) < tolerance * np.linalg.norm(expected)
 
 
+@pytest.mark.evidence
 def test_wind_drives_a_body_that_falls_from_rest() -> None:
     times, position, _, _, values = high(silent("ball", "wind"), 0.05, velocity_m_s=np.zeros(3))
     wind = np.array([values["w_x"], values["w_y"]])
@@ -109,6 +112,7 @@ def test_wind_drives_a_body_that_falls_from_rest() -> None:
     np.testing.assert_allclose(position[-1, :2] - position[0, :2], expected, rtol=0.03)
 
 
+@pytest.mark.evidence
 def test_magnus_lift_is_spin_times_velocity() -> None:
     velocity, omega = np.array([2.0, 0.0, 0.0]), np.array([0.0, 0.0, 12.0])
     change = {"velocity_m_s": velocity, "omega_body_rad_s": omega, "quat_wxyz": np.array([1.0, 0, 0, 0])}
@@ -117,6 +121,7 @@ def test_magnus_lift_is_spin_times_velocity() -> None:
     np.testing.assert_allclose((position - parabola(times, start))[-1], expected, atol=2e-5)
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize(("name", "law"), [("spin_damping", "linear"), ("quadratic_spin_drag", "quadratic")])
 def test_spin_decays(name: str, law: str) -> None:
     times, _, rotation, start, values = high(silent("ball", name))
@@ -127,6 +132,7 @@ def test_spin_decays(name: str, law: str) -> None:
     assert last == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.evidence
 def test_gravity_is_turned_scaled_or_joined_by_forces() -> None:
     times, position, _, start, values = high(silent("cube", "gravity_tilt"))
     turned = Rotation.from_rotvec([values["tilt_x"], values["tilt_y"], 0.0]).apply(-G * UP)
@@ -142,6 +148,7 @@ def test_gravity_is_turned_scaled_or_joined_by_forces() -> None:
         assert np.abs(position - parabola(times, start, gravity(values))).max() < 1e-6, name
 
 
+@pytest.mark.evidence
 def test_the_centre_of_mass_flies_the_parabola() -> None:
     times, position, rotation, _, values = high(silent("cube", "com_offset"))
     d = vector(values, "d")
@@ -149,6 +156,7 @@ def test_the_centre_of_mass_flies_the_parabola() -> None:
     assert far_from_a_parabola(times, position) > 1e-4
 
 
+@pytest.mark.evidence
 def test_the_angular_momentum_of_another_inertia_is_kept() -> None:
     case = silent("cube", "inertia_shape")
     times, _, rotation, _, values = high(case)
@@ -166,6 +174,7 @@ def test_the_angular_momentum_of_another_inertia_is_kept() -> None:
     assert 2 * np.linalg.eigvalsh(inertia)[-1] < np.trace(inertia)
 
 
+@pytest.mark.evidence
 def test_the_magnet_fades_with_the_height() -> None:
     case = silent("ball", "ground_magnet")
     radius = case.drawn_thing().size_m
@@ -200,6 +209,7 @@ def test_a_sliding_box_slows_by_friction(law: int) -> None:
     assert deceleration == pytest.approx(case.drawn_thing().friction * G, rel=0.01)
 
 
+@pytest.mark.evidence
 def test_friction_by_direction_by_place_and_by_speed() -> None:
     case = silent("cube", "anisotropic_friction")
     mu = case.drawn_thing().friction
@@ -234,6 +244,7 @@ def spinning(case, omega: np.ndarray, velocity: np.ndarray, length_s: float):
     return motion, spin, hidden[0].values
 
 
+@pytest.mark.evidence
 def test_torsion_and_rolling_resistance_of_a_ball() -> None:
     case = silent("ball", "torsional_friction")
     thing = case.drawn_thing()
@@ -256,6 +267,7 @@ def bounce(case, speed: float) -> float:
     return float(np.diff(motion.position_m[:, 2])[last] / np.diff(motion.time_s)[last]) / speed
 
 
+@pytest.mark.evidence
 def test_restitution_and_how_it_falls_with_the_speed() -> None:
     from_ratio = things.restitution_of
     case = silent("ball")
@@ -267,6 +279,7 @@ def test_restitution_and_how_it_falls_with_the_speed() -> None:
         assert bounce(falling, speed) / bounce(case, speed) == pytest.approx(1 / (1 + r * speed), rel=0.06)
 
 
+@pytest.mark.evidence
 def test_adhesion_takes_speed_from_a_low_bounce() -> None:
     speeds = [bounce(silent("ball", *effects), 0.3) for effects in ((), ("adhesion",))]
     assert speeds[1] < 0.9 * speeds[0]
@@ -279,6 +292,7 @@ def measure(case, kind: str = "throw", length_s: float = 0.5):
     return track, motion, hidden[0].values
 
 
+@pytest.mark.evidence
 def test_errors_of_the_measurement() -> None:
     track, motion, values = measure(silent("cube", "clock_scale"))
     z = np.polyfit(track.time_s, track.position_m[:, 2], 2)[0]
@@ -298,6 +312,7 @@ def test_errors_of_the_measurement() -> None:
     assert far_from_a_parabola(track.time_s, track.position_m) > 1e-4
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize("name", hidden_effects.UNKNOWN)
 def test_what_no_library_holds_bends_the_flight(name: str) -> None:
     for size, least in (("small", 0.002), ("large", 0.01)):
@@ -365,6 +380,7 @@ def test_noise_outliers_gaps_and_uneven_times() -> None:
     assert off[~wrong].max() < 1e-4 and off[wrong].min() > 0.019
 
 
+@pytest.mark.evidence
 def test_drake_as_a_second_truth(tmp_path: Path) -> None:
     pytest.importorskip("pydrake", reason="drake is not installed: pip install drake")
     case = silent("cube", "com_offset", engine="drake")
@@ -393,6 +409,7 @@ def test_drake_as_a_second_truth(tmp_path: Path) -> None:
     assert json.loads(truth.read_text())["engine"]["comes_with"] == ["velocity_restitution"]
 
 
+@pytest.mark.evidence
 def test_the_cases_of_drake() -> None:
     stages = [hidden_effects.drake_cases(stage) for stage in hidden_effects.STAGES]
     for found in stages:
@@ -426,6 +443,7 @@ def test_the_list_of_cases() -> None:
     assert set(stages[1]) & set(more) == {case for case in stages[1] if case in more}
 
 
+@pytest.mark.evidence
 def test_the_rough_cases(tmp_path: Path) -> None:
     found = hidden_effects.rough_cases("development", nulls=8)
     assert len(found) == 16 and sum(case.centroid_only for case in found) == 6
@@ -449,6 +467,7 @@ def test_wrong_cases_are_refused() -> None:
         hidden_effects.cases("test")
 
 
+@pytest.mark.evidence
 def test_a_case_is_filmed(tmp_path: Path) -> None:
     case = replace(hidden_effects.filmed_cases("development")[0], train=1, test=1, length_s=0.1)
     truth = hidden_effects.film_capture(tmp_path / "filmed", case)
@@ -471,12 +490,14 @@ def test_a_case_is_filmed(tmp_path: Path) -> None:
             assert len(rows) == pytest.approx(np.pi * (filmed.FOCAL_PX * radius / z) ** 2, rel=0.06)
 
 
+@pytest.mark.evidence
 def test_the_filmed_cases_have_seeds_of_their_own() -> None:
     stages = [hidden_effects.filmed_cases(stage) for stage in ("development", "report")]
     assert [len(found) for found in stages] == [6, 6] and all(case.filmed for found in stages for case in found)
     assert not {case.seed for case in stages[0]} & {case.seed for case in stages[1]}
 
 
+@pytest.mark.evidence
 def test_the_odd_cases() -> None:
     found = hidden_effects.odd_cases("development")
     assert len({case.name for case in found}) == len(found) and len({case.seed for case in found}) == len(found)
@@ -488,6 +509,7 @@ def test_the_odd_cases() -> None:
     assert (body.friction, body.damping_ratio, body.mass_kg) == (0.9, 0.06, thing.mass_kg)
 
 
+@pytest.mark.evidence
 def test_errors_that_last_and_smoothed_tracks(tmp_path: Path) -> None:
     case = Case("x", "ball", train=1, test=1, seed=3)
     found = {}

@@ -346,6 +346,7 @@ def _data() -> Path:
     return folder
 
 
+@pytest.mark.evidence
 def test_kermit_is_registered_completely():
     run = _benchmark().run_once(_data() / "kermit" / "images", CalibrateConfig(max_features=2048))
     assert (run["registered"], run["photos"]) == (11, 11)

@@ -1,4 +1,6 @@
-"""The engine against the laws of mechanics, case by case with its tolerance.
+"""The engine against the laws of mechanics, case by case with its tolerance: the kernel where a compiler is.
+
+That the kernel and the torch engine agree is the law of `test_fused.py`.
 
 Cases that need many steps share one rollout: a batch of 32 takes hardly longer than one.
 """
@@ -15,7 +17,8 @@ from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.datasets.synthetic.objects import make_object
 from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume
 from cgwm.pipeline.geometry.rotation import quat_rotate
-from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, damping_ratio_of, restitution, simulate
+from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, damping_ratio_of, restitution
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.sg_gs.collision_spheres import distil, shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
@@ -99,7 +102,7 @@ def momenta(world: World, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor]
 
 def test_free_fall_is_a_parabola_to_rounding() -> None:
     world = world_of(box_body(), ground=False)
-    rollout = simulate(world, state_of(((0, 0, 1), UP, (0.3, -0.2, 1.0), (3.0, 8.0, -2.0))), times(1.0))
+    rollout = roll_out(world, state_of(((0, 0, 1), UP, (0.3, -0.2, 1.0), (3.0, 8.0, -2.0))), times(1.0))
     t = rollout.times_s
     expected = torch.stack((0.3 * t, -0.2 * t, 1 + t - 0.5 * G * t**2), -1)
     torch.testing.assert_close(rollout.position_m[0, :, 0], expected, atol=1e-12, rtol=0)
@@ -113,7 +116,7 @@ def test_a_thrown_top_keeps_its_momenta_to_rounding_and_its_energy_to_2e_6_over_
     start = State.joined(
         state_of(((0, 0, 0), UP, thrown, (3.0, 8.0, -2.0))), state_of(((0, 0, 0), UP, thrown, (0.2, 0.1, 50.0)))
     )
-    rollout = simulate(world, start, times(10.0, 10))
+    rollout = roll_out(world, start, times(10.0, 10))
     fallen = values(0, 0, -G) * rollout.times_s[:, None]
     torch.testing.assert_close(
         rollout.velocity_m_s[:, :, 0], values(*thrown) + fallen.expand(2, -1, -1), atol=1e-10, rtol=0
@@ -129,9 +132,9 @@ def test_a_thrown_top_keeps_its_momenta_to_rounding_and_its_energy_to_2e_6_over_
 def test_tumbling_converges_with_the_second_order() -> None:
     errors = []
     start = state_of(((0, 0, 0), UP, (0, 0, 0), (3.0, 8.0, -2.0)))
-    exact = simulate(world_of(box_body(), ground=False, step_s=1e-4), start, times(0.5, 2)).quat_wxyz[0, -1, 0]
+    exact = roll_out(world_of(box_body(), ground=False, step_s=1e-4), start, times(0.5, 2)).quat_wxyz[0, -1, 0]
     for step in (0.004, 0.002):
-        quat = simulate(world_of(box_body(), ground=False, step_s=step), start, times(0.5, 2)).quat_wxyz[0, -1, 0]
+        quat = roll_out(world_of(box_body(), ground=False, step_s=step), start, times(0.5, 2)).quat_wxyz[0, -1, 0]
         errors.append(float((quat - exact).norm()))
     assert 3.4 < errors[0] / errors[1] < 4.6
 
@@ -152,7 +155,7 @@ def test_the_damping_ratio_of_a_restitution_is_the_inverse() -> None:
 @pytest.mark.parametrize("step", [0.0005, 0.001, 0.002])
 def test_a_head_on_impact_rebounds_with_the_analytic_restitution(zeta: float, step: float) -> None:
     world = world_of(ball_body(), contact=law(damping_ratio=zeta), gravity=0.0, step_s=step)
-    rollout = simulate(world, state_of(((0, 0, 0.0433), UP, (0, 0, -1.0), (0, 0, 0))), times(0.1, 50))
+    rollout = roll_out(world, state_of(((0, 0, 0.0433), UP, (0, 0, -1.0), (0, 0, 0))), times(0.1, 50))
     # the impact begins and ends inside a step: what is lost there is of the order of step / contact time
     expected = pytest.approx(float(restitution(torch.tensor(zeta))), abs=0.01 + 0.06 * step / 0.004)
     assert float(rollout.velocity_m_s[0, -1, 0, 2]) == expected
@@ -183,7 +186,7 @@ def test_bounce_heights_are_those_of_the_restitution() -> None:
         start = state_of(
             ((0, 0, 0.04 + 1e-3), UP, (0, 0, -math.sqrt(2 * G * (drop - 1e-3))), (0, 0, 0)), count=len(wanted)
         )
-        rollout = simulate(world, start, times(0.012, 1000))
+        rollout = roll_out(world, start, times(0.012, 1000))
         z, v = rollout.position_m[:, -1, 0, 2] - 0.04, rollout.velocity_m_s[:, -1, 0, 2]
         errors.append(float(((z + v.square() / (2 * G) - exact) / drop).abs().max()))
     assert errors[0] < 0.06
@@ -194,13 +197,13 @@ def test_bounce_heights_are_those_of_the_restitution() -> None:
 def test_coincident_spheres_are_one_contact(copies: int) -> None:
     """Neither rest depth nor rebound depends on how many spheres touch at one place."""
     start = state_of(((0, 0, 0.042), UP, (0, 0, -1.0), (0, 0, 0)))
-    one, many = (simulate(world_of(ball_body(copies=n), gravity=0.0), start, times(0.05)) for n in (1, copies))
+    one, many = (roll_out(world_of(ball_body(copies=n), gravity=0.0), start, times(0.05)) for n in (1, copies))
     torch.testing.assert_close(many.velocity_m_s, one.velocity_m_s, atol=1e-6, rtol=0)
 
 
 def test_restitution_does_not_depend_on_mass() -> None:
     start = state_of(((0, 0, 0.042), UP, (0, 0, -1), (0, 0, 0)))
-    light, heavy = (simulate(world_of(ball_body(mass=m), gravity=0.0), start, times(0.05)) for m in (0.01, 10.0))
+    light, heavy = (roll_out(world_of(ball_body(mass=m), gravity=0.0), start, times(0.05)) for m in (0.01, 10.0))
     torch.testing.assert_close(light.velocity_m_s, heavy.velocity_m_s, atol=1e-9, rtol=0)
 
 
@@ -210,7 +213,7 @@ def test_two_balls_collide_head_on_with_the_restitution_of_their_law() -> None:
     contact = ContactLaw(batch(0.3), batch(0.004), damping_ratio_of(wanted))
     world = world_of(ball_body(name="a"), ball_body(name="b", mass=0.5), contact=contact, ground=False, gravity=0.0)
     start = state_of(((0, 0, 0), UP, (1.0, 0, 0), (0, 0, 0)), ((0.1, 0, 0), UP, (0, 0, 0), (0, 0, 0)), count=3)
-    rollout = simulate(world, start, times(0.1))
+    rollout = roll_out(world, start, times(0.1))
     linear, _ = momenta(world, rollout)
     torch.testing.assert_close(linear[:, -1], linear[:, 0], atol=1e-13, rtol=0)
     parting = rollout.velocity_m_s[:, -1, 1, 0] - rollout.velocity_m_s[:, -1, 0, 0]
@@ -220,7 +223,7 @@ def test_two_balls_collide_head_on_with_the_restitution_of_their_law() -> None:
 def test_two_balls_that_graze_keep_both_momenta_and_gain_no_energy() -> None:
     world = world_of(ball_body(name="a"), ball_body(name="b", mass=0.5), ground=False, gravity=0.0)
     start = state_of(((0, 0, 0), UP, (1.0, 0, 0), (0, 0, 5.0)), ((0.1, 0.03, 0), UP, (0, 0, 0), (0, 0, 0)))
-    rollout = simulate(world, start, times(0.1))
+    rollout = roll_out(world, start, times(0.1))
     linear, angular = momenta(world, rollout)
     torch.testing.assert_close(linear[:, -1], linear[:, 0], atol=1e-12, rtol=0)
     # positions move by the mean velocity, so the moment of an impulse J is off by (h/2) (v_a - v_b) x J: first order
@@ -240,7 +243,7 @@ def test_a_tumbling_box_ends_with_less_energy_than_it_had() -> None:
         4 * torch.randn(20, 1, 3, generator=generator, dtype=F64),
     )
     world = world_of(box_body())
-    rollout = simulate(world, start, times(0.6, 20))
+    rollout = roll_out(world, start, times(0.6, 20))
     energy = kinetic(world, rollout) + world.bodies[0].mass * G * rollout.position_m[:, :, 0, 2]
     # a compressed contact holds energy that is not counted here, so only the end is compared with the start
     assert bool((energy[:, -1] < energy[:, 0]).all())
@@ -254,7 +257,7 @@ def test_a_slider_stops_after_v2_by_2_mu_g_to_a_thousandth() -> None:
     slab, cube = box_body(half=(0.05, 0.05, 0.005)), box_body(half=(0.05, 0.05, 0.05))
     world = world_of(batched([slab] * 5 + [cube] * 5), contact=ContactLaw(mu, batch(0.004), batch(1.0)))
     start = State.joined(*(state_of(((0, 0, z - REST_M), UP, (1.0, 0, 0), (0, 0, 0)), count=5) for z in (0.005, 0.05)))
-    rollout = simulate(world, start, times(1.1, 10))
+    rollout = roll_out(world, start, times(1.1, 10))
     torch.testing.assert_close(rollout.position_m[:, -1, 0, 0], 1 / (2 * mu * G), atol=0, rtol=1e-3)
     torch.testing.assert_close(
         rollout.velocity_m_s[:5, 5, 0, 0], (1 - 0.5 * mu[:5] * G).clamp_min(0), atol=1e-3, rtol=0
@@ -270,7 +273,7 @@ def test_a_box_on_a_slope_slides_beyond_the_friction_cone_and_nowhere_else() -> 
     slope = torch.cat((ratio, ratio)) * mu
     world = tilted(world_of(batched([slab] * 6 + [cube] * 6), contact=law(friction=mu)), slope)
     start = State.joined(*(state_of(((0, 0, z - REST_M), UP, (0, 0, 0), (0, 0, 0)), count=6) for z in (0.01, 0.05)))
-    moved = simulate(world, start, times(1.0, 20)).position_m[:, :, 0, 0].unflatten(0, (2, 6))
+    moved = roll_out(world, start, times(1.0, 20)).position_m[:, :, 0, 0].unflatten(0, (2, 6))
     angle = (ratio * mu).atan()
     assert float((moved[:, :3, -1] - moved[:, :3, 10]).abs().max()) < 5e-5
     analytic = 0.5 * G * (angle.sin() - mu * angle.cos())[3:]
@@ -279,7 +282,7 @@ def test_a_box_on_a_slope_slides_beyond_the_friction_cone_and_nowhere_else() -> 
 
 def test_a_ball_that_slides_ends_rolling_at_five_sevenths_and_keeps_that_speed() -> None:
     start = state_of(((0, 0, 0.04 - REST_M), UP, (1.0, 0, 0), (0, 0, 0)))
-    rollout = simulate(world_of(ball_body()), start, times(1.0, 10))
+    rollout = roll_out(world_of(ball_body()), start, times(1.0, 10))
     speed = rollout.velocity_m_s[0, :, 0, 0]
     assert float(speed[5]) == pytest.approx(5 / 7, rel=1e-9)
     assert float(speed[-1]) == pytest.approx(float(speed[5]), rel=1e-9)
@@ -318,7 +321,7 @@ def test_rods_that_slide_on_an_end_do_not_explode() -> None:
         torch.zeros(len(rows), 1, 3, dtype=F64),
     )
     world = world_of(rod, contact=ContactLaw(values(*(row[1] for row in rows)), batch(0.004), batch(0.5)))
-    rollout = simulate(world, start, times(1.2, 100))
+    rollout = roll_out(world, start, times(1.2, 100))
     energy = kinetic(world, rollout) + mass * G * rollout.position_m[:, :, 0, 2]
     assert float((energy / energy[:, :1]).max()) < 1 + 1e-9
     assert float(rollout.position_m[:, -1, 0, 2].max()) < radius
@@ -339,7 +342,7 @@ def test_bodies_rest_within_a_tenth_of_a_millimetre(duration_s: float) -> None:
     )
     low = [float((body.centers[..., 2] - body.radii).min()) for body in bodies]
     start = State.joined(*(state_of(((0, 0, -z), UP, (0, 0, 0), (0, 0, 0))) for z in low))
-    rollout = simulate(world, start, times(duration_s, 2))
+    rollout = roll_out(world, start, times(duration_s, 2))
     settled = 4
     drift = (rollout.position_m[:, settled:, 0] - rollout.position_m[:, settled : settled + 1, 0]).norm(dim=-1).amax(1)
     assert float(drift.max()) < 1e-4
@@ -354,7 +357,7 @@ def test_three_cubes_of_spheres_stand_on_each_other() -> None:
     half, count = 0.03, 3
     cubes = [cube_of_spheres(32, half, name=f"cube{k}") for k in range(count)]
     start = state_of(*[((0, 0, half + 2 * half * k), UP, (0, 0, 0), (0, 0, 0)) for k in range(count)])
-    rollout = simulate(world_of(*cubes), start, times(1.2, 5))
+    rollout = roll_out(world_of(*cubes), start, times(1.2, 5))
     place, turn = rollout.position_m[0, -1], 2 * rollout.quat_wxyz[0, -1, :, 1:3].norm(dim=-1).asin()
     expected = half + 2 * half * torch.arange(count, dtype=F64)
     torch.testing.assert_close(place[:, 2], expected, atol=1.5e-3, rtol=0)
@@ -378,7 +381,7 @@ def test_material_and_friction_do_not_depend_on_the_number_of_spheres(on_plane: 
             state_of(((0, 0, half - REST_M), UP, (0.5, 0, 0), (0, 0, 0))),
             state_of(((0, 0, half), UP, (0, 0, 0), (0, 0, 0))),
         )
-        place = simulate(world, start, times(0.3, 200)).position_m[:, :, 0]
+        place = roll_out(world, start, times(0.3, 200)).position_m[:, :, 0]
         after = place[0, 32:, 2] - half  # it lands after 0.143 s
         found.append((float(after.max()), float(place[1, -1, 0]), half - float(place[2, -1, 2])))
     rebound, slide, depth = torch.tensor(found, dtype=F64).unbind(-1)
@@ -393,7 +396,7 @@ def test_an_impact_off_the_centre_converges_in_the_step() -> None:
     contact = law(contact_time_s=0.01, friction=0.2)
     ends = []
     for step in (0.002, 0.001, 0.0005, 0.0000625):
-        rollout = simulate(world_of(ball_body(), contact=contact, step_s=step), start, times(0.06, 50))
+        rollout = roll_out(world_of(ball_body(), contact=contact, step_s=step), start, times(0.06, 50))
         ends.append(torch.cat((rollout.position_m[0, -1, 0], rollout.velocity_m_s[0, -1, 0])))
     errors = [float((end - ends[-1]).norm()) for end in ends[:-1]]
     assert errors[0] < 0.02

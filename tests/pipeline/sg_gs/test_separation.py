@@ -161,6 +161,7 @@ def test_a_box_the_wrong_way_round_is_refused():
         PhotoBox(min_m=(0, 0.2, 0), max_m=(1, 0.1, 1))
 
 
+@pytest.mark.evidence
 def test_the_fit_shows_what_it_took_for_the_body(capture, found, tmp_path, monkeypatch):
     root = shutil.copytree(capture.root, tmp_path / "capture")
     shutil.rmtree(root / "masks")

@@ -18,6 +18,7 @@ from cgwm.pipeline.physics.effects import (
     load_effect,
 )
 from cgwm.pipeline.physics.effects.registry import BUILT_IN
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.schemas import UsageError
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 
@@ -47,7 +48,8 @@ def observed(world: World, state: State, times_s: torch.Tensor, tracks: Mapping[
 
 
 def rolled(world: World, state: State, duration_s: float, *effects: ActiveEffect, rate_hz: float = 100.0):
-    return simulate(replace(world, effects=effects), state, times(duration_s, rate_hz))
+    """Roll out in the kernel where a compiler is: that the torch engine agrees is the law of `test_fused.py`."""
+    return roll_out(replace(world, effects=effects), state, times(duration_s, rate_hz))
 
 
 # Every effect: neutral, and differentiable
@@ -310,7 +312,7 @@ def deceleration(rollout, axis: int = 0) -> float:
     return float((speed[2] - speed[-1]) / (rollout.times_s[-1] - rollout.times_s[2]))
 
 
-@pytest.mark.parametrize("friction", [0.2, 0.6])
+@pytest.mark.parametrize("friction", [pytest.param(0.2, marks=pytest.mark.evidence), 0.6])
 def test_rolling_resistance_slows_a_rolling_ball(friction: float) -> None:
     """m a = -f, I alpha = f r - c_r m g, v = omega r: a = -(c_r g / r) / (1 + I / (m r^2)) = -(5/7) c_r g / r."""
     radius, arm = 0.04, 1e-3
@@ -454,7 +456,7 @@ def test_a_moved_centre_of_mass_flies_on_the_parabola() -> None:
 def test_a_moved_marker_is_seen_where_it_is_and_moves_nothing() -> None:
     world = world_of(box_body())
     start = state_of(((0.1, 0.2, 0.1), TILTED, (0.3, 0.1, 0.0), (4.0, -3.0, 6.0)))
-    plain = rolled(world, start, 0.1)
+    plain = simulate(world, start, times(0.1))
     seen = observed(replace(world, effects=(active("marker_offset", d_x=0.01, d_z=-0.02),)), start, times(0.1))
     arm = quat_rotate(plain.quat_wxyz, batch([0.01, 0.0, -0.02]))
     torch.testing.assert_close(seen.position_m, plain.position_m + arm, atol=1e-14, rtol=0)

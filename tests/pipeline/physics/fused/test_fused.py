@@ -110,7 +110,7 @@ def test_a_tumbling_box(fused: Fused, lanes: int) -> None:
     agree(expected, fused(world, state, times(0.3), None, True, lanes=lanes), 1e-9)
 
 
-@pytest.mark.parametrize("lanes", [1, 8, None])
+@pytest.mark.parametrize("lanes", [*(pytest.param(lanes, marks=pytest.mark.evidence) for lanes in (1, 8)), None])
 def test_a_cube_of_64_spheres_with_a_shifted_mass(fused: Fused, lanes: int | None) -> None:
     body = replace(cube(), com=batch([0.004, -0.003, 0.006]))
     assert body.on_plane is not None and len(body.on_plane) == 8
@@ -147,7 +147,7 @@ def crowd() -> tuple[World, State, dict[str, Track | Drive]]:
     return world, state, {"pusher": Track(time, along, quat)}
 
 
-@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.evidence), 4, None])
+@pytest.mark.parametrize("lanes", [*(pytest.param(lanes, marks=pytest.mark.evidence) for lanes in (1, 4)), None])
 def test_bodies_that_touch_each_other(fused: Fused, lanes: int | None) -> None:
     world, state, driven = crowd()
     like = state.position_m
@@ -367,7 +367,7 @@ def test_effects(fused: Fused, ground: str) -> None:
             assert (found - expected.position_m[:, : found.shape[1]]).abs().max() > 1e-6, left_out.effect.name
 
 
-@pytest.mark.parametrize("lanes", [1, 4])
+@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.evidence), 4])
 def test_the_pull_of_the_ground_on_one_body(fused: Fused, lanes: int) -> None:
     """Its lowest sphere is one of several threads'."""
     world = replace(world_of(cube(), step_s=0.002), effects=(active("ground_magnet", A=30.0, l=0.02),))
@@ -432,7 +432,11 @@ def sliding(world: World) -> State:
 
 @pytest.mark.parametrize(
     ("name", "lanes"),
-    [*(pytest.param(name, 1, marks=pytest.mark.evidence) for name in SURFACE_VALUES), ("all", 1), ("all", 4)],
+    [
+        *(pytest.param(name, 1, marks=pytest.mark.evidence) for name in SURFACE_VALUES),
+        pytest.param("all", 1, marks=pytest.mark.evidence),
+        ("all", 4),
+    ],
 )
 def test_effects_of_the_contact_of_one_body(fused: Fused, name: str, lanes: int) -> None:
     plain = world_of(cube(side=2, half=0.04))
