@@ -24,8 +24,8 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-LONGEST = ("test_hidden_loop.py", "test_fall_push.py", "test_scenes.py", "test_fused.py", "test_sg_gs.py")
-"""Files that take a minute or more of one core, or nearly, the longest first."""
+LONGEST = ("test_fused.py", "test_effects.py", "test_shards.py", "test_rollout_batches.py", "test_physics.py")
+"""Files that take 20 s or more of one core, the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

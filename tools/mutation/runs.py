@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from changes import FOLDERS, Mutant, applied, sample
+from changes import Mutant, applied, sample
 from line_map import environment_of
 
 TEST_START_S, PATIENCE = 60.0, 8.0
@@ -145,7 +145,7 @@ def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
         bad |= wrong
         results = {key: value for key, value in results.items() if value.get("killer") not in wrong}
     shutil.rmtree(work / "slots", ignore_errors=True)
-    return report(mutants, results, work)
+    return report(mutants, results, options.folders, work)
 
 
 def key_of(mutant: Mutant) -> str:
@@ -212,12 +212,14 @@ def control(results: dict[str, dict[str, Any]], tests: dict[str, Any], slots: Se
     return wrong
 
 
-def report(mutants: Sequence[Mutant], results: dict[str, dict[str, Any]], work: Path) -> dict[str, Any]:
+def report(
+    mutants: Sequence[Mutant], results: dict[str, dict[str, Any]], folders: Sequence[str], work: Path
+) -> dict[str, Any]:
     """Write and print the share killed by folder, and the survivors."""
     entries = [results[key_of(mutant)] for mutant in mutants]
     by_folder: dict[str, Counter[str]] = defaultdict(Counter)
     for entry in entries:
-        folder = next(f for f in FOLDERS if entry["path"].startswith(f + "/"))
+        folder = next(f for f in folders if entry["path"].startswith(f + "/"))
         by_folder[folder][entry["state"]] += 1
         by_folder["all"][entry["state"]] += 1
     table = {
