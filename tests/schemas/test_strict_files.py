@@ -333,3 +333,18 @@ def test_an_effect_is_added_once(effects: tuple[str, ...], twice: str | None) ->
         return
     with pytest.raises(InputDataError, match=f"the effect '{twice}' stands twice"):
         parse({"effects": list(effects)}, PhysConfig, "settings.toml")
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("{ mass = 1 }", "world.gravity_m_s2: input should be a list.\n"),
+        ("[{ mass = 1 }, 0, 0]", "world.gravity_m_s2.0: input should be a valid number.\n"),
+        ('"down"', 'world.gravity_m_s2: input should be a list (found "down").\n'),
+    ],
+)
+def test_a_wrong_value_is_shown_unless_it_is_a_table(tmp_path: Path, value: str, words: str) -> None:
+    (tmp_path / "capture.toml").write_text(f'format = "cgwm-capture/1"\n[world]\ngravity_m_s2 = {value}\n')
+    with pytest.raises(InputDataError) as error:
+        read_toml(tmp_path / "capture.toml", CaptureManifest)
+    assert f"capture.toml, line 3: {words}" in str(error.value)
