@@ -28,8 +28,8 @@ from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, a
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import InputDataError, UsageError
-from helpers import fused_host
-from helpers.worlds import F64, ball_body, batch, box_body, state_of, times, world_of
+from helpers import fused_host, worlds
+from helpers.worlds import F64, ball_body, batch, box_body, state_of, times
 from torch import Tensor
 
 CUDA = torch.cuda.is_available() and kernel_build.available()
@@ -40,6 +40,11 @@ CONTACTS = ("impulse_n_s", "position_m", "normal", "distance_m")
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 Fused = Callable[..., Rollout]
+
+
+def world_of(*bodies: Body, step_s: float = 0.002, **more: Any) -> World:
+    """Return a world of coarse steps: the two engines have to agree in each."""
+    return worlds.world_of(*bodies, step_s=step_s, **more)
 
 
 def on_cuda(
