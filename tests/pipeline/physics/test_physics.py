@@ -54,7 +54,7 @@ def test_a_driven_body_pushes_a_free_one_and_follows_its_command() -> None:
     shape = Shape(box=BoxShape(half_extents_m=(0.04, 0.04, 0.02)))
     spheres, _ = shape_to_spheres(shape, Path(), 128)
     box = replace(box_body(half=(0.04, 0.04, 0.02)), centers=batch(spheres.means), radii=batch(2 * spheres.scales))
-    world = world_of(box, tip)
+    world = world_of(box, tip, step_s=0.002)
     command = Track(np.array([0.0, 1.0]), np.array([[-0.08, 0, 0.02], [0.02, 0, 0.02]]))
     start = state_of(((0, 0, 0.02), UP, (0, 0, 0), (0, 0, 0)), ((-0.08, 0, 0.02), UP, (0, 0, 0), (0, 0, 0)))
     rollout = simulate(world, start, times(1.0, 20), {"tip": command})
@@ -100,7 +100,7 @@ def test_derivatives_of_a_rollout_match_finite_differences(until: float) -> None
             base.velocity_m_s.repeat(n, 1, 1),
             base.omega_body_rad_s.repeat(n, 1, 1) + torch.stack((x[:, 4], 0 * x[:, 4], 0 * x[:, 4]), -1)[:, None],
         )
-        rollout = simulate(world_of(box_body(), contact=contact), start, times(until))
+        rollout = simulate(world_of(box_body(), contact=contact, step_s=0.002), start, times(until))
         return torch.cat((rollout.position_m[:, -1, 0], rollout.quat_wxyz[:, -1, 0]), -1)
 
     x = torch.tensor([[math.log(0.3), math.log(0.35), math.log(0.004), 0.0, 0.0]], dtype=F64)
