@@ -95,6 +95,8 @@ DROPPED_TESTS: Mapping[str, str] = {
     r"^test_(errors_and_exit_codes|the_outcome_is_said_plainly|the_page_has_the_numbers)\[": "by a reworded message",
     r"^test_(a_wrong_plan_is_told_with_its_line|inadmissible_parameters_are_refused)\[": "by a reworded message",
     r"^test_a_rollout_that_diverges_names_environment_and_step_and_leaves_its_start$": "the start is in the message",
+    r"^test_(a_plan_repeats_itself|capture_opens_and_manifest_validates)$": "by scene",
+    r"^test_same_arguments_same_bytes\[": "the film of one plan; that plans repeat is a test of its own",
     r"\[(.*-)?(triton|cuda)(-.*)?\]$": "the GPU renderer has one kind of kernels",
 }
 """Tests (a pattern of their names) that this tree need not have, with the reason."""

@@ -325,6 +325,13 @@ def test_a_plan_repeats_itself(name: str) -> None:
         np.testing.assert_array_equal(one.motion.qpos, other.motion.qpos)
 
 
+@pytest.mark.evidence
+def test_the_search_for_a_toss_that_can_be_repeated_repeats_itself() -> None:
+    one, other = (plan_scene("fall", 2) for _ in range(2))
+    for mine, its in zip(one.episodes, other.episodes, strict=True):
+        np.testing.assert_array_equal(mine.motion.qpos, its.motion.qpos)
+
+
 def test_the_truth_is_that_of_the_plan_and_seeds_differ(fall: Path) -> None:
     plan, truth = planned("fall", 2), read_truth(fall)
     assert truth.object.mass_kg == plan.solid.mass
