@@ -51,6 +51,7 @@ class Slot:
         self.pid, self.count, self.began, self.limit = 0, 0, 0.0, 0.0
         self.mutant: Mutant | None = None
         self.before = b""
+        self.tests: list[str] = []
 
     def begin(self, mutant: Mutant | None, tests: Sequence[str], limit: float) -> None:
         """Apply a mutant, and run tests in a process of its own until the first fails."""
@@ -136,7 +137,7 @@ def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
         __import__(name)
     bad: set[str] = set(options.without)
     while True:
-        test_all(mutants, results, (tests, by_line, bad), slots, options)
+        test_all(mutants, results, (tests, by_line, bad), slots, options, kept)
         kept.write_text(json.dumps(results, indent=1))
         wrong = control(results, tests, slots) - bad
         if not wrong:
@@ -159,6 +160,7 @@ def test_all(
     known: tuple[dict[str, Any], dict[tuple[str, int], list[str]], set[str]],
     slots: Sequence[Slot],
     options: argparse.Namespace,
+    kept: Path,
 ) -> None:
     """Fill in the results that are missing, or of which tests are left that the budget allows now."""
     tests, by_line, bad = known
@@ -178,10 +180,11 @@ def test_all(
             if slot.pid and (over := slot.ended()) is not None:
                 assert slot.mutant is not None
                 take(results[key_of(slot.mutant)], over, slot)
+                kept.write_text(json.dumps(results, indent=1))
             if not slot.pid and waiting:
                 mutant, names = waiting.pop(0)
                 expected = sum(tests[name]["seconds"] for name in names)
-                results[key_of(mutant)]["ran"] += names
+                slot.tests = names
                 slot.begin(mutant, names, TEST_START_S + PATIENCE * expected)
                 if len(waiting) % 20 == 0:
                     print(f"{total - len(waiting)} of {total} begun, {time.monotonic() - began:.0f} s", flush=True)
@@ -191,6 +194,7 @@ def test_all(
 def take(entry: dict[str, Any], over: tuple[int | None, float], slot: Slot) -> None:
     """Write down how a run of tests ended."""
     code, seconds = over
+    entry["ran"] += slot.tests
     entry["seconds"] = round(entry["seconds"] + seconds, 2)
     entry["state"] = {None: "timeout", 0: "survived"}.get(code, "killed")
     if entry["state"] == "killed":  # where the file of tests cannot be read at all, the first that should have run
