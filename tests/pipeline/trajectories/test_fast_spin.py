@@ -15,7 +15,7 @@ from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_fra
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import InputDataError
-from small_model import HALF, small_model
+from helpers.small_model import HALF, small_model
 
 RATE_HZ = 100.0
 AXIS = torch.tensor([0.6, 0.0, 0.8]).double()
