@@ -1,25 +1,27 @@
-"""Robust Levenberg-Marquardt for shared parameters and one hidden state for each observed item.
-
-The normal equations have arrow structure: the state of an item is coupled only to that item's residuals and the shared
-parameters. Eliminating the states (Schur complement) leaves a small system in the parameters (Triggs et al., "Bundle
-adjustment - a modern synthesis", 2000, section 6).
-"""
+"""Robust fit of shared parameters and one hidden state for each observed item, from a function of their residuals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ...schemas import NotConvergedError
+from .least_squares import Descent, Policy, Stop, descend
+from .normal_equations import NormalEquations
+from .problem import Box, Point, Problem, Rows
 
 Residuals = Callable[[Tensor, Tensor, bool], tuple[Tensor, Tensor | None]]
 """(shared (P,), state change (B, S), with Jacobian) -> residuals (B, F, m) in sigmas, and (B, F, m, P + S) or None.
 
 The robust loss gives each row of F (a frame) one weight; an unobserved row is zero.
 """
+
+
+LAST_DAMPING = 1e-9
+"""Damping of the states in the information of the result: it is invertible even where a state was not observed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +44,17 @@ class Solution:
     """Covariance (B, S, S) of the states at fixed parameters."""
     chi2: Tensor
     """Squared norm (B, F) of each row of residuals, in sigmas."""
-    converged: bool
-    """Whether the fit converged within the given number of iterations."""
+    stop: Stop
+    """Why the fit ended."""
     free: Tensor
     """Mask (P,) of the parameters that are not on a bound."""
     by_item: Tensor
     """Contribution (B, P, P) of each item to the information."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit converged within the given number of iterations."""
+        return self.stop in (Stop.CONVERGED, Stop.NO_LOWER_COST)
 
 
 def robust_loss(chi2: Tensor, scale: float | None) -> tuple[Tensor, Tensor]:
@@ -102,146 +109,77 @@ def minimise(
     Raises:
         NotConvergedError: If the residuals at the start are not finite.
     """
+    zero = torch.zeros_like(shared)
+    centre, held = (zero, zero) if shared_prior is None else shared_prior
     prior = torch.zeros(states.shape[1]).to(states) if prior_information is None else prior_information
-    centre, held = (torch.zeros_like(shared), torch.zeros_like(shared)) if shared_prior is None else shared_prior
-    damping, costs, converged = 1e-3, [], False
-    linear = _linearise(residuals, shared, states, robust_scale, prior)
-    if not torch.isfinite(linear.cost):
+    box = Box.within(bounds, centre, held)
+    problem = _SharedAndStates(residuals, robust_scale, prior, box, torch.zeros(len(states), dtype=torch.long))
+    policy = Policy(iterations=iterations, relative=tolerance)
+    report = None if on_iteration is None else lambda step, descent: on_iteration(step, float(descent.cost[0]))
+    end = descend(problem, Point(values=shared[None], states=(states,)), policy, report)
+    if not bool(end.history[0].isfinite()):
         raise NotConvergedError("the model diverges already at the start of the fit (no finite residual).")
-    total = linear.cost + _pull(shared, centre, held)
-    costs.append(float(total))
-    for iteration in range(iterations):
-        step_shared, step_states = _step(linear, shared, bounds, damping, held, held * (centre - shared))
-        next_shared = (shared + step_shared).clamp(bounds[:, 0], bounds[:, 1])
-        next_states = states + step_states
-        cost = _cost(residuals, next_shared, next_states, robust_scale, prior) + _pull(next_shared, centre, held)
-        if torch.isfinite(cost) and cost < total:
-            fall = float((total - cost) / total.clamp_min(1e-300))
-            shared, states = next_shared, next_states
-            linear = _linearise(residuals, shared, states, robust_scale, prior)
-            total = linear.cost + _pull(shared, centre, held)
-            costs.append(float(total))
-            damping = max(damping / 5, 1e-8)
-            if fall < tolerance:
-                converged = True
-        else:
-            damping *= 6
-            converged = damping > 1e8
-        if on_iteration:
-            on_iteration(iteration, costs[-1])
-        if converged:
-            break
-    return _solution(linear, shared, states, bounds, costs, converged)
+    return _solution(problem, end)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Linear:
-    """Normal equations of one linearization."""
+@dataclass(frozen=True)
+class _SharedAndStates(Problem):
+    """Residuals of items (B) that all share their parameters, as one group."""
 
-    a: Tensor
-    """Information (B, S, S) on the states, with their prior."""
-    b: Tensor
-    """Mixed information (B, S, P) on states and parameters."""
-    c: Tensor
-    """Information (B, P, P) on the parameters."""
-    ga: Tensor
-    """Negative gradient (B, S) of half of the cost with respect to the states."""
-    gc: Tensor
-    """Negative gradient (B, P) of half of the cost with respect to the parameters."""
-    cost: Tensor
-    """Cost, a scalar."""
-    chi2: Tensor
-    """Squared norm (B, F) of each row of residuals."""
+    residuals: Residuals
+    """Residuals and their Jacobian."""
+    robust_scale: float | None
+    """Scale of the Cauchy loss of a row, in sigmas; None for plain squares."""
+    prior: Tensor
+    """Information (S,), or (B, S), of a zero-mean prior on each state change."""
+    box: Box
+    """Bounds and prior of the shared parameters."""
+    owner: Tensor
+    """Zeros (B,)."""
 
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the cost (B,) of each item, with the prior on its state."""
+        del rows
+        found, _ = self.residuals(point.values[0], point.states[0], False)
+        return self._item_costs(robust_loss(found.square().sum(-1), self.robust_scale)[0], point.states[0])
 
-def _pull(shared: Tensor, centre: Tensor, information: Tensor) -> Tensor:
-    """Return the cost of a normal prior on the shared parameters, twice the negative log density."""
-    return (information * (shared - centre).square()).sum()
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the robust normal equations of all items."""
+        del rows
+        shared, states = point.values[0], point.states[0]
+        found, jacobian = self.residuals(shared, states, True)
+        assert jacobian is not None  # it was requested
+        loss, weight = robust_loss(found.square().sum(-1), self.robust_scale)
+        normal = NormalEquations.of_rows(
+            found.flatten(1),
+            jacobian.flatten(1, 2),
+            len(shared),
+            self._item_costs(loss, states),
+            weight.repeat_interleave(found.shape[-1], -1),
+            self.prior,
+        )
+        return replace(normal, state_slope=normal.state_slope - self.prior * states)
 
-
-def _cost(residuals: Residuals, shared: Tensor, states: Tensor, scale: float | None, prior: Tensor) -> Tensor:
-    """Return the robust cost with the prior on the states."""
-    r, _ = residuals(shared, states, False)
-    return robust_loss(r.square().sum(-1), scale)[0].sum() + (prior * states.square()).sum()
-
-
-def _linearise(residuals: Residuals, shared: Tensor, states: Tensor, scale: float | None, prior: Tensor) -> _Linear:
-    """Return the robust normal equations of all items."""
-    r, jacobian = residuals(shared, states, True)
-    assert jacobian is not None  # it was requested
-    chi2 = r.square().sum(-1)
-    loss, weight = robust_loss(chi2, scale)
-    count = shared.shape[0]
-    # derivatives of rows that are not finite are not used: the cost already rejects them
-    weighted = jacobian * weight[..., None, None]
-    flat, flat_weighted, flat_r = jacobian.flatten(1, 2), weighted.flatten(1, 2), r.flatten(1, 2)
-    normal = flat_weighted.transpose(1, 2) @ flat
-    gradient = -(flat_weighted.transpose(1, 2) @ flat_r[..., None]).squeeze(-1)
-    a = normal[:, count:, count:] + torch.diag_embed(prior)
-    ga = gradient[:, count:] - prior * states
-    cost = loss.sum() + (prior * states.square()).sum()
-    return _Linear(
-        a=a,
-        b=normal[:, count:, :count],
-        c=normal[:, :count, :count],
-        ga=ga,
-        gc=gradient[:, :count],
-        cost=cost,
-        chi2=chi2,
-    )
+    def _item_costs(self, loss: Tensor, states: Tensor) -> Tensor:
+        return loss.sum(-1) + (self.prior * states.square()).sum(-1)
 
 
-def _eliminate(linear: _Linear, damping: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Eliminate the states, and return reduced information and gradient by item and the back-substitution."""
-    diagonal = torch.diag_embed(linear.a.diagonal(dim1=1, dim2=2).clamp_min(1e-12))
-    a = linear.a + damping * diagonal
-    solved = torch.linalg.solve(a, torch.cat((linear.b, linear.ga[..., None]), -1))
-    by_shared, by_gradient = solved[..., :-1], solved[..., -1]
-    reduced = linear.c - linear.b.transpose(1, 2) @ by_shared
-    gradient = linear.gc - (linear.b.transpose(1, 2) @ by_gradient[..., None]).squeeze(-1)
-    return reduced, gradient, by_shared, by_gradient
-
-
-def _step(
-    linear: _Linear, shared: Tensor, bounds: Tensor, damping: float, held: Tensor, pull: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return the damped step of the parameters and the states.
-
-    Args:
-        linear: The normal equations.
-        shared: Shared parameters (P,).
-        bounds: Lower and upper bounds (P, 2).
-        damping: Relative damping.
-        held: Information (P,) of the prior on the parameters.
-        pull: Negative gradient (P,) of half of its cost.
-    """
-    reduced, gradient, by_shared, by_gradient = _eliminate(linear, damping)
-    total, slope = reduced.sum(0) + torch.diag(held), gradient.sum(0) + pull
-    free = (~bound_stops(shared, slope, bounds)).to(shared.dtype)
-    scale = total.diagonal().clamp_min(1e-9)
-    system = total * free[:, None] * free + torch.diag(damping * scale + (1 - free) * scale + 1e-9)
-    step = torch.linalg.solve(system, slope * free) if shared.numel() else shared
-    return step, by_gradient - (by_shared @ step[:, None]).squeeze(-1)
-
-
-def _solution(
-    linear: _Linear, shared: Tensor, states: Tensor, bounds: Tensor, costs: list[float], converged: bool
-) -> Solution:
-    """Return the solution at the last linearization."""
-    reduced, gradient, _, _ = _eliminate(linear, 1e-9)
-    free = (shared > bounds[:, 0]) & (shared < bounds[:, 1])
-    eye = torch.eye(linear.a.shape[-1]).to(linear.a)
-    state_cov = torch.linalg.pinv(linear.a, hermitian=True) if linear.a.shape[-1] else linear.a * eye
+def _solution(problem: _SharedAndStates, end: Descent) -> Solution:
+    """Return the end of a descent as a solution."""
+    shared, states, normal = end.point.values[0], end.point.states[0], end.normal
+    reduced = normal.eliminated(torch.full_like(normal.cost, LAST_DAMPING))
+    bounds = problem.box
+    rows, _ = problem.residuals(shared, states, False)
     return Solution(
         shared=shared,
         states=states,
-        cost=costs[-1],
-        costs=costs,
-        information=reduced.sum(0),
-        scores=gradient,
-        state_cov=state_cov,
-        chi2=linear.chi2,
-        converged=converged,
-        free=free,
-        by_item=reduced,
+        cost=end.costs[-1],
+        costs=end.costs,
+        information=reduced.information.sum(0),
+        scores=reduced.score,
+        state_cov=torch.linalg.pinv(normal.states, hermitian=True) if states.shape[1] else normal.states,
+        chi2=rows.square().sum(-1),
+        stop=end.reasons[0],
+        free=(shared > bounds.low[0]) & (shared < bounds.high[0]),
+        by_item=reduced.information,
     )
