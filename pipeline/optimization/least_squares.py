@@ -110,6 +110,14 @@ class Descent:
     history: tuple[Tensor, ...]
     """Cost of each group at the start and after each iteration, each of shape (G,)."""
 
+    def with_groups(self, groups: Tensor, **values: Tensor) -> Descent:
+        """Return the descent with fields of some groups (g,) replaced by values (g,)."""
+        return replace(self, **{name: getattr(self, name).index_copy(0, groups, one) for name, one in values.items()})
+
+    def ended(self, reason: Stop) -> Tensor:
+        """Return the reasons for stopping (G,) with a given one for the groups that are still running."""
+        return torch.where(self.stop == Stop.RUNNING, int(reason), self.stop)
+
     @property
     def reasons(self) -> list[Stop]:
         """Reason for stopping of each group."""
@@ -153,9 +161,9 @@ def descend(
         descent = _iterated(descent, policy, rows, last=iteration + 1 == policy.iterations)
         descent = replace(descent, history=(*descent.history, descent.cost))
         if watch is not None and watch(iteration, descent):
-            descent = _stopped(descent, every.groups, Stop.WATCHER)
-    descent = _stopped(descent, every.groups, Stop.ITERATIONS)
-    return replace(descent, stop=torch.where(descent.cost.isfinite(), descent.stop, int(Stop.NOT_FINITE)))
+            descent = replace(descent, stop=descent.ended(Stop.WATCHER))
+    stop = torch.where(descent.cost.isfinite(), descent.ended(Stop.ITERATIONS), int(Stop.NOT_FINITE))
+    return replace(descent, stop=stop)
 
 
 def by_group(values: Tensor, owner: Tensor, count: int) -> Tensor:
@@ -240,7 +248,7 @@ def _limited(change: Tensor, problem: Problem, policy: Policy, rows: Rows) -> tu
     largest = change.new_zeros(len(rows.groups))
     if problem.units is None:
         return change, torch.full_like(largest, torch.inf)
-    largest = largest.index_reduce(0, rows.owner, (change.abs() / problem.units).amax(-1), "amax")
+    largest = largest.scatter_reduce(0, rows.owner, (change.abs() / problem.units).amax(-1), "amax")
     share = (policy.step_limit / largest).clamp_max(1.0)
     return change * share[rows.owner][:, None], largest * share
 
@@ -254,68 +262,73 @@ def _iterated(descent: Descent, policy: Policy, rows: Rows, last: bool) -> Desce
     cost = by_group(by_item, trials.rows.owner, len(trials.rows.groups))
     cost = cost + problem.box.at(trials.rows.groups).cost(trials.point.values)
     found, choice = torch.nan_to_num(cost.unflatten(0, (-1, len(groups))), nan=torch.inf).min(0)
-    before, used = descent.cost[groups], trials.damping.gather(0, choice[None])[0]
-    better = found < before
-    raised = descent.damping[groups] * policy.up
-    damping = torch.where(better, (used * policy.down).clamp_min(policy.least_damping), raised)
-    small = better & (before - found < (policy.relative * before).clamp_min(policy.absolute))
-    descent = replace(
-        descent,
-        damping=descent.damping.index_copy(0, groups, damping),
-        rejected=descent.rejected.index_copy(0, groups, torch.where(better, 0, descent.rejected[groups] + 1)),
-        accepted=descent.accepted.index_add(0, groups, better.long()),
-        evaluations=descent.evaluations.index_add(0, groups, torch.full_like(groups, len(trials.damping))),
-    )
-    descent = _stopped(descent, groups[small], Stop.CONVERGED)
-    descent = _stopped(descent, groups[trials.size < policy.small_step], Stop.SMALL_STEP)
-    descent = _stopped(descent, groups[~better & _exhausted(descent, policy)[groups]], Stop.NO_LOWER_COST)
-    if policy.steps is not None:
-        descent = _stopped(descent, groups[descent.accepted[groups] >= policy.steps], Stop.ITERATIONS)
+    better = found < descent.cost[groups]
+    descent = _judged(descent, policy, rows, trials, (found, choice, better))
     if not bool(better.any()):
         return descent
-    won, items = rows.where(better), choice[rows.owner] * len(rows.items) + torch.arange(len(rows.items)).to(choice)
-    items = items[better[rows.owner]]
-    places = (choice * len(groups) + torch.arange(len(groups)).to(choice))[better]
-    descent = replace(
-        descent,
-        point=descent.point.put(won, trials.point.at(places, items)),
-        item_cost=descent.item_cost.index_copy(0, won.items, by_item[items]),
-        cost=descent.cost.index_copy(0, won.groups, found[better]),
-    )
+    won, kept = rows.where(better), better[rows.owner]
+    items = (choice[rows.owner] * len(rows.items) + torch.arange(len(rows.items), device=choice.device))[kept]
+    places = (choice * len(groups) + torch.arange(len(groups), device=choice.device))[better]
+    point = descent.point.put(won, trials.point.at(places, items))
+    descent = replace(descent, point=point, item_cost=descent.item_cost.index_copy(0, won.items, by_item[items]))
     if seen is not None:
         return _linearised(descent, won, seen.at(items))
     if not policy.linearise_end:
         won = won.where((descent.stop[won.groups] == Stop.RUNNING) & (not last))
     if not len(won.groups):
         return descent
-    return _linearised(descent, won, problem.linearised(descent.point.at(won.groups, won.items), won))
+    return _linearised(descent, won, problem.linearised(point.at(won.groups, won.items), won))
+
+
+def _judged(
+    descent: Descent, policy: Policy, rows: Rows, trials: _Trials, best: tuple[Tensor, Tensor, Tensor]
+) -> Descent:
+    """Return the descent with costs, dampings, counts and reasons to stop after trials of some groups.
+
+    Args:
+        descent: Before the trials.
+        policy: Its policy.
+        rows: Rows of the groups.
+        trials: The trials.
+        best: Lowest cost of each group, its trial, and whether it is lower than before, each of shape (g,).
+    """
+    groups, (found, choice, better) = rows.groups, best
+    before, accepted = descent.cost[groups], descent.accepted[groups] + better
+    rejected = torch.where(better, 0, descent.rejected[groups] + 1)
+    lowered = (trials.damping.gather(0, choice[None])[0] * policy.down).clamp_min(policy.least_damping)
+    damping = torch.where(better, lowered, descent.damping[groups] * policy.up)
+    hopeless = ~better & (damping > policy.most_damping)
+    if policy.attempts is not None:
+        hopeless = hopeless | (rejected >= policy.attempts)
+    stop = torch.full_like(groups, Stop.RUNNING if policy.steps is None else Stop.ITERATIONS)
+    if policy.steps is not None:
+        stop = torch.where(accepted >= policy.steps, stop, int(Stop.RUNNING))
+    stop = torch.where(hopeless, int(Stop.NO_LOWER_COST), stop)
+    stop = torch.where(trials.size < policy.small_step, int(Stop.SMALL_STEP), stop)
+    small = better & (before - found < (policy.relative * before).clamp_min(policy.absolute))
+    return descent.with_groups(
+        groups,
+        stop=torch.where(small, int(Stop.CONVERGED), stop),
+        cost=torch.where(better, found, before),
+        damping=damping,
+        rejected=rejected,
+        accepted=accepted,
+        evaluations=descent.evaluations[groups] + len(trials.damping),
+    )
 
 
 def _linearised(descent: Descent, rows: Rows, normal: NormalEquations) -> Descent:
     """Return the descent with new normal equations of some rows."""
-    cost = by_group(normal.cost, rows.owner, len(rows.groups))
-    cost = cost + descent.problem.box.at(rows.groups).cost(descent.point.values[rows.groups])
-    descent = replace(
-        descent,
-        normal=descent.normal.put(rows.items, normal),
-        item_cost=descent.item_cost.index_copy(0, rows.items, normal.cost),
-        cost=descent.cost.index_copy(0, rows.groups, cost),
-        linearisations=descent.linearisations.index_add(0, rows.groups, torch.ones_like(rows.groups)),
+    groups = rows.groups
+    own = by_group(normal.cost, rows.owner, len(groups))
+    bad = int(Stop.NOT_FINITE)
+    descent = descent.with_groups(
+        groups,
+        cost=own + descent.problem.box.at(groups).cost(descent.point.values[groups]),
+        stop=torch.where(_finite(normal, rows), descent.stop[groups], bad),
+        linearisations=descent.linearisations[groups] + 1,
     )
-    return _stopped(descent, rows.groups[~_finite(normal, rows)], Stop.NOT_FINITE)
-
-
-def _exhausted(descent: Descent, policy: Policy) -> Tensor:
-    """Return whether the policy admits no further attempt after a rejected step, shape (G,)."""
-    found = descent.damping > policy.most_damping
-    return found if policy.attempts is None else found | (descent.rejected >= policy.attempts)
-
-
-def _stopped(descent: Descent, groups: Tensor, reason: Stop) -> Descent:
-    """Return the descent with those of some groups (n,) ended that are still running."""
-    stop = descent.stop.clone()
-    stop[groups] = torch.where(stop[groups] == Stop.RUNNING, int(reason), stop[groups])
-    return replace(descent, stop=stop)
+    return replace(descent, normal=descent.normal.put(rows.items, normal))
 
 
 def _finite(normal: NormalEquations, rows: Rows) -> Tensor:

@@ -130,6 +130,10 @@ class NormalEquations:
         Args:
             damping: Relative damping of the states of each item, shape (B,); none by default.
         """
+        if not self.states.shape[-1]:
+            return Eliminated(
+                information=self.information, score=self.slope, state_step=self.state_slope, by_parameter=self.mixed
+            )
         states = self.states
         if damping is not None:
             states = damped(states, damping)

@@ -33,6 +33,8 @@ class Rows:
 
     def where(self, chosen: Tensor) -> Rows:
         """Return the rows of the groups that a mask (g,) chooses."""
+        if bool(chosen.all()):
+            return self
         kept = chosen[self.owner]
         place = chosen.cumsum(0) - 1
         return Rows(groups=self.groups[chosen], items=self.items[kept], owner=place[self.owner[kept]])

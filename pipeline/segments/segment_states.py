@@ -7,9 +7,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..optimization.least_squares import Policy, descend
+from ..optimization.normal_equations import NormalEquations
+from ..optimization.problem import Box, Point, Problem, Rows
 from ..physics.parameters import Parameter
 from ..physics.world import State
-from ..trajectories.residuals import STATE_SIZE, state_prior
+from ..trajectories.residuals import STATE_SIZE, retract, state_prior
 from .segments import START_FRAMES, Segments, line_state
 
 BAD_FIT = 1.3
@@ -127,33 +130,59 @@ def _descended(
     segments: Segments, parameters: Sequence[Parameter], values: Tensor, iterations: int
 ) -> tuple[Segments, Tensor]:
     """Return the segments with their states at a nearby minimum, and the costs (B,) there."""
-    prior = torch.diag(state_prior(len(segments.observations.free))).to(segments.world.gravity)
-    rows, jacobian = segments.residuals(parameters, values)
-    cost = _costs(rows)
-    damping = torch.full_like(cost, 1e-4)
-    active = list(range(len(segments.items)))
-    for _ in range(iterations):
-        flat = torch.nan_to_num(jacobian[..., len(parameters) :].flatten(1, 2), posinf=0.0, neginf=0.0)
-        error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
-        normal = flat.transpose(1, 2) @ flat + prior
-        slope = (flat.transpose(1, 2) @ error[..., None]).squeeze(-1)
-        own = damping[active][:, None] * normal.diagonal(dim1=1, dim2=2)
-        step = -torch.linalg.solve(normal + torch.diag_embed(own), slope)
-        some = segments.select(active)
-        trial = some.moved(step)
-        new_rows, slopes = trial.residuals(parameters, values if values.ndim == 1 else values[active])
-        fall = cost[active] - _costs(new_rows)
-        better = fall > 0
-        segments = _placed(segments, active, _merged(better, trial, some))
-        cost = _put(cost, active, torch.where(better, _costs(new_rows), cost[active]))
-        damping = _put(damping, active, torch.where(better, damping[active] / 8, damping[active] * 10))
-        goes_on = torch.where(better, fall > FALL, damping[active] < MAX_DAMPING)
-        rows = torch.where(better[:, None, None], new_rows, rows)[goes_on]
-        jacobian = torch.where(better[:, None, None, None], slopes, jacobian)[goes_on]
-        active = [item for item, more in zip(active, goes_on.tolist(), strict=True) if more]
-        if not active:
-            break
-    return segments, cost
+    problem = _StateProblem(segments, parameters, values)
+    start = Point(
+        values=values.new_zeros(len(segments.items), 0), states=tuple(vars(segments.observations.state).values())
+    )
+    policy = Policy(
+        iterations=iterations,
+        damping=1e-4,
+        down=1 / 8,
+        up=10.0,
+        least_damping=0.0,
+        most_damping=MAX_DAMPING,
+        absolute=FALL,
+    )
+    end = descend(problem, start, policy)
+    return segments.with_state(State(*end.point.states)), end.cost
+
+
+class _StateProblem(Problem):
+    """States of segments (B) in a given world, each segment a group.
+
+    Args:
+        segments: The segments.
+        parameters: Parameters of their world that are set (P).
+        values: Their values in fitted coordinates, (P,) or (B, P).
+    """
+
+    derivatives_with_costs = True
+
+    def __init__(self, segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> None:
+        count = len(segments.items)
+        self.segments, self.parameters, self.values = segments, parameters, values
+        self.owner = torch.arange(count)
+        self.box = Box.unbounded(values.new_zeros(count, 0))
+        self.prior = state_prior(len(segments.observations.free)).to(values)
+
+    def _at(self, point: Point, rows: Rows) -> Segments:
+        return self.segments.select(rows.items.tolist()).with_state(State(*point.states))
+
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations of the states; those of a diverged rollout are of its finite part."""
+        values = self.values if self.values.ndim == 1 else self.values[rows.items]
+        found, jacobian = self._at(point, rows).residuals(self.parameters, values)
+        by_state = jacobian[..., len(self.parameters) :]
+        error, flat = (
+            torch.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (found.flatten(1), by_state.flatten(1, 2))
+        )
+        return NormalEquations.of_rows(error, flat, 0, _costs(found), prior=self.prior)
+
+    def moved(self, point: Point, values: Tensor, step: Tensor, rows: Rows) -> tuple[Tensor, ...]:
+        """Return the states (b) moved by steps (b, S)."""
+        del values, rows
+        state = retract(State(*point.states), step, self.segments.observations.free)
+        return tuple(vars(state).values())
 
 
 def _costs(rows: Tensor) -> Tensor:
