@@ -7,7 +7,7 @@ the same for every law.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -50,7 +50,11 @@ def soft_world(world: World) -> World:
 
 def chi2_by_segment(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
     """Return the chi2 (B,) of each segment; 1e12 where a rollout diverged."""
-    rows = without_loads(segments, segments.residuals(parameters, values, jacobian=False)[0])
+    return _chi2(without_loads(segments, segments.residuals(parameters, values, jacobian=False)[0]))
+
+
+def _chi2(rows: Tensor) -> Tensor:
+    """Return the chi2 (B,) of residuals (B, T, 6); 1e12 where a rollout diverged."""
     return torch.nan_to_num(rows.square().sum((1, 2)), nan=1e12, posinf=1e12)
 
 
@@ -82,20 +86,30 @@ def without_loads(segments: Segments, rows: Tensor) -> Tensor:
     return rows - (directions @ (known[..., None] * along)).view_as(rows)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SlidingDifferences:
+    """Residuals of sliding segments (B) and their derivatives by S parameters and K directions of the states."""
+
+    rows: Tensor
+    """Residuals in sigmas, 0 where a rollout diverged, shape (B, R)."""
+    chi2: Tensor
+    """Chi-square of each segment, 1e12 where a rollout diverged, shape (B,)."""
+    jacobian: Tensor
+    """Derivatives by the parameters and along the columns of the basis, shape (B, R, S + K)."""
+    basis: Tensor
+    """Changes of state that keep the body on the ground, shape (B, 12, K)."""
+
+
 def finite_differences(
     segments: Segments, parameters: Sequence[Parameter], values: Tensor, free: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return residuals (B, R) in sigmas, their derivatives (B, R, S + K) and the basis (B, 12, K) of the states.
+) -> SlidingDifferences:
+    """Return residuals of sliding segments with their derivatives by parameters and states.
 
     Args:
         segments: Sliding segments (B) with states.
         parameters: Parameters of their world (P).
         values: Of each segment (B, P), in fitted coordinates.
         free: Indices (B, S) of the parameters by which the first S derivatives are; -1 for a derivative of 0.
-
-    Returns:
-        Residuals; derivatives by these parameters and along the columns of the basis; and the basis, the changes of
-        state that keep the body on the ground.
     """
     basis = _basis(segments)
     k, (n, size) = basis.shape[-1], free.shape
@@ -110,11 +124,13 @@ def finite_differences(
     moves += [values] * (2 * k)
     every = segments.select(list(range(n)) * len(changes)).moved(torch.cat(changes))
     rows = every.residuals(parameters, torch.cat(moves), jacobian=False)[0]
-    rows = without_loads(every, rows).flatten(1).unflatten(0, (len(changes), n))
+    rows = without_loads(every, rows)
+    chi2 = _chi2(rows[:n])
+    rows = rows.flatten(1).unflatten(0, (len(changes), n))
     rows = torch.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
     by_value = (rows[1 : 1 + size] - rows[0]).movedim(0, -1) / steps[free.clamp_min(0)][:, None]
     by_state = 0.5 * (rows[1 + size :: 2] - rows[2 + size :: 2]).movedim(0, -1)
-    return rows[0], torch.cat((by_value, by_state), -1), basis
+    return SlidingDifferences(rows=rows[0], chi2=chi2, jacobian=torch.cat((by_value, by_state), -1), basis=basis)
 
 
 def _basis(segments: Segments) -> Tensor:
