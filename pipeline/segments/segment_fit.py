@@ -1,18 +1,20 @@
-"""Joint fits of chosen parameters and the states of all segments, by damped Gauss-Newton."""
+"""Joint fits of chosen parameters and the states of all segments."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..optimization.levenberg_marquardt import bound_stops
+from ..optimization.least_squares import Policy, descend
+from ..optimization.normal_equations import NormalEquations
+from ..optimization.problem import Box, Point, Problem, Rows
 from ..physics.parameters import Parameter, apply_parameters
-from ..physics.world import World
+from ..physics.world import State, World
 from ..trajectories.residuals import state_prior
 from .candidates import base_values
 from .segment_states import best_of
@@ -29,6 +31,8 @@ FALL_SHARE = 1e-3
 ROBUST_EXCESS = 20.0
 """Scale k of rho(e) = 2 k log(1 + e / 2k) for the excess e = chi2 - dof of a contact segment: the error of the contact
 law in an impact is one error, not one in each frame (study of diagnosis, section 3)."""
+LEAST_WEIGHT = 1e-12
+"""Minimum weight of a contact segment."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,92 +82,88 @@ def refit(
     values = centre if start is None else start
     prior = torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(centre)
     bounds = torch.tensor([p.limits for p in parameters]).reshape(-1, 2).to(centre)
-    parts = [part.in_world(world) for part in parts]
-    linears = [linearised(part, parameters, values) for part in parts]
-    cost, damping = _cost(parts, linears, values, centre, prior), 1e-3
-    for _ in range(iterations):
-        matrix, slope = _normal(parts, linears)
-        matrix = matrix + torch.diag(prior)
-        slope = slope - prior * (values - centre)
-        step = _step(matrix, slope, values, bounds, damping)
-        moved = (values + step).clamp(bounds[:, 0], bounds[:, 1])
-        trial = [
-            _following(part, linear, parameters, values, moved) for part, linear in zip(parts, linears, strict=True)
-        ]
-        seen = [linearised(part, parameters, moved) for part in trial]
-        found = _cost(trial, seen, moved, centre, prior)
-        if found < cost:
-            fall, cost, damping = cost - found, found, damping / 5
-            parts, linears, values = trial, seen, moved
-            if fall < max(FALL, FALL_SHARE * cost):
-                break
-        else:
-            damping *= 20
-            if damping > 1e4:
-                break
-    return _refitted(world, parameters, parts, linears, values, prior, cost)
-
-
-def _following(
-    part: Segments, linear: Linear, parameters: Sequence[Parameter], values: Tensor, moved: Tensor
-) -> Segments:
-    """Return segments with the states that go with parameters moved from `values` to `moved` (P,)."""
-    after = part.moved(linear.state_step - (linear.by_parameter @ (moved - values)))
-    # through contact, states do not always follow in a straight line
-    return best_of(part, [after.observations.state], parameters, moved) if after.kind == "contact" else after
-
-
-def _refitted(
-    world: World,
-    parameters: Sequence[Parameter],
-    parts: Sequence[Segments],
-    linears: Sequence[Linear],
-    values: Tensor,
-    prior: Tensor,
-    cost: float,
-) -> Refit:
-    """Return the end of a descent: the world with the values (P,), and their covariance."""
-    matrix, _ = _normal(parts, linears)
-    covariance = torch.linalg.pinv(matrix + torch.diag(prior), hermitian=True)
-    columns = torch.stack([p.decode(values[k]) for k, p in enumerate(parameters)])[None] if parameters else None
+    problem = _JointProblem([part.in_world(world) for part in parts], parameters, bounds, centre, prior)
+    policy = Policy(
+        iterations=iterations,
+        up=20.0,
+        least_damping=0.0,
+        most_damping=1e4,
+        damp_states=False,
+        absolute=FALL,
+        relative=FALL_SHARE,
+    )
+    states = [part.observations.state for part in problem.parts]
+    point = Point(values=values[None], states=tuple(vars(State.joined(*states)).values()))
+    end = descend(problem, point, policy)
+    columns = None
+    if parameters:
+        columns = torch.stack([p.decode(end.point.values[0, k]) for k, p in enumerate(parameters)])[None]
     return Refit(
         world=world if columns is None else apply_parameters(world, parameters, columns),
         parameters=tuple(parameters),
-        values=values,
-        covariance=covariance,
-        segments=tuple(parts),
-        cost=cost,
-        by_segment=tuple(_losses(part, linear) for part, linear in zip(parts, linears, strict=True)),
+        values=end.point.values[0],
+        covariance=torch.linalg.pinv(end.information()[0], hermitian=True),
+        segments=tuple(part for part, _ in problem.at(end.point)),
+        cost=float(end.cost[0]),
+        by_segment=end.item_cost.split(problem.sizes),
     )
 
 
-def _losses(part: Segments, linear: Linear) -> Tensor:
-    """Return the cost (B,) of each segment; infinite where a rollout diverged."""
-    chi2 = torch.nan_to_num(linear.chi2, nan=torch.inf, posinf=torch.inf)
-    return chi2 if part.kind == "flight" else robust_excess(chi2 - linear.dof)[0]
+class _JointProblem(Problem):
+    """Parameters (P) shared by parts of segments, and the states of these (B in all parts together).
 
+    Args:
+        parts: Flight and contact segments, or one of them, in the world that is fitted.
+        parameters: What is fitted in addition to the states.
+        bounds: Lower and upper bounds of the parameters, shape (P, 2).
+        centre: Centres of their priors, shape (P,).
+        prior: Information of their priors, shape (P,).
+    """
 
-def _cost(parts: Sequence[Segments], linears: Sequence[Linear], values: Tensor, centre: Tensor, prior: Tensor) -> float:
-    """Return the cost of all segments and of the priors."""
-    data = sum(float(_losses(part, linear).sum()) for part, linear in zip(parts, linears, strict=True))
-    return data + float((prior * (values - centre).square()).sum())
+    derivatives_with_costs = True
 
+    def __init__(
+        self, parts: Sequence[Segments], parameters: Sequence[Parameter], bounds: Tensor, centre: Tensor, prior: Tensor
+    ) -> None:
+        self.parts, self.parameters = parts, parameters
+        self.sizes = [len(part.items) for part in parts]
+        self.owner = torch.zeros(sum(self.sizes), dtype=torch.long)
+        self.box = Box.within(bounds, centre, prior)
 
-def _normal(parts: Sequence[Segments], linears: Sequence[Linear]) -> tuple[Tensor, Tensor]:
-    """Return information and score of all parts, contact segments weighted robustly."""
-    matrix, slope = [], []
-    for part, linear in zip(parts, linears, strict=True):
-        weight = linear.weight if part.kind == "contact" else None
-        matrix.append(summed(linear.information, weight))
-        slope.append(summed(linear.score, weight))
-    return torch.stack(matrix).sum(0), torch.stack(slope).sum(0)
+    def at(self, point: Point) -> list[tuple[Segments, slice]]:
+        """Return the parts in their states, and where each lies among all segments."""
+        state, first, found = State(*point.states), 0, []
+        for part, size in zip(self.parts, self.sizes, strict=True):
+            own = slice(first, first + size)
+            found.append((part.with_state(state.at(own)), own))
+            first += size
+        return found
 
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations of all segments; contact segments are weighted robustly."""
+        del rows
+        found = []
+        for part, _ in self.at(point):
+            error, jacobian = part.residuals(self.parameters, point.values[0])
+            normal = normal_equations(part, error, jacobian, len(self.parameters))
+            if part.kind == "contact":
+                loss, weight = robust_excess(normal.cost - part.dof)
+                # a weight of 0, of a diverged rollout, would leave the state's equations singular
+                normal = replace(normal.weighted(weight.clamp_min(LEAST_WEIGHT)), cost=loss)
+            found.append(normal)
+        return NormalEquations.joined(found)
 
-def _step(matrix: Tensor, slope: Tensor, values: Tensor, bounds: Tensor, damping: float) -> Tensor:
-    """Return a damped step; a parameter that a bound stops does not move."""
-    free = (~bound_stops(values, slope, bounds)).to(slope)
-    damped = torch.diag(damping * matrix.diagonal() + (1 - free))
-    return torch.linalg.solve(matrix * free[:, None] * free + damped, slope * free)
+    def moved(self, point: Point, values: Tensor, step: Tensor, rows: Rows) -> tuple[Tensor, ...]:
+        """Return the states that go with moved parameters (1, P); step (B, S)."""
+        del rows
+        states = []
+        for part, own in self.at(point):
+            after = part.moved(step[own])
+            # through contact, states do not always follow in a straight line
+            if part.kind == "contact":
+                after = best_of(part, [after.observations.state], self.parameters, values[0])
+            states.append(after.observations.state)
+        return tuple(vars(State.joined(*states)).values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,11 +174,6 @@ class Linear:
     """Information M_i = Jp'Jp - B_i' A_i^-1 B_i in fitted coordinates, shape (B, P, P)."""
     score: Tensor
     """Score g_i = -(Jp'r - B_i' A_i^-1 Jx'r), shape (B, P)."""
-    state_step: Tensor
-    """Step of the states without a change of the parameters, shape (B, S)."""
-    by_parameter: Tensor
-    """Change of the states with the parameters: these move by d, the states by state_step - by_parameter d; shape (B,
-    S, P)."""
     chi2: Tensor
     """Chi-square of each segment, shape (B,)."""
     dof: Tensor
@@ -198,27 +193,20 @@ def linearised(segments: Segments, parameters: Sequence[Parameter], values: Tens
 
 def projected(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) -> Linear:
     """Return the linearization from residuals (B, F, 6) and their Jacobian (B, F, 6, P + S), with P = count."""
+    found = normal_equations(segments, rows, jacobian, count).eliminated()
+    return Linear(information=found.information, score=found.score, chi2=rows.square().sum((1, 2)), dof=segments.dof)
+
+
+def normal_equations(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) -> NormalEquations:
+    """Return the normal equations of residuals (B, F, 6), with a weak prior on the states; costs are their chi2.
+
+    The Jacobian (B, F, 6, P + S) has P = count parameters. The chi2 of a diverged rollout is infinite, and its
+    equations are those of the finite part.
+    """
     error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
     flat = torch.nan_to_num(jacobian.flatten(1, 2), posinf=0.0, neginf=0.0)
-    by_value, by_state = flat[..., :count], flat[..., count:]
-    prior = torch.diag(state_prior(len(segments.observations.free))).to(error)
-    states = by_state.transpose(1, 2) @ by_state + prior
-    mixed = by_state.transpose(1, 2) @ by_value
-    slope = (by_state.transpose(1, 2) @ error[..., None]).squeeze(-1)
-    solved = torch.linalg.solve(states, torch.cat((mixed, slope[..., None]), -1))
-    by_parameter, state_step = solved[..., :-1], -solved[..., -1]
-    information = by_value.transpose(1, 2) @ by_value - mixed.transpose(1, 2) @ by_parameter
-    score = -(by_value.transpose(1, 2) @ error[..., None]).squeeze(-1) - (
-        mixed.transpose(1, 2) @ state_step[..., None]
-    ).squeeze(-1)
-    return Linear(
-        information=information,
-        score=score,
-        state_step=state_step,
-        by_parameter=by_parameter,
-        chi2=rows.square().sum((1, 2)),
-        dof=segments.dof,
-    )
+    chi2 = torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
+    return NormalEquations.of_rows(error, flat, count, chi2, prior=state_prior(len(segments.observations.free)))
 
 
 def robust_excess(excess: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,10 +214,3 @@ def robust_excess(excess: Tensor) -> tuple[Tensor, Tensor]:
     above = excess.clamp_min(0.0) / (2 * ROBUST_EXCESS)
     loss = torch.where(excess < 0, excess, 2 * ROBUST_EXCESS * torch.log1p(above))
     return loss, 1 / (1 + above)
-
-
-def summed(values: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return the sum over segments (B, ...) with weights (B,)."""
-    if weight is None:
-        return values.sum(0)
-    return (values * weight.view(-1, *[1] * (values.ndim - 1))).sum(0)
