@@ -1,4 +1,4 @@
-"""Impact fit: restitution, friction and an effect shared by all impacts, by Gauss-Newton."""
+"""Impact fit: restitution, friction and an effect shared by all impacts, by weighted least squares."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..optimization.least_squares import Policy, descend
+from ..optimization.normal_equations import NormalEquations
+from ..optimization.problem import Box, Point, Problem, Rows
 from ..physics.effects.effect import changed_by_effects
 from ..physics.impulse_solver import tangent_axes
 from ..physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, Parameter, apply_parameters
@@ -196,38 +199,52 @@ def fit_impacts(
         weight: Weight of each impact (n,); 1 by default.
         centre: Centres of the priors (P,); the start by default.
     """
-    parameters = problem.parameters
-    width = torch.tensor([p.prior[1] for p in parameters]).to(start)
-    low, high = torch.tensor([p.limits for p in parameters]).to(start).T
-    centre = start if centre is None else centre
     counts = np.ones(len(problem.impacts)) if weight is None else weight
-    counted = torch.as_tensor(counts).to(start)[:, None].expand(-1, 6)
+    fitted = _WeightedImpacts(problem, torch.as_tensor(counts).to(start), start if centre is None else centre)
+    policy = Policy(
+        iterations=ITERATIONS,
+        damping=0.0,
+        least_damping=0.0,
+        shares=SHARES,
+        attempts=1,
+        absolute=FALL,
+        linearise_end=False,
+    )
+    end = descend(fitted, Point(values=start[None]), policy)
+    value = end.point.values
+    return ImpactFit(
+        value[0].numpy(), end.information()[0].numpy(), problem.rows(value)[0].numpy(), float(fitted.box.cost(value))
+    )
 
-    def cost_of(rows: Tensor, value: Tensor) -> Tensor:
-        return (counted * rows.square()).sum((-1, -2)) + ((value - centre) / width).square().sum(-1)
 
-    value, cost = start, cost_of(problem.rows(start[None])[0], start)
-    information = torch.diag(1 / width.square())
-    for _ in range(ITERATIONS):
-        rows, slope = problem.linear(value)
-        slope, heavy = slope.flatten(0, 1), (counted[..., None] * slope).flatten(0, 1)
-        information = slope.T @ heavy + torch.diag(1 / width.square())
-        score = -(heavy.T @ rows.flatten()) - (value - centre) / width.square()
-        blocked = ((value <= low) & (score < 0)) | ((value >= high) & (score > 0))
-        moving = (~blocked).to(value)
-        reduced = information * moving[:, None] * moving + torch.diag(1 - moving)
-        step = torch.linalg.solve(reduced, score * moving)
-        trials = torch.stack([(value + share * step).clamp(low, high) for share in SHARES])
-        costs = cost_of(problem.rows(trials), trials)
-        best = int(costs.argmin())
-        fall = float(cost - costs[best])
-        if fall > 0:
-            value, cost = trials[best], costs[best]
-        if fall < FALL:
-            break
-    rows = problem.rows(value[None])[0]
-    prior = float(((value - centre) / width).square().sum())
-    return ImpactFit(value.numpy(), information.numpy(), rows.numpy(), prior)
+class _WeightedImpacts(Problem):
+    """The parameters of a problem of impacts (n).
+
+    Args:
+        problem: The problem, with weights of its residuals.
+        weight: Weight of each impact, shape (n,).
+        centre: Centres of the priors, shape (P,).
+    """
+
+    def __init__(self, problem: ImpactProblem, weight: Tensor, centre: Tensor) -> None:
+        width = torch.tensor([p.prior[1] for p in problem.parameters]).to(centre)
+        limits = torch.tensor([p.limits for p in problem.parameters]).to(centre)
+        self.problem, self.weight = problem, weight[:, None].expand(-1, 6)
+        self.owner = torch.zeros(1, dtype=torch.long)
+        self.box = Box.within(limits, centre, 1 / width.square())
+
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the weighted chi2 (g,) at points of one group each."""
+        del rows
+        return (self.weight * self.problem.rows(point.values).square()).sum((-1, -2))
+
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations by the parameters."""
+        del rows
+        found, slope = self.problem.linear(point.values[0])
+        cost = (self.weight * found.square()).sum()
+        error, flat = found.flatten()[None], slope.flatten(0, 1)[None]
+        return NormalEquations.of_rows(error, flat, flat.shape[-1], cost[None], self.weight.flatten()[None])
 
 
 @dataclass(frozen=True, eq=False)
