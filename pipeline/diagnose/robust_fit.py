@@ -13,8 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from ..segments.linearization import Linearization, layout, sums, widths
+from ..optimization.least_squares import Descent, Policy, descend
+from ..optimization.normal_equations import NormalEquations
+from ..optimization.problem import Box, Point, Problem, Rows
+from ..segments.linearization import Linearization, layout, widths
 from ..segments.segment_fit import robust_excess
 
 Array = NDArray[np.float64]
@@ -25,9 +29,9 @@ priors. No contact law is exact, and a residual that such deviations explain is 
 ITERATIONS = 12
 """Maximum number of reweighting iterations."""
 STEPS = (1.0, 0.5, 0.25, 0.1)
-"""Shares of a step that are tried in turn."""
+"""Shares of a step that are tried."""
 FALL = 1e-6
-"""Minimum fall of the cost for a step to be accepted."""
+"""Fall of the cost below which a fit ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,52 +58,34 @@ def with_segment_parameters(linear: Linearization) -> Linearization:
     if not base:
         return linear
     width = OWN_SHARE * np.array([linear.parameters[k].prior[1] for k in base])
-    own = linear.information[:, base][:, :, base] + np.diag(1 / width**2)
-    mixed, slope = linear.information[:, base], linear.score[:, base]
-    solved = np.linalg.solve(own, np.concatenate([mixed, slope[..., None]], -1))
+    chosen = torch.as_tensor(linear.information)
+    normal = NormalEquations(
+        states=chosen[:, base][:, :, base] + torch.diag(torch.as_tensor(1 / width**2)),
+        mixed=chosen[:, base],
+        information=chosen,
+        state_slope=torch.as_tensor(linear.score[:, base]),
+        slope=torch.as_tensor(linear.score),
+        cost=torch.as_tensor(linear.chi2),
+    )
+    found = normal.eliminated()
     return replace(
         linear,
-        information=linear.information - mixed.transpose(0, 2, 1) @ solved[..., :-1],
-        score=linear.score - (mixed.transpose(0, 2, 1) @ solved[..., -1:])[..., 0],
-        chi2=linear.chi2 - (slope * solved[..., -1]).sum(1),
+        information=found.information.numpy(),
+        score=found.score.numpy(),
+        chi2=linear.chi2 - (normal.state_slope * found.state_step).sum(1).numpy(),
     )
 
 
-def robust_fit(linear: Linearization, columns: Sequence[int], counted: Array | None = None) -> RobustFit:
+def robust_fit(linear: Linearization, columns: Sequence[int]) -> RobustFit:
     """Minimize the robust loss over chosen parameters, starting at zero; lower bounds at zero are kept.
 
     Args:
         linear: The linearization.
         columns: Columns of the parameters, including the model's.
-        counted: Weight of each segment (B,) in addition to its robust weight; 1 by default.
     """
-    counts = np.ones(len(linear.chi2)) if counted is None else counted
-    places, _ = layout(linear, columns)
-    prior = 1 / widths(linear, columns) ** 2
-    low = np.full(len(prior), -np.inf)
-    for k, column in enumerate(columns):
-        if column >= linear.base and linear.parameters[column].bounds[0] == 0.0:
-            low[places[:, k]] = 0.0
-
-    def at(value: Array) -> tuple[float, Array]:
-        """Return the cost at given parameters and the weight of each segment there."""
-        loss, weight = _losses(linear, columns, value)
-        return float((loss * counts).sum() + (prior * value**2).sum()), weight * counts
-
-    value = np.zeros(len(prior))
-    cost, weight = at(value)
-    for _ in range(ITERATIONS):
-        information, score = sums(replace(linear, weight=weight), columns, prior)
-        target = np.maximum(np.linalg.solve(information, score), low)
-        for share in STEPS:
-            trial = value + share * (target - value)
-            found, heavier = at(trial)
-            if found < cost - FALL:
-                break
-        else:
-            break
-        value, cost, weight = trial, found, heavier
-    return RobustFit(tuple(columns), value, cost, sums(replace(linear, weight=weight), columns, prior)[0])
+    end = _fitted(_RobustProblem(linear, columns, np.ones((1, len(linear.chi2)))))
+    value, information = end.point.values[0].numpy(), end.information()[0].numpy()
+    return RobustFit(tuple(columns), value, float(end.cost[0]), information)
 
 
 def robust_gains(linear: Linearization, base: Sequence[int], columns: Sequence[int]) -> Array:
@@ -110,22 +96,67 @@ def robust_gains(linear: Linearization, base: Sequence[int], columns: Sequence[i
         base: Columns of the model's parameters, which are fitted jointly.
         columns: Columns of the effect's parameters.
     """
-    gains = []
-    for episode in np.unique(linear.episode):
-        others = (linear.episode != episode).astype(np.float64)
-        losses = []
-        for chosen in (list(base), [*base, *columns]):
-            value = robust_fit(linear, chosen, others).value
-            losses.append(float(_losses(linear, chosen, value)[0][linear.episode == episode].sum()))
-        gains.append(losses[0] - losses[1])
-    return np.array(gains)
+    own = (linear.episode == np.unique(linear.episode)[:, None]).astype(np.float64)
+    losses = []
+    for chosen in (list(base), [*base, *columns]):
+        problem = _RobustProblem(linear, chosen, 1 - own)
+        loss, _ = problem.losses(_fitted(problem).point.values)
+        losses.append((loss.numpy() * own).sum(1))
+    return losses[0] - losses[1]
 
 
-def _losses(linear: Linearization, columns: Sequence[int], value: Array) -> tuple[Array, Array]:
-    """Return loss and robust weight (B,) of each segment at given parameters."""
-    chosen = list(columns)
-    own = value[layout(linear, chosen)[0]]
-    moved = (linear.information[:, chosen][:, :, chosen] @ own[..., None])[..., 0]
-    chi2 = linear.chi2 - 2 * (linear.score[:, chosen] * own).sum(1) + (moved * own).sum(1)
-    loss, weight = robust_excess(torch.as_tensor(chi2 - linear.dof))
-    return loss.numpy(), weight.numpy()
+def _fitted(problem: _RobustProblem) -> Descent:
+    """Return the descent of a problem from zero, by Gauss-Newton steps without damping."""
+    policy = Policy(iterations=ITERATIONS, damping=0.0, least_damping=0.0, shares=STEPS, attempts=1, absolute=FALL)
+    return descend(problem, Point(values=torch.zeros_like(problem.box.low)), policy)
+
+
+class _RobustProblem(Problem):
+    """The robust loss of a linearization's segments (B) by chosen parameters (k), once for each of several weightings.
+
+    Args:
+        linear: The linearization.
+        columns: Columns of the parameters.
+        counts: Weight of each segment in each group, in addition to its robust weight, shape (G, B).
+    """
+
+    def __init__(self, linear: Linearization, columns: Sequence[int], counts: Array) -> None:
+        chosen = list(columns)
+        places, _ = layout(linear, chosen)
+        prior = 1 / widths(linear, chosen) ** 2
+        low = np.full(len(prior), -np.inf)
+        for k, column in enumerate(chosen):
+            if column >= linear.base and linear.parameters[column].bounds[0] == 0.0:
+                low[places[:, k]] = 0.0
+        self.places, self.counts = torch.as_tensor(places), torch.as_tensor(counts)
+        self.information = torch.as_tensor(linear.information[:, chosen][:, :, chosen])
+        self.score = torch.as_tensor(linear.score[:, chosen])
+        self.excess = torch.as_tensor(linear.chi2 - linear.dof)
+        self.owner = torch.arange(len(counts))
+        parts = (
+            torch.as_tensor(one).expand(len(counts), -1) for one in (low, np.full_like(low, np.inf), 0 * prior, prior)
+        )
+        self.box = Box(**dict(zip(("low", "high", "centre", "information"), parts, strict=True)))
+
+    def losses(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return loss and robust weight (g, B) of each segment at parameters (g, n)."""
+        own = values[:, self.places]
+        moved = (self.information @ own[..., None])[..., 0]
+        return robust_excess(self.excess - 2 * (self.score * own).sum(-1) + (moved * own).sum(-1))
+
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the weighted loss (g,) of all segments."""
+        return (self.losses(point.values)[0] * self.counts[rows.groups]).sum(1)
+
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations with the weights at the point."""
+        loss, weight = self.losses(point.values)
+        heavy = weight * self.counts[rows.groups]
+        count, size = point.values.shape
+        place = (self.places[:, :, None] * size + self.places[:, None]).flatten()
+        own = (heavy[..., None, None] * self.information).flatten(1)
+        information = own.new_zeros(count, size * size).index_add(1, place, own).unflatten(1, (size, size))
+        score = (heavy[..., None] * self.score).flatten(1)
+        score = score.new_zeros(count, size).index_add(1, self.places.flatten(), score)
+        slope = score - (information @ point.values[..., None])[..., 0]
+        return NormalEquations.of_parameters(information, slope, (loss * self.counts[rows.groups]).sum(1))
