@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..optimization.least_squares import Descent, Policy, descend
-from ..optimization.normal_equations import NormalEquations
-from ..optimization.problem import Box, Point, Problem, Rows
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..segments.linearization import Linearization, layout, widths
 from ..segments.segment_fit import robust_excess
 

@@ -20,8 +20,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from .normal_equations import Eliminated, NormalEquations, damped, solved
-from .problem import Box, Point, Problem, Rows
+from .problem import Box, Eliminated, NormalEquations, Point, Problem, Rows, damped, solved
 
 
 class Stop(IntEnum):
@@ -32,7 +31,7 @@ class Stop(IntEnum):
     CONVERGED = 1
     """A step lowered the cost by less than the tolerance."""
     SMALL_STEP = 2
-    """The step is shorter than the policy's smallest one."""
+    """An accepted step was shorter than the policy's smallest one."""
     NO_LOWER_COST = 3
     """No step lowers the cost, with any damping that the policy admits."""
     ITERATIONS = 4
@@ -76,7 +75,7 @@ class Policy:
     step_limit: float = math.inf
     """Maximum change of a state in one step, in the problem's units."""
     small_step: float = 0.0
-    """Change of a state below which a descent ends, in the problem's units."""
+    """Change of a state in an accepted step below which a descent ends, in the problem's units."""
     linearise_end: bool = True
     """Whether the normal equations of the result are those at its end, or those of the last step."""
 
@@ -304,7 +303,7 @@ def _judged(
     if policy.steps is not None:
         stop = torch.where(accepted >= policy.steps, stop, int(Stop.RUNNING))
     stop = torch.where(hopeless, int(Stop.NO_LOWER_COST), stop)
-    stop = torch.where(trials.size < policy.small_step, int(Stop.SMALL_STEP), stop)
+    stop = torch.where(better & (trials.size < policy.small_step), int(Stop.SMALL_STEP), stop)
     small = better & (before - found < (policy.relative * before).clamp_min(policy.absolute))
     return descent.with_groups(
         groups,

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from ...schemas import NotConvergedError
 from .least_squares import Descent, Policy, Stop, descend
-from .normal_equations import NormalEquations
-from .problem import Box, Point, Problem, Rows
+from .problem import Box, NormalEquations, Point, Problem, Rows
 
 Residuals = Callable[[Tensor, Tensor, bool], tuple[Tensor, Tensor | None]]
 """(shared (P,), state change (B, S), with Jacobian) -> residuals (B, F, m) in sigmas, and (B, F, m, P + S) or None.
@@ -68,17 +67,6 @@ def robust_loss(chi2: Tensor, scale: float | None) -> tuple[Tensor, Tensor]:
     return scale**2 * torch.log1p(ratio), 1 / (1 + ratio)
 
 
-def bound_stops(shared: Tensor, downhill: Tensor, bounds: Tensor) -> Tensor:
-    """Return the mask (P,) of parameters that a bound stops: those on it where the cost falls beyond it.
-
-    Args:
-        shared: The parameters, shape (P,).
-        downhill: The negative gradient of the cost with respect to them, shape (P,).
-        bounds: Lower and upper bounds, shape (P, 2).
-    """
-    return ((shared <= bounds[:, 0]) & (downhill < 0)) | ((shared >= bounds[:, 1]) & (downhill > 0))
-
-
 def minimise(
     residuals: Residuals,
     shared: Tensor,
@@ -113,7 +101,7 @@ def minimise(
     centre, held = (zero, zero) if shared_prior is None else shared_prior
     prior = torch.zeros(states.shape[1]).to(states) if prior_information is None else prior_information
     box = Box.within(bounds, centre, held)
-    problem = _SharedAndStates(residuals, robust_scale, prior, box, torch.zeros(len(states), dtype=torch.long))
+    problem = _SharedAndStates(residuals, robust_scale, prior, box, states.new_zeros(len(states), dtype=torch.long))
     policy = Policy(iterations=iterations, relative=tolerance)
     report = None if on_iteration is None else lambda step, descent: on_iteration(step, float(descent.cost[0]))
     end = descend(problem, Point(values=shared[None], states=(states,)), policy, report)

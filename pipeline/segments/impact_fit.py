@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..optimization.least_squares import Policy, descend
-from ..optimization.normal_equations import NormalEquations
-from ..optimization.problem import Box, Point, Problem, Rows
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.effects.effect import changed_by_effects
 from ..physics.impulse_solver import tangent_axes
 from ..physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, Parameter, apply_parameters

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..optimization.least_squares import Policy, descend
-from ..optimization.normal_equations import NormalEquations
-from ..optimization.problem import Box, Point, Problem, Rows
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import State, World
 from ..trajectories.residuals import state_prior

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ..optimization.least_squares import Policy, descend
-from ..optimization.normal_equations import NormalEquations
-from ..optimization.problem import Box, Point, Problem, Rows
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.parameters import Parameter
 from ..physics.world import State
 from ..trajectories.residuals import STATE_SIZE, retract, state_prior

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from ..optimization.least_squares import Policy, descend
-from ..optimization.normal_equations import NormalEquations
-from ..optimization.problem import Box, Point, Problem, Rows
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.parameters import Parameter
 from ..physics.world import State
 from ..trajectories.residuals import retract
@@ -70,7 +69,7 @@ def fit_groups(
         iterations: Maximum number of steps.
         centre: Centres of the priors (G, P); the start by default.
     """
-    problem = _SlidingProblem(segments, parameters, values, free, group, centre)
+    problem = _SlidingProblem(segments, parameters, values, free, group=group, centre=centre)
     policy = Policy(
         iterations=iterations,
         damping=1e-2,
@@ -111,6 +110,7 @@ class _SlidingProblem(Problem):
         parameters: Sequence[Parameter],
         values: Tensor,
         free: Tensor,
+        *,
         group: Tensor,
         centre: Tensor | None,
     ) -> None:

@@ -7,6 +7,7 @@ rollout are unsuitable: for a body that rests on many spheres they grow by a thi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,9 @@ from torch import Tensor
 
 from ....datasets.io.progress import progress
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
-from ...optimization.levenberg_marquardt import bound_stops, robust_loss
+from ...optimization.least_squares import Descent, Policy, Stop, descend
+from ...optimization.levenberg_marquardt import robust_loss
+from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ...physics.engine import rollouts_at_once
 from ...physics.observation_model import measure
 from ...physics.parameters import Parameter, apply_parameters
@@ -40,6 +43,14 @@ SMALLEST_FALL = 3e-4
 """Relative decrease of the objective in a step below which the refinement ends."""
 PATIENCE = 2
 """Number of steps without a lower loss of the held-out frames after which the refinement ends."""
+STOPPED = {
+    Stop.CONVERGED: "small fall",
+    Stop.NO_LOWER_COST: "no lower point along the step",
+    Stop.ITERATIONS: "iterations",
+    Stop.NOT_FINITE: "the rollouts diverge",
+    Stop.WATCHER: "the frames held out are no longer explained better",
+}
+"""Reasons for the end, as they are reported."""
 GEOMETRY_WEIGHT = 1e-5
 """Cost of moving a sphere by one standard deviation of its prior, as a share of the image loss at the start. It fixes
 spheres that the motion does not identify, and hardly restrains the others (choice of cgwm)."""
@@ -256,60 +267,95 @@ def refine_end_to_end(
         bounds: Bounds of the parameters and spheres, shape (P + G, 2).
         iterations: Maximum number of steps.
     """
-    rollout = objective.rollout(shared, states)
-    before = parts = objective.parts(rollout)
-    history, damping, stopped = [objective.value(parts, shared)], 1e-2, "iterations"
+    problem = _ImageProblem(objective, len(shared), states.shape, bounds)
+    start = Point(values=torch.cat([shared, states.flatten()])[None])
+    rollout, first = problem.rolled(start)
+    points, parts = [start], [first]
     held = [float(objective.parts(rollout, held=True).sum())] if objective.held else []
-    kept, best = 0, (shared, states, parts)
-    curvature = objective.curvature(rollout)
-    for step in progress(range(iterations), "phys-geo: images end to end", iterations):
-        matrix, slope = objective.normal_equations(shared, states, rollout, curvature)
-        accepted = False
-        for _ in range(ATTEMPTS):
-            next_shared, next_states = _step(matrix, slope, damping, shared, states, bounds)
-            trial = objective.rollout(next_shared, next_states)
-            trial_parts = objective.parts(trial)
-            if objective.value(trial_parts, next_shared) < history[-1]:
-                accepted = True
-                break
-            damping *= 6
-        if not accepted:
-            stopped = "no lower point along the step"
-            break
-        shared, states, rollout, parts = next_shared, next_states, trial, trial_parts
-        damping = max(damping / 5, 1e-4)
-        history.append(objective.value(parts, shared))
-        if held:
-            held.append(float(objective.parts(rollout, held=True).sum()))
-        if not held or held[-1] < held[kept]:
-            kept, best = step + 1, (shared, states, parts)
-        if history[-2] - history[-1] < SMALLEST_FALL * history[-2]:
-            stopped = "small fall"
-            break
-        if step + 1 - kept >= PATIENCE:
-            stopped = "the frames held out are no longer explained better"
-            break
+    with progress(desc="phys-geo: images end to end", total=iterations) as bar:
+
+        def watch(iteration: int, descent: Descent) -> bool:
+            """Record an accepted step; True where the held-out frames have not been explained better for a while."""
+            del iteration
+            if int(descent.accepted[0]) < len(points):
+                return False
+            bar.update()
+            rollout, found = problem.rolled(descent.point)
+            points.append(descent.point)
+            parts.append(found)
+            if held:
+                held.append(float(objective.parts(rollout, held=True).sum()))
+            return bool(held) and len(held) - 1 - _best(held) >= PATIENCE
+
+        policy = Policy(
+            iterations=iterations * ATTEMPTS,
+            steps=iterations,
+            attempts=ATTEMPTS,
+            damping=1e-2,
+            least_damping=1e-4,
+            relative=SMALLEST_FALL,
+            linearise_end=False,
+        )
+        end = descend(problem, start, policy, watch)
+    kept = _best(held) if held else len(points) - 1
+    shared, states = problem.split(points[kept])
     return Refined(
-        shared=best[0],
-        states=best[1],
-        before=before,
-        after=best[2],
-        history=history,
+        shared=shared,
+        states=states,
+        before=parts[0],
+        after=parts[kept],
+        history=end.costs,
         held=held,
         kept=kept,
-        stopped=stopped,
+        stopped=STOPPED[end.reasons[0]],
     )
 
 
-def _step(
-    matrix: Tensor, slope: Tensor, damping: float, shared: Tensor, states: Tensor, bounds: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return shared parameters and states after one damped step; parameters that a bound stops are left out."""
-    count = len(shared)
-    free = torch.ones_like(slope)
-    free[:count] = (~bound_stops(shared, -slope[:count], bounds)).double()
-    diagonal = matrix.diagonal().clamp_min(1e-12)
-    system = matrix * free[:, None] * free + torch.diag(damping * diagonal + (1 - free) * diagonal)
-    step = -torch.linalg.solve(system, slope * free)
-    moved = (shared + step[:count]).clamp(bounds[:, 0], bounds[:, 1])
-    return moved, states + step[count:].view_as(states)
+def _best(held: Sequence[float]) -> int:
+    """Return the first step with the lowest loss of the held-out frames."""
+    return min(range(len(held)), key=held.__getitem__)
+
+
+class _ImageProblem(Problem):
+    """Parameters, spheres and all start states of an objective as one dense problem, without eliminated states.
+
+    Args:
+        objective: The objective.
+        count: Number of parameters and spheres (P + G).
+        shape: Shape of the state changes (B, S).
+        bounds: Bounds of the parameters and spheres, shape (P + G, 2).
+    """
+
+    def __init__(self, objective: ImageObjective, count: int, shape: Sequence[int], bounds: Tensor) -> None:
+        self.objective, self.count, self.shape = objective, count, tuple(shape)
+        far = torch.full((math.prod(shape), 2), torch.inf).to(bounds) * torch.tensor([-1.0, 1.0]).to(bounds)
+        self.owner = torch.zeros(1, dtype=torch.long)
+        self.box = Box.within(torch.cat([bounds, far]))
+        self.curvature: Tensor | None = None  # that of the image loss by poses, at the start
+        self._last: tuple[Tensor, Rollout, Tensor] | None = None
+
+    def split(self, point: Point) -> tuple[Tensor, Tensor]:
+        """Return parameters and spheres (P + G,), and state changes (B, S)."""
+        shared, states = point.values[0].split([self.count, math.prod(self.shape)])
+        return shared, states.view(self.shape)
+
+    def rolled(self, point: Point) -> tuple[Rollout, Tensor]:
+        """Return the rollouts at a point and the parts of their loss; those of the last point are kept."""
+        if self._last is None or not torch.equal(self._last[0], point.values):
+            rollout = self.objective.rollout(*self.split(point))
+            self._last = point.values, rollout, self.objective.parts(rollout)
+        return self._last[1:]
+
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the objective (1,)."""
+        del rows
+        value = self.objective.value(self.rolled(point)[1], self.split(point)[0])
+        return torch.tensor([value], dtype=torch.float64)
+
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations of the objective."""
+        rollout, _ = self.rolled(point)
+        if self.curvature is None:
+            self.curvature = self.objective.curvature(rollout)
+        matrix, slope = self.objective.normal_equations(*self.split(point), rollout, self.curvature)
+        return NormalEquations.of_parameters(matrix[None], -slope[None], self.costs(point, rows))

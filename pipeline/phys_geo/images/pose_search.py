@@ -1,4 +1,8 @@
-"""Search for the pose of bodies at one instant of a video, from silhouettes, over all orientations, and by descent."""
+"""Search for the pose of bodies at one instant of a video, from silhouettes, over all orientations, and by descent.
+
+The descent has a loop of its own: it rounds to single precision, and which of two equally good histories of a symmetric
+body is kept depends on that rounding.
+"""
 
 from __future__ import annotations
 

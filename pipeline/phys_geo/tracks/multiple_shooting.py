@@ -4,7 +4,7 @@ A rollout over several impacts is a rough function of its initial state, and its
 of some hundredths of a second they lead to the minimum. The segments of an episode are tied: the final state of one and
 the initial state of the next may differ by the expected error of the contact model, so that an impact that it cannot
 reproduce does not bias the parameters (Bock & Plitt 1984; with soft ties, weak-constraint assimilation, Tremolet 2006).
-Gauss-Newton solves for everything at once: the initial states of all segments and the parameters.
+The least-squares solver finds everything at once: the initial states of all segments and the parameters.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
-from ...optimization.levenberg_marquardt import bound_stops, robust_loss
+from ...optimization.least_squares import Descent, Policy, descend
+from ...optimization.levenberg_marquardt import robust_loss
+from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ...physics.engine import rollout as rolled_out
 from ...physics.engine import rollouts_at_once
 from ...physics.observation_model import as_measured, true_times
@@ -30,9 +31,6 @@ from ...trajectories.observations import Observations
 from ...trajectories.residuals import retract, state_prior
 from ...trajectories.track_noise import Noise
 from .shooting_segments import TiedSegments
-
-if TYPE_CHECKING:
-    pass
 
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """Standard deviation of a tie over flight: position [m], rotation [rad], velocity [m/s], angular velocity [rad/s]."""
@@ -173,26 +171,11 @@ class Shooting:
         return sorted(shots, key=lambda shot: shot.cost)
 
     def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[ShootingFit, State]:
-        linear = self._linearised(shared, states)
-        costs, damping, converged = [linear.cost], 1e-3, not math.isfinite(linear.cost)
-        for _ in range(iterations):
-            if converged:
-                break
-            diagonal = linear.matrix.diagonal().clamp_min(1e-12)
-            step = self._solved(linear, damping * diagonal, shared)
-            moved = (shared + step[: len(shared)]).clamp(self.prior.bounds[:, 0], self.prior.bounds[:, 1])
-            changed = retract(states, step[len(shared) :].view(len(self.following), -1), self.segments.free)
-            cost = self._cost(moved, changed)
-            if cost < linear.cost:
-                fall = (linear.cost - cost) / max(linear.cost, 1e-300)
-                shared, states, damping = moved, changed, max(damping / 5, 1e-8)
-                linear = self._linearised(shared, states)
-                costs.append(linear.cost)
-                converged = fall < TOLERANCE
-            else:
-                damping *= 6
-                converged = damping > 1e8
-        return self._shot(linear, shared, states, costs, converged), states
+        changes = torch.zeros(self.tie.numel()).to(shared)
+        start = Point(values=torch.cat([shared, changes])[None], states=_as_item(states))
+        end = descend(_TiedProblem(self), start, Policy(iterations=iterations, relative=TOLERANCE))
+        states = _from_item(end.point.states)
+        return self._shot(end, end.point.values[0, : len(shared)], states), states
 
     def _allowed(self, shared: Tensor, states: State) -> Tensor:
         """Return the standard deviations (B, S) of the difference of states where segments meet."""
@@ -211,30 +194,39 @@ class Shooting:
             columns += [torch.hypot(part, part.new_tensor(least)) for part, least in zip(parts, TIE, strict=True)]
         return torch.nan_to_num(torch.stack(columns, 1), nan=1.0).repeat_interleave(3, 1)
 
-    def _shot(self, linear: _Linear, shared: Tensor, states: State, costs: list[float], converged: bool) -> ShootingFit:
-        covariance = torch.linalg.pinv(linear.matrix, hermitian=True)
+    def _shot(self, end: Descent, shared: Tensor, states: State) -> ShootingFit:
+        covariance = torch.linalg.pinv(end.information()[0], hermitian=True)
         count = len(shared)
         names = self.segments.names
         first = [row for row, name in enumerate(names) if row == 0 or names[row - 1] != name]
+        misfit, chi2 = self._misfits(shared, states)
         shot = ShootingFit(
             shared=shared,
             covariance=covariance[:count, :count],
             state=states.at(first),
-            cost=linear.cost,
-            costs=costs,
-            misfit=linear.misfit,
-            chi2=linear.chi2,
-            converged=converged,
+            cost=float(end.cost[0]) if bool(end.cost[0].isfinite()) else math.inf,
+            costs=end.costs,
+            misfit=misfit,
+            chi2=chi2,
+            converged=end.converged,
         )
         return replace(shot, covariance=shot.scale * shot.covariance)
 
-    def _solved(self, linear: _Linear, damping: Tensor, shared: Tensor) -> Tensor:
-        """Return a damped step; a parameter that a bound stops takes no part."""
-        count = len(shared)
-        slope, free = linear.slope, torch.ones_like(linear.slope)
-        free[:count] = (~bound_stops(shared, -slope[:count], self.prior.bounds)).to(slope)
-        system = linear.matrix * free[:, None] * free + torch.diag(damping + (1 - free))
-        return -torch.linalg.solve(system, slope * free)
+    def _misfits(self, shared: Tensor, states: State) -> tuple[float, float]:
+        """Return the mean square of the tied residuals and the median chi-square of a frame, as in `ShootingFit`."""
+        frames, ties = self._residuals(shared, states)
+        _, _, tie_weight = _losses(frames, ties)
+        tied = self.following >= 0
+        misfit = float((tie_weight[:, None] * ties.square())[tied].mean()) if bool(tied.any()) else 0.0
+        chi2 = frames.square().sum(-1)
+        chi2 = chi2[chi2 > 0]
+        return misfit, float(chi2.median()) / 5.35 if len(chi2) else 0.0  # median of chi-square, 6 degrees
+
+    def _residuals(self, shared: Tensor, states: State) -> tuple[Tensor, Tensor]:
+        """Return residuals of frames (B, T nf, 6) and of ties (B, S), in sigmas."""
+        with torch.no_grad():
+            nothing = torch.zeros_like(self.tie)
+            return self._split(self._rows(shared.expand(len(nothing), -1), states, nothing, 1))
 
     def _rows(self, shared: Tensor, states: State, changes: Tensor, repeats: int) -> Tensor:
         """Return for each item residuals (6 nf T) in sigmas, then how its end differs from the next start (S)."""
@@ -286,20 +278,6 @@ class Shooting:
         tied = (self.following >= 0).to(rows)[:, None]
         return rows[:, :-size].unflatten(1, (-1, 6)), rows[:, -size:] / self.tie * tied
 
-    def _parts(self, frames: Tensor, ties: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the cost, and the robust weights of frames (B, F) and ties (B,)."""
-        loss, weight = robust_loss(frames.square().sum(-1), ROBUST_SCALE)
-        tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * ROBUST_SCALE)
-        pull = ((shared - self.prior.mean) / self.prior.std).square().sum()
-        return loss.sum() + tie_loss.sum() + pull, weight, tie_weight
-
-    def _cost(self, shared: Tensor, states: State) -> float:
-        with torch.no_grad():
-            nothing = torch.zeros_like(self.tie)
-            rows = self._rows(shared.expand(len(nothing), -1), states, nothing, 1)
-        cost = float(self._parts(*self._split(rows), shared)[0])
-        return cost if math.isfinite(cost) else math.inf
-
     def _differences(self, shared: Tensor, states: State) -> tuple[Tensor, Tensor]:
         """Return rows (B, m) and their Jacobian (B, m, P + S) by central differences over `STEPS`.
 
@@ -325,11 +303,12 @@ class Shooting:
         slopes = (every[1 : half + 1] - every[half + 1 :]) / (2 * steps[:, None, None])
         return every[0], torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 
-    def _linearised(self, shared: Tensor, states: State) -> _Linear:
+    def normal_equations(self, shared: Tensor, states: State) -> NormalEquations:
+        """Return the normal equations of one item by parameters and all states (P + B S), which ties couple."""
         batch, size, count = *self.tie.shape, len(shared)
         rows, jacobian = self._differences(shared, states)
         frames, ties = self._split(rows)
-        cost, weight, tie_weight = self._parts(frames, ties, shared)
+        cost, weight, tie_weight = _losses(frames, ties)
         total = count + batch * size
         matrix, slope = torch.zeros(total, total).to(shared), torch.zeros(total).to(shared)
         weak_prior = state_prior(len(self.segments.free)).to(shared) * 1e-3
@@ -347,34 +326,58 @@ class Shooting:
                 leading = torch.cat([jacobian[row, -size:], -torch.eye(size).to(shared)], 1) / self.tie[row][:, None]
                 matrix[there[:, None], there] += tie_weight[row] * leading.T @ leading
                 slope[there] += tie_weight[row] * leading.T @ ties[row]
-        index = torch.arange(count)
-        matrix[index, index] += 1 / self.prior.std.square()
-        slope[:count] += (shared - self.prior.mean) / self.prior.std.square()
-        tied = self.following >= 0
-        misfit = float((tie_weight[:, None] * ties.square())[tied].mean()) if bool(tied.any()) else 0.0
-        chi2 = frames.square().sum(-1)
-        chi2 = chi2[chi2 > 0]
-        middle = float(chi2.median()) / 5.35 if len(chi2) else 0.0  # 5.35: median of chi-square, 6 degrees
-        return _Linear(
-            matrix=matrix,
-            slope=slope,
-            cost=float(cost) if bool(cost.isfinite()) else math.inf,
-            misfit=misfit,
-            chi2=middle,
+        return NormalEquations.of_parameters(matrix[None], -slope[None], cost[None])
+
+
+class _TiedProblem(Problem):
+    """The parameters of a problem and the changes of all states, as the parameters of one group.
+
+    Ties couple the states of neighbouring segments, so that none of them is eliminated. The states themselves are the
+    state of the only item.
+    """
+
+    def __init__(self, shooting: Shooting) -> None:
+        prior = shooting.prior
+        self.shooting, self.count = shooting, len(prior.mean)
+        still = torch.zeros(shooting.tie.numel()).to(prior.mean)
+        far = torch.full_like(still, torch.inf)
+        self.owner = torch.zeros(1, dtype=torch.long)
+        self.box = Box.within(
+            torch.cat([prior.bounds, torch.stack([-far, far], 1)]),
+            torch.cat([prior.mean, still]),
+            torch.cat([1 / prior.std.square(), still]),
         )
 
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the robust cost (1,)."""
+        del rows
+        found = self.shooting._residuals(point.values[0, : self.count], _from_item(point.states))
+        return _losses(*found)[0][None]
 
-@dataclass(frozen=True, kw_only=True)
-class _Linear:
-    """Normal equations of half the cost at a point."""
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations."""
+        del rows
+        return self.shooting.normal_equations(point.values[0, : self.count], _from_item(point.states))
 
-    matrix: Tensor
-    """Curvature by parameters and states, shape (P + B S, P + B S)."""
-    slope: Tensor
-    """Gradient by parameters and states, shape (P + B S,)."""
-    cost: float
-    """Cost, infinite where the rollouts diverge."""
-    misfit: float
-    """As in `ShootingFit`."""
-    chi2: float
-    """As in `ShootingFit`."""
+    def moved(self, point: Point, values: Tensor, step: Tensor, rows: Rows) -> tuple[Tensor, ...]:
+        """Return the states moved by the changes among the values (1, P + B S)."""
+        del step, rows
+        change = (values - point.values)[0, self.count :].view_as(self.shooting.tie)
+        return _as_item(retract(_from_item(point.states), change, self.shooting.segments.free))
+
+
+def _as_item(states: State) -> tuple[Tensor, ...]:
+    """Return the states of all segments as the state of one item."""
+    return tuple(value[None] for value in vars(states).values())
+
+
+def _from_item(states: tuple[Tensor, ...]) -> State:
+    """Return the states of all segments from the state of one item."""
+    return State(*(value[0] for value in states))
+
+
+def _losses(frames: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the cost of residuals of frames (B, F, 6) and ties (B, S), and their robust weights (B, F) and (B,)."""
+    loss, weight = robust_loss(frames.square().sum(-1), ROBUST_SCALE)
+    tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * ROBUST_SCALE)
+    return loss.sum() + tie_loss.sum(), weight, tie_weight
