@@ -65,7 +65,7 @@ class StartUncertainty:
 
         Gauss-Newton steps with Cauchy weights in the coordinates in which the start's covariance is the identity, with
         several dampings in parallel; a state is kept only where it lowers the distance, so the result never exceeds
-        that of the start. It is no use of the least-squares solver, because what it lowers is not the sum that it linearises.
+        that of the start. The loop is its own, because it lowers the distance and not the sum that it linearises.
 
         Args:
             noise: Standard deviations of the measurement (position [m], rotation [rad]).
