@@ -280,9 +280,13 @@ def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] |
         faults += [fault] if fault else []
     extra = sorted(file.name for file in path.glob("*.h5") if file.name not in listed)
     faults += [f"{name}: not listed in {MANIFEST}." for name in extra]
+    fault = _model_fault(path, manifest)
+    return faults if fault is None else [*faults, fault]
+
+
+def _model_fault(path: Path, manifest: DatasetManifest) -> str | None:
+    """Return what is wrong with a dataset's copy of its model; None if it is as the manifest says."""
     model = path / manifest.model
     if not model.is_dir():
-        faults.append(f"{manifest.model}/: the model's copy is missing.")
-    elif sha256(model) != manifest.model_sha256:
-        faults.append(f"{manifest.model}/: its sha256 differs from {MANIFEST}.")
-    return faults
+        return f"{manifest.model}/: the model's copy is missing."
+    return None if sha256(model) == manifest.model_sha256 else f"{manifest.model}/: its sha256 differs from {MANIFEST}."
