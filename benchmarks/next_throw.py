@@ -32,7 +32,7 @@ from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic.hidden_effects.mechanics import Mechanics, Start, build
 from cgwm.datasets.synthetic.hidden_effects.record import ENGINES, measured
 from cgwm.datasets.synthetic.hidden_effects.things import Kind
-from cgwm.pipeline.diagnose.effect_selection import Evidence
+from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.experiments import DEFAULT, experiments_of
 from cgwm.pipeline.diagnose.next_experiment import RankedExperiment, Rivals, ranked_experiments
 from cgwm.pipeline.diagnose.score_test import ScoreTest

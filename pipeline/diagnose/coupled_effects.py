@@ -18,7 +18,7 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, base_parameters, base_values
 from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
-from .effect_selection import Evidence
+from .evidence import Evidence
 from .score_test import ScoreTest
 
 DRAGS = ("linear_drag", "quadratic_drag")

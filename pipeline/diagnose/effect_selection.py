@@ -20,6 +20,7 @@ from ..segments.candidates import Candidate, Variant, acts_in, admissible, base_
 from ..segments.linearization import Linearization, linearize
 from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
+from .evidence import Evidence
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
 
 ALPHA = 0.002
@@ -41,38 +42,6 @@ explanations: on the development cases five such detections were false (sizes 0.
 of BIC -15, -8, -10, -12 and 0), and the smallest true effect had size 0.22."""
 CONTAINED = 0.995
 """Minimum canonical correlation at which an effect of more parameters can imitate the best one and is its equal."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evidence:
-    """Evidence for one candidate in one kind of segments, in addition to a model."""
-
-    candidate: Candidate
-    """The candidate."""
-    constants: dict[str, float]
-    """Its constants with the best test."""
-    test: ScoreTest
-    """Score test at these constants."""
-    p_value: float
-    """P-value of the test, corrected for the number of constants that were tried."""
-    gains: tuple[float, ...] = ()
-    """Linearized gain of chi2 in each held-out episode."""
-    refitted: Refit | None = None
-    """Refit with the effect; None where it was not refitted."""
-    delta_bic: float | None = None
-    """Change of BIC against the model without the effect; None where it was not refitted."""
-    numbers: dict[str, tuple[float, float]] | None = None
-    """Estimate and standard error by parameter; None where only the score test was made."""
-
-    @property
-    def name(self) -> str:
-        """Name of the effect."""
-        return self.candidate.effect.name
-
-    @property
-    def estimates(self) -> dict[str, tuple[float, float]]:
-        """Estimate and standard error by parameter; empty where only the score test was made."""
-        return self.numbers or {}
 
 
 @dataclass(frozen=True)

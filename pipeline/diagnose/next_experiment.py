@@ -23,7 +23,7 @@ from ...schemas import NextExperiment
 from ..physics.world import World
 from ..segments.candidates import Variant, variants_of
 from ..segments.prepare import Prepared
-from .effect_selection import Evidence
+from .evidence import Evidence
 from .experiments import Experiment, described
 from .fisher_information import Layout, experiment_states, information_of_data, information_of_experiments, layout_of
 from .verdict import Findings
@@ -273,12 +273,12 @@ def _second_in_flight(findings: Findings) -> Evidence | None:
 def _second_in_contact(findings: Findings) -> Evidence | None:
     """Return the second best effect in contact by score; None where the best one is clearly better."""
     first = findings.chosen[0].evidence
-    score = next((one.score for one in findings.contact if one.evidence.name == first.name), None)
-    others = [one for one in findings.contact if one.evidence.name != first.name and one.evidence.test.admissible]
+    score = next((one.score for one in findings.contact if one.name == first.name), None)
+    others = [one for one in findings.contact if one.name != first.name and one.test.admissible]
     second = max(others, key=lambda one: one.score, default=None)
     if second is None or score is None:
         return None
-    return second.evidence if score - second.score < NEAR_BIC else None
+    return second if score - second.score < NEAR_BIC else None
 
 
 def _advice(rivals: Rivals, left: Sequence[str]) -> str:

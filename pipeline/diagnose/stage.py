@@ -36,8 +36,8 @@ from ..segments.input_checks import check_observability, check_units_and_geometr
 from ..segments.prepare import Prepared, prepare
 from ..segments.residual_wrench import Omnibus, covariates_of, wrench_windows
 from .detection_limits import DetectionLimit
-from .effect_selection import Evidence
 from .episodes import diagnosed_episodes
+from .evidence import Evidence
 from .experiments import DEFAULT, Experiment, experiments_of, read_experiments
 from .law_export import require_law_file, save_law
 from .next_experiment import next_experiment
@@ -266,7 +266,7 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
         acts_in=(effect.phase,),
         judged_in=where,
         score_p=evidence.p_value,
-        contact_score=next((_finite(c.score) for c in findings.contact if c.evidence.name == effect.name), None),
+        contact_score=next((_finite(c.score) for c in findings.contact if c.name == effect.name), None),
         delta_bic=evidence.delta_bic,
         cv_error_before_m=before,
         cv_error_after_m=after,

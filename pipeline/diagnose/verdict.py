@@ -13,10 +13,10 @@ from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, om
 from ..segments.segments import Segments
 from .alternative_laws import OtherLaw, other_laws
 from .contact_search import Chosen, ContactFindings, with_contact
-from .contact_tests.segments import ContactEvidence
 from .cross_validation import held_out_errors
 from .detection_limits import DetectionLimit
-from .effect_selection import Evidence, SelectionStep
+from .effect_selection import SelectionStep
+from .evidence import Evidence
 from .falsification import consistency
 from .flight_search import flight_search
 
@@ -48,7 +48,7 @@ class Findings:
     """The same with the selected effects."""
     ranking: tuple[Evidence, ...]
     """Evidence of the candidates, the best first."""
-    contact: tuple[ContactEvidence, ...]
+    contact: tuple[Evidence, ...]
     """Evidence of the candidates in contact."""
     world: World
     """World with the selected effects."""
@@ -66,9 +66,7 @@ class Findings:
     @property
     def judged_in_contact(self) -> set[str]:
         """Names of the effects whose evidence comes from contact."""
-        return {one.evidence.name for one in self.contact} | {
-            c.evidence.name for c in self.chosen if c.where != "flight"
-        }
+        return {one.name for one in self.contact} | {c.evidence.name for c in self.chosen if c.where != "flight"}
 
 
 def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
@@ -161,14 +159,12 @@ def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
     return 1 - (after.statistic - 1) / (before.statistic - 1)
 
 
-def _ranking(
-    chosen: Sequence[Chosen], steps: Sequence[SelectionStep], contact: Sequence[ContactEvidence]
-) -> list[Evidence]:
+def _ranking(chosen: Sequence[Chosen], steps: Sequence[SelectionStep], contact: Sequence[Evidence]) -> list[Evidence]:
     """Return each candidate once: the selected effects and their equals, then flight, then contact."""
     found: dict[str, Evidence] = {}
     everything = [e for one in chosen for e in one.equals]
     everything += [e for step in steps[:1] for e in step.evidence]
-    everything += [one.evidence for one in contact if one.evidence.candidate.effect.phase == "contact"]
+    everything += [one for one in contact if one.candidate.effect.phase == "contact"]
     for evidence in everything:
         found.setdefault(evidence.name, evidence)
     return list(found.values())

@@ -12,25 +12,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...optimization.uncertainty import chi2_tail
 from ...physics.parameters import CONTACT_PARAMETERS, Parameter
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, admissible, variants_of
+from ...segments.candidates import Candidate, Variant
 from ...segments.contact_phases import is_round
-from ...segments.prepare import Prepared
 from ...segments.segment_fit import refit
-from ...segments.segments import Segments
 from ...segments.sliding_descent import SlidingFit
 from ...segments.sliding_fit import StartedSliding, fit_sliding
 from ...trajectories.segmentation import Segment
-from ..effect_selection import Evidence
-from ..score_test import ScoreTest
-from .sliding import FIRST_ITERATIONS, SURPLUS_SIGMAS, SlidingEvidence, batches
+from ..evidence import Evidence
+from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked
+from .sliding import FIRST_ITERATIONS, SURPLUS_SIGMAS, batches
 
 SPREAD = 0.13
 """Standard deviation of the logarithm of the ratio between the frictions of sliding and of impacts where nothing is
@@ -66,6 +64,10 @@ class _ImpactFriction:
         variance = float(self.covariance(fit)[0, 0])
         return self.apart(fit.values[0, 0]) ** 2 / (self.width**2 + variance)
 
+    def discrepancy(self, value: Tensor) -> float:
+        """Return chi2 of the discrepancy between a friction, given by its logarithm, and that of the impacts."""
+        return (self.apart(value) / self.width) ** 2
+
     def apart(self, value: Tensor) -> float:
         """Return the difference between the logarithm of a friction and that of the impacts."""
         return float(value) - math.log(self.friction)
@@ -75,52 +77,62 @@ class _ImpactFriction:
         return torch.linalg.pinv(fit.information[0], hermitian=True) * self.spread
 
 
-def friction_consistency_evidence(
-    prepared: Prepared,
-    world: World,
-    contact: Segments,
-    candidates: Sequence[Candidate],
-    started: StartedSliding | None,
-) -> list[SlidingEvidence]:
-    """Return the evidence of candidates that resolve a discrepancy between the frictions, the best first.
+class FrictionConsistencyTest(ContactTest):
+    """Comparison of candidates by how well they reconcile the frictions of sliding and of impacts."""
 
-    It is empty without such a discrepancy, without sliding segments or enough impacts, and for a round body.
+    name: ClassVar[str] = "friction_consistency"
+    lists_all: ClassVar[bool] = False
 
-    Args:
-        prepared: The episodes.
-        world: The model's world.
-        contact: Contact segments with fitted states.
-        candidates: All candidates.
-        started: The sliding segments and their fit without candidates.
-    """
-    if started is None or is_round(world.bodies[world.free[0]]):
-        return []
-    sliding, own, known = started.segments, started.friction, started.flight_parameters
-    struck = [k for k, item in enumerate(contact.items) if not _within(item, sliding.items)]
+    def evidence(self, data: ContactData, candidates: Sequence[Candidate]) -> list[Evidence]:
+        """Return the evidence of candidates fitted with both frictions, the best first.
+
+        It is empty without a discrepancy between the frictions, without sliding segments or enough impacts, and for a
+        round body.
+
+        Args:
+            data: Motions and model.
+            candidates: Candidates that the world admits.
+        """
+        started = data.sliding
+        impacts = None if started is None else _discrepancy(data, started)
+        if started is None or impacts is None:
+            return []
+        own, known, soft_world = started.friction, started.flight_parameters, started.segments.world
+        alone = fit_sliding(soft_world, [], [(started.segments, own[None])], known)[0]
+        degrees = float(started.segments.dof.sum())
+        impacts = replace(impacts, spread=max(1.0, alone.cost / degrees))
+        # chi2 of the sliding segments falls no further below its mean by chance
+        surplus = alone.cost - degrees + SURPLUS_SIGMAS * math.sqrt(2 * degrees)
+        most = impacts.discrepancy(own) + surplus / impacts.spread
+        variants = [v for v in data.variants(candidates) if len(v.parameters) * math.log(degrees) + SCORE < most]
+        found = _fits(soft_world, variants, alone, impacts, known)
+        if not found:
+            return []
+        # the friction alone, fitted again from the states of the best candidate: what both gain is no sign of an effect
+        _, ended = min(found, key=lambda one: impacts.joint(one[1]))
+        again = fit_sliding(soft_world, [], [(ended.segments, own[None])], known)[0]
+        least = min((alone, again), key=impacts.joint)
+        return ranked(_judged(variant, fit, candidates, least, degrees, impacts) for variant, fit in found)
+
+    def leads(self, best: Evidence) -> tuple[Lead, ...]:
+        """Return the lead in score over effects that reconcile the frictions, too."""
+        return (Lead(score=LEAD, rival=Bar(share=RESOLVED)),)
+
+    def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
+        """Return the bar."""
+        return (Bar(score=SCORE, share=RESOLVED),)
+
+
+def _discrepancy(data: ContactData, started: StartedSliding) -> _ImpactFriction | None:
+    """Return the friction of the impacts if it contradicts that of sliding; None else, or if impacts do not show it."""
+    if data.segments is None or is_round(data.world.bodies[data.world.free[0]]):
+        return None
+    struck = [k for k, item in enumerate(data.segments.items) if not _within(item, started.segments.items)]
     if len(struck) < FEWEST:
-        return []
-    soft_world = sliding.world
-    friction, error = refit([contact.select(struck)], world, CONTACT_PARAMETERS).number("friction")
+        return None
+    friction, error = refit([data.segments.select(struck)], data.world, CONTACT_PARAMETERS).number("friction")
     impacts = _ImpactFriction(friction, math.hypot(SPREAD, error / friction), 1.0)
-    if (impacts.apart(own) / impacts.width) ** 2 < SCORE:
-        return []
-    alone = fit_sliding(soft_world, [], [(sliding, own[None])], known)[0]
-    degrees = float(sliding.dof.sum())
-    impacts = replace(impacts, spread=max(1.0, alone.cost / degrees))
-    kept, _ = admissible(world, candidates, prepared.has_orientation)
-    variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
-    # chi2 of the sliding segments falls no further below its mean by chance
-    surplus = alone.cost - degrees + SURPLUS_SIGMAS * math.sqrt(2 * degrees)
-    most = (impacts.apart(own) / impacts.width) ** 2 + surplus / impacts.spread
-    variants = [v for v in variants if len(v.parameters) * math.log(degrees) + SCORE < most]
-    found = _fits(soft_world, variants, alone, impacts, known)
-    if not found:
-        return []
-    # the friction alone, fitted again from the states of the best candidate: what both gain is no sign of an effect
-    _, ended = min(found, key=lambda one: impacts.joint(one[1]))
-    again = fit_sliding(soft_world, [], [(ended.segments, own[None])], known)[0]
-    least = min((alone, again), key=impacts.joint)
-    return _ranked(found, kept, least, degrees, impacts)
+    return None if impacts.discrepancy(started.friction) < SCORE else impacts
 
 
 def _fits(
@@ -153,56 +165,30 @@ def _fits(
     return found
 
 
-def _ranked(
-    found: Sequence[tuple[Variant, SlidingFit]],
-    kept: Sequence[Candidate],
+def _judged(
+    variant: Variant,
+    fit: SlidingFit,
+    candidates: Sequence[Candidate],
     alone: SlidingFit,
     degrees: float,
     impacts: _ImpactFriction,
-) -> list[SlidingEvidence]:
-    """Return the evidence of the fits, the best first; its share is that of the discrepancy between the frictions."""
-    best: dict[int, SlidingEvidence] = {}
-    for variant, fit in found:
-        candidate, number = kept[variant.place], len(variant.parameters)
-        gain = max(0.0, impacts.joint(alone) - impacts.joint(fit))
-        spread = impacts.covariance(fit)
-        # the residual discrepancy is distributed over all fitted parameters
-        share = spread[:, 0] / (impacts.width**2 + spread[0, 0])
-        moved = fit.values[0] - share * impacts.apart(fit.values[0, 0])
-        spread = spread - share[:, None] * spread[0]
-        values = moved[-number:].numpy().astype(np.float64)
-        covariance = spread[-number:, -number:].numpy().astype(np.float64)
-        p_value = chi2_tail(gain, number)
-        test = ScoreTest(
-            statistic=gain,
-            dof=number,
-            p_value=p_value,
-            estimate=values,
-            covariance=covariance,
-            admissible=bool((values != 0).any()),
-        )
-        deviations = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-        names = [p.name for p in candidate.effect.parameters]
-        estimates = {name: (float(v), float(s)) for name, v, s in zip(names, values, deviations, strict=True)}
-        evidence = Evidence(
-            candidate=candidate, constants=variant.constants, test=test, p_value=p_value, numbers=estimates
-        )
-        score = gain - number * math.log(degrees)
-        resolved = 1 - impacts.between(fit) / impacts.between(alone)
-        one = SlidingEvidence(
-            evidence=evidence, score=score, friction=float(moved[0].exp()), left=fit.cost / degrees, share=resolved
-        )
-        if variant.place not in best or score > best[variant.place].score:
-            best[variant.place] = one
-    return sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))
-
-
-def selected_by_friction_consistency(evidence: Sequence[SlidingEvidence]) -> list[SlidingEvidence]:
-    """Return the effect that reconciles sliding and impacts, and its equals; empty if none passes the thresholds."""
-    fit = [one for one in evidence if one.evidence.test.admissible]
-    if not fit or fit[0].score < SCORE or fit[0].share < RESOLVED:
-        return []
-    return [one for one in fit if one.score > fit[0].score - LEAD and one.share >= RESOLVED]
+) -> Evidence:
+    """Return the evidence of a fit; its share is that of the discrepancy between the frictions."""
+    number, spread = len(variant.parameters), impacts.covariance(fit)
+    # the residual discrepancy is distributed over all fitted parameters
+    share = spread[:, 0] / (impacts.width**2 + spread[0, 0])
+    moved = fit.values[0] - share * impacts.apart(fit.values[0, 0])
+    spread = spread - share[:, None] * spread[0]
+    one = fitted_evidence(
+        candidates[variant.place],
+        variant,
+        gain=max(0.0, impacts.joint(alone) - impacts.joint(fit)),
+        values=moved[-number:].numpy().astype(np.float64),
+        covariance=spread[-number:, -number:].numpy().astype(np.float64),
+        penalty=math.log(degrees),
+    )
+    resolved = 1 - impacts.between(fit) / impacts.between(alone)
+    return replace(one, share=resolved, contact={"friction": float(moved[0].exp())})
 
 
 def _within(item: Segment, sliding: Sequence[Segment]) -> bool:

@@ -9,8 +9,9 @@ the friction is. Effects that no impact shows are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -18,14 +19,11 @@ from numpy.typing import NDArray
 
 from ...optimization.uncertainty import f_tail
 from ...physics.contact_law import ContactLaw
-from ...physics.effects.effect import ActiveEffect
-from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, admissible, variants_of
+from ...segments.candidates import Candidate, Variant
 from ...segments.impact_fit import BASE, LEAST, ImpactBase, ImpactFit, ImpactProblem, fit_impacts
 from ...segments.impact_velocities import measured_impacts
-from ...segments.prepare import Prepared
-from ..effect_selection import Evidence
-from ..score_test import ScoreTest
+from ..evidence import Evidence
+from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
 
 Array = NDArray[np.float64]
 
@@ -39,78 +37,52 @@ development cases the largest scores of 30 balls without an effect were 4.1 and 
 LEAD, LEAD_SHARE = 6.0, 0.1
 """Another effect counts as equal if its score is lower by less than the first value, or by less than this share of the
 best score, and its size is above `SIZE`."""
+WITHOUT_GAINS = Bar(score=SCORE, share=EXPLAINED, size=SIZE)
+"""All thresholds but that of held-out episodes."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImpactEvidence:
-    """Evidence for a candidate in impacts."""
+class ImpactTest(ContactTest):
+    """Comparison of candidates by their residuals in the impacts of a ball."""
 
-    evidence: Evidence
-    """Evidence with estimates and held-out gains."""
-    score: float
-    """Fall of chi2 in units of the residual of the best candidate, less the penalty of BIC."""
-    fit: ImpactFit
-    """Fit of restitution, friction and the effect."""
-    size: float
-    """Size of the largest parameter, in usual sizes."""
-    gain: float
-    """Gain of all held-out episodes together; 0 except for the best candidate above the other thresholds."""
-    t: float
-    """Mean gain of the held-out episodes in its standard errors; 0 where `gain` is not computed."""
-    share: float
-    """Share of the excess of chi2 that it explains, in the part (rebounds, or the rest) that it acts on."""
+    name: ClassVar[str] = "impact"
+    lists_all: ClassVar[bool] = True
 
+    def evidence(self, data: ContactData, candidates: Sequence[Candidate]) -> list[Evidence]:
+        """Return the evidence of the candidates that impacts show, the best first; empty without enough impacts.
 
-def impact_evidence(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> list[ImpactEvidence]:
-    """Return the evidence of the candidates that impacts show, the best first; empty without enough impacts of a ball.
+        Gains in held-out episodes are computed for the best candidate alone, and only where it passes the other
+        thresholds, because they take most of the time.
 
-    Args:
-        prepared: The episodes.
-        world: The model's world.
-        candidates: All candidates.
-    """
-    if not isinstance(world.contact, ContactLaw):
-        return []
-    impacts = measured_impacts(prepared, world)
-    if impacts is None or len(impacts) < LEAST:
-        return []
-    kept, _ = admissible(world, candidates, prepared.has_orientation)
-    variants = [v for v in variants_of(kept, world.gravity[0, :1]) if v.active.effect.phase == "contact"]
-    base = ImpactBase.of(world, impacts)
-    found = []
-    for variant in variants:
-        problem, start = base.beside(variant)
-        if _is_shown(problem, start, len(base.parameters)):
-            found.append((variant, fit_impacts(problem, start, centre=base.centre_of(start))))
-    return _ranked(base, found, kept)
+        Args:
+            data: Motions and model.
+            candidates: Candidates that the world admits.
+        """
+        if not isinstance(data.world.contact, ContactLaw):
+            return []
+        impacts = measured_impacts(data.prepared, data.world)
+        if impacts is None or len(impacts) < LEAST:
+            return []
+        base = ImpactBase.of(data.world, impacts)
+        found = []
+        for variant in data.variants(candidates):
+            problem, start = base.beside(variant)
+            if _is_shown(problem, start, len(base.parameters)):
+                found.append((variant, fit_impacts(problem, start, centre=base.centre_of(start))))
+        if not found:
+            return []
+        fits = _Fits.of(base, found, candidates)
+        order = ranked(fits.evidence())
+        if not order[0].test.admissible or not WITHOUT_GAINS.passed(order[0]):
+            return order
+        return [fits.with_gains(order[0]), *order[1:]]
 
+    def leads(self, best: Evidence) -> tuple[Lead, ...]:
+        """Return the lead in score over effects of a size that matters."""
+        return (Lead(score=LEAD, share=LEAD_SHARE, rival=Bar(score=0.0, size=SIZE)),)
 
-def with_impact_effect(world: World, found: ImpactEvidence) -> World:
-    """Return the world with an effect and the restitution, both as estimated from the impacts.
-
-    The friction keeps its value: impacts seldom show it, and it was fitted to sliding and other contacts.
-    """
-    evidence, law = found.evidence, world.contact
-    assert isinstance(law, ContactLaw)  # impacts are tested under no other law
-    values = evidence.constants | {name: value for name, (value, _) in evidence.estimates.items()}
-    active = ActiveEffect.of(evidence.candidate.effect, values, world.gravity[0, :1])
-    place = [p.name for p in BASE].index("damping_ratio")
-    ratio = torch.full_like(law.damping_ratio, float(np.exp(found.fit.values[place])))
-    return replace(world, contact=replace(law, damping_ratio=ratio), effects=(*world.effects, active))
-
-
-def selected_in_impacts(evidence: Sequence[ImpactEvidence]) -> list[ImpactEvidence]:
-    """Return the effect that the impact test selects and its equals; empty where it selects none."""
-    if not evidence or not _is_candidate(evidence[0]) or evidence[0].gain <= 0 or evidence[0].t < HELD_OUT_T:
-        return []
-    lead = max(LEAD, LEAD_SHARE * evidence[0].score)
-    fit = [one for one in evidence if one.evidence.test.admissible and one.size > SIZE and one.score > 0]
-    return [one for one in fit if one.score > evidence[0].score - lead]
-
-
-def _is_candidate(one: ImpactEvidence) -> bool:
-    """Return whether an effect passes all thresholds but those of held-out episodes, which take most of the time."""
-    return one.evidence.test.admissible and one.size > SIZE and one.score >= SCORE and one.share >= EXPLAINED
+    def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
+        """Return the bar, held-out episodes included."""
+        return (replace(WITHOUT_GAINS, gain_t=HELD_OUT_T),)
 
 
 def _is_shown(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
@@ -126,67 +98,56 @@ def _is_shown(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
     return float((rows[1:] - rows[:1]).square().sum((1, 2)).max()) > TOLD
 
 
-def _ranked(
-    base: ImpactBase, found: Sequence[tuple[Variant, ImpactFit]], kept: Sequence[Candidate]
-) -> list[ImpactEvidence]:
-    """Return the evidence of the fits, the best first and with its held-out gains."""
-    if not found:
-        return []
-    tries: dict[int, int] = {}
-    for variant, _ in found:
-        tries[variant.place] = tries.get(variant.place, 0) + 1
-    count = len(base.problem.impacts)
-    degrees = np.array([count - 1, 5 * count - 1], dtype=float)
-    # smallest residuals of all fits, in rebounds and in the rest: impacts with more scatter have less weight
-    left = np.min([fit.chi2 for _, fit in found], axis=0)
-    spread = np.maximum(1.0, left / degrees)
-    best: dict[int, ImpactEvidence] = {}
-    for variant, fit in found:
-        candidate, number = kept[variant.place], len(variant.parameters)
-        values = fit.values[-number:]
-        falls = base.fit.chi2 - fit.chi2
-        fall = max(0.0, float((falls / spread).sum()) + base.fit.prior - fit.prior)
-        part = int(np.argmax(falls / spread))
-        share = float(falls[part] / max(base.fit.chi2[part] - degrees[part], 1.0))
-        freedom = max(float(degrees.sum()) - number, 1.0)
-        p_value = f_tail(fall / number, number, freedom)
-        covariance = np.linalg.inv(fit.information)[-number:, -number:] * spread[part]
-        test = ScoreTest(
-            statistic=fall,
-            dof=number,
-            p_value=p_value,
-            estimate=values,
-            covariance=covariance,
-            admissible=bool((values != 0).any()),
-        )
-        estimates = {
-            p.name: (float(v), float(s))
-            for p, v, s in zip(candidate.effect.parameters, values, np.sqrt(np.diag(covariance)), strict=True)
-        }
-        size = float(np.max([abs(v) / p.scale for p, v in zip(candidate.effect.parameters, values, strict=True)]))
-        score = fall - number * math.log(count) - 2 * math.log(tries[variant.place])
-        corrected = min(1.0, p_value * tries[variant.place])
-        evidence = Evidence(
-            candidate=candidate, constants=variant.constants, test=test, p_value=corrected, numbers=estimates
-        )
-        one = ImpactEvidence(evidence=evidence, score=score, fit=fit, size=size, gain=0.0, t=0.0, share=share)
-        if variant.place not in best or score > best[variant.place].score:
-            best[variant.place] = one
-    order = sorted(best.values(), key=lambda one: (-one.score, one.evidence.name))
-    return [_held_out(base, order[0], found, kept, spread), *order[1:]] if _is_candidate(order[0]) else order
+@dataclass(frozen=True, kw_only=True)
+class _Fits:
+    """Fits of all candidates to the same impacts."""
 
+    base: ImpactBase
+    """The fit without candidates."""
+    found: Sequence[tuple[Variant, ImpactFit]]
+    """The variants with their fits."""
+    candidates: Sequence[Candidate]
+    """The candidates."""
+    degrees: Array
+    """Degrees of freedom (2,) of the rebounds, and of the rest."""
+    spread: Array
+    """Factor (2,) by which chi2 is divided: smallest residuals of all fits; more scatter means less weight."""
 
-def _held_out(
-    base: ImpactBase,
-    one: ImpactEvidence,
-    found: Sequence[tuple[Variant, ImpactFit]],
-    kept: Sequence[Candidate],
-    spread: Array,
-) -> ImpactEvidence:
-    """Return the evidence with its gains in held-out episodes."""
-    own = one.evidence
-    variant = next(v for v, _ in found if kept[v.place] is own.candidate and v.constants == own.constants)
-    gains = base.gains(base.beside(variant)[0], one.fit.values) / float(spread.max())
-    error = gains.std(ddof=1) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
-    t = float(gains.mean() / error) if error > 0 else 0.0
-    return replace(one, evidence=replace(own, gains=tuple(gains.tolist())), gain=float(gains.sum()), t=t)
+    @staticmethod
+    def of(base: ImpactBase, found: Sequence[tuple[Variant, ImpactFit]], candidates: Sequence[Candidate]) -> _Fits:
+        """Return the fits with the scatter that the best of them leave."""
+        count = len(base.problem.impacts)
+        degrees = np.array([count - 1, 5 * count - 1], dtype=float)
+        spread = np.maximum(1.0, np.min([fit.chi2 for _, fit in found], axis=0) / degrees)
+        return _Fits(base=base, found=found, candidates=candidates, degrees=degrees, spread=spread)
+
+    def evidence(self) -> Iterator[Evidence]:
+        """Yield the evidence of the fits, without gains in held-out episodes."""
+        tries, alone = tries_of(variant for variant, _ in self.found), self.base.fit
+        place = [p.name for p in BASE].index("damping_ratio")
+        for variant, fit in self.found:
+            number = len(variant.parameters)
+            falls = alone.chi2 - fit.chi2
+            fall = max(0.0, float((falls / self.spread).sum()) + alone.prior - fit.prior)
+            part = int(np.argmax(falls / self.spread))
+            freedom = max(float(self.degrees.sum()) - number, 1.0)
+            one = fitted_evidence(
+                self.candidates[variant.place],
+                variant,
+                gain=fall,
+                values=fit.values[-number:],
+                covariance=np.linalg.inv(fit.information)[-number:, -number:] * self.spread[part],
+                penalty=math.log(len(self.base.problem.impacts)),
+                tries=tries[variant.place],
+                p_value=f_tail(fall / number, number, freedom),
+            )
+            # the friction is not taken over: impacts seldom show it, and it was fitted to sliding and other contacts
+            share = float(falls[part] / max(alone.chi2[part] - self.degrees[part], 1.0))
+            yield replace(one, share=share, contact={"damping_ratio": float(np.exp(fit.values[place]))})
+
+    def with_gains(self, one: Evidence) -> Evidence:
+        """Return the evidence with its gains in held-out episodes."""
+        variant = variant_of(one, (v for v, _ in self.found), self.candidates)
+        fit = next(fit for own, fit in self.found if own is variant)
+        gains = self.base.gains(self.base.beside(variant)[0], fit.values) / float(self.spread.max())
+        return replace(one, gains=tuple(gains.tolist()))

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.diagnose import diagnose, flight_search
-from cgwm.pipeline.diagnose.contact_tests.segments import fitted_contact, separated
-from cgwm.pipeline.diagnose.effect_selection import Evidence, SelectionStep, is_slight, select_next
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, select_next
+from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.falsification import consistency
+from cgwm.pipeline.diagnose.flight_equals import fitted_contact, separated
 from cgwm.pipeline.diagnose.score_test import ScoreTest, score_test
 from cgwm.pipeline.diagnose.sparse_regression import residual_law
 from cgwm.pipeline.physics.effects import load_effect

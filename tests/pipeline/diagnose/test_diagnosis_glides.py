@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose.contact_search import SLIDING_SCORE, selected_in_sliding
-from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingEvidence, sliding_evidence, with_effect
+from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, selected, with_effect
+from cgwm.pipeline.diagnose.contact_tests.sliding import SLIDING_SCORE, SlidingTest
 from cgwm.pipeline.diagnose.detection_limits import DetectionLimit, detection_limits
-from cgwm.pipeline.diagnose.effect_selection import Evidence
+from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
@@ -84,7 +84,7 @@ def test_hidden_frames_shorten_no_glide() -> None:
     assert covered >= sum(last - first for _, first, last in parts) - 2 * 7
 
 
-def evidence(name: str, score: float, share: float, size: float = 1.0) -> SlidingEvidence:
+def evidence(name: str, score: float, share: float, size: float = 1.0) -> Evidence:
     """An effect in glides, each of its numbers so many times what is usual."""
     effect = load_effect(name)
     values = np.array([size * p.scale for p in effect.parameters])
@@ -92,13 +92,29 @@ def evidence(name: str, score: float, share: float, size: float = 1.0) -> Slidin
         statistic=score, dof=len(values), p_value=0.0, estimate=values, covariance=np.eye(len(values)), admissible=True
     )
     numbers = {p.name: (float(v), 0.0) for p, v in zip(effect.parameters, values, strict=True)}
-    return SlidingEvidence(
-        evidence=Evidence(candidate=Candidate(name, effect), constants={}, test=test, p_value=0.0, numbers=numbers),
+    return Evidence(
+        candidate=Candidate(name, effect),
+        constants={},
+        test=test,
+        p_value=0.0,
+        numbers=numbers,
         score=score,
-        friction=0.3,
-        left=1.0,
         share=share,
+        contact={"friction": 0.3},
     )
+
+
+def data_of(prepared: Prepared, world: World) -> ContactData:
+    """Return data with sliding segments and without contact segments, of which the sliding test reads nothing."""
+    sliding = StartedSliding.of(prepared, world, prepared.flight)
+    return ContactData(prepared=prepared, world=world, segments=None, sliding=sliding)
+
+
+def named_in_sliding(given: list[Evidence], flown: bool, explained: bool = True) -> list[Evidence]:
+    """Return what the sliding test selects of given evidence, which alone decides."""
+    prepared, world = rolls()
+    data = ContactData(prepared=prepared, world=world, segments=None, sliding=None, flown=flown, explained=explained)
+    return selected(SlidingTest(), given, data)
 
 
 @pytest.mark.parametrize(
@@ -126,23 +142,22 @@ def evidence(name: str, score: float, share: float, size: float = 1.0) -> Slidin
 )
 def test_what_glides_name(found: list[tuple], flown: bool, named: list[str]) -> None:
     given = [evidence(*one) for one in found]
-    assert [one.evidence.name for one in selected_in_sliding(given, explained=True, flown=flown)] == named
+    assert [one.name for one in named_in_sliding(given, flown)] == named
 
 
 def test_what_a_single_episode_says_is_not_named_beside_an_effect_of_flight() -> None:
     told = evidence("anisotropic_friction", 900, 0.9)
-    alone, twice = replace(told, others=20.0), replace(told, others=200.0)
-    assert selected_in_sliding([alone], explained=True, flown=True) == []
-    assert selected_in_sliding([twice], explained=True, flown=True) == [twice]
-    assert selected_in_sliding([alone], explained=True, flown=False) == [alone]  # no law from flight can be off
+    alone, twice = replace(told, without_best=20.0), replace(told, without_best=200.0)
+    assert named_in_sliding([alone], flown=True) == []
+    assert named_in_sliding([twice], flown=True) == [twice]
+    assert named_in_sliding([alone], flown=False) == [alone]  # no law from flight can be off
 
 
 def test_evidence_tells_what_the_other_episodes_say() -> None:
     prepared, world = rolls({"rolling_resistance": {"c_r": 1e-3}})
-    started = StartedSliding.of(prepared, world, prepared.flight)
-    (first, *_) = sliding_evidence(prepared, world, LIBRARY, 50.0, started)
-    assert first.evidence.name == "rolling_resistance"
-    assert 80 < first.others < 0.6 * first.score  # two balls
+    (first, *_) = SlidingTest().evidence(data_of(prepared, world), LIBRARY)
+    assert first.name == "rolling_resistance"
+    assert 80 < first.without_best < 0.6 * first.score  # two balls
 
 
 @pytest.mark.parametrize(
@@ -157,15 +172,13 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     # another contact than the model's, and a friction that it does not know
     prepared, world = rolls({name: values}, {"contact_time_s": 0.006, "damping_ratio": 0.2, "friction": 0.22}, thrown=2)
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
-    found = sliding_evidence(
-        prepared, world, library, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight)
-    )
-    assert found[0].evidence.name == name
+    found = SlidingTest().evidence(data_of(prepared, world), library)
+    assert found[0].name == name
     assert found[0].score > SLIDING_SCORE
     assert found[0].score > 3 * found[1].score
-    assert found[0].evidence.numbers is not None
+    assert found[0].numbers is not None
     (key, value) = next(iter(values.items()))
-    estimate, error = found[0].evidence.numbers[key]
+    estimate, error = found[0].numbers[key]
     assert abs(estimate - value) < max(4 * error, 0.1 * value)
     after = with_effect(world, found[0])
     assert after.effects[-1].effect.name == name
@@ -190,11 +203,9 @@ def test_from_the_limit_on_an_effect_is_named() -> None:
         (limit,) = found[name].sizes.values()
         for times, seen in ((1.1, True), (0.2, False)):
             prepared, world = rolls({name: {number: times * limit}})
-            ranked = sliding_evidence(
-                prepared, world, LIBRARY, 20.0, StartedSliding.of(prepared, world, prepared.flight)
-            )
-            named = bool(ranked) and ranked[0].evidence.name == name and ranked[0].score > SLIDING_SCORE
-            assert named == seen, (name, times, limit, [(one.evidence.name, one.score) for one in ranked])
+            ranked = SlidingTest().evidence(data_of(prepared, world), LIBRARY)
+            named = bool(ranked) and ranked[0].name == name and ranked[0].score > SLIDING_SCORE
+            assert named == seen, (name, times, limit, [(one.name, one.score) for one in ranked])
 
 
 def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
@@ -208,9 +219,7 @@ def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
 
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
-    found = sliding_evidence(
-        prepared, world, LIBRARY, SLIDING_SCORE, StartedSliding.of(prepared, world, prepared.flight)
-    )
+    found = SlidingTest().evidence(data_of(prepared, world), LIBRARY)
     assert not found or found[0].score < SLIDING_SCORE
 
 

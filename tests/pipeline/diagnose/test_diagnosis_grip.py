@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose.contact_tests.friction_consistency import (
-    friction_consistency_evidence,
-    selected_by_friction_consistency,
-)
-from cgwm.pipeline.diagnose.contact_tests.segments import fitted_contact
-from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingEvidence
+from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, selected
+from cgwm.pipeline.diagnose.contact_tests.friction_consistency import FrictionConsistencyTest
+from cgwm.pipeline.diagnose.evidence import Evidence
+from cgwm.pipeline.diagnose.flight_equals import fitted_contact
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State
 from cgwm.pipeline.physics.effects import load_effect
@@ -23,8 +21,8 @@ from helpers.worlds import F64
 LIBRARY = [Candidate(name, load_effect(name)) for name in ("adhesion", "viscous_friction", "torsional_friction")]
 
 
-def told(body: str, effects: Effects | None = None) -> list[SlidingEvidence]:
-    """Return what three slides and three tosses say."""
+def told(body: str, effects: Effects | None = None) -> tuple[list[Evidence], ContactData]:
+    """Return what three slides and three tosses say, and their data."""
     truth, world = world_with(body, effects), world_with(body)
     rng, count = np.random.default_rng(4), 3
     position, quat, velocity = np.zeros((count, 1, 3)), np.zeros((count, 1, 4)), np.zeros((count, 1, 3))
@@ -43,25 +41,25 @@ def told(body: str, effects: Effects | None = None) -> list[SlidingEvidence]:
     prepared = prepare(world, [*slides, *tosses(truth, 2, count=count, lift_m_s=(-0.5, 0.0))])
     found = fitted_contact(prepared, world)
     assert found is not None
-    return friction_consistency_evidence(
-        prepared, found[0].world, found[1], LIBRARY, StartedSliding.of(prepared, found[0].world, prepared.flight)
-    )
+    sliding = StartedSliding.of(prepared, found[0].world, prepared.flight)
+    data = ContactData(prepared=prepared, world=found[0].world, segments=found[1], sliding=sliding)
+    return FrictionConsistencyTest().evidence(data, LIBRARY), data
 
 
 def test_adhesion_shows_where_glides_have_more_friction_than_impacts() -> None:
     mass = float(world_with("cube").bodies[0].mass[0])
     pull = 9.81 * mass
-    named = selected_by_friction_consistency(told("cube", {"adhesion": {"F": pull, "g": 0.002}}))
-    assert [one.evidence.name for one in named] == ["adhesion"]
-    assert named[0].evidence.numbers is not None
+    named = selected(FrictionConsistencyTest(), *told("cube", {"adhesion": {"F": pull, "g": 0.002}}))
+    assert [one.name for one in named] == ["adhesion"]
+    assert named[0].numbers is not None
     # the friction of impacts is taken for known to 13 % alone
-    assert named[0].evidence.numbers["F"][0] == pytest.approx(pull, rel=0.4)
-    assert named[0].friction == pytest.approx(0.3, rel=0.25)
+    assert named[0].numbers["F"][0] == pytest.approx(pull, rel=0.4)
+    assert named[0].contact["friction"] == pytest.approx(0.3, rel=0.25)
 
 
 def test_where_nothing_pulls_nothing_is_fitted() -> None:
-    assert told("cube") == []
+    assert told("cube")[0] == []
 
 
 def test_a_ball_is_left_out() -> None:
-    assert told("ball", {"adhesion": {"F": 2.0, "g": 0.002}}) == []
+    assert told("ball", {"adhesion": {"F": 2.0, "g": 0.002}})[0] == []

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose.contact_tests.impact import impact_evidence, selected_in_impacts, with_impact_effect
+from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, selected, with_effect
+from cgwm.pipeline.diagnose.contact_tests.impact import ImpactTest
+from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
@@ -28,6 +30,16 @@ LIBRARY = [
     Candidate(name, load_effect(name))
     for name in ("linear_drag", "velocity_restitution", "anisotropic_friction", "rolling_resistance", "adhesion")
 ]
+
+
+def data_of(prepared: Prepared, world: World) -> ContactData:
+    """Return data of which the impact test reads the episodes and the world."""
+    return ContactData(prepared=prepared, world=world, segments=None, sliding=None)
+
+
+def named_by_impacts(prepared: Prepared, world: World) -> list[Evidence]:
+    data = data_of(prepared, world)
+    return selected(ImpactTest(), ImpactTest().evidence(data, LIBRARY), data)
 
 
 def impact(twist: list[list[float]], bounce: float = 0.5) -> Impact:
@@ -174,7 +186,7 @@ def test_measured_impacts_tell_restitution_and_friction() -> None:
 def test_impacts_are_silent_where_nothing_is_missing() -> None:
     for fast in (False, True):
         prepared, world = throws(fast=fast, seed=7)
-        assert not selected_in_impacts(impact_evidence(prepared, world, LIBRARY))
+        assert not named_by_impacts(prepared, world)
 
 
 @pytest.mark.parametrize(
@@ -183,13 +195,13 @@ def test_impacts_are_silent_where_nothing_is_missing() -> None:
 )
 def test_impacts_name_what_is_hidden(name: str, values: dict[str, float], fast: bool) -> None:
     prepared, world = throws({name: values}, fast)
-    named = selected_in_impacts(impact_evidence(prepared, world, LIBRARY))
-    assert [one.evidence.name for one in named] == [name]
-    assert named[0].evidence.numbers is not None
+    named = named_by_impacts(prepared, world)
+    assert [one.name for one in named] == [name]
+    assert named[0].numbers is not None
     for key, value in values.items():
-        estimate, error = named[0].evidence.numbers[key]
+        estimate, error = named[0].numbers[key]
         assert abs(estimate - value) < 3 * error + 0.1 * value
-    after = with_impact_effect(world, named[0])
+    after = with_effect(world, named[0])
     assert after.effects[-1].effect.name == name
 
 
@@ -206,4 +218,4 @@ def test_a_box_tells_nothing_by_impacts() -> None:
     world = world_with("cube")
     prepared = prepare(world, tosses(world, 1, count=3))
     assert measured_impacts(prepared, world) is None
-    assert impact_evidence(prepared, world, LIBRARY) == []
+    assert ImpactTest().evidence(data_of(prepared, world), LIBRARY) == []

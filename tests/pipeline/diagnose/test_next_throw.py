@@ -13,7 +13,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.diagnose.contact_search import Chosen
-from cgwm.pipeline.diagnose.effect_selection import Evidence
+from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.experiments import DEFAULT, Experiment, experiments_of, read_experiments, states_of
 from cgwm.pipeline.diagnose.law_export import law_source, save_law
 from cgwm.pipeline.diagnose.next_experiment import (

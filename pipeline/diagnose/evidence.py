@@ -1,0 +1,72 @@
+"""Evidence for a missing effect: what any test, in flight or in contact, found out about one candidate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..segments.candidates import Candidate
+from ..segments.segment_fit import Refit
+from .score_test import ScoreTest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """Evidence for one candidate in one kind of segments, in addition to a model."""
+
+    candidate: Candidate
+    """The candidate."""
+    constants: dict[str, float]
+    """Its constants with the best test."""
+    test: ScoreTest
+    """Score test at these constants."""
+    p_value: float
+    """P-value of the test, corrected for the number of constants that were tried."""
+    gains: tuple[float, ...] = ()
+    """Gain of chi2 in each held-out episode; empty where it was not computed."""
+    refitted: Refit | None = None
+    """Refit with the effect; None where it was not refitted."""
+    delta_bic: float | None = None
+    """Change of BIC against the model without the effect; None where it was not refitted."""
+    numbers: dict[str, tuple[float, float]] | None = None
+    """Estimate and standard error by parameter; None where only the score test was made."""
+    score: float = -math.inf
+    """Fall of the loss of a contact test less the penalty of BIC; minus infinity in flight."""
+    share: float = 0.0
+    """Share of what the model leaves unexplained in a contact test that the candidate explains."""
+    without_best: float = math.inf
+    """Fall of chi2 without the episode in which it falls most; infinite where it was not computed."""
+    contact: Mapping[str, float] = field(default_factory=dict)
+    """Contact parameters fitted jointly, by their name in the contact law, that a world with the effect takes over."""
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.candidate.effect.name
+
+    @property
+    def estimates(self) -> dict[str, tuple[float, float]]:
+        """Estimate and standard error by parameter; empty where only the score test was made."""
+        return self.numbers or {}
+
+    @property
+    def size(self) -> float:
+        """Size of the largest parameter, in usual sizes; 0 where only the score test was made."""
+        scale = {p.name: p.scale for p in self.candidate.effect.parameters}
+        return max((abs(value) / scale[name] for name, (value, _) in self.estimates.items()), default=0.0)
+
+    @property
+    def gain(self) -> float:
+        """Gain of all held-out episodes together; 0 where it was not computed."""
+        return float(np.sum(self.gains))
+
+    @property
+    def gain_t(self) -> float:
+        """Mean gain of the held-out episodes in its standard errors; 0 for fewer than two episodes."""
+        if len(self.gains) < 2:
+            return 0.0
+        error = float(np.std(self.gains, ddof=1)) / math.sqrt(len(self.gains))
+        return float(np.mean(self.gains)) / error if error > 0 else 0.0

@@ -1,0 +1,237 @@
+"""Separation of effects that are equal in flight by what they do in contact.
+
+No contact law is exact: the contact parameters are fitted jointly, segments that no candidate explains are
+downweighted, and an equal is ruled out only where most episodes agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..physics.effects.registry import CONTACT_ALIASES
+from ..physics.parameters import GROUND_SHIFT
+from ..physics.world import World
+from ..segments.candidates import base_parameters, variants_of, without_effect
+from ..segments.linearization import Linearization, linearize
+from ..segments.prepare import Prepared
+from ..segments.segment_fit import Refit, refit, robust_excess
+from ..segments.segment_states import fit_states
+from ..segments.segments import Segments
+from .effect_selection import SelectionStep
+from .evidence import Evidence
+
+Array = NDArray[np.float64]
+
+SEPARATE_CHI2 = 12.0
+"""Minimum excess of cost over the best equal for contact to rule out a flight equal: odds of 400."""
+SEPARATE_T = 1.5
+"""Minimum mean of the differences between episodes, in its standard errors, for contact to rule out a flight equal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResolvedFlight:
+    """Effects selected in flight, with the equals that contact admits, and the contact segments."""
+
+    chosen: tuple[tuple[Evidence, ...], ...]
+    """The equals of each effect selected in flight, the selected one first."""
+    after_flight: World
+    """World with these effects and the refitted contact parameters."""
+    world: World
+    """The same with the equals that are not separable left out until the last refit."""
+    segments: Segments | None
+    """Contact segments with states fitted by `world`; None without contact."""
+
+    @property
+    def chi2(self) -> float | None:
+        """Chi2 per degree of freedom of the contact segments; None without contact."""
+        if self.segments is None:
+            return None
+        none = self.segments.observations.times_s.new_zeros(0)
+        rows = self.segments.residuals([], none, jacobian=False)[0]
+        return float(rows.square().sum() / self.segments.dof.sum())
+
+
+def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[SelectionStep]) -> ResolvedFlight:
+    """Fit the contact segments and keep the flight equals that they admit; all of them without contact.
+
+    Args:
+        prepared: The episodes.
+        after_flight: The world with the effects selected in flight.
+        steps: Selection steps of the flight search.
+    """
+    flagged = [step for step in steps if step.flagged]
+    ambiguous = [step for step in flagged if len(step.equals) > 1]
+    neutral = after_flight
+    for step in ambiguous:
+        neutral = without_effect(neutral, step.best.name)
+    fitted = fitted_contact(prepared, neutral)
+    if fitted is None:
+        chosen = tuple(tuple(step.equals) for step in flagged)
+        return ResolvedFlight(chosen=chosen, after_flight=after_flight, world=after_flight, segments=None)
+    base, contact = fitted
+    final, chosen = after_flight, []
+    for step in flagged:
+        equals = list(step.equals)
+        if len(equals) > 1:
+            kept, _ = separated(equals, contact, base.world, prepared.groups)
+            equals = _with_aliases(kept, equals)
+            final = _replaced(final, step.best, equals[0])
+        chosen.append(tuple(equals))
+    final = replace(final, contact=base.world.contact)
+    if ambiguous:
+        base, contact = refitted_contact(contact, final)
+    return ResolvedFlight(chosen=tuple(chosen), after_flight=final, world=base.world, segments=contact)
+
+
+def fitted_contact(prepared: Prepared, world: World) -> tuple[Refit, Segments] | None:
+    """Return the contact parameters refitted to the contact segments, and the segments; None without contact.
+
+    The height of the ground stays at its given value: it is projected out later and must not bend the states here.
+    """
+    contact = prepared.contact(world)
+    return None if contact is None else _fitted(contact, world)
+
+
+def refitted_contact(contact: Segments, world: World) -> tuple[Refit, Segments]:
+    """Return the contact parameters refitted in another world, and the segments, from states fitted before."""
+    return _fitted(fit_states(contact.in_world(world), iterations=4, search=False), world)
+
+
+def _fitted(contact: Segments, world: World) -> tuple[Refit, Segments]:
+    """Refit the contact parameters, without the height of the ground and the effects, and return the segments, too."""
+    own = {f"{a.effect.name}." for a in world.effects}
+    parameters = [
+        p
+        for p in base_parameters(world, "contact")
+        if p is not GROUND_SHIFT and not any(p.name.startswith(name) for name in own)
+    ]
+    found = refit([contact], world, parameters)
+    return found, found.segments[0]
+
+
+def separated(
+    equals: Sequence[Evidence], contact: Segments, world: World, groups: Sequence[int]
+) -> tuple[list[Evidence], dict[str, float]]:
+    """Return the flight equals that contact does not rule out, the best first, and the gain of each in contact.
+
+    Each effect has the parameters estimated in flight, which contact may move within their standard errors; the contact
+    parameters are fitted jointly. Without this freedom, poorly known parameters would reflect their errors rather than
+    the effects.
+
+    Args:
+        equals: Evidence of the equals, refitted in flight.
+        contact: Contact segments with states fitted by the world without any of them.
+        world: That world.
+        groups: Session of each episode.
+    """
+    chosen = [e.candidate for e in equals]
+    variants = variants_of(chosen, world.gravity[0, :1])
+    picked = [
+        next(v for v in variants if chosen[v.place] is e.candidate and v.constants == e.constants) for e in equals
+    ]
+    linear = linearize(contact, world, picked, groups, robust=False)
+    linear = reweighted(linear, [k for v in picked for k in linear.columns(v.parameters)])
+    # the misfit of the contact law itself is no evidence against an effect
+    misfit = max(1.0, float((linear.weight * linear.chi2).sum() / (linear.weight * linear.dof).sum()))
+    gains, total = [], np.array([float(e.refitted.cost) if e.refitted else math.inf for e in equals])
+    for k, (evidence, variant) in enumerate(zip(equals, picked, strict=True)):
+        known = np.array([evidence.estimates[p.name] for p in evidence.candidate.effect.parameters])
+        by_episode, moved = _gains_near(linear, linear.columns(variant.parameters), known[:, 0], known[:, 1], misfit)
+        gains.append(by_episode / misfit)
+        total[k] += moved - gains[k].sum()
+    kept = _not_ruled_out(equals, gains, total, linear)
+    return kept, {e.name: float(g.sum()) for e, g in zip(equals, gains, strict=True)}
+
+
+def _not_ruled_out(
+    equals: Sequence[Evidence], gains: Sequence[Array], total: Array, linear: Linearization
+) -> list[Evidence]:
+    """Return the equals that contact does not rule out, the best first.
+
+    Args:
+        equals: The equals.
+        gains: Gain of each in each episode (E,).
+        total: Cost of each in flight and contact together.
+        linear: Linearization of the contact segments, for the penalty of BIC.
+    """
+    order = sorted(range(len(equals)), key=lambda k: (total[k] + _bic(equals[k], linear), equals[k].name))
+    best = min(order, key=lambda k: total[k])
+    kept = []
+    for k in order:
+        worse = gains[best] - gains[k]
+        spread = worse.std(ddof=1) / math.sqrt(len(worse)) if len(worse) > 1 else math.inf
+        out = total[k] - total[best] > SEPARATE_CHI2 and worse.mean() > SEPARATE_T * spread
+        if not out:
+            kept.append(equals[k])
+    return kept
+
+
+def reweighted(linear: Linearization, columns: Sequence[int]) -> Linearization:
+    """Return the linearization with robust weights from the residual of fits to single segments.
+
+    A segment that a candidate explains has full weight; one that none explains is downweighted.
+    """
+    chosen = [*range(linear.base), *columns]
+    width = np.array([linear.parameters[k].prior[1] for k in chosen])
+    information = linear.information[:, chosen][:, :, chosen] * np.outer(width, width)
+    score = linear.score[:, chosen] * width
+    step = np.linalg.solve(information + np.eye(len(chosen)), score[..., None])[..., 0]
+    left = linear.chi2 - np.einsum("bi,bi->b", score, step) - linear.dof
+    weight = robust_excess(torch.as_tensor(left))[1].numpy()
+    return replace(linear, weight=weight)
+
+
+def _gains_near(
+    linear: Linearization, columns: Sequence[int], value: Array, std: Array, misfit: float
+) -> tuple[Array, float]:
+    """Return the gain of each episode (E,) with an effect near known parameters, and chi2 of their change.
+
+    Args:
+        linear: Linearization of the contact segments.
+        columns: Columns of the effect's parameters.
+        value: Their known values (k,).
+        std: Standard errors of these (k,).
+        misfit: Factor by which chi2 in contact exceeds that of noise.
+    """
+    base, count = list(range(linear.base)), linear.base
+    chosen = [*base, *columns]
+    known = misfit / np.maximum(std, 1e-12) ** 2
+    m = (linear.information * linear.weight[:, None, None]).sum(0)[np.ix_(chosen, chosen)]
+    g = (linear.score * linear.weight[:, None]).sum(0)[chosen]
+    prior = np.concatenate([linear.prior[:count], known])
+    with_effect = np.linalg.solve(m + np.diag(prior), g + np.concatenate([np.zeros(count), known * value]))
+    without = np.linalg.solve(m[:count, :count] + np.diag(prior[:count]), g[:count])
+    both = [with_effect, np.concatenate([without, np.zeros_like(value)])]
+    gains = []
+    for episode in np.unique(linear.episode):
+        mine = linear.weight * (linear.episode == episode)
+        own = (linear.information * mine[:, None, None]).sum(0)[np.ix_(chosen, chosen)]
+        slope = (linear.score * mine[:, None]).sum(0)[chosen]
+        gains.append(np.subtract(*[2 * slope @ x - x @ own @ x for x in both]))
+    return np.array(gains), float((known / misfit) @ (with_effect[count:] - value) ** 2)
+
+
+def _bic(evidence: Evidence, linear: Linearization) -> float:
+    """Return the penalty of BIC."""
+    return len(evidence.candidate.effect.parameters) * math.log(max(linear.dof.sum(), 2.0))
+
+
+def _replaced(world: World, old: Evidence, new: Evidence) -> World:
+    """Return the world with one effect replaced by another at its refitted parameters."""
+    if old.name == new.name or new.refitted is None:
+        return world
+    own = next(a for a in new.refitted.world.effects if a.effect.name == new.name)
+    return replace(world, effects=(*without_effect(world, old.name).effects, own))
+
+
+def _with_aliases(kept: Sequence[Evidence], equals: Sequence[Evidence]) -> list[Evidence]:
+    """Return the remaining equals, with the original ones that rigid contact cannot distinguish from them."""
+    names = {one.name for one in kept}
+    names |= {name for group in CONTACT_ALIASES if group & names for name in group}
+    return [*kept, *(one for one in equals if one.name in names and one not in kept)]
