@@ -16,10 +16,9 @@ from ..physics.world import World
 from ..segments.candidates import base_parameters, base_values, without_effect
 from ..segments.segment_fit import refit
 from ..segments.segments import Segments
+from .thresholds import THRESHOLDS
 
-BETTER_CHI2 = 12.0
-"""Minimum difference of chi2 with which one law explains the flights better than another: odds of 400. Below it, both
-explain them equally well."""
+LIMITS = THRESHOLDS.verdict
 
 
 class QuadraticSpinDamping(Effect):
@@ -54,12 +53,12 @@ class OtherLaw:
     @property
     def better(self) -> bool:
         """Whether the alternative law explains the flights clearly better."""
-        return self.gain > BETTER_CHI2
+        return self.gain > LIMITS.better_chi2
 
     @property
     def as_good(self) -> bool:
         """Whether the flights do not separate the two laws."""
-        return abs(self.gain) <= BETTER_CHI2
+        return abs(self.gain) <= LIMITS.better_chi2
 
 
 def other_laws(flight: Segments, world: World, names: Sequence[str], dispersion: float) -> list[OtherLaw]:

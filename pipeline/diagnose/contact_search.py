@@ -19,12 +19,13 @@ from ..segments.sliding_fit import StartedSliding
 from .contact_tests.contact_test import ContactData, ContactTest, selected
 from .contact_tests.friction_consistency import FrictionConsistencyTest
 from .contact_tests.impact import ImpactTest
-from .contact_tests.segments import IN_IMPACTS_ALONE, SegmentsTest
-from .contact_tests.sliding import SLIDING_SCORE, SLIDING_SCORE_FLEXIBLE, SlidingTest
+from .contact_tests.segments import SegmentsTest
+from .contact_tests.sliding import SlidingTest
 from .detection_limits import DetectionLimit, detection_limits
 from .effect_selection import SelectionStep
 from .evidence import Evidence
 from .flight_equals import resolved_flight
+from .thresholds import THRESHOLDS
 
 TESTS: tuple[ContactTest, ...] = (SlidingTest(), ImpactTest(), FrictionConsistencyTest(), SegmentsTest())
 """The contact tests in the order in which they run."""
@@ -117,7 +118,6 @@ def with_contact(
 
 def _limits(data: ContactData, candidates: Sequence[Candidate]) -> list[DetectionLimit]:
     """Return the detection limits in sliding segments; effects that only measured impacts show are left out."""
-    asked = [c for c in candidates if not data.earlier["impact"] or c.effect.name not in IN_IMPACTS_ALONE]
-    scores = (SLIDING_SCORE, SLIDING_SCORE_FLEXIBLE)
-    turned = data.prepared.has_orientation
-    return detection_limits(data.sliding, data.world, asked, scores, turned, IN_IMPACTS_ALONE)
+    unseen, scores = THRESHOLDS.segments.in_impacts_alone, (THRESHOLDS.sliding.score, THRESHOLDS.sliding.score_flexible)
+    asked = [c for c in candidates if not data.earlier["impact"] or c.effect.name not in unseen]
+    return detection_limits(data.sliding, data.world, asked, scores, data.prepared.has_orientation, unseen)

@@ -15,12 +15,7 @@ from ..segments.candidates import Candidate, Variant, admissible, base_values, v
 from ..segments.sliding_descent import SlidingFit
 from ..segments.sliding_fit import StartedSliding, fit_sliding, noiseless_misfits, nuisance_parameters
 from .contact_tests.sliding import batches
-
-SAFE = 1.5
-"""Safety factor on the size at which an effect would reach its minimum score if it acted linearly. Of 78 effects of the
-development cases, 19 were above their limits, of which 18 were selected, and 59 were below, of which 14 were selected.
-The one above its limit that was missed is friction against spin at a corner, which stops the spin and then no longer
-acts."""
+from .thresholds import THRESHOLDS
 
 
 @dataclass(frozen=True)
@@ -100,7 +95,9 @@ def _lowest_limits(
         start = [(started.base.segments, started.base.values[0])] * len(part)
         fits = fit_sliding(started.segments.world, part, start, started.flight_parameters, iterations=1)
         for variant, fit in zip(part, fits, strict=True):
-            one = _variant_limit(variant, fit, SAFE * math.sqrt(least_chi2[len(variant.parameters) > 1]))
+            one = _variant_limit(
+                variant, fit, THRESHOLDS.experiment.safe * math.sqrt(least_chi2[len(variant.parameters) > 1])
+            )
             if variant.place not in best or one.times < best[variant.place].times:
                 best[variant.place] = one
     return [

@@ -22,26 +22,9 @@ from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
 from .evidence import Evidence
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
+from .thresholds import THRESHOLDS
 
-ALPHA = 0.002
-"""Significance level of all flight tests of a diagnosis together (Bonferroni over the candidates and their grids)."""
-SHORTLIST = 5
-"""Number of candidates that are refitted."""
-SHORTLIST_SHARE = 0.4
-"""Minimum score statistic of a refitted candidate, as a share of the largest."""
-UNFITTED = 1.5
-"""Threshold on chi2 per degree of freedom: where every refit is above it, constants that the score test did not choose
-are refitted, too."""
-ALIAS_CHI2 = 6.0
-"""Maximum excess of chi2, at equal numbers of parameters, with which an effect counts as equal to the best: odds of
-20."""
-SLIGHT, SLIGHT_BIC = 0.15, -20.0
-"""Thresholds on small effects: an effect with all parameters below the first share of their usual sizes is selected
-only if its change of BIC is below the second value; the same holds for its equals. Small residuals have many
-explanations: on the development cases five such detections were false (sizes 0.08, 0.10, 0.06, 0.11 and 0.03; changes
-of BIC -15, -8, -10, -12 and 0), and the smallest true effect had size 0.22."""
-CONTAINED = 0.995
-"""Minimum canonical correlation at which an effect of more parameters can imitate the best one and is its equal."""
+LIMITS = THRESHOLDS.flight
 
 
 @dataclass(frozen=True)
@@ -118,7 +101,7 @@ def select_next(
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if acts_in(v, "flight")]
     linear = linearize(flight, world, variants, groups, robust=False)
     evidence = tested(linear, kept, variants, dispersion)
-    level = ALPHA / max(1, len(evidence))
+    level = LIMITS.alpha / max(1, len(evidence))
     significant = [e for e in evidence if e.p_value < level]
     if not significant:
         return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
@@ -143,11 +126,11 @@ def _refitted_shortlist(
     """Refit the most significant candidates and return those that lower BIC, each at its best constants, best first."""
     # a known sign that comes out wrong is not a detection, but the bounds may still admit the effect's other parameters
     most = max(e.test.statistic for e in significant)
-    short = [e for e in significant if e.test.statistic >= SHORTLIST_SHARE * most]
-    short = sorted(short, key=lambda e: (_penalty(e) * _log(linear) - e.test.statistic, e.name))[: SHORTLIST + 2]
+    short = [e for e in significant if e.test.statistic >= LIMITS.shortlist_share * most]
+    short = sorted(short, key=lambda e: (_penalty(e) * _log(linear) - e.test.statistic, e.name))[: LIMITS.shortlist + 2]
     before = refit([flight], world, base_parameters(world, "flight"))
     done = [refitted(e, [flight], world, before, math.exp(_log(linear)), dispersion) for e in short]
-    enough = UNFITTED * float(linear.dof.sum()) * dispersion
+    enough = LIMITS.unfitted * float(linear.dof.sum()) * dispersion
     if all(e.refitted is not None and e.refitted.cost > enough for e in done):
         others = [e for one in short for e in _with_other_constants(one, linear, variants, candidates, dispersion)]
         done += [refitted(e, [flight], world, before, math.exp(_log(linear)), dispersion) for e in others]
@@ -159,8 +142,10 @@ def _refitted_shortlist(
 
 def is_slight(evidence: Evidence) -> bool:
     """Return whether a refitted effect is too small to be selected on its evidence."""
-    small = all(abs(evidence.estimates[p.name][0]) < SLIGHT * p.scale for p in evidence.candidate.effect.parameters)
-    return small and evidence.delta_bic is not None and evidence.delta_bic > SLIGHT_BIC
+    small = all(
+        abs(evidence.estimates[p.name][0]) < LIMITS.slight * p.scale for p in evidence.candidate.effect.parameters
+    )
+    return small and evidence.delta_bic is not None and evidence.delta_bic > LIMITS.slight_bic
 
 
 def _with_other_constants(
@@ -229,8 +214,8 @@ def _equals(
             continue
         worse = (other.refitted.cost - best.refitted.cost) / dispersion
         more = len(other.candidate.effect.parameters) > len(best.candidate.effect.parameters)
-        close = other.delta_bic - best.delta_bic < ALIAS_CHI2 if more else worse < ALIAS_CHI2
-        if more and not close and worse < ALIAS_CHI2:
+        close = other.delta_bic - best.delta_bic < LIMITS.alias_chi2 if more else worse < LIMITS.alias_chi2
+        if more and not close and worse < LIMITS.alias_chi2:
             close = _contains(linear, candidates, variants, best, other)
         if close:
             found.append(other)
@@ -245,7 +230,7 @@ def _contains(
     for one in (best, other):
         mine = [v for v in variants if candidates[v.place] is one.candidate and v.constants == one.constants]
         columns.append(linear.columns(mine[0].parameters))
-    return canonical_correlation(linear, columns[0], columns[1]) > CONTAINED
+    return canonical_correlation(linear, columns[0], columns[1]) > LIMITS.contained
 
 
 def _clamped(parameter: Parameter, value: torch.Tensor) -> torch.Tensor:

@@ -11,9 +11,8 @@ from ...datasets.capture.tracks import Episode
 from ...datasets.models.model import POSE_TRACKS, Model
 from ...schemas import InputDataError
 from ..trajectories.observations import track_episodes
+from .thresholds import THRESHOLDS
 
-MIN_EPISODES = 3
-"""Minimum number of episodes: with fewer, none can be held out to confirm an effect found in the others."""
 MAX_EPISODES = 40
 """Maximum number of episodes; of more, an evenly spread subset is used, which suffices to show a missing effect."""
 
@@ -54,10 +53,10 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
         )
     moving = {body.name for body in model.file.bodies if body.motion != "fixed"}
     episodes = [episode for episode in found if moving <= set(episode.tracks)]
-    if len(episodes) < MIN_EPISODES:
+    if len(episodes) < THRESHOLDS.verdict.min_episodes:
         raise InputDataError(
             f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all moving bodies.",
-            f"at least {MIN_EPISODES}: an effect found in one has to be confirmed in others.",
+            f"at least {THRESHOLDS.verdict.min_episodes}: an effect found in one has to be confirmed in others.",
             "record more, or name another split with --split.",
         )
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)

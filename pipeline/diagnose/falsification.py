@@ -20,14 +20,11 @@ from ..segments.candidates import base_values
 from ..segments.linearization import Linearization, linearize
 from ..segments.segments import Segments
 from .score_test import solved
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
 
 Array = NDArray[np.float64]
-
-LEVEL = 1e-4
-"""Significance level of the test."""
-ENOUGH_SHARE = 0.9
-"""Minimum share that common parameters explain of what separate parameters of each unit explain. Above it, a difference
-between units counts as a detail of the effect's law; below it, the effect is a surrogate for an unknown one."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class Consistency:
     @property
     def doubtful(self) -> bool:
         """Whether the effects differ between units by more than a detail of their law."""
-        return self.p_value < LEVEL and self.share < ENOUGH_SHARE
+        return self.p_value < LIMITS.consistent_p and self.share < LIMITS.consistent_share
 
 
 def consistency(

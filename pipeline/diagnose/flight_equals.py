@@ -25,13 +25,11 @@ from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from .effect_selection import SelectionStep
 from .evidence import Evidence
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.segments
 
 Array = NDArray[np.float64]
-
-SEPARATE_CHI2 = 12.0
-"""Minimum excess of cost over the best equal for contact to rule out a flight equal: odds of 400."""
-SEPARATE_T = 1.5
-"""Minimum mean of the differences between episodes, in its standard errors, for contact to rule out a flight equal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +164,7 @@ def _not_ruled_out(
     for k in order:
         worse = gains[best] - gains[k]
         spread = worse.std(ddof=1) / math.sqrt(len(worse)) if len(worse) > 1 else math.inf
-        out = total[k] - total[best] > SEPARATE_CHI2 and worse.mean() > SEPARATE_T * spread
+        out = total[k] - total[best] > LIMITS.separate_chi2 and worse.mean() > LIMITS.separate_t * spread
         if not out:
             kept.append(equals[k])
     return kept

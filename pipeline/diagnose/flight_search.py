@@ -17,15 +17,10 @@ from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from .coupled_effects import DRAGS, drag_in_wind
 from .cross_validation import held_out_loss
-from .effect_selection import ALIAS_CHI2, SelectionStep, select_next
+from .effect_selection import SelectionStep, select_next
+from .thresholds import THRESHOLDS
 
-MOST_EFFECTS = 3
-"""Maximum number of effects that are selected in flight."""
-
-SHARE = 0.6
-"""Minimum share of the remaining excess of chi2 that a further effect explains. On the development cases true effects
-explained at least 0.83, and effects that compensate an error in the law of a drag at most 0.42, where an excess
-remained."""
+LIMITS = THRESHOLDS.flight
 
 
 def flight_search(
@@ -66,7 +61,7 @@ def _forward_selection(
     steps: list[SelectionStep] = []
     losses: list[float] = []
     current = world
-    while len(steps) < MOST_EFFECTS:
+    while len(steps) < LIMITS.most_effects:
         step = select_next(flight, current, candidates, prepared.groups, prepared.has_orientation, scatter)
         refitted = step.best.refitted if step.flagged else None
         if refitted is None:
@@ -75,7 +70,7 @@ def _forward_selection(
         before = steps[-1].best.refitted if steps else None
         if before is not None:
             excess = before.cost - float(flight.dof.sum()) * scatter
-            if before.cost - refitted.cost < SHARE * excess:
+            if before.cost - refitted.cost < LIMITS.share * excess:
                 break
             losses = losses or [held_out_loss(flight, current)]
             losses.append(held_out_loss(refitted.segments[0], refitted.world))
@@ -121,7 +116,7 @@ def _coupled(
     kept = [candidate for candidate in candidates if candidate.effect.name not in present]
     coupled = drag_in_wind(prepared.flight, world, kept, count, scatter)
     size = sum(len(step.best.candidate.effect.parameters) for step in steps)
-    if coupled is None or coupled.total > last.cost / scatter + size * math.log(count) - ALIAS_CHI2:
+    if coupled is None or coupled.total > last.cost / scatter + size * math.log(count) - LIMITS.alias_chi2:
         return None
     rest = steps[0].evidence
     selected = [SelectionStep((one, *rest), (one,), True) for one in (coupled.drag, coupled.wind)]

@@ -26,19 +26,14 @@ from ..segments.prepare import Prepared
 from .evidence import Evidence
 from .experiments import Experiment, described
 from .fisher_information import Layout, experiment_states, information_of_data, information_of_experiments, layout_of
+from .thresholds import THRESHOLDS
 from .verdict import Findings
+
+LIMITS = THRESHOLDS.experiment
 
 Array = NDArray[np.float64]
 Pairs = list[tuple[str, str]]
 
-NEAR_BIC = 2 * math.log(1000)
-"""Maximum difference of BIC with which a second effect is a rival of the first without being its equal: odds of
-1000."""
-ENOUGH_NATS = 3.0
-"""Minimum gain [nats] of an experiment that separates two rivals, whichever is true: odds of 20. An effect that
-contains the other always gains a little if it is true, from the noise of its additional parameters."""
-NEARLY = 1.15
-"""Factor within which gains count as equal, because they are estimates."""
 OTHERWISE = {
     "gravity_scale": "look gravity up for where you are, or drop another body: it changes all alike",
     "buoyancy": "repeat with a heavier body of the same shape: buoyancy lessens the acceleration of that one less",
@@ -95,8 +90,8 @@ class RankedExperiment:
         return min((self.least[pair] for pair in pairs), default=0.0)
 
     def order(self, pairs: Sequence[tuple[str, str]]) -> tuple[float, ...]:
-        """Return the sort key: the gain in steps of `NEARLY`, then the simplicity of the throw."""
-        step = round(math.log(max(self.gain(pairs), 1e-9)) / math.log(NEARLY))
+        """Return the sort key: the gain in steps of the factor `nearly`, then the simplicity of the throw."""
+        step = round(math.log(max(self.gain(pairs), 1e-9)) / math.log(LIMITS.nearly))
         return -step, self.throw.spin_rad_s, self.throw.speed_m_s, self.throw.height_m
 
 
@@ -151,7 +146,7 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Exp
 def _pairs_by_separation(ranked: Sequence[RankedExperiment], rivals: Rivals) -> tuple[Pairs, Pairs]:
     """Return the pairs of rivals that some throw separates, and the other pairs."""
     pairs = list(itertools.combinations(rivals.names, 2))
-    open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= ENOUGH_NATS]
+    open_pairs = [pair for pair in pairs if max((r.least[pair] for r in ranked), default=0.0) >= LIMITS.enough_nats]
     return open_pairs, [pair for pair in pairs if pair not in open_pairs]
 
 
@@ -267,7 +262,7 @@ def _second_in_flight(findings: Findings) -> Evidence | None:
     second = min(others, key=lambda e: (e.delta_bic, e.name), default=None)
     if second is None or second.delta_bic is None or first.delta_bic is None:
         return None
-    return second if second.delta_bic - first.delta_bic < NEAR_BIC else None
+    return second if second.delta_bic - first.delta_bic < LIMITS.near_bic else None
 
 
 def _second_in_contact(findings: Findings) -> Evidence | None:
@@ -278,7 +273,7 @@ def _second_in_contact(findings: Findings) -> Evidence | None:
     second = max(others, key=lambda one: one.score, default=None)
     if second is None or score is None:
         return None
-    return second if score - second.score < NEAR_BIC else None
+    return second if score - second.score < LIMITS.near_bic else None
 
 
 def _advice(rivals: Rivals, left: Sequence[str]) -> str:

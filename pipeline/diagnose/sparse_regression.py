@@ -15,18 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..segments.residual_wrench import ResidualWrenches
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.experiment
 
 Array = NDArray[np.float64]
 
-MOST_TERMS = 4
-"""Maximum number of terms of a law."""
 EXPONENTS = tuple(np.arange(0.0, 3.51, 0.25).tolist())
 """Exponents of the speed that are tried."""
-MARGIN = 10.0
-"""Minimum fall of chi2 beyond the penalty of BIC for a term to be added, because the term is searched in a
-dictionary."""
-CHI2_95 = 3.84
-"""95 % quantile of chi2 of one degree of freedom, for the interval of an exponent."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +57,8 @@ def residual_law(found: ResidualWrenches) -> Law:
     columns = {name: build(found) for name, (build, _) in DICTIONARY.items()}
     chosen: list[str] = []
     total = _chi2(target, information)
-    penalty = math.log(max(6 * len(target), 2)) + MARGIN
-    while len(chosen) < MOST_TERMS:
+    penalty = math.log(max(6 * len(target), 2)) + LIMITS.law_margin
+    while len(chosen) < LIMITS.most_terms:
         gains = {
             name: total - _fit([columns[k] for k in (*chosen, name)], target, information)[2]
             for name in columns
@@ -93,9 +89,9 @@ def residual_law(found: ResidualWrenches) -> Law:
 def _exponent(
     power: Callable[[ResidualWrenches, float], Array], others: list[Array], found: ResidualWrenches
 ) -> tuple[float, float, float]:
-    """Return the exponent with the lowest chi2, and the range in which it rises by less than `CHI2_95`."""
+    """Return the exponent with the lowest chi2, and the range in which it rises by less than `exponent_chi2`."""
     costs = np.array([_fit([power(found, p), *others], found.wrench, found.information)[2] for p in EXPONENTS])
-    near = [p for p, cost in zip(EXPONENTS, costs, strict=True) if cost < costs.min() + CHI2_95]
+    near = [p for p, cost in zip(EXPONENTS, costs, strict=True) if cost < costs.min() + LIMITS.exponent_chi2]
     return EXPONENTS[int(costs.argmin())], min(near), max(near)
 
 

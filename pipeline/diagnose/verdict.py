@@ -19,17 +19,11 @@ from .effect_selection import SelectionStep
 from .evidence import Evidence
 from .falsification import consistency
 from .flight_search import flight_search
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
-
-OMNIBUS_S = (0.3, 0.15)
-"""Lengths of the flight windows of the omnibus test [s]: the long ones show slow forces, the short ones fast forces."""
-OMNIBUS_LIMIT, OMNIBUS_P = 1.6, 1e-4
-"""Thresholds of the omnibus test: a residual is significant if the mean chi2 of the residual wrench is above the first
-and its p-value below the second. On data without an effect the statistic was 1.0 +- 0.2."""
-ENOUGH_SHARE = 0.9
-"""Minimum share of the excess that the selected effects explain. Above it, a significant residual counts as a detail of
-their laws; below it, as an effect that no candidate describes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +112,7 @@ def _verdict(chosen: Sequence[Chosen], before: Omnibus | None, after: Omnibus | 
         after: Omnibus statistic of flight with them.
         doubtful: Whether an effect selected in flight changes between units or follows another law.
     """
-    if doubtful or (_is_significant(after) and _explained(before, after) < ENOUGH_SHARE):
+    if doubtful or (_is_significant(after) and _explained(before, after) < LIMITS.enough_share):
         return "unexplained"
     if any(len(one.equals) > 1 for one in chosen):
         return "not_separable"
@@ -136,8 +130,8 @@ def _errors(contact: ContactFindings, flight: Segments | None) -> dict[str, tupl
 
 
 def _flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
-    """Cut the flights into windows of each length of `OMNIBUS_S` and estimate their residual wrenches."""
-    cut = [windows for longest_s in OMNIBUS_S if (windows := prepared.pieces(world, longest_s)) is not None]
+    """Cut the flights into windows of each length of the omnibus test and estimate their residual wrenches."""
+    cut = [windows for longest_s in LIMITS.omnibus_s if (windows := prepared.pieces(world, longest_s)) is not None]
     return [(windows, residual_wrenches(windows)) for windows in cut]
 
 
@@ -149,7 +143,7 @@ def _worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter
 
 def _is_significant(found: Omnibus | None) -> bool:
     """Return whether a residual wrench exceeds the noise by both thresholds; False without flight."""
-    return found is not None and found.statistic > OMNIBUS_LIMIT and found.p_value < OMNIBUS_P
+    return found is not None and found.statistic > LIMITS.omnibus_limit and found.p_value < LIMITS.omnibus_p
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:

@@ -27,21 +27,9 @@ from ...segments.sliding_descent import SlidingFit
 from ...segments.sliding_fit import StartedSliding, fit_sliding
 from ...trajectories.segmentation import Segment
 from ..evidence import Evidence
+from ..thresholds import THRESHOLDS, FrictionThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked
-from .sliding import FIRST_ITERATIONS, SURPLUS_SIGMAS, batches
-
-SPREAD = 0.13
-"""Standard deviation of the logarithm of the ratio between the frictions of sliding and of impacts where nothing is
-missing, because no contact law is exact in an impact. Root mean square of 14 development cases, of which the largest
-was 0.33."""
-SCORE, RESOLVED = 8.0, 0.75
-"""Thresholds of the test: minimum score, and minimum share of the discrepancy between the frictions that the effect
-removes. The score is also the minimum discrepancy [chi2] for which effects are fitted: on the development cases it was
-at most 6 without an effect and 13 to 29 with one."""
-LEAD = 6.0
-"""Another effect counts as equal if its score is lower by less than this."""
-FEWEST = 6
-"""Minimum number of segments with impacts for an estimate of their friction."""
+from .sliding import FIRST_ITERATIONS, batches
 
 
 @dataclass(frozen=True)
@@ -77,11 +65,15 @@ class _ImpactFriction:
         return torch.linalg.pinv(fit.information[0], hermitian=True) * self.spread
 
 
+@dataclass(frozen=True)
 class FrictionConsistencyTest(ContactTest):
     """Comparison of candidates by how well they reconcile the frictions of sliding and of impacts."""
 
     name: ClassVar[str] = "friction_consistency"
     lists_all: ClassVar[bool] = False
+
+    limits: FrictionThresholds = THRESHOLDS.friction
+    """What decides."""
 
     def evidence(self, data: ContactData, candidates: Sequence[Candidate]) -> list[Evidence]:
         """Return the evidence of candidates fitted with both frictions, the best first.
@@ -94,7 +86,7 @@ class FrictionConsistencyTest(ContactTest):
             candidates: Candidates that the world admits.
         """
         started = data.sliding
-        impacts = None if started is None else _discrepancy(data, started)
+        impacts = None if started is None else _discrepancy(data, started, self.limits)
         if started is None or impacts is None:
             return []
         own, known, soft_world = started.friction, started.flight_parameters, started.segments.world
@@ -102,9 +94,11 @@ class FrictionConsistencyTest(ContactTest):
         degrees = float(started.segments.dof.sum())
         impacts = replace(impacts, spread=max(1.0, alone.cost / degrees))
         # chi2 of the sliding segments falls no further below its mean by chance
-        surplus = alone.cost - degrees + SURPLUS_SIGMAS * math.sqrt(2 * degrees)
+        surplus = alone.cost - degrees + THRESHOLDS.sliding.surplus_sigmas * math.sqrt(2 * degrees)
         most = impacts.discrepancy(own) + surplus / impacts.spread
-        variants = [v for v in data.variants(candidates) if len(v.parameters) * math.log(degrees) + SCORE < most]
+        variants = [
+            v for v in data.variants(candidates) if len(v.parameters) * math.log(degrees) + self.limits.score < most
+        ]
         found = _fits(soft_world, variants, alone, impacts, known)
         if not found:
             return []
@@ -116,23 +110,23 @@ class FrictionConsistencyTest(ContactTest):
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the lead in score over effects that reconcile the frictions, too."""
-        return (Lead(score=LEAD, rival=Bar(share=RESOLVED)),)
+        return (Lead(score=self.limits.lead, rival=Bar(share=self.limits.resolved)),)
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bar."""
-        return (Bar(score=SCORE, share=RESOLVED),)
+        return (Bar(score=self.limits.score, share=self.limits.resolved),)
 
 
-def _discrepancy(data: ContactData, started: StartedSliding) -> _ImpactFriction | None:
+def _discrepancy(data: ContactData, started: StartedSliding, thresholds: FrictionThresholds) -> _ImpactFriction | None:
     """Return the friction of the impacts if it contradicts that of sliding; None else, or if impacts do not show it."""
     if data.segments is None or is_round(data.world.bodies[data.world.free[0]]):
         return None
     struck = [k for k, item in enumerate(data.segments.items) if not _within(item, started.segments.items)]
-    if len(struck) < FEWEST:
+    if len(struck) < thresholds.fewest:
         return None
     friction, error = refit([data.segments.select(struck)], data.world, CONTACT_PARAMETERS).number("friction")
-    impacts = _ImpactFriction(friction, math.hypot(SPREAD, error / friction), 1.0)
-    return None if impacts.discrepancy(started.friction) < SCORE else impacts
+    impacts = _ImpactFriction(friction, math.hypot(thresholds.spread, error / friction), 1.0)
+    return None if impacts.discrepancy(started.friction) < thresholds.score else impacts
 
 
 def _fits(

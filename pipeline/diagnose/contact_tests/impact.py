@@ -23,29 +23,21 @@ from ...segments.candidates import Candidate, Variant
 from ...segments.impact_fit import BASE, LEAST, ImpactBase, ImpactFit, ImpactProblem, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ..evidence import Evidence
+from ..thresholds import THRESHOLDS, ImpactThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
 
 Array = NDArray[np.float64]
 
-TOLD = 1.0
-"""Minimum change of the impacts [chi2] by an effect of the usual size for the effect to be tested."""
-SCORE, SIZE, EXPLAINED, HELD_OUT_T = 6.0, 0.35, 0.5, 1.0
-"""Thresholds of the impact test: minimum score, minimum size in usual sizes of the parameters, minimum share of the
-excess of chi2 that the effect explains, and minimum mean gain of held-out episodes in its standard errors. On the
-development cases the largest scores of 30 balls without an effect were 4.1 and 2.7, of effects of sizes 0.26 and
-0.33."""
-LEAD, LEAD_SHARE = 6.0, 0.1
-"""Another effect counts as equal if its score is lower by less than the first value, or by less than this share of the
-best score, and its size is above `SIZE`."""
-WITHOUT_GAINS = Bar(score=SCORE, share=EXPLAINED, size=SIZE)
-"""All thresholds but that of held-out episodes."""
 
-
+@dataclass(frozen=True)
 class ImpactTest(ContactTest):
     """Comparison of candidates by their residuals in the impacts of a ball."""
 
     name: ClassVar[str] = "impact"
     lists_all: ClassVar[bool] = True
+
+    limits: ImpactThresholds = THRESHOLDS.impact
+    """What decides."""
 
     def evidence(self, data: ContactData, candidates: Sequence[Candidate]) -> list[Evidence]:
         """Return the evidence of the candidates that impacts show, the best first; empty without enough impacts.
@@ -66,27 +58,38 @@ class ImpactTest(ContactTest):
         found = []
         for variant in data.variants(candidates):
             problem, start = base.beside(variant)
-            if _is_shown(problem, start, len(base.parameters)):
+            if _change(problem, start, len(base.parameters)) > self.limits.shown:
                 found.append((variant, fit_impacts(problem, start, centre=base.centre_of(start))))
         if not found:
             return []
         fits = _Fits.of(base, found, candidates)
         order = ranked(fits.evidence())
-        if not order[0].test.admissible or not WITHOUT_GAINS.passed(order[0]):
+        if not order[0].test.admissible or not self._without_gains.passed(order[0]):
             return order
         return [fits.with_gains(order[0]), *order[1:]]
 
+    @property
+    def _without_gains(self) -> Bar:
+        """All thresholds but that of held-out episodes."""
+        return Bar(score=self.limits.score, share=self.limits.explained, size=self.limits.size)
+
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the lead in score over effects of a size that matters."""
-        return (Lead(score=LEAD, share=LEAD_SHARE, rival=Bar(score=0.0, size=SIZE)),)
+        return (
+            Lead(
+                score=self.limits.lead,
+                share=self.limits.lead_share,
+                rival=Bar(score=0.0, size=self.limits.size),
+            ),
+        )
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bar, held-out episodes included."""
-        return (replace(WITHOUT_GAINS, gain_t=HELD_OUT_T),)
+        return (replace(self._without_gains, gain_t=self.limits.gain_t),)
 
 
-def _is_shown(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
-    """Return whether an effect of the usual size, of either sign where both are allowed, changes the impacts."""
+def _change(problem: ImpactProblem, start: torch.Tensor, base: int) -> float:
+    """Return the change of the impacts [chi2] by an effect of the usual size, of either sign where both are allowed."""
     moves = []
     for place, parameter in enumerate(problem.parameters[base:], base):
         scale = parameter.prior[1] / 5
@@ -95,7 +98,7 @@ def _is_shown(problem: ImpactProblem, start: torch.Tensor, base: int) -> bool:
             moved[place] += sign * scale
             moves.append(moved)
     rows = problem.rows(torch.stack([start, *moves]))
-    return float((rows[1:] - rows[:1]).square().sum((1, 2)).max()) > TOLD
+    return float((rows[1:] - rows[:1]).square().sum((1, 2)).max())
 
 
 @dataclass(frozen=True, kw_only=True)

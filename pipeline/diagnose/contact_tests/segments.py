@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -23,33 +23,21 @@ from ...segments.segment_fit import refit
 from ...segments.segments import Segments
 from ..evidence import Evidence
 from ..robust_fit import RobustFit, robust_fit, robust_gains, with_segment_parameters
+from ..thresholds import THRESHOLDS, SegmentsThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
 
 Array = NDArray[np.float64]
 
-CONTACT_SCORE, CONTACT_T = 22.0, 1.0
-"""Thresholds of the test in contact segments: minimum score, and minimum mean gain of held-out episodes in its standard
-errors."""
-AGREED_SCORE = 40.0
-"""Minimum score in contact segments of an effect that sliding segments can show. It must also have the highest score in
-the sliding test, above this value."""
-ALONE_SCORE = 120.0
-"""Minimum score in contact segments where sliding segments are missing. Directional friction has reached 113 where it
-was absent."""
-IN_IMPACTS_ALONE = ("velocity_restitution",)
-"""Effects that sliding segments cannot show."""
-CONTACT_LEAD = 0.5
-"""Another effect counts as equal in contact segments if its score is at least this share of the best score."""
-CONFIRMED = 2.0
-"""Minimum distance of a parameter from zero after the refit, in its standard errors, for an effect to be confirmed in
-contact segments."""
 
-
+@dataclass(frozen=True)
 class SegmentsTest(ContactTest):
     """Comparison of candidates by the robust loss that they leave in all contact segments."""
 
     name: ClassVar[str] = "segments"
     lists_all: ClassVar[bool] = True
+
+    limits: SegmentsThresholds = THRESHOLDS.segments
+    """What decides."""
 
     def evidence(self, data: ContactData, candidates: Sequence[Candidate]) -> list[Evidence]:
         """Return the evidence of the candidates, with gains in held-out episodes, the best first.
@@ -82,24 +70,24 @@ class SegmentsTest(ContactTest):
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the lead in score over effects that improve held-out episodes."""
-        return (Lead(share=1 - CONTACT_LEAD, rival=Bar(gain_t=CONTACT_T)),)
+        return (Lead(share=self.limits.lead_share, rival=Bar(gain_t=self.limits.gain_t)),)
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bar, which is higher for an effect that sliding segments would show; none if they contradict."""
         best, sliding = equals[0], data.earlier.get("sliding", ())
-        if best.candidate.effect.phase != "contact" or best.name in IN_IMPACTS_ALONE:
-            return (Bar(score=CONTACT_SCORE, gain_t=CONTACT_T),)
+        if best.candidate.effect.phase != "contact" or best.name in self.limits.in_impacts_alone:
+            return (Bar(score=self.limits.score, gain_t=self.limits.gain_t),)
         if not sliding:
-            return (Bar(score=ALONE_SCORE, gain_t=CONTACT_T),)
+            return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
         first = next((one for one in sliding if one.test.admissible), None)
-        agreed = first is not None and first.name == best.name and first.score > AGREED_SCORE
-        return (Bar(score=AGREED_SCORE, gain_t=CONTACT_T),) if agreed else ()
+        agreed = first is not None and first.name == best.name and first.score > self.limits.agreed_score
+        return (Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t),) if agreed else ()
 
     def added(self, data: ContactData, best: Evidence) -> tuple[World, Evidence] | None:
         """Return the world refitted with the effect, and the evidence with its estimates; None if it may be zero."""
         assert data.segments is not None  # without contact segments there is no evidence
         world, estimates = _refitted(data.world, data.segments, best)
-        if not any(abs(value) > CONFIRMED * error for value, error in estimates.values()):
+        if not any(abs(value) > self.limits.confirmed * error for value, error in estimates.values()):
             return None
         return world, replace(best, numbers=estimates)
 

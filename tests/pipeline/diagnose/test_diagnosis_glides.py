@@ -7,10 +7,11 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, selected, with_effect
-from cgwm.pipeline.diagnose.contact_tests.sliding import SLIDING_SCORE, SlidingTest
+from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
 from cgwm.pipeline.diagnose.detection_limits import DetectionLimit, detection_limits
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import World
@@ -174,7 +175,7 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
     library = [*LIBRARY, GRAIN] if name == GRAIN.spec else LIBRARY
     found = SlidingTest().evidence(data_of(prepared, world), library)
     assert found[0].name == name
-    assert found[0].score > SLIDING_SCORE
+    assert found[0].score > THRESHOLDS.sliding.score
     assert found[0].score > 3 * found[1].score
     assert found[0].numbers is not None
     (key, value) = next(iter(values.items()))
@@ -188,7 +189,9 @@ def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None
 def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY) -> dict[str, DetectionLimit]:
     started = StartedSliding.of(prepared, world, prepared.flight)
     blind_to = ("velocity_restitution",)
-    found = detection_limits(started, world, library, (SLIDING_SCORE, 400.0), prepared.has_orientation, blind_to)
+    found = detection_limits(
+        started, world, library, (THRESHOLDS.sliding.score, 400.0), prepared.has_orientation, blind_to
+    )
     return {one.candidate.effect.name: one for one in found}
 
 
@@ -204,7 +207,7 @@ def test_from_the_limit_on_an_effect_is_named() -> None:
         for times, seen in ((1.1, True), (0.2, False)):
             prepared, world = rolls({name: {number: times * limit}})
             ranked = SlidingTest().evidence(data_of(prepared, world), LIBRARY)
-            named = bool(ranked) and ranked[0].name == name and ranked[0].score > SLIDING_SCORE
+            named = bool(ranked) and ranked[0].name == name and ranked[0].score > THRESHOLDS.sliding.score
             assert named == seen, (name, times, limit, [(one.name, one.score) for one in ranked])
 
 
@@ -220,7 +223,7 @@ def test_worse_data_have_larger_limits_and_no_glide_has_none() -> None:
 def test_glides_are_silent_under_another_contact_law() -> None:
     prepared, world = rolls(None, {"contact_time_s": 0.002, "damping_ratio": 0.6, "friction": 0.25})
     found = SlidingTest().evidence(data_of(prepared, world), LIBRARY)
-    assert not found or found[0].score < SLIDING_SCORE
+    assert not found or found[0].score < THRESHOLDS.sliding.score
 
 
 def test_what_glides_tell_is_the_verdict() -> None:
