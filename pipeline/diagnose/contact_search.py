@@ -69,6 +69,7 @@ def with_contact(
     candidates: Sequence[Candidate],
     flight: Segments | None,
     explained: bool,
+    tests: Sequence[ContactTest] = TESTS,
 ) -> ContactFindings:
     """Resolve the flight equals with the contact data, then return the first contact effect that a test selects.
 
@@ -80,6 +81,7 @@ def with_contact(
         candidates: All candidates.
         flight: Flight segments with fitted states; None without flight.
         explained: Whether the flight segments are explained down to the noise.
+        tests: The contact tests, in the order in which they run.
     """
     resolved = resolved_flight(prepared, after_flight, steps)
     chosen = [Chosen(equals[0], equals, "flight") for equals in resolved.chosen]
@@ -97,7 +99,7 @@ def with_contact(
     common = ContactFindings(
         chosen=chosen, evidence=[], world=resolved.world, chi2=resolved.chi2, segments=resolved.segments
     )
-    for test in TESTS:
+    for test in tests:
         evidence = test.evidence(data, kept)
         equals = selected(test, evidence, data)
         added = test.added(data, equals[0]) if equals else None
@@ -110,7 +112,7 @@ def with_contact(
         data = replace(data, earlier={**data.earlier, test.name: evidence})
     return replace(
         common,
-        evidence=list(data.earlier[TESTS[-1].name]),
+        evidence=list(data.earlier[tests[-1].name]),
         world=replace(resolved.after_flight, contact=data.world.contact),
         limits=tuple(_limits(data, candidates)),
     )
@@ -119,5 +121,5 @@ def with_contact(
 def _limits(data: ContactData, candidates: Sequence[Candidate]) -> list[DetectionLimit]:
     """Return the detection limits in sliding segments; effects that only measured impacts show are left out."""
     unseen, scores = THRESHOLDS.segments.in_impacts_alone, (THRESHOLDS.sliding.score, THRESHOLDS.sliding.score_flexible)
-    asked = [c for c in candidates if not data.earlier["impact"] or c.effect.name not in unseen]
+    asked = [c for c in candidates if not data.earlier.get("impact") or c.effect.name not in unseen]
     return detection_limits(data.sliding, data.world, asked, scores, data.prepared.has_orientation, unseen)

@@ -12,7 +12,8 @@ from ..segments.prepare import Prepared
 from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, omnibus, residual_wrenches
 from ..segments.segments import Segments
 from .alternative_laws import OtherLaw, other_laws
-from .contact_search import Chosen, ContactFindings, with_contact
+from .contact_search import TESTS, Chosen, ContactFindings, with_contact
+from .contact_tests.contact_test import ContactTest
 from .cross_validation import held_out_errors
 from .detection_limits import DetectionLimit
 from .effect_selection import SelectionStep
@@ -63,22 +64,24 @@ class Findings:
         return {one.name for one in self.contact} | {c.evidence.name for c in self.chosen if c.where != "flight"}
 
 
-def find(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> Findings:
+def find(
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], tests: Sequence[ContactTest] = TESTS
+) -> Findings:
     """Search prepared episodes for the effects that a world lacks, in flight and then in contact.
 
     Args:
         prepared: The episodes.
         world: The model's world.
         candidates: All candidates.
+        tests: The contact tests, in the order in which they run.
     """
     windows = _flight_windows(prepared, world)
     scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
     before = _worst_omnibus(windows, scatter)
     steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
     after_search = _worst_omnibus(_flight_windows(prepared, after_flight), scatter)
-    contact = with_contact(
-        prepared, world, after_flight, steps, candidates, flight, explained=not _is_significant(after_search)
-    )
+    explained = not _is_significant(after_search)
+    contact = with_contact(prepared, world, after_flight, steps, candidates, flight, explained, tests)
     chosen, final = contact.chosen, contact.world
     after = _worst_omnibus(_flight_windows(prepared, final), scatter) if chosen else before
     in_flight = [step.best.name for step in steps if step.flagged]
