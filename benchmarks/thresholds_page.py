@@ -1,7 +1,7 @@
 """Write the thresholds of a diagnosis into docs/thresholds.md: `python benchmarks/thresholds_page.py`.
 
 The tables between the comments `<!-- thresholds: GROUP -->` and `<!-- end -->` are replaced by those of
-`pipeline/diagnose/thresholds.py`; the rest of the page is left as it is.
+`pipeline/diagnose/thresholds.py` and `pipeline/segments/thresholds.py`; the rest of the page is left as it is.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
-from cgwm.pipeline.segments.thresholds import Threshold, thresholds_of
+from cgwm.pipeline.segments.thresholds import SEGMENT_THRESHOLDS, Threshold, thresholds_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "thresholds.md"
 HEAD = ("name", "value", "unit", "decides", "calibrated on", "false alarms and misses")
@@ -20,7 +20,11 @@ HEAD = ("name", "value", "unit", "decides", "calibrated on", "false alarms and m
 
 def groups() -> dict[str, list[Threshold]]:
     """Return the thresholds of each group."""
-    return {one.name: thresholds_of(getattr(THRESHOLDS, one.name)) for one in fields(THRESHOLDS)}
+    return {
+        one.name: thresholds_of(getattr(every, one.name))
+        for every in (THRESHOLDS, SEGMENT_THRESHOLDS)
+        for one in fields(every)
+    }
 
 
 def table(group: str, thresholds: list[Threshold]) -> str:

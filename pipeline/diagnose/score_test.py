@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..optimization.uncertainty import chi2_tail, normal_tail
-from ..segments.linearization import MEASURED, Linearization, eliminate, sums, widths
+from ..segments.linearization import Linearization, eliminate, sums, widths
+from .thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
@@ -129,7 +130,7 @@ def solved(information: Array, score: Array, width: Array) -> tuple[Array, Array
         width: Widths (k,) of the priors, the units of the parameters.
     """
     values, vectors = np.linalg.eigh(information * np.outer(width, width))
-    kept = values > MEASURED
+    kept = values > THRESHOLDS.flight.measured
     vectors = vectors[:, kept] * width[:, None]
     along = vectors.T @ score
     estimate = vectors @ (along / values[kept])

@@ -10,9 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ..segments.thresholds import threshold
-
-BY_ARGUMENT = "by argument"
+from ..segments.thresholds import BY_ARGUMENT, threshold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +66,12 @@ class FlightThresholds:
         "share of the remaining excess of chi2 that a second effect must explain",
         "development: true ones at least 0.83, false ones at most 0.42",
         "report8: 1 of 44 named with an effect too many",
+    )
+    measured: float = threshold(
+        0.04,
+        "1",
+        "a direction of parameter space counts as measured where information times prior variance is above this (five "
+        "prior widths)",
     )
 
 

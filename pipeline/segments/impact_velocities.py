@@ -25,19 +25,11 @@ from .contact_phases import is_round
 from .prepare import Prepared
 from .segment_states import fit_states
 from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.impact_data
 
 Array = NDArray[np.float64]
-
-CONTACT_S = 0.008
-"""Maximum time [s] after reaching the ground for which a body may still touch it: these frames belong to no flight."""
-MIN_FRAMES = 4
-"""Minimum number of frames of a flight between two impacts."""
-MISFIT_SIGMAS = 5.0
-"""Distance from a flight's parabola, in sigmas, above which a frame does not belong to the flight."""
-BAD_FLIGHT = 2.5
-"""Maximum chi2 / dof of a flight."""
-LONGEST_S = 0.03
-"""Maximum time [s] between the end of a flight and the start of the next: a longer contact is not a single impact."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,7 +79,7 @@ def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
         for before, after in _neighbours(chains)
         if good[before]
         and good[after]
-        and -CONTACT_S < float(starts.time_s[after]) - float(ends.time_s[before]) < LONGEST_S
+        and -LIMITS.contact_s < float(starts.time_s[after]) - float(ends.time_s[before]) < LIMITS.longest_s
     ]
     if not kept:
         return None
@@ -172,27 +164,28 @@ class _Hops:
 
     def _next(self, landed: float) -> tuple[int, int, float] | None:
         """Return frames and end of the flight that follows a landing."""
-        a = int(np.searchsorted(self.times, landed + CONTACT_S))
-        if a + MIN_FRAMES > len(self.times):
+        a = int(np.searchsorted(self.times, landed + LIMITS.contact_s))
+        if a + LIMITS.min_frames > len(self.times):
             return None
-        t = self.times[a : a + MIN_FRAMES - 1] - landed
+        t = self.times[a : a + LIMITS.min_frames - 1] - landed
         speed = float((t * (self.heights[a : a + len(t)] + 0.5 * self.fall * t**2)).sum() / (t**2).sum())
         b = int(np.searchsorted(self.times, landed + 2 * speed / self.fall)) - 1
-        return self._grown(a, b) if b - a + 1 >= MIN_FRAMES else None
+        return self._grown(a, b) if b - a + 1 >= LIMITS.min_frames else None
 
     def _grown(self, a: int, b: int) -> tuple[int, int, float] | None:
         """Return the frames of a flight, extended to its landing, and the landing time [s]; infinite if unseen."""
         landing = math.inf
         for _ in range(4):
-            if b - a + 1 < MIN_FRAMES:
+            if b - a + 1 < LIMITS.min_frames:
                 return None
             middle = 0.5 * (self.times[a] + self.times[b])
             t = self.times[a : b + 1] - middle
             line = np.polyfit(t, self.heights[a : b + 1] + 0.5 * self.fall * t**2, 1)
             left = np.abs(self.heights[a : b + 1] + 0.5 * self.fall * t**2 - np.polyval(line, t))
             root = line[0] ** 2 + 2 * self.fall * line[1]
-            if root <= 0 or left.max() > MISFIT_SIGMAS * self.noise:
-                return (a, b, landing) if math.isfinite(landing) and left.max() <= MISFIT_SIGMAS * self.noise else None
+            fits = left.max() <= LIMITS.misfit_sigmas * self.noise
+            if root <= 0 or not fits:
+                return (a, b, landing) if math.isfinite(landing) and fits else None
             landing = middle + (line[0] + math.sqrt(root)) / self.fall
             end = int(np.searchsorted(self.times, landing - 1e-4)) - 1
             if end == b:
@@ -224,7 +217,7 @@ def _ends(flights: Segments) -> tuple[_Ends, _Ends, list[bool]]:
     flat = jacobian.flatten(1, 2)
     prior = torch.diag(state_prior(1)).to(flat)
     spread = torch.linalg.inv(flat.mT @ flat + prior)
-    good = (rows.square().sum((1, 2)) < BAD_FLIGHT * flights.dof).tolist()
+    good = (rows.square().sum((1, 2)) < LIMITS.bad_flight * flights.dof).tolist()
     steps = torch.tensor([step for step in STATE_STEPS for _ in range(3)]).to(flat)
     moves = torch.cat([torch.zeros(1, size).to(flat), torch.diag(steps), -torch.diag(steps)])
     every = flights.select(list(range(count)) * len(moves)).moved(moves.repeat_interleave(count, 0))

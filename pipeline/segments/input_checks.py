@@ -19,29 +19,12 @@ from ..trajectories.observations import Observations, refuse_slow_times
 from ..trajectories.segmentation import size_of, whole_episodes
 from ..trajectories.track_noise import estimate_noise
 from .prepare import Prepared
+from .thresholds import SEGMENT_THRESHOLDS
 
-MOST_OFF = 0.2
-"""Maximum depth of a body's lowest point under the ground, or height at rest above it, as a share of its size; beyond
-it the shape or the ground is wrong."""
-NOISE_SIGMAS = 2.0
-"""Tolerance in sigmas in addition: 2 % of the frames of a body at rest are measured that much deeper; for a box, any of
-whose corners may be the lowest, 5 %."""
-MOST_TILT = 0.1
-"""Maximum tilt [rad] of the measured frame for a ground that is level in the manifest: such an error is a named
-effect."""
-ENVELOPE_ITERATIONS, ENVELOPE_WEIGHT = 20, 0.02
-"""Iterations, and weight of places above the plane, of the lower envelope of all places: an expectile (Newey & Powell
-1987)."""
-MOST_CARRIED = 0.2
-"""Maximum share of supported frames above the ground."""
-DENSEST_KG_M3 = 23000.0
-"""Density of osmium [kg/m3]: no body is heavier than a ball of it that encloses the shape."""
-ALIKE_SIGMAS = 3.0
-"""Root mean square difference, in sigmas, below which motions are one motion measured several times."""
-LEAST_SEEN = 0.25
-"""Largest acceptable detection limit of a force in flight, as a share of gravity."""
-SHARE_OF_SIZE = 0.25
-"""Noise of the position, as a share of the body's size, above which that detection limit is required."""
+LIMITS = SEGMENT_THRESHOLDS.input
+
+ENVELOPE_ITERATIONS = 20
+"""Iterations of the lower envelope of all places: an expectile (Newey & Powell 1987)."""
 _BELONG_TOGETHER = (
     "a shape, a ground and tracks that belong together.",
     "check [[bodies]] shape, [world] ground, whether the tracks' frame is level, and which body was tracked.",
@@ -65,7 +48,7 @@ def check_units_and_geometry(world: World, episodes: Sequence[Episode], where: s
 def _check_mass(body: Body, where: str) -> None:
     """Refuse a mass or moments of inertia that no body of that shape has."""
     mass, size = float(body.mass[0]), size_of(body)
-    most = DENSEST_KG_M3 * 4 / 3 * math.pi * size**3
+    most = LIMITS.densest_kg_m3 * 4 / 3 * math.pi * size**3
     if mass > most:
         raise InputDataError(
             f"{where}: '{body.name}' has {mass:.3g} kg within {1e3 * size:.0f} mm of its origin; a ball of osmium "
@@ -93,11 +76,11 @@ def _check_depth(world: World, episodes: Sequence[Episode], where: str) -> None:
     seen = whole.seen.amax(-1) > 0
     gap, place = clearance(world, whole)[seen], whole.position_m[:, :, 0][seen]
     deep = float(torch.quantile(gap, 0.05))
-    if deep >= -MOST_OFF * size:
+    if deep >= -LIMITS.most_off * size:
         return
     free = [world.bodies[k].name for k in world.free]
     position, rotation = estimate_noise([t[name] for _, t in episodes for name in free if name in t])
-    most = MOST_OFF * size + NOISE_SIGMAS * math.hypot(position, rotation * size)
+    most = LIMITS.most_off * size + LIMITS.noise_sigmas * math.hypot(position, rotation * size)
     if deep < -most and not _on_a_tilted_plane(gap, place, world.ground_normal, most):
         raise InputDataError(
             f"{where}: in 5 % of the frames the body lies {-1e3 * deep:.0f} mm or more under the ground; its "
@@ -120,10 +103,10 @@ def _on_a_tilted_plane(gap: Tensor, place: Tensor, normal: Tensor, most: float) 
     columns = torch.cat((along, torch.ones_like(gap)[:, None]), 1)
     plane = columns.new_zeros(4)
     for _ in range(ENVELOPE_ITERATIONS):  # frames of low flight lie above the tilted ground
-        weight = torch.where(gap[under] < columns[under] @ plane, 1.0, ENVELOPE_WEIGHT).sqrt()
+        weight = torch.where(gap[under] < columns[under] @ plane, 1.0, LIMITS.envelope_weight).sqrt()
         plane = torch.linalg.lstsq(weight[:, None] * columns[under], weight * gap[under], driver="gelsd").solution
     left = gap - columns @ plane
-    level = float(plane[:3].norm()) <= MOST_TILT and abs(float(plane[3])) <= most
+    level = float(plane[:3].norm()) <= LIMITS.most_tilt and abs(float(plane[3])) <= most
     return level and float(torch.quantile(left, 0.05)) >= -most
 
 
@@ -136,22 +119,22 @@ def check_observability(world: World, prepared: Prepared, where: str) -> None:
     whole, sigma = prepared.observations, prepared.noise.position_m
     size = min(size_of(world.bodies[k]) for k in world.free)
     gravity, seen = float(world.gravity.norm()) or 9.81, prepared.least_force_m_s2
-    if seen > LEAST_SEEN * gravity and sigma > SHARE_OF_SIZE * size:
+    if seen > LIMITS.least_seen * gravity and sigma > LIMITS.share_of_size * size:
         what = f"no force below {100 * seen / gravity:.0f} % of the weight" if math.isfinite(seen) else "no force"
         raise InputDataError(
             f"{where}: with a noise of {1e3 * sigma:.3g} mm on a body of {1e3 * size:.3g} mm {what} could be detected "
             "in these flights, and no contact.",
-            f"noise and episodes in which a force of {100 * LEAST_SEEN:.0f} % of the weight can be detected.",
+            f"noise and episodes in which a force of {100 * LIMITS.least_seen:.0f} % of the weight can be detected.",
             "record longer flights, more of them, or with less noise; check the unit of the positions.",
         )
     spread, alike = _travel(whole), _apart(whole)
-    if spread < ALIKE_SIGMAS * sigma and not _turns(whole, prepared.noise.rotation_rad):
+    if spread < LIMITS.alike_sigmas * sigma and not _turns(whole, prepared.noise.rotation_rad):
         raise InputDataError(
             f"{where}: nothing moves by more than {1e3 * spread:.2g} mm, with a noise of {1e3 * sigma:.2g} mm.",
             "motions: throws, drops, pushes, slides.",
             "record some, or check which body was tracked.",
         )
-    if alike < ALIKE_SIGMAS * sigma:
+    if alike < LIMITS.alike_sigmas * sigma:
         raise InputDataError(
             f"{where}: the {len(whole.names)} episodes are one motion: they differ by {1e3 * alike:.2g} mm, with a "
             f"noise of {1e3 * sigma:.2g} mm. An effect that fits one of them fits all, which is no evidence.",
@@ -168,9 +151,9 @@ def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
         return
     gap = clearance(world, whole)
     size = min(size_of(world.bodies[k]) for k in world.free)
-    high = prepared.supported & (gap > MOST_OFF * size)
+    high = prepared.supported & (gap > LIMITS.most_off * size)
     share = float(high.sum()) / max(float((whole.seen.amax(-1) > 0).sum()), 1.0)
-    if share > MOST_CARRIED:
+    if share > LIMITS.most_carried:
         raise InputDataError(
             f"{where}: in {100 * share:.0f} % of the frames the body is {1e3 * float(gap[high].median()):.0f} mm above "
             f"the ground and does not fall; its size is {1e3 * size:.0f} mm.",
@@ -190,7 +173,7 @@ def _turns(whole: Observations, sigma: float) -> bool:
     """Return whether any orientation changes by more than the noise [rad]."""
     known = (whole.has_orientation[..., None] * whole.quat_wxyz).abs()
     spread = known.amax(1) - torch.where(whole.has_orientation[..., None] > 0, known, torch.inf).amin(1)
-    return bool((torch.nan_to_num(spread, neginf=0.0) > 2 * ALIKE_SIGMAS * sigma).any())
+    return bool((torch.nan_to_num(spread, neginf=0.0) > 2 * LIMITS.alike_sigmas * sigma).any())
 
 
 def _apart(whole: Observations) -> float:

@@ -19,11 +19,6 @@ from .segments import Segments
 
 Array = NDArray[np.float64]
 
-MEASURED = 0.04
-"""A direction counts as measured where its information times the parameters' prior variance exceeds this: a standard
-error below five widths of the priors."""
-
-
 PART_ROLLOUTS = 700
 """Maximum number of rollouts of candidates in one world: more effects at once cost more than the calls they save."""
 

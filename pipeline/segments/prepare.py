@@ -22,15 +22,13 @@ from .contact_phases import is_round
 from .release_detection import held_starts, release_warnings, without_held
 from .segment_states import fit_states
 from .segments import Kind, Segments
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.preparation
 
 if TYPE_CHECKING:
     pass
 
-NOISE_DISAGREES = 1.3
-"""Ratio of given to measured noise (or its inverse) at and above which the two disagree."""
-
-SURE = 4.0
-"""Number of standard errors from which an acceleration counts as detected."""
 SMEARED = 3
 """Frames on both sides of a contact that count as contact where the noise is correlated: a filter of seven frames
 smears impacts this far."""
@@ -75,14 +73,14 @@ class Prepared:
     def least_force_m_s2(self) -> float:
         """Smallest acceleration [m/s2] that all flights together detect; infinite without flight.
 
-        It is `SURE` standard errors; that of the acceleration of a parabola through n points of noise s over a time T
-        is s (720 / (n T^4))^1/2.
+        It is `sure` standard errors (see `thresholds.py`); that of the acceleration of a parabola through n points of
+        noise s over a time T is s (720 / (n T^4))^1/2.
         """
         information = 0.0
         for item in () if self.flight is None else self.flight.items:
             times = self.observations.times_s[item.episode, item.first : item.last + 1]
             information += len(times) * float(times[-1] - times[0]) ** 4 / (720 * self.noise.position_m**2)
-        return SURE / math.sqrt(information) if information > 0 else math.inf
+        return LIMITS.sure / math.sqrt(information) if information > 0 else math.inf
 
     def segments(self, kind: Kind, world: World, items: Sequence[Segment]) -> Segments:
         """Return segments of these episodes, with first guesses of their states."""
@@ -290,7 +288,7 @@ def _agreed(
     rough: Noise,
     warnings: list[str],
 ) -> Noise:
-    """Return the noise to use: the given one, or the measured one where that is larger by `NOISE_DISAGREES`.
+    """Return the noise to use: the given one, or the measured one where that is larger by `LIMITS.noise_disagrees`.
 
     Args:
         given: Standard deviations that the user states (position [m], rotation [rad]).
@@ -302,14 +300,14 @@ def _agreed(
     for name, unit, said, seen, otherwise in zip(
         ("position", "rotation"), ("m", "rad"), given, found, rough, strict=True
     ):
-        if said is not None and seen is not None and said / seen >= NOISE_DISAGREES:
+        if said is not None and seen is not None and said / seen >= LIMITS.noise_disagrees:
             warnings.append(
                 f"the {name} noise is given as {said:.2g} {unit}; neighbouring frames of a flight agree within "
                 f"{seen:.2g} {unit}. The given value is used, because slowly varying errors do not show between "
                 "neighbouring frames. Effects smaller than it cannot be detected."
             )
             chosen.append(said)
-        elif said is not None and seen is not None and said / seen <= 1 / NOISE_DISAGREES:
+        elif said is not None and seen is not None and said / seen <= 1 / LIMITS.noise_disagrees:
             warnings.append(
                 f"the {name} noise is given as {said:.2g} {unit}; in flight it is {seen:.2g} {unit}, which is used."
             )

@@ -23,20 +23,12 @@ from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
 from ..trajectories.track_noise import estimate_noise
 from .segment_states import fit_states
 from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.input
 
 if TYPE_CHECKING:
     from ..physics.world import World
-
-HELD_CHI2 = 3.0
-"""Reduced chi-square of the rotation, relative to that of most flights, above which a flight may begin in a hand. Of
-349 measured tosses of a cube, 12 fit 20 times as well without the first third of their flight, none without the
-last."""
-FREE_CHI2 = 2.0
-"""Largest relative reduced chi-square of the rotation without the first frames for which the rest is free flight."""
-SKEW = 3.0
-"""Minimum factor by which the fit without as many last frames is worse than the fit without the first ones."""
-LEAST_FREE = 8
-"""Minimum number of frames that remain of the flight; at least half of it must remain, too."""
 
 
 def held_starts(flight: Segments, whole: Observations) -> dict[int, int]:
@@ -52,17 +44,17 @@ def held_starts(flight: Segments, whole: Observations) -> dict[int, int]:
         return {}
     usual = max(float(share[known].median()), 1.0)
     found: dict[int, int] = {}
-    for place in torch.nonzero(known & (share > HELD_CHI2 * usual))[:, 0].tolist():
+    for place in torch.nonzero(known & (share > LIMITS.held_chi2 * usual))[:, 0].tolist():
         item = flight.items[place]
         count = item.last - item.first + 1
-        counts = range(1, min(count // 2, count - LEAST_FREE) + 1)
+        counts = range(1, min(count // 2, count - LIMITS.least_free) + 1)
         if item.first > int((whole.seen[item.episode].amax(-1) > 0).to(torch.int64).argmax()) or not counts:
             continue
         late = [replace(item, first=item.first + k) for k in counts]
         early = [replace(item, last=item.last - k) for k in counts]
         left = _rotation_chi2(_fitted(flight, whole, [*late, *early]))
         for k, without_first, without_last in zip(counts, *left.unflatten(0, (2, -1)).tolist(), strict=True):
-            if without_first <= FREE_CHI2 * usual and without_last >= SKEW * without_first:
+            if without_first <= LIMITS.free_chi2 * usual and without_last >= LIMITS.skew * without_first:
                 found[item.episode] = item.first + k
                 break
     return found

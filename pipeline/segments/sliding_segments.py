@@ -23,21 +23,14 @@ from ..trajectories.segmentation import GAP, GroundPlane, Segment, heights_of, s
 from ..trajectories.track_noise import Noise
 from .contact_phases import is_round
 from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.sliding_data
 
 Array = NDArray[np.float64]
 
-LONGEST_S, SHORTEST_S = 0.5, 0.15
-"""Maximum and minimum length [s]: longer ones are cut into equal parts, shorter ones are left to the contact
-segments."""
-NEAR_M, NEAR_SIGMAS = 0.0015, 3.0
-"""Maximum height of the lowest point on the ground: this length [m], and this many sigmas of the noise."""
 SIDE_S, SIDE_FRAMES = 0.04, 3
 """Time [s] and minimum number of frames on both sides over which a jump of a velocity is measured."""
-TILTING_RAD_S = 0.3
-"""Rate [rad/s] of tilting above which a body that is not round turns over an edge; or `JUMP_SIGMAS` where that is
-more."""
-JUMP_M_S, JUMP_SIGMAS = 0.12, 4.0
-"""Jump of the velocity [m/s] of any point of the body that is an impact, or this many sigmas where that is more."""
 
 
 def find_sliding_segments(world: World, whole: Observations, clear: Tensor, noise: Noise) -> list[Segment]:
@@ -52,7 +45,7 @@ def find_sliding_segments(world: World, whole: Observations, clear: Tensor, nois
     if world.ground_normal is None or len(whole.free) != 1 or len(world.bodies) != 1:
         return []
     body = world.bodies[whole.free[0]]
-    margin = NEAR_M + NEAR_SIGMAS * float(np.hypot(noise.position_m, noise.rotation_rad * size_of(body)))
+    margin = LIMITS.near_m + LIMITS.near_sigmas * float(np.hypot(noise.position_m, noise.rotation_rad * size_of(body)))
     lowest = heights_of(world, body, whole, 0).amin(-1)
     on = (lowest < margin) & ~clear & (whole.seen[:, :, 0] > 0)
     found = []
@@ -102,12 +95,13 @@ def _impacts(world: World, whole: Observations, episode: int, seen: Tensor, nois
             continue
         inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], 1))[3]
         spread = float(np.linalg.norm(inverse))
-        jumps[k] = np.abs(inverse @ height[frames]).max() > max(JUMP_M_S, JUMP_SIGMAS * noise.position_m * spread)
+        least = max(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
+        jumps[k] = np.abs(inverse @ height[frames]).max() > least
         if is_round(body) or not turned[frames].all():
             continue  # an impact of a ball never changes its spin alone
         turns = quat_log(quat_multiply(quat[frames], quat_conjugate(quat[k : k + 1])))  # world axes
         tilting = np.linalg.norm(inverse @ (turns @ level.T).numpy())
-        jumps[k] |= tilting > max(JUMP_M_S / size_of(body), JUMP_SIGMAS * noise.rotation_rad * spread)
+        jumps[k] |= tilting > max(LIMITS.jump_m_s / size_of(body), LIMITS.jump_sigmas * noise.rotation_rad * spread)
     wide = jumps.copy()
     wide[1:] |= jumps[:-1]
     wide[:-1] |= jumps[1:]
@@ -126,7 +120,8 @@ def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, nois
             continue
         slope = np.linalg.pinv(np.stack([np.ones(int(known.sum())), t[known]], 1))[1]
         spread = float(np.linalg.norm(slope))
-        tilts[k] = np.linalg.norm(slope @ up[frames][known]) > max(TILTING_RAD_S, JUMP_SIGMAS * noise_rad * spread)
+        least = max(LIMITS.tilting_rad_s, LIMITS.jump_sigmas * noise_rad * spread)
+        tilts[k] = np.linalg.norm(slope @ up[frames][known]) > least
     return tilts
 
 
@@ -148,9 +143,9 @@ def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:
     edges = np.flatnonzero(np.append(True, (steady[1:] != steady[:-1]) | breaks[1:]))
     for first, end in itertools.pairwise([*edges.tolist(), len(times)]):
         length = times[end - 1] - times[first]
-        if not steady[first] or length < SHORTEST_S:
+        if not steady[first] or length < LIMITS.shortest_s:
             continue
-        number = int(np.ceil(length / LONGEST_S - 1e-9))
+        number = int(np.ceil(length / LIMITS.longest_s - 1e-9))
         cuts = [first + round(k * (end - 1 - first) / number) for k in range(number + 1)]
         found += itertools.pairwise(cuts)
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-NOT_KNOWN, NOT_MEASURED = "not known", "not measured alone"
+NOT_KNOWN, NOT_MEASURED, BY_ARGUMENT = "not known", "not measured alone", "by argument"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,3 +50,148 @@ def threshold(
 def thresholds_of(group: Any) -> list[Threshold]:
     """Return the thresholds of a group, in their order."""
     return [Threshold(name=one.name, value=getattr(group, one.name), **one.metadata) for one in fields(group)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputThresholds:
+    """An input is refused, or its first frames are left out."""
+
+    most_off: float = threshold(
+        0.2,
+        "sizes",
+        "depth under the ground, or height of rest above it, beyond which shape or ground are wrong",
+        BY_ARGUMENT,
+    )
+    noise_sigmas: float = threshold(
+        2.0,
+        "sigma",
+        "tolerance of `most_off` in addition",
+        "by argument: 2 % (5 % of a box's) frames at rest lie 2 sigma deeper",
+        "noise of 5 mm: 3 of 7 balls refused before the noise counted, 0 since",
+    )
+    most_tilt: float = threshold(
+        0.1,
+        "rad",
+        "tilt of the tracking frame up to which such depths are diagnosed, not refused",
+        "report6: one ball and one cube, frames tilted by 2 degrees",
+        "both refused before, exact since",
+    )
+    envelope_weight: float = threshold(
+        0.02,
+        "1",
+        "weight of places above the plane in the lower envelope that shows a tilt",
+        "as `most_tilt`",
+        "see `most_tilt`",
+    )
+    most_carried: float = threshold(
+        0.2, "1", "share of the frames above the ground and not falling: shape or ground are wrong"
+    )
+    densest_kg_m3: float = threshold(23000.0, "kg/m3", "heaviest body of its shape: osmium", "physical bound")
+    alike_sigmas: float = threshold(
+        3.0, "sigma", "motions that differ by less are one motion; bodies that move by less stand still"
+    )
+    least_seen: float = threshold(
+        0.25, "weights", "smallest visible force at which nothing can be diagnosed, with `share_of_size`"
+    )
+    share_of_size: float = threshold(0.25, "sizes", "noise above which `least_seen` is required")
+    held_chi2: float = threshold(
+        3.0,
+        "chi2 / dof",
+        "rotation that fits worse than that of most flights: an episode may begin in a hand",
+        "349 measured tosses of a cube",
+        "12 of 349 fit 20 times as well without the first third of their flight, none without the last",
+    )
+    free_chi2: float = threshold(
+        2.0, "chi2 / dof", "rotation without the first frames that is free flight", "as `held_chi2`", "see `held_chi2`"
+    )
+    skew: float = threshold(
+        3.0, "1", "how much worse it fits without as many last frames", "as `held_chi2`", "see `held_chi2`"
+    )
+    least_free: int = threshold(8, "frames", "fewest that remain of the flight", "as `held_chi2`", "see `held_chi2`")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparationThresholds:
+    """Noise is believed, a direction or a force counts as measured."""
+
+    noise_disagrees: float = threshold(
+        1.3, "1", "a given noise that differs by this factor is replaced (if smaller) or warned about"
+    )
+    sure: float = threshold(4.0, "standard errors", "from which a force in flight counts as shown (`least_force_m_s2`)")
+    robust_excess: float = threshold(
+        20.0, "chi2", "scale of the robust loss of a contact segment", "study of diagnosis, section 3"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlidingSegmentThresholds:
+    """A motion is a sliding segment, and shows the friction."""
+
+    longest_s: float = threshold(0.5, "s", "longest sliding segment; longer ones are cut")
+    shortest_s: float = threshold(0.15, "s", "shortest sliding segment; shorter ones are left to other tests")
+    near_m: float = threshold(0.0015, "m", "height below which the lowest point is on the ground")
+    near_sigmas: float = threshold(3.0, "sigma", "tolerance of `near_m` in addition")
+    jump_m_s: float = threshold(0.12, "m/s", "jump of velocity that is an impact, which ends a sliding segment")
+    jump_sigmas: float = threshold(4.0, "sigma", "the same, where it is more")
+    tilting_rad_s: float = threshold(
+        0.3,
+        "rad/s",
+        "a body with edges that tilts faster turns over an edge and does not slide",
+        "development: chi2 / dof of such segments up to 161",
+    )
+    well_known: float = threshold(100.0, "1", "information from which one sliding segment determines the friction")
+    well_fitted: float = threshold(4.0, "chi2 / dof", "up to which one sliding segment determines the friction")
+    loads_unknown: float = threshold(
+        0.01,
+        "weights",
+        "how corners share the weight counts as unknown to this share",
+        "development: 6 of 30 cubes with a false effect of contact",
+        "0 of 32 on report3",
+        (0, 32),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImpactDataThresholds:
+    """A motion is an impact, and how exact the model of an impact is."""
+
+    least: int = threshold(4, "impacts", "fewest that show more than a restitution")
+    rebound_share: float = threshold(
+        0.03,
+        "1",
+        "scatter of a rebound about any law",
+        "development without an effect: 0.7 to 5 %",
+        "a restitution that falls by 0.03 s/m is found in 1 of 30 nulls",
+    )
+    friction_share: float = threshold(
+        0.04, "1", "model error of the tangential impulse, of itself: a slip ends within the impact", "development"
+    )
+    impulse_share: float = threshold(
+        0.002, "1", "model error of the tangential impulse, of the normal one", "development"
+    )
+    spin_share: float = threshold(
+        0.06, "1", "model error of the change of spin: the ground deforms and shortens the arm", "development"
+    )
+    contact_s: float = threshold(0.008, "s", "duration after reaching the ground that belongs to no flight")
+    longest_s: float = threshold(0.03, "s", "longest contact that is one impact")
+    misfit_sigmas: float = threshold(5.0, "sigma", "a frame farther off a flight's parabola does not belong to it")
+    bad_flight: float = threshold(2.5, "chi2 / dof", "up to which a flight gives the velocities of an impact")
+    min_frames: int = threshold(4, "frames", "fewest of a flight between two impacts")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentThresholds:
+    """All thresholds on segments that decide a verdict."""
+
+    input: InputThresholds = InputThresholds()
+    """Input checks."""
+    preparation: PreparationThresholds = PreparationThresholds()
+    """Preparation and linearization."""
+    sliding_data: SlidingSegmentThresholds = SlidingSegmentThresholds()
+    """Sliding segments."""
+    impact_data: ImpactDataThresholds = ImpactDataThresholds()
+    """Impacts of a ball."""
+
+
+SEGMENT_THRESHOLDS = SegmentThresholds()
+"""The thresholds in use."""
