@@ -20,13 +20,16 @@ from .candidates import Variant, base_values, with_variants
 from .impact_law import Impact, after_impact, contact_law, point_velocity, rebound_speed
 from .impact_velocities import Impacts
 from .sliding_fit import contact_effect_parameters
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.impact_data
 
 Array = NDArray[np.float64]
 
-REBOUND_SHARE = 0.03
+REBOUND_SHARE = LIMITS.rebound_share
 """Model error of an impact: standard deviation of the rebound speed as a share of itself (0.7 to 5 % without hidden
 effects). Without it the few impacts of a capture could appear exact."""
-FRICTION_SHARE, IMPULSE_SHARE, SPIN_SHARE = 0.04, 0.002, 0.06
+FRICTION_SHARE, IMPULSE_SHARE, SPIN_SHARE = LIMITS.friction_share, LIMITS.impulse_share, LIMITS.spin_share
 """Model error of an impact: standard deviation of the tangential impulse (4 % of itself plus 0.2 % of the normal
 impulse, because a slip that ends during the impact leaves some per cent) and of the change of spin (6 % of itself,
 because the ground deforms and shortens the arm)."""
@@ -40,8 +43,6 @@ ITERATIONS, FALL = 12, 0.02
 """Maximum number of steps, and the fall of the cost below which a fit ends."""
 SHARES = (1.0, 0.4, 0.1)
 """Lengths of a step that are tried."""
-LEAST = 4
-"""Minimum number of impacts that determine more than a restitution."""
 WEIGH_AGAIN = 2
 """Number of fits of the base, each with weights from the previous one."""
 

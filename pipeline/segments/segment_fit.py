@@ -18,6 +18,7 @@ from ..trajectories.residuals import state_prior
 from .candidates import base_values
 from .segment_states import best_of
 from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ FALL = 0.05
 """Fall of the cost below which a refit ends: a twentieth of a standard error of one parameter."""
 FALL_SHARE = 1e-3
 """The same as a share of the cost: where the law misses far more than the noise, smaller changes are roughness."""
-ROBUST_EXCESS = 20.0
+ROBUST_EXCESS = SEGMENT_THRESHOLDS.preparation.robust_excess
 """Scale k of rho(e) = 2 k log(1 + e / 2k) for the excess e = chi2 - dof of a contact segment: the error of the contact
 law in an impact is one error, not one in each frame (study of diagnosis, section 3)."""
 LEAST_WEIGHT = 1e-12

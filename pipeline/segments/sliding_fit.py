@@ -24,16 +24,14 @@ from .segments import Segments, line_state
 from .sliding_descent import ITERATIONS, SlidingFit, fit_groups
 from .sliding_residuals import soft_world
 from .sliding_segments import find_sliding_segments, grounded_states
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.sliding_data
 
 START_FRAMES = (4, 7)
 """Numbers of frames of the straight lines from which states are fitted first."""
 START_FRICTION = (0.15, 0.35)
 """Friction coefficients from which each segment is fitted first."""
-WELL_KNOWN = 100.0
-"""Minimum information on the logarithm of the friction for a segment to contribute to the initial friction (standard
-error 0.1)."""
-WELL_FITTED = 4.0
-"""Maximum chi2 / dof of such a segment."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def _started(segments: Segments, known: float) -> tuple[Segments, Tensor]:
     found = fit_groups(every, [FRICTION], values, torch.zeros(len(values), 1, dtype=torch.long), group)
     best = found.chi2.unflatten(0, (-1, count)).argmin(0) * count + torch.arange(count)
     certainty = found.information[best, 0, 0] - 1 / FRICTION.prior[1] ** 2
-    good = (certainty > WELL_KNOWN) & (found.chi2[best] < WELL_FITTED * segments.dof)
+    good = (certainty > LIMITS.well_known) & (found.chi2[best] < LIMITS.well_fitted * segments.dof)
     own = found.values[best, 0]
     friction = own[good].median() if bool(good.any()) else torch.full_like(own[0], FRICTION.encode(known))
     return segments.with_state(found.segments.observations.state.at(best)), friction

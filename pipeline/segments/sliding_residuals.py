@@ -21,6 +21,7 @@ from ..trajectories.segmentation import GroundPlane
 from .contact_phases import is_round
 from .impact_law import contact_law
 from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
 
 TIME_S = 0.01
 """Contact time [s] of the soft, critically damped law."""
@@ -30,7 +31,7 @@ STATE_STEPS = (1e-4, 1e-3, 1e-3, 1e-2)
 """Steps of central differences by position [m], rotation [rad], velocity [m/s] and angular velocity [rad/s]."""
 PARAMETER_STEP = 0.02
 """Step of differences by parameters, in widths of their priors."""
-LOADS_UNKNOWN = 0.01
+LOADS_UNKNOWN = SEGMENT_THRESHOLDS.sliding_data.loads_unknown
 """Model error of the load distribution over more than three contact points, as a share of the weight: a body is never
 perfectly flat, and engines differ by as much. The torque about the normal that it may cause is not used as evidence."""
 

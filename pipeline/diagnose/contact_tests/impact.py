@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from ...optimization.uncertainty import f_tail
 from ...physics.contact_law import ContactLaw
 from ...segments.candidates import Candidate, Variant
-from ...segments.impact_fit import BASE, LEAST, ImpactBase, ImpactFit, ImpactProblem, fit_impacts
+from ...segments.impact_fit import BASE, ImpactBase, ImpactFit, ImpactProblem, fit_impacts
 from ...segments.impact_velocities import measured_impacts
+from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ..evidence import Evidence
 from ..thresholds import THRESHOLDS, ImpactThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
@@ -52,7 +53,7 @@ class ImpactTest(ContactTest):
         if not isinstance(data.world.contact, ContactLaw):
             return []
         impacts = measured_impacts(data.prepared, data.world)
-        if impacts is None or len(impacts) < LEAST:
+        if impacts is None or len(impacts) < SEGMENT_THRESHOLDS.impact_data.least:
             return []
         base = ImpactBase.of(data.world, impacts)
         found = []

@@ -22,12 +22,13 @@ from ...physics.world import World
 from ...segments.candidates import base_values
 from ...segments.first_contact_fit import EffectEstimate, placed
 from ...segments.fitted_parameters import UNOBSERVABLE_SHARE, fitted_parameter
-from ...segments.impact_fit import BASE, LEAST, ImpactBase, fit_impacts
+from ...segments.impact_fit import BASE, ImpactBase, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import linearised, refit
 from ...segments.sliding_descent import information_by_segment
 from ...segments.sliding_fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
+from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ...trajectories.track_noise import Noise
 from .identified_effects import at_neutral, identified_effects
 
@@ -163,7 +164,11 @@ class ImpactStart:
             bare: World without the effects that are to be fitted.
         """
         impacts = measured_impacts(prepared, bare) if isinstance(bare.contact, ContactLaw) else None
-        return None if impacts is None or len(impacts) < LEAST else ImpactStart(ImpactBase.of(bare, impacts))
+        return (
+            None
+            if impacts is None or len(impacts) < SEGMENT_THRESHOLDS.impact_data.least
+            else ImpactStart(ImpactBase.of(bare, impacts))
+        )
 
     def fit(self, world: World, names: Sequence[str]) -> EffectEstimate:
         """Fit the effects at their constants, together with the contact parameters.
