@@ -126,6 +126,13 @@ def test_what_is_not_known_of_a_threshold_is_said(one: Threshold) -> None:
         assert one.calibrated_on != NOT_KNOWN
 
 
+def test_every_threshold_of_the_table_is_read() -> None:
+    sources = (path for room in ("diagnose", "segments") for path in (ROOT / "pipeline" / room).rglob("*.py"))
+    text = "\n".join(path.read_text(encoding="utf-8") for path in sources)
+    reads = set(re.findall(r"(?:limits|LIMITS|thresholds|THRESHOLDS\.\w+)\.(\w+)", text))
+    assert {name.partition(".")[2] for name in TABLE} <= reads
+
+
 def module_numbers(source: str) -> Iterator[str]:
     """Yield the names to which a module assigns numbers at its top level, dictionaries and lists of objects aside."""
     for node in ast.parse(source).body:

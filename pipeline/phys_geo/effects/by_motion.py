@@ -164,11 +164,9 @@ class ImpactStart:
             bare: World without the effects that are to be fitted.
         """
         impacts = measured_impacts(prepared, bare) if isinstance(bare.contact, ContactLaw) else None
-        return (
-            None
-            if impacts is None or len(impacts) < SEGMENT_THRESHOLDS.impact_data.least
-            else ImpactStart(ImpactBase.of(bare, impacts))
-        )
+        if impacts is None or len(impacts) < SEGMENT_THRESHOLDS.impact_data.least:
+            return None
+        return ImpactStart(ImpactBase.of(bare, impacts))
 
     def fit(self, world: World, names: Sequence[str]) -> EffectEstimate:
         """Fit the effects at their constants, together with the contact parameters.
