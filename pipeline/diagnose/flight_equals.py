@@ -39,9 +39,9 @@ class ResolvedFlight:
     chosen: tuple[tuple[Evidence, ...], ...]
     """The equals of each effect selected in flight, the selected one first."""
     after_flight: World
-    """World with these effects and the refitted contact parameters."""
+    """World with these effects."""
     world: World
-    """The same with the equals that are not separable left out until the last refit."""
+    """The same with the contact parameters refitted."""
     segments: Segments | None
     """Contact segments with states fitted by `world`; None without contact."""
 
