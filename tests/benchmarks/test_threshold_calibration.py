@@ -12,9 +12,9 @@ from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
-from diagnosis_data import world_with
+from helpers.diagnosis_data import world_with
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import thresholds
 
 
