@@ -31,7 +31,7 @@ from .structure import Structure, kernel_file
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
 
-FLAGS = ("-std=c++17", "-O2", "-shared", "-fPIC", "-pthread", "-ffp-contract=off", "-w")
+FLAGS = ("-std=c++17", "-O3", "-shared", "-fPIC", "-pthread", "-ffp-contract=off", "-w")
 """Compiler options: no reordering of sums, and no instructions of this processor only, as others read the cache too."""
 BUILD_S = 120.0
 """Time limit of the compiler [s]."""

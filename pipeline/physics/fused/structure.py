@@ -98,13 +98,16 @@ class Structure:
         paired = len(self.free) > 1
         unrolled = self.slots <= _FREE_SLOTS[True, False]
         # the sums of labels take the registers of eight spheres
-        held = unrolled and not paired and not (self.record and self.slots > _FREE_SLOTS[False, False])
+        registers = unrolled and not (self.record and self.slots > _FREE_SLOTS[False, False])
+        alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
+        held = not paired and (alone or registers)
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
             "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
+            "LISTED": paired or alone, "CULLED": alone,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip

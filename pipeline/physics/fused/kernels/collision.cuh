@@ -250,6 +250,9 @@ INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
         Vec along = vec(dot(c.impulse, c.normal), dot(c.impulse, one), dot(c.impulse, two));
         env.before[c.slot] = c.b < 0 ? c.impulse : along;
     }
+#elif LISTED
+    forget(env);
+    for (int i = 0; i < count; i++) env.before[list[i].slot] = list[i].impulse;
 #else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) env.before[i] = list[i].on ? list[i].impulse : none();
@@ -257,71 +260,74 @@ INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
     env.warm = count > 0;
 }
 
-// Finds the contacts of a body with the ground. They are appended to the list; if this is the only pair, each is stored
-// in its own slot.
+// Finds the contacts of a body with the ground. They are appended to the list (LISTED), or each is stored in its own
+// slot.
 INLINE void touch_plane(const Problem& problem, const Environment& env, int p, const Mat& rotation,
                         const Motion& motion, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), first = count;
     Moments moments = {Real(0), Real(0), Real(0), Real(0), Real(0), Real(0)};
     Real height = env.bodies[a].position.z - env.ground;
+#if CULLED
+    // no point of the body sinks further in this step, up to rounding
+    Number fall = size(motion.velocity) + size(motion.omega) * env.constants[a].reach;
+    Number far = plain(env.law.step_s) * fall + Number(1e-6);
+#endif
 #if PAIRED
     int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
     for (int k = behind; k < contact_count(p); k += LANES) {
         int contact = start + k, i = count;
 #else
     EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) {
-        int contact = i * LANES + env.lanes.lane;
+    for (int k = 0; k < SLOTS; k++) {
+        int contact = k * LANES + env.lanes.lane;
+#if LISTED
+        int i = count;
+#else
+        int i = k;
         list[i].on = false;
         weights[i] = Real(0);
+#endif
         if (contact >= CONTACTS) continue;
 #endif
 #if HELD
-        Vec arm = rotation * env.arms[i];
-        Real radius = env.radii[i];
+        Vec held = env.arms[k];
+        Real radius = env.radii[k];
 #else
         long long row = env.geometry + 4LL * problem.spheres[contact];
-        Vec arm = rotation * (problem.geometry.vector(row) - env.constants[a].com);
+        Vec held = problem.geometry.vector(row) - env.constants[a].com;
         Real radius = problem.geometry.at(row + 3);
 #endif
-        bool touches = touch_ground(list[i], env.law, motion, arm, height, radius, weights[i]);
+#if CULLED
+        if (plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far) continue;
+#endif
+        bool touches = touch_ground(list[i], env.law, motion, rotation * held, height, radius, weights[i]);
         if (touches) {
             add_row(moments, list[i], weights[i]);
             count++;
-        }
 #if PAIRED
-        if (touches) {
             list[i].normal = vec(Real(0), Real(0), Real(1));
             list[i].arm_b = none();
             list[i].a = a;
             list[i].b = -1;
+#endif
+#if LISTED
             list[i].slot = contact / LANES;
             list[i].impulse = env.before[contact / LANES];
+#endif
         }
-#else
+#if !LISTED
         list[i].on = touches;
         list[i].impulse = env.before[i];
 #endif
     }
     if (!env.lanes.any(count > first)) return;
     moments = sum_rows(env.lanes, moments);
-#if PAIRED
-    for (int i = first; i < count; i++) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
-#else
-    EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) {
-        if (list[i].on) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
-    }
+    EACH_CONTACT(list, first, count) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
 #if SURFACE
     Real total = Real(0);
-    EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) total += weights[i];
+    EACH_CONTACT(list, first, count) total += weights[i];
     total = env.lanes.sum(total);
-    EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) {
-        if (list[i].on) surface(list[i], env.law, motion, env.bodies[a].position, weights[i], total);
-    }
-#endif
+    EACH_CONTACT(list, first, count) surface(list[i], env.law, motion, env.bodies[a].position, weights[i], total);
 #endif
 }
 
@@ -390,10 +396,8 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             }
         }
 #else
-        EACH_SLOT
-        for (int i = 0; i < SLOTS; i++) {
+        EACH_CONTACT(list, 0, count) {
             Contact& c = list[i];
-            if (!c.on) continue;
             if (sweep >= 0) c.impulse = swept(c, env.law, motions[0].velocity + cross(motions[0].omega, c.arm));
             linear[0] = linear[0] + c.impulse;
             angular[0] = angular[0] + cross(c.arm, c.impulse);
@@ -421,10 +425,9 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
     }
 #if RECORD
 #if PAIRED
-    for (int i = 0; i < count; i++) {
-        const Contact& c = list[i];
-        note(env.tallies[c.slot], c, env.law, env.bodies[c.a].position);
-    }
+    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.law, env.bodies[list[i].a].position);
+#elif LISTED
+    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.law, env.bodies[0].position);
 #else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {

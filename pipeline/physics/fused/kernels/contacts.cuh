@@ -23,7 +23,10 @@ struct Contact {  // world frame, impulse on body a
 #endif
 #if PAIRED
     Vec normal, arm_b;
-    int a, b, slot;
+    int a, b;
+#endif
+#if LISTED
+    int slot;
 #else
     bool on;
 #endif

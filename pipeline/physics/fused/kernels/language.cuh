@@ -15,3 +15,10 @@
 #endif
 #define KEEP_LOOP _Pragma("unroll 1")
 #endif
+// The touching contacts from `first` on, one after another (LISTED), or those that are on, each in its own slot, which
+// keeps them in registers.
+#if LISTED
+#define EACH_CONTACT(list, first, count) for (int i = first; i < count; i++)
+#else
+#define EACH_CONTACT(list, first, count) EACH_SLOT for (int i = 0; i < SLOTS; i++) if (list[i].on)
+#endif
