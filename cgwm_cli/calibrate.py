@@ -7,33 +7,32 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import running
-from .options import ConfigFile, Debug, Json, Overwrite, Quiet, Seed, Settings
+from .execution import Emit
+from .options import ConfigFile, Overwrite, Seed, Settings
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import CalibrationReport
 
 
+@verb
 def calibrate(
+    emit: Emit,
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="The capture's directory.", show_default=False)],
     seed: Seed = None,
     overwrite: Overwrite = False,
     config: ConfigFile = None,
     set_: Settings = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Estimate cameras from photos: poses, lens, metric scale, and a verdict for each image."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.calibrate import calibrate as work
-        from ..schemas import CalibrateConfig
-        from .settings import StageSettings
+    from ..pipeline.calibrate import calibrate as work
+    from ..schemas import CalibrateConfig
+    from .settings import StageSettings
 
-        settings = StageSettings({"calibrate": CalibrateConfig}, config, set_).configure(
-            "calibrate", CalibrateConfig, seed=seed
-        )
-        emit(work(capture, settings, overwrite), _summary)
+    settings = StageSettings({"calibrate": CalibrateConfig}, config, set_).configure(
+        "calibrate", CalibrateConfig, seed=seed
+    )
+    emit(work(capture, settings, overwrite), _summary)
 
 
 def _summary(report: CalibrationReport) -> str:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import running
-from .options import AcceptUnits, AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
+from .execution import Emit
+from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, trust
+from .verb import verb
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
     from ..schemas import CompareResult, ModelComparison, PairedDifference
 
 
+@verb
 def compare(
+    emit: Emit,
     models: Annotated[
         list[Path],
         typer.Argument(metavar="MODEL...", help="Directories of models, the base first.", show_default=False),
@@ -41,23 +44,19 @@ def compare(
     overwrite: Overwrite = False,
     trust_effects: TrustEffects = "",
     accept_units: AcceptUnits = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Compare models on measured motion: where and when each fails, as figures and as an HTML page."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        trust(trust_effects)
-        from ..pipeline.compare import compare as work
-        from ..schemas import UsageError
+    trust(trust_effects)
+    from ..pipeline.compare import compare as work
+    from ..schemas import UsageError
 
-        if not warmup_s > 0:
-            raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
-        from ..pipeline.compare.page_file import default_page, shows_the_same
+    if not warmup_s > 0:
+        raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
+    from ..pipeline.compare.page_file import default_page, shows_the_same
 
-        page = out or default_page(models)
-        overwrite = overwrite or (out is None and shows_the_same(page, models, capture))
-        emit(work(models, capture, split, page, warmup_s, device, overwrite, accept_units), _summary)
+    page = out or default_page(models)
+    overwrite = overwrite or (out is None and shows_the_same(page, models, capture))
+    emit(work(models, capture, split, page, warmup_s, device, overwrite, accept_units), _summary)
 
 
 def _summary(result: CompareResult) -> str:

@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .execution import running
-from .options import AnyDevice, Debug, Json, Overwrite, Quiet
+from .execution import Emit
+from .options import AnyDevice, Overwrite
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit, MysteryResult
 
 
+@verb
 def demo(
+    emit: Emit,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The directory to write.", show_default=False)],
     scene: Annotated[
         Literal["fall", "push", "mystery"],
@@ -30,20 +33,16 @@ def demo(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of object, parameters and noise.")] = 0,
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Run the whole pipeline on a simulated scene, and write a report."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        if scene == "mystery":
-            from ..pipeline.demo import run_mystery
+    if scene == "mystery":
+        from ..pipeline.demo import run_mystery
 
-            emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
-            return
-        from ..pipeline.demo import run_demo
+        emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
+        return
+    from ..pipeline.demo import run_demo
 
-        emit(run_demo(out, scene, seed, renderer, device, overwrite), lambda result: _summary(result, out))
+    emit(run_demo(out, scene, seed, renderer, device, overwrite), lambda result: _summary(result, out))
 
 
 def _story(result: MysteryResult, out: Path) -> str:

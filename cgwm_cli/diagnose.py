@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import running
-from .options import AcceptUnits, AnyDevice, Debug, Json, Overwrite, Quiet, TrustEffects, trust
+from .execution import Emit
+from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, trust
+from .verb import verb
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +22,9 @@ THROWS_SHOWN = 3
 """Number of throws that are listed."""
 
 
+@verb
 def diagnose(
+    emit: Emit,
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
     capture: Annotated[
         Path,
@@ -63,17 +66,13 @@ def diagnose(
     overwrite: Overwrite = False,
     trust_effects: TrustEffects = "",
     accept_units: AcceptUnits = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Find the missing physical or measurement effect, and those that these data cannot distinguish from it."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        trust(trust_effects)
-        from ..pipeline.diagnose import diagnose as work
+    trust(trust_effects)
+    from ..pipeline.diagnose import diagnose as work
 
-        wanted = [name.strip() for name in candidates.split(",") if name.strip()]
-        emit(work(model, capture, split, wanted, throws, save_law, overwrite, device, accept_units), _summary)
+    wanted = [name.strip() for name in candidates.split(",") if name.strip()]
+    emit(work(model, capture, split, wanted, throws, save_law, overwrite, device, accept_units), _summary)
 
 
 def _summary(result: DiagnoseResult) -> str:

@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from .execution import running
-from .options import Debug, Json, Quiet
+from .execution import Emit
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import DoctorReport
 
 
-def doctor(json: Json = False, quiet: Quiet = False, debug: Debug = False) -> None:
+@verb
+def doctor(emit: Emit) -> None:
     """Report what this machine has, what is missing, and what cgwm would use."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.runtime.doctor import doctor as work
+    from ..pipeline.runtime.doctor import doctor as work
 
-        report = work()
-        emit(report, _summary)
+    report = work()
+    emit(report, _summary)
     if not report.ready:
         raise typer.Exit(1)
 

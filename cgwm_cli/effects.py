@@ -7,48 +7,45 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import running
-from .options import Debug, Json, Overwrite, Quiet
+from .execution import Emit
+from .options import Overwrite
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas.effects import EffectCard, EffectList, NewEffect
 
 
-def list_effects(json: Json = False, quiet: Quiet = False, debug: Debug = False) -> None:
+@verb
+def list_effects(emit: Emit) -> None:
     """List the effects that can be added to a model: built-in ones and those of installed packages."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.physics.effects.catalogue import list_effects as work
+    from ..pipeline.physics.effects.catalogue import list_effects as work
 
-        emit(work(), _listed)
+    emit(work(), _listed)
 
 
+@verb
 def show_effect(
+    emit: Emit,
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="An effect, or path/to/file.py:ClassName.", show_default=False)
     ],
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Show an effect's formula, its parameters, the motion that reveals it, and effects it can be mistaken for."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.physics.effects.catalogue import show_effect as work
+    from ..pipeline.physics.effects.catalogue import show_effect as work
 
-        emit(work(name), _shown)
+    emit(work(name), _shown)
 
 
+@verb
 def new_effect(
+    emit: Emit,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The Python file to write.", show_default=False)],
     overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Write a template of a custom effect, which runs unchanged."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.physics.effects.catalogue import new_effect as work
+    from ..pipeline.physics.effects.catalogue import new_effect as work
 
-        emit(work(file, overwrite), _written)
+    emit(work(file, overwrite), _written)
 
 
 def _listed(found: EffectList) -> str:

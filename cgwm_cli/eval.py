@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .execution import running
-from .options import AcceptUnits, AnyDevice, Debug, Json, Quiet, TrustEffects, trust
+from .execution import Emit
+from .options import AcceptUnits, AnyDevice, TrustEffects, trust
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import ErrorSummary, EvalResult
 
 
+@verb
 def evaluate(
+    emit: Emit,
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
     target: Annotated[
         Path, typer.Argument(metavar="TARGET", help="A capture with tracks, or a dataset.", show_default=False)
@@ -26,19 +29,15 @@ def evaluate(
     device: AnyDevice = "auto",
     trust_effects: TrustEffects = "",
     accept_units: AcceptUnits = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Evaluate a model against measurements: open-loop errors of position, rotation and image."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        trust(trust_effects)
-        from ..pipeline.evaluate import evaluate as work
-        from ..schemas import UsageError
+    trust(trust_effects)
+    from ..pipeline.evaluate import evaluate as work
+    from ..schemas import UsageError
 
-        if not warmup_s > 0:
-            raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
-        emit(work(model, target, split, warmup_s, device, accept_units), _summary)
+    if not warmup_s > 0:
+        raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
+    emit(work(model, target, split, warmup_s, device, accept_units), _summary)
 
 
 def _summary(result: EvalResult) -> str:

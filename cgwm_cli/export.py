@@ -7,15 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .execution import running
-from .options import Debug, Json, Overwrite, Quiet, TrustEffects, trust
+from .execution import Emit
+from .options import Overwrite, TrustEffects, trust
 from .usage import refuse_foreign
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import ExportResult
 
 
+@verb
 def export(
+    emit: Emit,
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A dataset or a model.", show_default=False)],
     to: Annotated[
         Literal["lerobot", "bop", "nerfstudio", "mjcf", "ply", "colmap", "glb"],
@@ -86,23 +89,19 @@ def export(
     ] = None,
     overwrite: Overwrite = False,
     trust_effects: TrustEffects = "",
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Convert a dataset or a model to the format of another tool."""
     given = {"split": split, "cameras": cameras, "every": every, "task": task, "rollout": rollout, "mask": mask}
     given |= {"sh_degree": sh_degree, "capture": capture, "seed": seed, "duration_s": duration}
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        trust(trust_effects)
-        from ..pipeline.export import export as work
-        from ..pipeline.export.stage import OPTIONS, ExportOptions
+    trust(trust_effects)
+    from ..pipeline.export import export as work
+    from ..pipeline.export.stage import OPTIONS, ExportOptions
 
-        words = {name: value for name, value in given.items() if value is not None}
-        refuse_foreign(words, OPTIONS[to], f"--to {to}")
-        if cameras is not None:
-            words["cameras"] = tuple(name.strip() for name in cameras.split(","))
-        emit(work(thing, to, out, ExportOptions(**words), overwrite), _summary)
+    words = {name: value for name, value in given.items() if value is not None}
+    refuse_foreign(words, OPTIONS[to], f"--to {to}")
+    if cameras is not None:
+        words["cameras"] = tuple(name.strip() for name in cameras.split(","))
+    emit(work(thing, to, out, ExportOptions(**words), overwrite), _summary)
 
 
 def _summary(result: ExportResult) -> str:

@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .execution import running
-from .options import AcceptUnits, ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings, TrustEffects, trust
+from .execution import Emit
+from .options import AcceptUnits, ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects, trust
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import FittedParameter, ModelFile
 
 
+@verb
 def fit(
+    emit: Emit,
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="The capture's directory.", show_default=False)],
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="MODEL", help="The directory to write.", show_default=False)
@@ -74,31 +77,27 @@ def fit(
     set_: Settings = None,
     trust_effects: TrustEffects = "",
     accept_units: AcceptUnits = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Fit a world model to a capture: shape and appearance (sg-gs), then physics (phys-geo)."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        trust(trust_effects)
-        from ..pipeline.fit import fit_or_keep as work
-        from ..schemas import PhysConfig, SplatConfig
-        from .settings import StageSettings
+    trust(trust_effects)
+    from ..pipeline.fit import fit_or_keep as work
+    from ..schemas import PhysConfig, SplatConfig
+    from .settings import StageSettings
 
-        settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
-        looks = {
-            "spheres": spheres,
-            "joint": joint,
-            "exposure": exposure,
-            "refine_poses": refine_poses,
-            "collision": collision,
-        }
-        names = None if effects is None else [name.strip() for name in effects.split(",")]
-        motion = {"supervise": supervise, "effects": names}
-        splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
-        physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, **motion)
-        fitted, kept = work(capture, out, stage, parent, split, splats, physics, overwrite, resume, accept_units)
-        emit(fitted, lambda model: _summary(model, out, kept))
+    settings = StageSettings({"sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
+    looks = {
+        "spheres": spheres,
+        "joint": joint,
+        "exposure": exposure,
+        "refine_poses": refine_poses,
+        "collision": collision,
+    }
+    names = None if effects is None else [name.strip() for name in effects.split(",")]
+    motion = {"supervise": supervise, "effects": names}
+    splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device, **looks)
+    physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device, **motion)
+    fitted, kept = work(capture, out, stage, parent, split, splats, physics, overwrite, resume, accept_units)
+    emit(fitted, lambda model: _summary(model, out, kept))
 
 
 def _summary(model: ModelFile, out: Path, kept: bool = False) -> str:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .execution import running
-from .options import Debug, Json, Overwrite, Quiet
+from .execution import Emit
+from .options import Overwrite
 from .usage import refuse_foreign
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import ImportResult
@@ -29,7 +30,9 @@ _OPTIONS = {
 """Options that each format takes."""
 
 
+@verb
 def import_capture(
+    emit: Emit,
     format_: Annotated[
         Literal["contactnets", "pinwm", "jugglebot", "balldrops", "csv", "tum", "hdf5", "rosbag"],
         typer.Argument(
@@ -100,17 +103,13 @@ def import_capture(
         typer.Option("--topic", help="rosbag: topic of the poses; for transforms /tf:CHILD_FRAME.", show_default=False),
     ] = None,
     overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Convert recordings in another format to a capture."""
     given = {"train": train, "test": test, "seed": seed, "only": only, "columns": columns, "body": body, "up": up}
     given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic}
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        words = {name: value for name, value in given.items() if value is not None}
-        refuse_foreign(words, _OPTIONS[format_], format_, "omit it.")
-        emit(_imported(format_, source, out, words, overwrite), _summary)
+    words = {name: value for name, value in given.items() if value is not None}
+    refuse_foreign(words, _OPTIONS[format_], format_, "omit it.")
+    emit(_imported(format_, source, out, words, overwrite), _summary)
 
 
 def _imported(format_: str, source: Path, out: Path, given: dict[str, Any], overwrite: bool) -> ImportResult:

@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import running
-from .options import Debug, Json, Overwrite, Quiet
+from .execution import Emit
+from .options import Overwrite
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import MergeSummary
 
 
+@verb
 def merge(
+    emit: Emit,
     datasets: Annotated[
         list[Path],
         typer.Argument(
@@ -37,15 +40,11 @@ def merge(
         bool, typer.Option("--hashes/--sizes", help="Check every byte of the shards, or only their sizes.")
     ] = True,
     overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Join the shards of a dataset into one HDF5 file of virtual datasets; nothing is copied."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        from ..pipeline.synthesize import merge as work
+    from ..pipeline.synthesize import merge as work
 
-        emit(work(datasets, out, overwrite, hashes), _summary)
+    emit(work(datasets, out, overwrite, hashes), _summary)
 
 
 def _summary(summary: MergeSummary) -> str:

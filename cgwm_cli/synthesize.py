@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import running, typed
-from .options import ConfigFile, Debug, Device, Json, Overwrite, Quiet, Seed, Settings, TrustEffects, trust
+from .execution import Emit, typed
+from .options import ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects, trust
+from .verb import verb
 
 if TYPE_CHECKING:
     from ..schemas import DatasetSummary, ShardsSummary
 
 
+@verb
 def synthesize(
+    emit: Emit,
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="The model's directory.", show_default=False)],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DATASET", help="The directory to write.", show_default=False)
@@ -66,43 +69,39 @@ def synthesize(
     config: ConfigFile = None,
     set_: Settings = None,
     trust_effects: TrustEffects = "",
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Make labelled rollouts of a model, in HDF5: images, depth, masks, poses, contacts, parameters."""
-    with running(json=json, quiet=quiet, debug=debug) as emit:
-        trust(trust_effects)
-        from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
-        from .settings import StageSettings
+    trust(trust_effects)
+    from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
+    from .settings import StageSettings
 
-        _refuse_contradictions(shard, shards, ray, workers)
-        index, count = _shard(shard) if shard is not None else (None, shards)
-        settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
-            "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
-        )
-        if plan is not None:
-            if "plan" in settings.model_fields_set:
-                raise UsageError("--plan and synthesize.plan in the settings were given.", "one of the two.")
-            settings = settings.model_copy(update={"plan": read_plan(plan)})
-        if print_plan:
-            from ..pipeline.synthesize.job import resolved_plan
+    _refuse_contradictions(shard, shards, ray, workers)
+    index, count = _shard(shard) if shard is not None else (None, shards)
+    settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
+        "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
+    )
+    if plan is not None:
+        if "plan" in settings.model_fields_set:
+            raise UsageError("--plan and synthesize.plan in the settings were given.", "one of the two.")
+        settings = settings.model_copy(update={"plan": read_plan(plan)})
+    if print_plan:
+        from ..pipeline.synthesize.job import resolved_plan
 
-            emit(resolved_plan(model, settings.plan), plan_toml)
-        elif out is None:
-            raise UsageError("--out is missing.", todo="name the directory to write: --out DATASET.")
-        elif shards is None and ray is None and workers == 1:
-            from ..pipeline.synthesize import synthesize as work
+        emit(resolved_plan(model, settings.plan), plan_toml)
+    elif out is None:
+        raise UsageError("--out is missing.", todo="name the directory to write: --out DATASET.")
+    elif shards is None and ray is None and workers == 1:
+        from ..pipeline.synthesize import synthesize as work
 
-            done = work(model, out, settings, overwrite, resume, preview)
-            emit(done, lambda found: (_plan(found) if plan is not None else "") + _summary(found, settings.shards))
-        else:
-            from ..pipeline.synthesize.shards import default_shards, synthesize_shards
+        done = work(model, out, settings, overwrite, resume, preview)
+        emit(done, lambda found: (_plan(found) if plan is not None else "") + _summary(found, settings.shards))
+    else:
+        from ..pipeline.synthesize.shards import default_shards, synthesize_shards
 
-            if "shards" not in settings.model_fields_set:
-                settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
-            made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview, workers)
-            emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
+        if "shards" not in settings.model_fields_set:
+            settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
+        made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview, workers)
+        emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
 
 
 def _refuse_contradictions(shard: str | None, shards: int | None, ray: str | None, workers: int) -> None:
