@@ -7,6 +7,7 @@ not derivatives of the tracks, which are dominated by noise.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..segments.residual_wrench import ResidualWrenches
+from ..physics.effects.effect import Effect
+from ..segments.residual_wrench import TERMS, ResidualWrenches, unit_acceleration
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.experiment
@@ -126,29 +128,20 @@ def _along(values: Array, exponent: float) -> Array:
     return values * size ** (exponent - 1)
 
 
-def _axis(place: int) -> Callable[[ResidualWrenches], Array]:
-    """Return the builder of a constant acceleration along an axis of the world frame."""
-
-    def build(found: ResidualWrenches) -> Array:
-        column = np.zeros((len(found.wrench), 6))
-        column[:, place] = 1.0
-        return column
-
-    return build
+def _unit(kind: type[Effect], parameter: str) -> str:
+    """Return the unit of a parameter of an effect."""
+    return next(one.unit for one in kind.parameters if one.name == parameter)
 
 
 DICTIONARY: dict[str, tuple[Callable[[ResidualWrenches], Array], str]] = {
-    "-u": (lambda f: _linear(-f.velocity), "1/s"),
-    "-|u| u": (lambda f: _linear(-_along(f.velocity, 2)), "1/m"),
-    "omega x u": (lambda f: _linear(np.cross(f.omega, f.velocity)), "1"),
-    "x": (_axis(0), "m/s2"),
-    "y": (_axis(1), "m/s2"),
-    "z": (_axis(2), "m/s2"),
-    "-omega": (lambda f: _angular(-f.omega), "1/s"),
+    **{
+        name: (functools.partial(unit_acceleration, term=name), _unit(kind, parameter))
+        for name, (kind, parameter) in TERMS.items()
+    },
     "-|omega| omega": (lambda f: _angular(-_along(f.omega, 2)), "1/rad"),
 }
-"""Column builder and unit of each term: of the acceleration (x, y, z: constant along an axis of the world frame), and
-with omega alone of the angular acceleration."""
+"""Column builder and unit of each term: those of effects, and one that is none; of the acceleration, and with omega
+alone of the angular acceleration."""
 POWERS: dict[str, Callable[[ResidualWrenches, float], Array]] = {
     "-u": lambda f, p: _linear(-_along(f.velocity, p)),
     "-|u| u": lambda f, p: _linear(-_along(f.velocity, p)),

@@ -12,10 +12,14 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_rotate
 from ..optimization.uncertainty import chi2_tail
-from ..physics.effects.effect import ActiveEffect
-from ..physics.effects.residual_wrench import ResidualWrench
+from ..physics.effects.effect import ActiveEffect, BodyMotion, Effect
+from ..physics.effects.linear_drag import LinearDrag
+from ..physics.effects.magnus_lift import MagnusLift
+from ..physics.effects.quadratic_drag import QuadraticDrag
+from ..physics.effects.residual_wrench import AXES, ResidualWrench
+from ..physics.effects.spin_damping import SpinDamping
 from ..physics.parameters import effect_parameters
-from ..physics.world import World
+from ..physics.world import Body, World
 from ..trajectories.correlated_noise import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment
@@ -36,6 +40,18 @@ COORDINATES = ("time", "x", "y", "height", "heading", "speed", "spin", "episode"
 WEAK_STD = 1e4
 """Prior standard deviation of an acceleration [m/s2, rad/s2]: fixes those that were not measured (a centroid has no
 spin)."""
+
+TERMS: dict[str, tuple[type[Effect], str]] = {
+    "-u": (LinearDrag, "c"),
+    "-|u| u": (QuadraticDrag, "k"),
+    "omega x u": (MagnusLift, "s"),
+    "x": (ResidualWrench, AXES[0]),
+    "y": (ResidualWrench, AXES[1]),
+    "z": (ResidualWrench, AXES[2]),
+    "-omega": (SpinDamping, "d"),
+}
+"""Effect and parameter of terms of a wrench, each of which is proportional to its parameter; x, y, z: constant along an
+axis of the world frame."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,6 +126,35 @@ def residual_wrenches(segments: Segments) -> ResidualWrenches:
         velocity=velocity,
         omega=omega,
     )
+
+
+def unit_acceleration(found: ResidualWrenches, term: str) -> Array:
+    """Return the linear and angular acceleration (n, 6) of a term of `TERMS` whose parameter is 1.
+
+    The effect itself computes it, as the wrench on a body of unit mass and inertia.
+    """
+    kind, parameter = TERMS[term]
+    velocity, omega = torch.as_tensor(found.velocity).double(), torch.as_tensor(found.omega).double()
+    one, zero, unit = velocity.new_ones(1), velocity.new_zeros(1, 3), torch.eye(3).to(velocity)[None]
+    body = Body(
+        name="unit", motion="free", mass=one, inertia=unit, com=zero, centers=zero[:, None], radii=0 * one[:, None]
+    )
+    motion = BodyMotion(
+        body=body,
+        mass=one.expand(len(velocity)),
+        inertia=unit.expand(len(velocity), -1, -1),
+        com=zero.expand(len(velocity), -1),
+        rotation=unit.expand(len(velocity), -1, -1),
+        velocity=velocity,
+        omega=omega,
+        up=unit[:, 2],
+        normal=unit[:, 2],
+    )
+    active = ActiveEffect.of(kind(), {parameter: 1.0}, one)
+    wrench = active.effect.wrench(active.values, motion)
+    nothing = torch.zeros_like(velocity)
+    parts = (nothing if value is None else value.expand_as(nothing) for value in (wrench.force, wrench.torque))
+    return torch.cat(tuple(parts), 1).numpy()
 
 
 def wrench_windows(

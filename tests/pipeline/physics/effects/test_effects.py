@@ -18,7 +18,10 @@ from cgwm.pipeline.physics.effects import (
     load_effect,
 )
 from cgwm.pipeline.physics.effects.registry import BUILT_IN
+from cgwm.pipeline.physics.effects.residual_wrench import ResidualWrench
 from cgwm.pipeline.physics.engine import rollout as roll_out
+from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
+from cgwm.pipeline.runtime.kernel_build import compiler
 from cgwm.schemas import UsageError
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 
@@ -164,6 +167,28 @@ def test_every_effect_is_nothing_at_zero(name: str) -> None:
         with_it = observed(replace(world, effects=zero), state_of(row), times(0.06))
         torch.testing.assert_close(with_it.position_m, plain.position_m, atol=1e-13, rtol=0)
         torch.testing.assert_close(with_it.quat_wxyz, plain.quat_wxyz, atol=1e-13, rtol=0)
+
+
+@pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler to build the kernel")
+@pytest.mark.parametrize("name", [*BUILT_IN, ResidualWrench.name])
+def test_every_effect_is_the_same_in_the_kernel(name: str) -> None:
+    """The formula in torch and the kernel's text agree in flight, in a slide and in a graze, and both act."""
+    effect = ResidualWrench() if name == ResidualWrench.name else load_effect(name)
+    alike = "constant_force" if name == ResidualWrench.name else name
+    there = scenes(alike)
+    values = {p.name: torch.tensor(0.7 * p.scale / (1 + k), dtype=F64) for k, p in enumerate(effect.parameters)}
+    bare = replace(there.world, effects=company(alike, 1))
+    world = replace(bare, effects=(ActiveEffect.of(effect, values, batch(0.0)), *bare.effects))
+    assert lacking(world) is None, "the kernel must have every built-in effect"
+    expected, found, without = (
+        run(at, there.state, times(0.05), there.tracks)
+        for run, at in ((simulate, world), (simulate_on_host, world), (simulate, bare))
+    )
+    for key in ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s"):
+        torch.testing.assert_close(getattr(found, key), getattr(expected, key), rtol=1e-9, atol=1e-9)
+    acts = (found.velocity_m_s - without.velocity_m_s).abs().max() > 1e-7
+    acts |= (found.omega_body_rad_s - without.omega_body_rad_s).abs().max() > 1e-7
+    assert bool(acts) == any(effect.has(hook) for hook in ("world", "flow", "wrench", "contact"))
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
