@@ -1,9 +1,9 @@
-"""Choice between the fused kernel, on the GPU or the CPU, and the torch engine for a rollout."""
+"""Choice between the fused kernel, on the GPU or the CPU, and the torch engine; batches of rollouts."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 CPU_CONTACTS, CPU_ROLLOUTS, GPU_ROLLOUTS = 32_000, (160, 2048), 8192
 """Batch sizes: possible contacts on the CPU, minimum and maximum rollouts on the CPU, rollouts on a GPU."""
+LEAST_SAVED, LEAST_SHARE = 2000, 0.1
+"""Minimum number of frames that a further group saves, absolute and as a share of all: a rollout takes milliseconds to
+prepare, as long as a few thousand frames of the kernel."""
+_MOTION = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
 
 
 def rollout(
@@ -62,6 +66,56 @@ def rollouts_at_once(world: World) -> int:
         return GPU_ROLLOUTS
     contacts = sum(slot_count(world, pair) for pair in pairs_of(world))
     return min(max(CPU_CONTACTS // max(contacts, 1), CPU_ROLLOUTS[0]), CPU_ROLLOUTS[1])
+
+
+def length_groups(lengths: Sequence[int], repeats: int = 1) -> list[tuple[list[int], int]]:
+    """Return the items of each group, in their order, and the length of its longest item.
+
+    Args:
+        lengths: Number of frames of each item (B,).
+        repeats: How often each item is simulated.
+    """
+    return _split(sorted(range(len(lengths)), key=lambda item: lengths[item]), lengths, repeats)
+
+
+def _split(items: list[int], lengths: Sequence[int], repeats: int) -> list[tuple[list[int], int]]:
+    """Return groups of items that are sorted by length."""
+    longest = lengths[items[-1]]
+    saved = [(longest - lengths[items[k - 1]]) * k for k in range(1, len(items))]
+    best = max(saved, default=0)
+    if repeats * best < LEAST_SAVED or best < LEAST_SHARE * longest * len(items):
+        return [(sorted(items), longest)]
+    place = saved.index(best) + 1
+    return [*_split(items[:place], lengths, repeats), *_split(items[place:], lengths, repeats)]
+
+
+def ragged_rollout(
+    times_s: Tensor, lengths: Sequence[int], repeats: int, roll: Callable[[list[int], int], Rollout]
+) -> Rollout:
+    """Return the rollout of a batch whose items are simulated only up to their last frame, which they then keep.
+
+    Args:
+        times_s: Frame times, shape (repeats * B, T) [s].
+        lengths: Number of frames of each item (B,).
+        repeats: How often each item is in the batch, the whole items one after another.
+        roll: Simulates some items, each `repeats` times, for a number of frames.
+    """
+    groups = length_groups(lengths, repeats)
+    if len(groups) == 1:
+        return roll(list(range(len(lengths))), times_s.shape[-1])
+    parts = [roll(items, frames) for items, frames in groups]
+    back = torch.cat([torch.tensor(items) for items, _ in groups]).argsort()
+
+    def joined(name: str) -> Tensor:
+        padded = []
+        for part in parts:
+            values = getattr(part, name)
+            kept = values[:, -1:].expand(-1, times_s.shape[-1] - values.shape[1], -1, -1)
+            padded.append(torch.cat([values, kept], 1).unflatten(0, (repeats, -1)))
+        return torch.cat(padded, 1)[:, back].flatten(0, 1)
+
+    position, quat, velocity, omega = (joined(name) for name in _MOTION)
+    return Rollout(times_s=times_s, position_m=position, quat_wxyz=quat, velocity_m_s=velocity, omega_body_rad_s=omega)
 
 
 def lacking_derivatives(

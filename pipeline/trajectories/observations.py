@@ -68,6 +68,12 @@ class Observations:
         """Number of measured frames of each item (B,)."""
         return (self.seen.amax(-1) > 0).sum(-1)
 
+    @property
+    def ends(self) -> Tensor:
+        """Number of frames of each item up to its last measured one (B,), at least 2."""
+        measured = (self.seen.amax(-1) > 0) | (self.has_orientation.amax(-1) > 0)
+        return (measured * torch.arange(1, measured.shape[1] + 1)).amax(-1).clamp(min(2, measured.shape[1]))
+
     @staticmethod
     def of(world: World, episodes: Sequence[Episode], windows: Sequence[tuple[float, float]]) -> Observations:
         """Collect one window (start, end) [s] from each of the given episodes, which may repeat."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..optimization.forward_mode import batched_jacobian
+from ..physics.engine import ragged_rollout
 from ..physics.observation_model import measure
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
@@ -102,6 +103,16 @@ class TrajectoryResiduals:
 
     def _roll(self, inputs: Tensor, repeats: int) -> Rollout:
         """Return the rollout, as measured, of inputs (repeats * B, P + S): parameters, then state changes."""
+        every, seen = inputs.unflatten(0, (repeats, -1)), self.observations
+
+        def roll(items: list[int], frames: int) -> Rollout:
+            some = replace(self, observations=seen if len(items) == len(seen.names) else seen.select(items))
+            return some._roll_together(every[:, items].flatten(0, 1), repeats, frames)
+
+        return ragged_rollout(seen.times_s.repeat(repeats, 1), seen.ends.tolist(), repeats, roll)
+
+    def _roll_together(self, inputs: Tensor, repeats: int, frames: int) -> Rollout:
+        """Return the first frames of the rollout, as measured, of inputs (repeats * B, P + S)."""
         count = len(self.parameters)
         values = [p.decode(inputs[:, k]) for k, p in enumerate(self.parameters)]
         seen = self.observations
@@ -110,7 +121,7 @@ class TrajectoryResiduals:
             world = apply_parameters(world, self.parameters, torch.stack(values, -1))
         state = retract(seen.state.repeat(repeats), inputs[:, count:], seen.free)
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
-        return measure(world, state, seen.times_s.repeat(repeats, 1), drives)
+        return measure(world, state, seen.times_s[:, :frames].repeat(repeats, 1), drives)
 
     def _residuals(self, inputs: Tensor, repeats: int) -> Tensor:
         """Return the flat residuals (repeats * B, F * 6) of inputs (repeats * B, P + S)."""

@@ -20,9 +20,10 @@ from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...optimization.least_squares import Descent, Policy, descend
 from ...optimization.levenberg_marquardt import robust_loss
+from ...optimization.marginal_covariance import marginal_covariance
 from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
+from ...physics.engine import ragged_rollout, rollouts_at_once
 from ...physics.engine import rollout as rolled_out
-from ...physics.engine import rollouts_at_once
 from ...physics.observation_model import as_measured, true_times
 from ...physics.parameters import Parameter, apply_parameters
 from ...physics.rollout import Rollout
@@ -180,7 +181,7 @@ class Shooting:
     def _allowed(self, shared: Tensor, states: State) -> Tensor:
         """Return the standard deviations (B, S) of the difference of states where segments meet."""
         with torch.no_grad():
-            motion = self._motion(self._world(shared[None]), states, torch.zeros_like(self.tie), 1)
+            motion = self._motion(shared.expand(len(self.end), -1), states, torch.zeros_like(self.tie), 1)
         item, columns = torch.arange(len(self.end)), []
         duration = self.segments.times_s[item, self.end] - self.segments.times_s[:, 0]
         for index in self.segments.free:
@@ -201,7 +202,7 @@ class Shooting:
         misfit, chi2 = self._misfits(shared, states)
         shot = ShootingFit(
             shared=shared,
-            covariance=_marginal_covariance(end.information()[0], count),
+            covariance=marginal_covariance(end.information()[0], count),
             state=states.at(first),
             cost=float(end.cost[0]) if bool(end.cost[0].isfinite()) else math.inf,
             costs=end.costs,
@@ -231,7 +232,7 @@ class Shooting:
         """Return for each item residuals (6 nf T) in sigmas, then how its end differs from the next start (S)."""
         seen, free = self.segments, list(self.segments.free)
         world, times = self._world(shared), seen.times_s.repeat(repeats, 1)
-        motion = self._motion(world, states, changes, repeats)
+        motion = self._motion(shared, states, changes, repeats)
         poses = as_measured(world, motion, times)
         shift = poses.position_m[:, :, free] - seen.position_m.repeat(repeats, 1, 1, 1)
         measured = quat_conjugate(seen.quat_wxyz.repeat(repeats, 1, 1, 1))
@@ -247,12 +248,20 @@ class Shooting:
         values = [p.decode(shared[:, k]) for k, p in enumerate(self.parameters)]
         return apply_parameters(self.world, self.parameters, torch.stack(values, -1)) if values else self.world
 
-    def _motion(self, world: World, states: State, changes: Tensor, repeats: int) -> Rollout:
-        """Return the true motion of the segments in a world (K B) from changed states (K B, S)."""
-        seen, base = self.segments, states.repeat(repeats)
+    def _motion(self, shared: Tensor, states: State, changes: Tensor, repeats: int) -> Rollout:
+        """Return the true motion of the segments by parameters (K B, P) from changed states (K B, S)."""
+        seen = self.segments
+        every = retract(states.repeat(repeats), changes, list(seen.free))
         times = seen.times_s.repeat(repeats, 1)
-        drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
-        return rolled_out(world, retract(base, changes, list(seen.free)), true_times(world, times), drives)
+        number = torch.arange(len(times)).view(repeats, -1)
+
+        def roll(items: list[int], frames: int) -> Rollout:
+            rows = number[:, items].flatten()
+            world, some = self._world(shared[rows]), seen.select(items)
+            drives = {name: drive.repeat(repeats) for name, drive in some.drives.items()}
+            return rolled_out(world, every.at(rows), true_times(world, times[rows, :frames]), drives)
+
+        return ragged_rollout(times, (self.end + 1).tolist(), repeats, roll)
 
     def _gap(self, motion: Rollout, states: State, repeats: int) -> Tensor:
         """Return the difference of the end of each segment from the start of the next (K B, S)."""
@@ -380,16 +389,3 @@ def _losses(frames: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     loss, weight = robust_loss(frames.square().sum(-1), ROBUST_SCALE)
     tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * ROBUST_SCALE)
     return loss.sum() + tie_loss.sum(), weight, tie_weight
-
-
-def _marginal_covariance(information: Tensor, count: int) -> Tensor:
-    """Return the covariance (count, count) of the first parameters, all others free, from information (N, N).
-
-    It is the inverse of the Schur complement, at a tenth of the time of a pseudo-inverse, which is taken where the
-    information of the others is singular.
-    """
-    factor, singular = torch.linalg.cholesky_ex(information[count:, count:])
-    if bool(singular) or not bool(factor.isfinite().all()):
-        return torch.linalg.pinv(information, hermitian=True)[:count, :count]
-    shared = torch.linalg.solve_triangular(factor, information[count:, :count], upper=False)
-    return torch.linalg.pinv(information[:count, :count] - shared.T @ shared, hermitian=True)

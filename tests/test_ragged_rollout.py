@@ -1,0 +1,40 @@
+"""Rollouts of batches of different lengths: the same motion, and fewer frames."""
+
+from __future__ import annotations
+
+import torch
+from cgwm.pipeline.physics import Rollout, State, simulate
+from cgwm.pipeline.physics.engine import LEAST_SAVED, length_groups, ragged_rollout
+from worlds import F64, ball_body, state_of, world_of
+
+
+def test_items_of_one_length_stay_together() -> None:
+    assert length_groups([7, 7, 7], 10**6) == [([0, 1, 2], 7)]
+
+
+def test_groups_are_few_and_save_frames() -> None:
+    lengths = [5, 50, 5, 5, 49]
+    assert length_groups(lengths, 10**6) == [([0, 2, 3], 5), ([1, 4], 50)]
+    assert length_groups(lengths, LEAST_SAVED // 200) == [([0, 1, 2, 3, 4], 50)]  # it saves 135 frames a repeat
+
+
+def test_the_motion_is_the_same_up_to_each_end_and_then_keeps_its_last_frame() -> None:
+    world = world_of(ball_body(), step_s=0.01)
+    state = State.joined(*(state_of(((0, 0, 1 + 0.1 * k), (1, 0, 0, 0), (k, 0, 0), (0, k, 1))) for k in range(3)))
+    lengths, repeats = [3, 9, 4], 500
+    times = (torch.arange(9, dtype=F64) / 100).repeat(3, 1)
+    every, rolled = state.repeat(repeats), []
+
+    def roll(items: list[int], frames: int) -> Rollout:
+        rolled.append((items, frames))
+        rows = torch.arange(3 * repeats).view(repeats, 3)[:, items].flatten()
+        return simulate(world, every.at(rows), times.repeat(repeats, 1)[rows, :frames])
+
+    found = ragged_rollout(times.repeat(repeats, 1), lengths, repeats, roll)
+    whole = simulate(world, state, times)
+    assert rolled == [([0, 2], 4), ([1], 9)]
+    for name in ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s"):
+        values, expected = getattr(found, name).unflatten(0, (repeats, 3)), getattr(whole, name)
+        for item, end in ((0, 4), (1, 9), (2, 4)):
+            assert torch.equal(values[:, item, :end], expected[item, :end].expand(repeats, -1, -1, -1))
+            assert torch.equal(values[:, item, end:], values[:, item, end - 1 : end].expand(-1, 9 - end, -1, -1))
