@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from ...datasets.capture.cameras import require_metric
 from ...datasets.capture.capture import Capture
+from ...datasets.capture.video import video_info
 from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
 from ...schemas import (
@@ -124,9 +125,11 @@ def _fitted_motion(
 
 
 def _video_s(capture: Capture, episode: str) -> float:
-    """Return the duration of the longest video of an episode [s]; 0 without one."""
-    times = [capture.frame_times(camera, episode) for camera in capture.videos(episode)]
-    return max((float(time[-1] - time[0]) for time in times if len(time)), default=0.0)
+    """Return the duration of the longest video of an episode [s], by the headers, without decoding; 0 without one."""
+    rate_hz = capture.manifest.video.frame_rate_hz
+    counts = [video_info(capture.video_path(camera, episode)).frames for camera in capture.videos(episode)]
+    kept = zip(capture.videos(episode), counts, strict=True)
+    return max(((capture.frames_kept(camera, episode, count) - 1) / rate_hz for camera, count in kept), default=0.0)
 
 
 def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:
