@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from cgwm.pipeline.physics import Rollout, State, simulate
 from cgwm.pipeline.physics.engine import LEAST_SAVED, length_groups, ragged_rollout
-from worlds import F64, ball_body, state_of, world_of
+from helpers.worlds import F64, ball_body, state_of, world_of
 
 
 def test_items_of_one_length_stay_together() -> None:
