@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...schemas import InputDataError
 from .tracks import Track
@@ -14,6 +15,9 @@ MOST_TURN_RAD = 0.8 * np.pi
 the margin is for changes of the spin and for noise."""
 STEPS_IN_A_ROW = 3
 """Number of such rotations in a row that is refused; single ones are errors of the tracking."""
+ALIGNED = 0.7
+"""Smallest cosine between the axes of neighbouring rotations: those of a spin agree, up to their sense, while wrong
+orientations turn about any axis."""
 GAP = 1.5
 """Time between neighbouring frames, in units of its median, beyond which they are not neighbours."""
 
@@ -31,10 +35,14 @@ def require_told_spin(path: Path, body: str, track: Track) -> None:
     """
     if track.quat_wxyz is None or len(track) < STEPS_IN_A_ROW + 1:
         return
-    cosine = np.abs((track.quat_wxyz[:-1] * track.quat_wxyz[1:]).sum(1)).clip(0.0, 1.0)
-    turn, step = 2 * np.arccos(cosine), np.diff(track.time_s)
+    pose, step = Rotation.from_quat(track.quat_wxyz, scalar_first=True), np.diff(track.time_s)
+    turns = (pose[:-1].inv() * pose[1:]).as_rotvec()
+    turn = np.linalg.norm(turns, axis=1)
+    axes = turns / np.maximum(turn, 1e-12)[:, None]
     far = (turn > MOST_TURN_RAD) & (step <= GAP * np.median(step))
+    aligned = np.append(np.abs((axes[:-1] * axes[1:]).sum(1)) > ALIGNED, True)
     rows = np.lib.stride_tricks.sliding_window_view(far, STEPS_IN_A_ROW).all(1)
+    rows &= np.lib.stride_tricks.sliding_window_view(aligned, STEPS_IN_A_ROW)[:, :-1].all(1)
     if not rows.any():
         return
     first = int(rows.argmax())

@@ -81,6 +81,13 @@ def test_a_spin_that_cannot_be_told_is_refused_with_the_frame_rate_needed(
         require_told_spin(tmp_path / "a.csv", "cube", track)
 
 
+def test_orientations_that_are_wrong_are_no_spin() -> None:
+    _, track, _ = spun(1.1, 400)
+    quat = np.random.default_rng(0).standard_normal((400, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    require_told_spin(Path("a.csv"), "cube", replace(track, quat_wxyz=quat))
+
+
 def test_single_jumps_and_gaps_are_no_spin() -> None:
     _, track, _ = spun(1.1, 12)
     assert track.quat_wxyz is not None
