@@ -202,6 +202,11 @@ class State:
     omega_body_rad_s: Tensor
     """Angular velocities, body frame [rad/s], shape (B, nb, 3)."""
 
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The fields in their order, from which `State(*tensors)` is made again."""
+        return tuple(vars(self).values())
+
     def at(self, rows: Tensor | Sequence[int] | slice) -> State:
         """Return the state at some rows of the batch."""
         return State(*(getattr(self, field.name)[rows] for field in fields(self)))

@@ -14,9 +14,8 @@ from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import State, World
-from ..trajectories.residuals import state_prior
 from .candidates import base_values
-from .segment_states import best_of
+from .segment_states import best_of, normal_equations
 from .segments import Segments
 from .thresholds import SEGMENT_THRESHOLDS
 
@@ -93,7 +92,7 @@ def refit(
         relative=FALL_SHARE,
     )
     states = [part.observations.state for part in problem.parts]
-    point = Point(values=values[None], states=tuple(vars(State.joined(*states)).values()))
+    point = Point(values=values[None], states=State.joined(*states).tensors)
     end = descend(problem, point, policy)
     columns = None
     if parameters:
@@ -163,7 +162,7 @@ class _JointProblem(Problem):
             if part.kind == "contact":
                 after = best_of(part, [after.observations.state], self.parameters, values[0])
             states.append(after.observations.state)
-        return tuple(vars(State.joined(*states)).values())
+        return State.joined(*states).tensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,18 +194,6 @@ def projected(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) ->
     """Return the linearization from residuals (B, F, 6) and their Jacobian (B, F, 6, P + S), with P = count."""
     found = normal_equations(segments, rows, jacobian, count).eliminated()
     return Linear(information=found.information, score=found.score, chi2=rows.square().sum((1, 2)), dof=segments.dof)
-
-
-def normal_equations(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) -> NormalEquations:
-    """Return the normal equations of residuals (B, F, 6), with a weak prior on the states; costs are their chi2.
-
-    The Jacobian (B, F, 6, P + S) has P = count parameters. The chi2 of a diverged rollout is infinite, and its
-    equations are those of the finite part.
-    """
-    error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
-    flat = torch.nan_to_num(jacobian.flatten(1, 2), posinf=0.0, neginf=0.0)
-    chi2 = torch.nan_to_num(rows.square().sum((1, 2)), nan=torch.inf, posinf=torch.inf)
-    return NormalEquations.of_rows(error, flat, count, chi2, prior=state_prior(len(segments.observations.free)))
 
 
 def robust_excess(excess: Tensor) -> tuple[Tensor, Tensor]:

@@ -130,9 +130,7 @@ def _descended(
 ) -> tuple[Segments, Tensor]:
     """Return the segments with their states at a nearby minimum, and the costs (B,) there."""
     problem = _StateProblem(segments, parameters, values)
-    start = Point(
-        values=values.new_zeros(len(segments.items), 0), states=tuple(vars(segments.observations.state).values())
-    )
+    start = Point(values=values.new_zeros(len(segments.items), 0), states=segments.observations.state.tensors)
     policy = Policy(
         iterations=iterations,
         damping=1e-4,
@@ -162,7 +160,6 @@ class _StateProblem(Problem):
         self.segments, self.parameters, self.values = segments, parameters, values
         self.owner = torch.arange(count)
         self.box = Box.unbounded(values.new_zeros(count, 0))
-        self.prior = state_prior(len(segments.observations.free)).to(values)
 
     def _at(self, point: Point, rows: Rows) -> Segments:
         return self.segments.select(rows.items.tolist()).with_state(State(*point.states))
@@ -170,18 +167,26 @@ class _StateProblem(Problem):
     def linearised(self, point: Point, rows: Rows) -> NormalEquations:
         """Return the normal equations of the states; those of a diverged rollout are of its finite part."""
         values = self.values if self.values.ndim == 1 else self.values[rows.items]
-        found, jacobian = self._at(point, rows).residuals(self.parameters, values)
-        by_state = jacobian[..., len(self.parameters) :]
-        error, flat = (
-            torch.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (found.flatten(1), by_state.flatten(1, 2))
-        )
-        return NormalEquations.of_rows(error, flat, 0, _costs(found), prior=self.prior)
+        segments = self._at(point, rows)
+        error, jacobian = segments.residuals(self.parameters, values)
+        return normal_equations(segments, error, jacobian[..., len(self.parameters) :], 0)
 
     def moved(self, point: Point, values: Tensor, step: Tensor, rows: Rows) -> tuple[Tensor, ...]:
         """Return the states (b) moved by steps (b, S)."""
         del values, rows
-        state = retract(State(*point.states), step, self.segments.observations.free)
-        return tuple(vars(state).values())
+        return retract(State(*point.states), step, self.segments.observations.free).tensors
+
+
+def normal_equations(segments: Segments, rows: Tensor, jacobian: Tensor, count: int) -> NormalEquations:
+    """Return the normal equations of residuals (B, F, 6), with a weak prior on the states; costs are their chi2.
+
+    The Jacobian (B, F, 6, P + S) has P = count parameters. The chi2 of a diverged rollout is infinite, and its
+    equations are those of the finite part.
+    """
+    error = torch.nan_to_num(rows.flatten(1), posinf=0.0, neginf=0.0)
+    flat = torch.nan_to_num(jacobian.flatten(1, 2), posinf=0.0, neginf=0.0)
+    prior = state_prior(len(segments.observations.free))
+    return NormalEquations.of_rows(error, flat, count, _costs(rows), prior=prior)
 
 
 def _costs(rows: Tensor) -> Tensor:

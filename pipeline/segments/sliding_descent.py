@@ -82,8 +82,7 @@ def fit_groups(
         relative=FALL_SHARE,
         linearise_end=False,
     )
-    state = tuple(vars(segments.observations.state).values())
-    end = descend(problem, Point(values=problem.start, states=state), policy)
+    end = descend(problem, Point(values=problem.start, states=segments.observations.state.tensors), policy)
     return SlidingFit(
         segments.with_state(State(*end.point.states)),
         end.item_cost,
@@ -156,7 +155,7 @@ class _SlidingProblem(Problem):
         del values
         assert self.basis is not None  # a step follows a linearisation
         change = (self.basis[rows.items] @ step[..., None])[..., 0]
-        return tuple(vars(retract(State(*point.states), change, self.segments.observations.free)).values())
+        return retract(State(*point.states), change, self.segments.observations.free).tensors
 
 
 def information_by_segment(

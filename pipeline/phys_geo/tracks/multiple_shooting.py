@@ -376,7 +376,7 @@ class _TiedProblem(Problem):
 
 def _as_item(states: State) -> tuple[Tensor, ...]:
     """Return the states of all segments as the state of one item."""
-    return tuple(value[None] for value in vars(states).values())
+    return tuple(value[None] for value in states.tensors)
 
 
 def _from_item(states: tuple[Tensor, ...]) -> State:
