@@ -40,9 +40,8 @@ def require_told_spin(path: Path, body: str, track: Track) -> None:
     turn = np.linalg.norm(turns, axis=1)
     axes = turns / np.maximum(turn, 1e-12)[:, None]
     far = (turn > MOST_TURN_RAD) & (step <= GAP * np.median(step))
-    aligned = np.append(np.abs((axes[:-1] * axes[1:]).sum(1)) > ALIGNED, True)
-    rows = np.lib.stride_tricks.sliding_window_view(far, STEPS_IN_A_ROW).all(1)
-    rows &= np.lib.stride_tricks.sliding_window_view(aligned, STEPS_IN_A_ROW)[:, :-1].all(1)
+    pairs = far[:-1] & far[1:] & (np.abs((axes[:-1] * axes[1:]).sum(1)) > ALIGNED)
+    rows = np.lib.stride_tricks.sliding_window_view(pairs, STEPS_IN_A_ROW - 1).all(1)
     if not rows.any():
         return
     first = int(rows.argmax())

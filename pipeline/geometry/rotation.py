@@ -92,7 +92,9 @@ def quat_log(quat_wxyz: Tensor) -> Tensor:
     return factor * vector
 
 
-def continuous_turns(times_s: Tensor, quat_wxyz: Tensor, known: Tensor, reference: Tensor) -> Tensor:
+def continuous_turns(
+    times_s: Tensor, quat_wxyz: Tensor, known: Tensor | None = None, reference: Tensor | None = None
+) -> Tensor:
     """Return rotation vectors (..., T, 3) [rad] from one orientation of a motion to each, also beyond half a turn.
 
     The logarithm of a rotation is at most half a turn, so that a fast spin seems to slow down, stop and reverse. Turns
@@ -103,9 +105,11 @@ def continuous_turns(times_s: Tensor, quat_wxyz: Tensor, known: Tensor, referenc
     Args:
         times_s: Times of the frames, shape (..., T) [s].
         quat_wxyz: Orientations (body to world), shape (..., T, 4).
-        known: 1 where the orientation was measured, 0 elsewhere, shape (..., T).
-        reference: Index of the frame from which the rotations are, where it is known, shape (...).
+        known: 1 where the orientation was measured, 0 elsewhere, shape (..., T); everywhere by default.
+        reference: Index of the frame from which the rotations are, where it is known, shape (...); 0 by default.
     """
+    known = torch.ones_like(times_s) if known is None else known
+    reference = torch.zeros_like(times_s[..., 0], dtype=torch.long) if reference is None else reference
     both = known[..., 1:] * known[..., :-1]
     steps = quat_log(quat_multiply(quat_conjugate(quat_wxyz[..., :-1, :]), quat_wxyz[..., 1:, :])) * both[..., None]
     span = (times_s.diff(dim=-1) * both).sum(-1, keepdim=True).clamp_min(1e-12)

@@ -127,9 +127,11 @@ def _fitted_motion(
 def _video_s(capture: Capture, episode: str) -> float:
     """Return the duration of the longest video of an episode [s], by the headers, without decoding; 0 without one."""
     rate_hz = capture.manifest.video.frame_rate_hz
-    counts = [video_info(capture.video_path(camera, episode)).frames for camera in capture.videos(episode)]
-    kept = zip(capture.videos(episode), counts, strict=True)
-    return max(((capture.frames_kept(camera, episode, count) - 1) / rate_hz for camera, count in kept), default=0.0)
+    steps = [
+        capture.frames_kept(camera, episode, video_info(capture.video_path(camera, episode)).frames) - 1
+        for camera in capture.videos(episode)
+    ]
+    return max(steps, default=0) / rate_hz
 
 
 def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:

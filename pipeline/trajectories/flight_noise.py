@@ -202,9 +202,7 @@ def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind:
         values = _positions(whole, episode, column, frames)
     else:
         quat = whole.quat_wxyz[episode, frames, column]
-        times = whole.times_s[episode, frames]
-        middle = torch.tensor(len(quat) // 2)
-        values = continuous_turns(times, quat, torch.ones_like(times), middle).numpy()
+        values = continuous_turns(whole.times_s[episode, frames], quat, reference=torch.tensor(len(quat) // 2)).numpy()
     scaled = (t - t.mean()) / (t[-1] - t[0])
     q, _ = np.linalg.qr(np.vander(scaled, DEGREE + 1))
     left = 1 - (q * q).sum(1)

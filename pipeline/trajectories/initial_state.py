@@ -119,7 +119,7 @@ def _information(world: World, warm: Observations, noise: Noise) -> Tensor:
                 continue
             t = warm.times_s[item, at] - warm.times_s[item, 0]
             measured = warm.quat_wxyz[item, at, column]
-            turn = continuous_turns(t, measured, torch.ones_like(t), at.new_zeros(()))
+            turn = continuous_turns(t, measured)
             rows = torch.stack([warm.position_m[item, at, column] / noise.position_m, turn / noise.rotation_rad])
             lines = [straight_line(t, values) for values in rows]
             away = torch.stack([v - (a + t[:, None] * b) for v, (a, b) in zip(rows, lines, strict=True)])

@@ -205,7 +205,7 @@ def first_state(world: World, observations: Observations) -> State:
             position[item, body], velocity[item, body] = straight_line(t, observations.position_m[item, at, column])
             if bool(observations.has_orientation[item, at, column].all()):
                 measured = observations.quat_wxyz[item, at, column]
-                turn = continuous_turns(t, measured, torch.ones_like(t), at.new_zeros(()))
+                turn = continuous_turns(t, measured)
                 quat[item, body], omega[item, body] = measured[0], straight_line(t, turn)[1]
     return State(position, quat, velocity, omega)
 

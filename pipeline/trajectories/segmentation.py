@@ -162,7 +162,7 @@ def _turns(whole: Observations, item: Segment) -> Tensor:
     quat = whole.quat_wxyz[item.episode, frames].movedim(1, 0)
     known = whole.has_orientation[item.episode, frames].movedim(1, 0)
     times = whole.times_s[item.episode, frames].expand(len(quat), -1)
-    return continuous_turns(times, quat, known, torch.zeros(len(quat), dtype=torch.long)).movedim(0, 1)
+    return continuous_turns(times, quat, known).movedim(0, 1)
 
 
 def _stretches(times: Tensor) -> list[tuple[int, int]]:
