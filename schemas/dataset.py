@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import PurePosixPath, PureWindowsPath
+from pathlib import PureWindowsPath
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from .base import FileModel
 from .model import repeated
 from .plan import SamplingPlan
+from .regular_files import leads_outside
 
 DATASET_FORMAT = "cgwm-dataset/1"
 ROLLOUTS_FORMAT = "cgwm-rollouts/1"
@@ -17,9 +18,7 @@ Count = Annotated[int, Field(ge=0, le=10**15)]
 
 
 def _inside(path: str) -> str:
-    parts = PureWindowsPath(path).parts
-    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).anchor
-    if not parts or rooted or ".." in parts or not path.isprintable():
+    if not PureWindowsPath(path).parts or leads_outside(path) or not path.isprintable():
         raise ValueError("a path within the dataset is relative and has no '..'")
     return path
 

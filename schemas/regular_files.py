@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from .errors import InputDataError
 
@@ -52,6 +52,12 @@ def real_path(path: Path | str) -> Path:
     `Path.resolve` raises RuntimeError for such links, which are to be refused where the file is opened.
     """
     return Path(os.path.realpath(path))
+
+
+def leads_outside(name: str) -> bool:
+    """Return whether a path, of any system, is absolute or may lead out of the folder that it is looked up in."""
+    windows = PureWindowsPath(name)
+    return bool(windows.anchor) or PurePosixPath(name).is_absolute() or ".." in windows.parts
 
 
 def read_text_file(path: Path | str, encoding: str = "utf-8") -> str:

@@ -129,18 +129,16 @@ def _require_spheres(body: BodyModel, file: ModelFile, spheres: Splats | None, p
 
 def _require_size(body: BodyModel, spheres: Splats, path: Path) -> None:
     """Refuse moments of inertia that no body within the spheres has, and spheres far larger than the given shape."""
-    radii = np.asarray(spheres.scales, float) * body.radius_factor
-    reach = float((np.linalg.norm(np.asarray(spheres.means, float), axis=1) + radii).max())
+    reach = spheres.reach_m(body.radius_factor)
     if reach > LARGEST_BODY_M:
         raise InputDataError(
             f"{path}: the spheres of body '{body.name}' reach {reach:.3g} m from its origin.",
             f"at most {LARGEST_BODY_M:g} m.",
             "get the model again from where it came, or fit it again.",
         )
-    from_com = float((np.linalg.norm(np.asarray(spheres.means, float) - body.com_m, axis=1) + radii).max())
     xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
     greatest = float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
-    most = LARGEST * body.mass_kg * from_com**2
+    most = LARGEST * body.mass_kg * spheres.reach_m(body.radius_factor, body.com_m) ** 2
     if greatest > most:
         raise InputDataError(
             f"{path}: inertia_kg_m2 of body '{body.name}' has the moment {greatest:.3g} kg m2.",

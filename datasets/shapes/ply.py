@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -72,6 +73,11 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def reach_m(self, radius_factor: float, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> float:
+        """Return how far spheres with radii of so many standard deviations reach from a point of their frame [m]."""
+        distance = np.linalg.norm(np.asarray(self.means, float) - origin, axis=1)
+        return float((distance + np.asarray(self.scales, float) * radius_factor).max())
 
 
 def write_splats(

@@ -73,5 +73,4 @@ def _reach_m(model: Model, name: str) -> float:
     listed = next((body for body in model.file.bodies if body.name == name), None)
     if spheres is None or listed is None or not len(spheres):
         return float("inf")
-    radii = np.asarray(spheres.scales, float) * listed.radius_factor
-    return float((np.linalg.norm(np.asarray(spheres.means, float), axis=1) + radii).max())
+    return spheres.reach_m(listed.radius_factor)

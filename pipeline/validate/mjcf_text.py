@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import PurePosixPath, PureWindowsPath
 from xml.etree import ElementTree
+
+from ...schemas.regular_files import leads_outside
 
 MOST_CHARACTERS = 1 << 26
 """Longest text; that of a million spheres is about as long."""
@@ -59,14 +60,8 @@ class _Elements:
         if name.lower() == "include":
             raise _RefusedError("includes a file")
         for key, value in attributes.items():
-            if (key.startswith("file") or key.endswith(("file", "dir"))) and _leads_outside(value):
+            if (key.startswith("file") or key.endswith(("file", "dir"))) and (leads_outside(value) or "://" in value):
                 raise _RefusedError(f"names the file {value}, which lies outside")
 
     def close(self) -> None:
         """End the document."""
-
-
-def _leads_outside(name: str) -> bool:
-    """Return whether a file name, of any system, may lead out of the folder that it is looked up in."""
-    windows = PureWindowsPath(name)
-    return bool(windows.anchor or PurePosixPath(name).is_absolute() or ".." in windows.parts or "://" in name)
