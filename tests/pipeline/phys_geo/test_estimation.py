@@ -98,10 +98,11 @@ def test_search_gives_the_posterior_of_a_linear_model() -> None:
     def costs(z: np.ndarray) -> np.ndarray:
         return np.sqrt(0.04 + np.einsum("ki,ij,kj->k", z - centre, curvature, z - centre))[:, None]
 
-    prior = NormalPrior(np.zeros(2), np.array([1.0, 0.5]), np.array([[-9.0, 9.0]] * 2))
+    prior = NormalPrior(np.array([-0.6, 0.4]), np.array([1.0, 0.5]), np.array([[-9.0, 9.0]] * 2))
     found = importance_search(costs, prior, seed=1, population=400, generations=8, errors=3.0, floor=0.01)
     precision = 3.0 * curvature / found.lowest**2 + np.diag(1 / prior.std**2)
-    expected = np.linalg.solve(precision, 3.0 * curvature / found.lowest**2 @ centre)
+    pulls = 3.0 * curvature / found.lowest**2 @ centre + prior.mean / prior.std**2
+    expected = np.linalg.solve(precision, pulls)
     np.testing.assert_allclose(found.mean, expected, atol=0.03)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=0.15, atol=1e-3)
     assert found.effective_samples > 400
@@ -248,3 +249,22 @@ def test_no_restitution_above_one_is_held_possible() -> None:
     low, high = derived["restitution"].interval_95
     assert 0 < low < derived["restitution"].estimate < high == 1.0
     assert derived["stiffness_n_m"].interval_95[1] > derived["stiffness_n_m"].estimate
+
+
+def test_search_begins_at_the_sample_that_it_is_given_once() -> None:
+    """A narrow valley far out in the prior's tail is found because the first sample lies in it."""
+    drawn = []
+
+    def costs(z: np.ndarray) -> np.ndarray:
+        drawn.append(z.copy())
+        return np.abs(z - 4.0) + 0.01
+
+    prior = NormalPrior(np.array([1.0]), np.array([1.0]), np.array([[-6.0, 6.0]]))
+    found = importance_search(
+        costs, prior, seed=0, population=16, generations=3, errors=9.0, floor=0.01, first=np.array([4.0])
+    )
+    assert [bool((z == 4.0).any()) for z in drawn] == [True, False, False]
+    assert found.lowest == pytest.approx(0.01)
+    drawn.clear()
+    importance_search(costs, prior, seed=0, population=16, generations=1, errors=9.0, floor=0.01)
+    assert drawn[0][0, 0] == 1.0, "the prior's mean where none is given"

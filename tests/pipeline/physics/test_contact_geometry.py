@@ -1,0 +1,85 @@
+"""Geometry of contacts: tangents, slots of spheres, relative spin, depth, and states that are not finite."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from cgwm.pipeline.physics import simulate
+from cgwm.pipeline.physics.checks import overlaps
+from cgwm.pipeline.physics.contact_detection import Placed, all_body_points
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.impulse_solver import tangent_axes
+from cgwm.pipeline.physics.rollout import require_finite
+from cgwm.pipeline.physics.rollout_cost import rollout_seconds
+from cgwm.pipeline.physics.world import Body
+from cgwm.schemas import NotConvergedError
+from helpers.worlds import F64, ball_body, law, state_of, times, world_of
+
+UP = (1.0, 0.0, 0.0, 0.0)
+
+
+def test_tangents_are_a_right_handed_frame_on_both_hemispheres() -> None:
+    normal = torch.randn(200, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+    normal = torch.cat([normal, torch.eye(3, dtype=F64), -torch.eye(3, dtype=F64)])
+    normal = normal / normal.norm(dim=-1, keepdim=True)
+    axes = tangent_axes(normal)
+    torch.testing.assert_close(axes @ axes.mT, torch.eye(3, dtype=F64).expand_as(axes), atol=1e-12, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(len(axes), dtype=F64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(axes[:, 0], normal)
+
+
+def _at(body: Body, place: tuple[float, float, float]) -> Placed:
+    zero = torch.zeros(1, 3, dtype=F64)
+    eye = torch.eye(3, dtype=F64)[None]
+    return Placed(body=body, reference=torch.tensor([place], dtype=F64), rotation=eye, velocity=zero, omega=zero)
+
+
+def test_slots_of_two_bodies_are_their_spheres_in_order() -> None:
+    one, two = ball_body(0.04, name="one"), ball_body(0.03, name="two", copies=2)
+    points = all_body_points(_at(one, (0, 0, 0)), _at(two, (0.1, 0, 0)))
+    assert points.slot.tolist() == [[0, 1, 2]]
+    torch.testing.assert_close(points.gap, torch.full((1, 3), 0.03, dtype=F64), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("omega", "slows"), [((4.0, 4.0), False), ((4.0, -4.0), True)])
+def test_torsional_friction_between_bodies_acts_on_their_relative_spin(omega: tuple[float, float], slows: bool) -> None:
+    """Two balls pressed together along x: spinning alike they feel nothing, against each other they slow down."""
+    world = world_of(
+        ball_body(0.04, name="one"), ball_body(0.04, name="two"), contact=law(0.0), ground=False, gravity=0.0
+    )
+    world = replace(world, effects=(ActiveEffect.of(load_effect("torsional_friction"), {"c_t": 4e-3}),))
+    start = state_of(
+        ((-0.0399, 0, 0), UP, (0.3, 0, 0), (omega[0], 0, 0)), ((0.0399, 0, 0), UP, (-0.3, 0, 0), (omega[1], 0, 0))
+    )
+    after = simulate(world, start, times(0.02)).omega_body_rad_s[0, -1, :, 0]
+    change = after - torch.tensor(omega, dtype=F64)
+    if slows:
+        assert float(change[0]) < -0.1 and float(change[0]) == pytest.approx(-float(change[1]), rel=1e-6)
+    else:
+        torch.testing.assert_close(change, torch.zeros(2, dtype=F64), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize(("height", "depth"), [(0.05, 0.0), (0.033, 0.007)])
+def test_depth_in_the_ground_is_that_of_the_lowest_point(height: float, depth: float) -> None:
+    (found,) = overlaps(world_of(ball_body(0.04)), state_of(((0, 0, height), UP, (0, 0, 0), (0, 0, 0))))
+    assert float(found.depth_m) == pytest.approx(depth, abs=1e-12)
+    assert float(found.size_m) == pytest.approx(0.04)
+
+
+def test_a_state_that_is_not_finite_is_told_with_its_environment_and_frames_behind_the_end_do_not_count() -> None:
+    world = world_of(ball_body(0.04))
+    start = state_of(((0, 0, 0.5), UP, (0, 0, 0), (0, 0, 0)), count=2)
+    rolled = simulate(world, start, times(0.05))
+    position = rolled.position_m.clone()
+    position[1, 3, 0, 2] = math.nan
+    broken = replace(rolled, position_m=position)
+    require_finite(broken, world, start, frames=(6, 3))
+    with pytest.raises(NotConvergedError, match="second"):
+        require_finite(broken, world, start, names=("first", "second"), frames=(6, 4))
+
+
+def test_more_bodies_cost_more() -> None:
+    one = rollout_seconds(world_of(ball_body(0.04)), 10, 1.0)
+    two = rollout_seconds(world_of(ball_body(0.04), ball_body(0.04, name="two")), 10, 1.0)
+    assert 0 < one < two and rollout_seconds(world_of(ball_body(0.04)), 20, 1.0) == pytest.approx(2 * one, rel=0.2)

@@ -1,0 +1,80 @@
+"""Segments: their degrees of freedom, states of straight lines, and what a linearization weighs."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
+from cgwm.pipeline.segments.segments import Segments
+from cgwm.pipeline.trajectories.observations import Observations
+from cgwm.pipeline.trajectories.segmentation import Segment
+from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers.worlds import F64, ball_body, world_of
+
+BEGIN_S, RATE_HZ, FRAMES = 7.0, 100.0, 12
+VELOCITY, SPIN = np.array([0.8, -0.3, 1.2]), np.array([0.0, 0.0, 9.0])
+
+
+def _flight(turned: bool = True, flat: bool = False) -> Segments:
+    """A ball in free fall whose clock begins at 7 s, exactly measured."""
+    t = np.arange(FRAMES) / RATE_HZ
+    position = np.array([0.1, 0.2, 1.5]) + t[:, None] * VELOCITY
+    position[:, 2] -= 0.5 * 9.81 * t**2
+    if flat:
+        position[:, 1] = 0.2
+    half = 0.5 * SPIN[2] * t
+    quat = np.stack([np.cos(half), 0 * t, 0 * t, np.sin(half)], -1) if turned else None
+    episodes = [("one", {"ball": Track(BEGIN_S + t, position, quat)})]
+    world = world_of(ball_body(), ground=False)
+    whole = Observations.of(world, episodes, [(BEGIN_S, math.inf)])
+    return Segments.of("flight", world, whole, [Segment(0, 2, FRAMES - 1)], Noise(1e-3, 1e-2))
+
+
+def test_states_are_those_of_the_first_frame_whatever_the_clock() -> None:
+    state, t = _flight().observations.state, 2 / RATE_HZ
+    expected = np.array([0.1, 0.2, 1.5]) + t * VELOCITY - [0, 0, 0.5 * 9.81 * t**2]
+    np.testing.assert_allclose(state.position_m[0, 0], expected, atol=1e-9)
+    np.testing.assert_allclose(state.velocity_m_s[0, 0], VELOCITY - [0, 0, 9.81 * t], atol=1e-7)
+    np.testing.assert_allclose(state.omega_body_rad_s[0, 0], SPIN, atol=1e-7)
+
+
+@pytest.mark.parametrize(("turned", "flat", "expected"), [(True, False, 48), (False, False, 24), (False, True, 16)])
+def test_degrees_of_freedom_are_measured_coordinates_less_those_of_the_state(
+    turned: bool, flat: bool, expected: float
+) -> None:
+    """Ten frames of three coordinates less two each; a coordinate that never changes was not measured."""
+    assert float(_flight(turned, flat).dof) == expected
+
+
+def test_an_excess_weighs_like_the_slope_of_its_loss() -> None:
+    excess = torch.tensor([-5.0, 0.0, 3.0, 400.0], dtype=F64, requires_grad=True)
+    loss, weight = robust_excess(excess)
+    (slope,) = torch.autograd.grad(loss.sum(), excess)
+    torch.testing.assert_close(slope[[0, 2, 3]], weight[[0, 2, 3]])
+    linear = Linear(
+        information=torch.zeros(2, 1, 1),
+        score=torch.zeros(2, 1),
+        chi2=torch.tensor([10.0, 90.0]),
+        dof=torch.tensor([10.0, 10.0]),
+    )
+    assert float(linear.weight[0]) == 1.0 and float(linear.weight[1]) == float(robust_excess(torch.tensor(80.0))[1])
+
+
+@pytest.mark.parametrize(("logarithmic", "error"), [(True, 0.2), (False, 0.1)])
+def test_the_error_of_a_logarithm_is_that_of_the_number_times_it(logarithmic: bool, error: float) -> None:
+    one = Parameter(
+        name="c", unit="1", bounds=(0.1, 10.0), logarithmic=logarithmic, reveals="sliding", prior=(1.0, 1.0)
+    )
+    fit = Refit(
+        world=world_of(ball_body()),
+        parameters=(one,),
+        values=torch.tensor([one.encode(2.0)], dtype=F64),
+        covariance=torch.tensor([[0.01]], dtype=F64),
+        segments=(),
+        cost=0.0,
+        by_segment=(),
+    )
+    assert fit.number("c") == pytest.approx((2.0, error))
