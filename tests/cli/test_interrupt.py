@@ -1,6 +1,5 @@
 """A command that is interrupted, or killed outright, leaves nothing under its final name and can be run again."""
 
-import os
 import random
 import signal
 import subprocess
@@ -16,9 +15,11 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.cli import main
+from cgwm.datasets import import_contactnets
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Provenance
+from helpers.forked import Forked, forked
 
 Case = tuple[list[str], Path]
 
@@ -48,7 +49,7 @@ def tosses(path: Path, count: int = 300) -> Path:
 def import_case(folder: Path) -> Case:
     out = folder / "capture"
     # many, so that a slow machine still sends the signal while they are written
-    return ["import", "contactnets", str(tosses(folder / "source", 3000)), "--out", str(out)], out
+    return ["import", "contactnets", str(tosses(folder / "source", 1500)), "--out", str(out)], out
 
 
 def demo_case(folder: Path) -> Case:
@@ -70,7 +71,7 @@ def calibrate_case(folder: Path) -> Case:
 def fit_case(folder: Path) -> Case:
     capture, out = folder / "capture", folder / "model"
     source = tosses(folder / "source", 60)
-    subprocess.run([*CGWM, "import", "contactnets", str(source), "--out", str(capture)], check=True, timeout=120)
+    import_contactnets(source, capture)
     # so long that a fast machine, too, is still at it when the signal comes
     return ["fit", str(capture), "--out", str(out), "--set", "phys-geo.generations=400"], out
 
@@ -91,16 +92,8 @@ def synthesize_case(folder: Path) -> Case:
     return ["synthesize", str(folder / "model"), "--out", str(out), "--rollouts", "500"], out
 
 
-CGWM = [sys.executable, "-m", "cgwm"]
-# A parent in the background may have had SIGINT ignored, which a child inherits.
-CGWM_INTERRUPTIBLE = [
-    sys.executable,
-    "-c",
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from cgwm.cli import main; main()",
-]
 WRITE_EARLY = ("demo", "synthesize", "import")
-"""What makes its temporary output at once: on a slow machine too it is interrupted while it works, not while it loads
-packages, where an interrupt can get lost."""
+"""What makes its temporary output at once: on a slow machine too it is interrupted while it writes."""
 CASES: dict[str, Callable[[Path], Case]] = {
     "demo": demo_case,
     "calibrate": calibrate_case,
@@ -133,7 +126,7 @@ def started(command: list[str], **options: object) -> Iterator[subprocess.Popen[
             process.kill()
 
 
-def at_work(process: subprocess.Popen[bytes], out: Path, seconds: float) -> bool:
+def at_work(process: Forked, out: Path, seconds: float) -> bool:
     """Wait until the command writes (its temporary output is there), or for so long."""
     end = time.monotonic() + seconds
     while time.monotonic() < end and not partial(out):
@@ -149,20 +142,18 @@ def test_an_interrupted_command_leaves_nothing(verb: str, number: signal.Signals
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     before = set(tmp_path.rglob("*"))
-    environment = os.environ | {"TMPDIR": str(scratch)}
-    command = [*CGWM_INTERRUPTIBLE, *arguments]
-    with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
-        assert at_work(process, out, 30.0 if verb in WRITE_EARLY else 4.0), process.communicate()[1].decode()
+    with Forked(*arguments, environment={"TMPDIR": str(scratch)}) as process:
+        assert at_work(process, out, 30.0 if verb in WRITE_EARLY else 1.0), process.printed()
         process.send_signal(number)
-        printed, said = process.communicate(timeout=60)
+        ended = process.ended(60)
     assert not out.exists()
-    assert printed == b""
+    assert ended.stdout == ""
     if number == signal.SIGKILL:
-        assert process.returncode == -signal.SIGKILL
+        assert ended.returncode == -signal.SIGKILL
         assert set(tmp_path.iterdir()) - before == set(partial(out))  # nothing but what is plainly unfinished
     else:
-        assert process.returncode == 130
-        assert said.decode() == "Interrupted; no output was written.\n"
+        assert ended.returncode == 130
+        assert ended.stderr == "Interrupted; no output was written.\n"
         assert set(tmp_path.rglob("*")) == before
 
 
@@ -302,10 +293,11 @@ def test_two_hundred_signals_at_random_moments(arguments: list[str]) -> None:
 
 def test_a_killed_command_can_be_run_again(tmp_path: Path) -> None:
     arguments, out = import_case(tmp_path)
-    with started([*CGWM, *arguments]) as process:
+    with Forked(*arguments) as process:
         assert at_work(process, out, 30.0)
         process.kill()
+        process.wait()
     assert len(partial(out)) == 1
-    subprocess.run([*CGWM, *arguments], check=True, capture_output=True, timeout=240)
+    assert forked(*arguments).returncode == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "source"]
     assert (out / "capture.toml").is_file()

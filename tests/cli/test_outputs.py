@@ -1,9 +1,8 @@
 """`--overwrite` replaces an output of cgwm of the same kind, and never an input or anything else of the user's."""
 
 import hashlib
+import multiprocessing
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from cgwm.pipeline.physics.effects.catalogue import new_effect
 from cgwm.pipeline.synthesize import merge, synthesize
 from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.schemas import CgwmError, SynthesizeConfig, UsageError
+from helpers.forked import Forked
 from helpers.small_model import small_model
 
 TINY = SynthesizeConfig(rollouts=2, duration_s=0.1, width=20, height=16)
@@ -146,9 +146,6 @@ def test_cameras_of_ones_own_in_an_imported_capture_stay(things: Path) -> None:
     assert not (capture / "cameras.json").exists()
 
 
-IMPORT = "import sys; from cgwm.cli import main; sys.stdin.readline(); main()"
-
-
 def test_two_commands_that_write_one_output_at_once_do_not_mix_it(things: Path) -> None:
     other = things / "other"
     other.mkdir()
@@ -160,25 +157,13 @@ def test_two_commands_that_write_one_output_at_once_do_not_mix_it(things: Path) 
         want[source] = content(things / f"by_{source}")
     for number, overwrite in enumerate(([], ["--overwrite"], ["--overwrite"])):
         out = things / f"out{number // 2}"
-        command = [sys.executable, "-c", IMPORT, "import", "csv"]
-        both = {
-            source: subprocess.Popen(
-                [*command, str(things / source), "--out", str(out), *overwrite],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-            for source in ("csv", "other")
-        }
-        for process in both.values():
-            assert process.stdin is not None
-            process.stdin.write("go\n")
-            process.stdin.flush()
-        ended = {source: (process.communicate(timeout=60)[1], process.returncode) for source, process in both.items()}
-        codes = {source: code for source, (_, code) in ended.items()}
+        words = [("import", "csv", things / source, "--out", out, *overwrite) for source in ("csv", "other")]
+        start = multiprocessing.get_context("fork").Barrier(2)
+        with Forked(*words[0], before=start.wait) as one, Forked(*words[1], before=start.wait) as two:
+            ended = {"csv": one.ended(60), "other": two.ended(60)}
+        codes = {source: one.returncode for source, one in ended.items()}
         assert set(codes.values()) <= {0, 1, 2} and 0 in codes.values(), ended
-        assert all("Internal error" not in said and "Traceback" not in said for said, _ in ended.values())
+        assert all("Internal error" not in one.stderr and "Traceback" not in one.stderr for one in ended.values())
         assert content(out) in [want[source] for source, code in codes.items() if code == 0]
         assert not list(things.glob(".*partial*")) + list(things.glob(".*replaced*"))
 

@@ -15,11 +15,15 @@ from cgwm.pipeline.runtime import kernel_build
 from cgwm.pipeline.synthesize import simulator as batches
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.pipeline.synthesize.simulator import joined_worlds
-from cgwm.schemas import SynthesizeConfig
+from cgwm.schemas import SamplingPlan, SynthesizeConfig
 from helpers import fused_host
 from helpers.small_model import MASS, small_model, write_small_model
 
-CONFIG = SynthesizeConfig(rollouts=9, duration_s=0.2, width=48, height=32, device="cpu", seed=5)
+CONFIG = SynthesizeConfig(
+    rollouts=9, duration_s=0.2, width=48, height=32, device="cpu", seed=5, plan=SamplingPlan(views=1)
+)
+FEW_FRAMES = CONFIG.model_copy(update={"frame_rate_hz": 10.0})
+"""Of the same motions: each image takes longer than the steps between two."""
 CUDA = torch.cuda.is_available() and kernel_build.available()
 NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
@@ -33,7 +37,7 @@ def hashes(model: Path, folder: Path, config: SynthesizeConfig) -> set[str]:
 
 
 def test_the_batch_changes_no_byte(tmp_path: Path) -> None:
-    assert len(hashes(write_small_model(tmp_path / "model"), tmp_path, CONFIG)) == 1
+    assert len(hashes(write_small_model(tmp_path / "model"), tmp_path, FEW_FRAMES)) == 1
 
 
 @NEEDS_COMPILER
@@ -57,10 +61,10 @@ def test_the_batch_changes_no_byte_in_the_kernel(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(batches.Simulator, "__init__", together)
     model = write_small_model(tmp_path / "model", driven=driven)
-    assert len(hashes(model, tmp_path, CONFIG)) == 1
+    assert len(hashes(model, tmp_path, FEW_FRAMES)) == 1
     assert set(calls) == {4} and len(calls) == 9 + (2 + 1) + 3
     monkeypatch.undo()
-    alone = synthesize(model, tmp_path / "torch", CONFIG)
+    alone = synthesize(model, tmp_path / "torch", FEW_FRAMES)
     one, other = RolloutReader(tmp_path / "torch" / alone.shard), RolloutReader(tmp_path / "8" / alone.shard)
     for number in range(9):  # the same motions as the torch engine's, to rounding
         np.testing.assert_allclose(one.read(number, "bodies/pos"), other.read(number, "bodies/pos"), atol=1e-7)
@@ -117,7 +121,7 @@ def test_worlds_are_joined_by_their_numbers() -> None:
 
 def test_one_that_diverges_is_drawn_again_and_takes_none_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = write_small_model(tmp_path / "model")
-    synthesize(model, tmp_path / "whole", CONFIG)
+    synthesize(model, tmp_path / "whole", FEW_FRAMES)
     simulate, calls = batches.roll_out, []
 
     def diverge(*arguments: object, **options: object) -> object:
@@ -126,7 +130,7 @@ def test_one_that_diverges_is_drawn_again_and_takes_none_along(tmp_path: Path, m
         return replace(rollout, position_m=rollout.position_m * torch.nan) if calls[-1] == 3 else rollout
 
     monkeypatch.setattr(batches, "roll_out", diverge)
-    summary = synthesize(model, tmp_path / "out", CONFIG)
+    summary = synthesize(model, tmp_path / "out", FEW_FRAMES)
     (note,) = (note for note in summary.notes if "drawn again" in note)
     assert "drawn again: rollout 3 (seed 5) diverged by step 0" in note
     assert summary.rollouts == 9 and summary.rejected == {"diverged": 1}

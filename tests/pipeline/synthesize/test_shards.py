@@ -9,7 +9,6 @@ import resource
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -31,12 +30,17 @@ from cgwm.schemas import (
     InputDataError,
     NotConvergedError,
     NotEnoughSpaceError,
+    SamplingPlan,
     SynthesizeConfig,
     UsageError,
 )
+from helpers.commands import Ended
+from helpers.forked import Forked, forked
 from helpers.small_model import write_small_model
 
-CONFIG = SynthesizeConfig(rollouts=5, duration_s=0.3, width=32, height=24, device="cpu", seed=3, shards=3)
+CONFIG = SynthesizeConfig(
+    rollouts=5, duration_s=0.3, width=32, height=24, device="cpu", seed=3, shards=3, plan=SamplingPlan(views=1)
+)
 
 
 def shard(number: int, **changes: object) -> SynthesizeConfig:
@@ -183,8 +187,8 @@ def test_resume_of_one_shard_and_of_none(model: Path, whole: Path, tmp_path: Pat
     assert synthesize(model, whole, shard(0, shards=1), resume=True).up_to_date
     assert sha256(whole) == before
     assert not synthesize(model, tmp_path / "out", shard(0), resume=True).up_to_date
-    with pytest.raises(UsageError, match=r"another dataset: its config.plan.views is 2, here 1\."):
-        plan = CONFIG.plan.model_copy(update={"views": 1})
+    with pytest.raises(UsageError, match=r"another dataset: its config.plan.views is 1, here 2\."):
+        plan = CONFIG.plan.model_copy(update={"views": 2})
         synthesize(model, tmp_path / "out", shard(1, plan=plan), resume=True)
 
 
@@ -196,8 +200,7 @@ def test_other_versions_are_refused(model: Path, parts: Path) -> None:
         synthesize(model, parts, shard(0), overwrite=True)
 
 
-@pytest.mark.parametrize("split", ["train", "valid"])
-def test_the_index_reads_as_one_file(whole: Path, parts: Path, split: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_index_reads_as_one_file(whole: Path, parts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(parts.parent.parent)
     summary = merge([parts])
     assert summary.shards == 3 and summary.rollouts == 5 and summary.index == str(parts / INDEX)
@@ -205,13 +208,15 @@ def test_the_index_reads_as_one_file(whole: Path, parts: Path, split: str, monke
     with h5py.File(parts / INDEX) as index, h5py.File(whole / shard_name(0, 1)) as single:
         assert dict(index["data"].attrs) == dict(single["data"].attrs)
         assert {**index.attrs, "config_json": ""} == {**single.attrs, "config_json": ""}  # which has shards = 1
-        np.testing.assert_array_equal(index["mask"][split], single["mask"][split])
+        for split in ("train", "valid"):
+            np.testing.assert_array_equal(index["mask"][split], single["mask"][split])
         assert index["data/demo_3/obs/view0_image"].is_virtual
     for joined, alone in zip(RolloutDataset(parts / INDEX, 4), RolloutDataset(whole, 4), strict=True):
         assert joined.keys() == alone.keys()
         for key, value in alone.items():
             np.testing.assert_array_equal(joined[key], value)
-    assert len(RolloutReader(parts / INDEX, split)) == len(RolloutReader(whole, split))
+    for split in ("train", "valid"):
+        assert len(RolloutReader(parts / INDEX, split)) == len(RolloutReader(whole, split))
     assert check_hashes(parts, read_manifest(parts)) == []
 
 
@@ -394,19 +399,9 @@ def small_limit() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 
 
-_SYNTHESIZE = """
-import signal; signal.signal(signal.SIGINT, signal.default_int_handler)
-from cgwm.cli import main; main()
-"""
-
-
-def command(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-c", _SYNTHESIZE, *map(str, arguments)]
-    return subprocess.run(words, capture_output=True, text=True, timeout=240, check=False, **options)
-
-
 def options_of(config: SynthesizeConfig) -> list[str]:
     sizes = {"duration_s": config.duration_s, "width": config.width, "height": config.height}
+    sizes["plan.views"] = config.plan.views
     pairs = [f"--set=synthesize.{name}={value}" for name, value in sizes.items()]
     return [f"--rollouts={config.rollouts}", f"--seed={config.seed}", "--device=cpu", "--no-preview", *pairs]
 
@@ -416,7 +411,8 @@ def test_a_full_disk_is_named_and_what_was_complete_stays(model: Path, parts: Pa
     (parts / shard_name(1, 3)).with_suffix(".json").unlink()
     before = sha256(parts)
     words = ["synthesize", model, "--out", parts, "--shard=1/3", *options_of(CONFIG)]
-    done = command(*words, preexec_fn=small_limit)
+    with Forked(*words, before=small_limit) as process:
+        done = process.ended()
     assert done.stderr == (
         f"{parts}: no room for rollouts-0001-of-0003.h5: File too large. What was unfinished is removed.\n"
         "Allowed: what df, quota and ulimit -f leave.\n"
@@ -443,22 +439,15 @@ def test_a_disk_that_is_full_at_the_end_is_no_complete_shard(
     assert list(tmp_path.iterdir()) == []
 
 
-def interrupted(model: Path, out: Path, number: signal.Signals) -> subprocess.CompletedProcess[str]:
+def interrupted(model: Path, out: Path, number: signal.Signals) -> Ended:
     """Make all shards in a process of its own, and send it a signal while it writes the second."""
-    words = ["synthesize", model, "--out", out, "--shards=3", *options_of(CONFIG)]
-    process = subprocess.Popen(
-        [sys.executable, "-c", _SYNTHESIZE, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    try:
+    with Forked("synthesize", model, "--out", out, "--shards=3", *options_of(CONFIG)) as process:
         end = time.monotonic() + 120
         while not list(out.parent.glob(f".{out.name}.{shard_name(1, 3)}.partial-*")):
-            assert process.poll() is None and time.monotonic() < end, process.communicate()
+            assert process.poll() is None and time.monotonic() < end, process.printed()
             time.sleep(0.002)
         process.send_signal(number)
-        printed, said = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    return subprocess.CompletedProcess(words, process.returncode, printed, said)
+        return process.ended(60)
 
 
 def test_an_interrupt_leaves_the_complete_shards(model: Path, made: Path, tmp_path: Path) -> None:
@@ -514,15 +503,15 @@ def test_a_shard_that_fails_does_not_hold_up_the_others(
 def test_the_command_line_speaks_of_shards(model: Path, parts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SLURM_JOB_ID", raising=False)
     words = ["synthesize", str(model), "--out", str(parts), *options_of(CONFIG)]
-    done = command(*words, "--shard", "1/3", "--resume")
+    done = forked(*words, "--shard", "1/3", "--resume")
     assert done.returncode == 0
     first, *rest = done.stdout.splitlines()
     line, last = (next(found for found in rest if found.startswith(start)) for start in ("all 3", "then"))
-    assert first == f"{parts}/rollouts-0001-of-0003.h5 is up to date; cameras: view0, view1."
+    assert first == f"{parts}/rollouts-0001-of-0003.h5 is up to date; cameras: view0."
     wrap = "cgwm " + shlex.join(words) + " --shard $SLURM_ARRAY_TASK_ID/3 --resume"
     assert line == f"all 3 on SLURM: sbatch --array=0-2 --wrap {shlex.quote(wrap)}"
     assert last == f"then: cgwm merge {parts}"
-    refused = command(*words, "--shard=1/3", "--shards=3")
+    refused = forked(*words, "--shard=1/3", "--shards=3")
     assert (refused.returncode, refused.stderr) == (
         2,
         "--shard 1/3 is one shard, --shards makes all.\nAllowed: one of the two.\n",

@@ -1,26 +1,21 @@
 """Shards in several processes: the same bytes, and nothing unfinished after an interrupt or a death."""
 
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 from cgwm.datasets.io.atomic import sha256
+from cgwm.pipeline.runtime import processes
 from cgwm.pipeline.runtime.processes import in_workers, share_of_cores
 from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.schemas import CgwmError, SynthesizeConfig, UsageError
+from helpers.forked import Forked, forked
 from helpers.small_model import write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=3, duration_s=0.3, width=32, height=24, device="cpu", seed=3, shards=2)
-_CLI = """
-import signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, and so inherited, where tests run in the background
-from cgwm.cli.main import main
-main(sys.argv[1:])
-"""
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +23,15 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_small_model(tmp_path_factory.mktemp("models") / "model")
 
 
-def test_processes_make_the_same_bytes(model: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start processes as forks of one that has loaded the stage: each that is spawned loads it for three seconds."""
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload([synthesize_shards.__module__])
+    monkeypatch.setattr(processes.multiprocessing, "get_context", {"spawn": server}.__getitem__)
+
+
+def test_processes_make_the_same_bytes(quick_start: None, model: Path, tmp_path: Path) -> None:
     synthesize_shards(model, tmp_path / "one", CONFIG)
     summary = synthesize_shards(model, tmp_path / "two", CONFIG, workers=2)
     assert (summary.made, summary.shards, summary.rollouts) == (2, 2, 3)
@@ -43,21 +46,16 @@ def test_an_interrupt_ends_the_processes_and_leaves_nothing_unfinished(model: Pa
     out = tmp_path / "out"
     words = ["synthesize", model, "--out", out, "--shards=2", "--workers=2", "--no-preview", "--device=cpu"]
     words += ["--rollouts=400", "--set=synthesize.width=32", "--set=synthesize.height=24"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", _CLI, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    try:
+    with Forked(*words) as process:
         end = time.monotonic() + 120
         while len(list(tmp_path.glob(".out.*.partial-*"))) < 2:
-            assert process.poll() is None and time.monotonic() < end, process.communicate()
+            assert process.poll() is None and time.monotonic() < end, process.printed()
             time.sleep(0.01)
         writers = {int(path.name.split(".partial-")[1].split("-")[0]) for path in tmp_path.glob(".out.*.partial-*")}
         process.send_signal(signal.SIGINT)
-        printed, said = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert (process.returncode, printed) == (130, "")
-    assert said == f"Interrupted; 0 of 2 shards of {out} are complete; the same command with --resume goes on.\n"
+        done = process.ended(60)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == f"Interrupted; 0 of 2 shards of {out} are complete; the same command with --resume goes on.\n"
     assert list(tmp_path.iterdir()) == []
     assert len(writers) == 2 and process.pid not in writers
     for pid in writers:
@@ -87,5 +85,5 @@ def test_shares_of_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_are_no_part_of_a_shard_or_a_cluster(model: Path, tmp_path: Path) -> None:
     words = ["synthesize", str(model), "--out", str(tmp_path / "out"), "--workers=2"]
     for more, text in ((["--shard=0/2"], "--shard makes one"), (["--ray", "local"], "--ray has its own workers")):
-        done = subprocess.run([sys.executable, "-c", _CLI, *words, *more], check=False, capture_output=True, text=True)
+        done = forked(*words, *more)
         assert (done.returncode, text in done.stderr) == (2, True)
