@@ -19,12 +19,10 @@ from ..optimization.least_squares import Descent, Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..segments.linearization import Linearization, layout, widths
 from ..segments.segment_fit import robust_excess
+from .thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
-OWN_SHARE = 0.1
-"""Standard deviation of the contact parameters (friction, contact time, damping) between segments, in widths of their
-priors. No contact law is exact, and a residual that such deviations explain is no evidence for an effect."""
 ITERATIONS = 12
 """Maximum number of reweighting iterations."""
 STEPS = (1.0, 0.5, 0.25, 0.1)
@@ -56,7 +54,7 @@ def with_segment_parameters(linear: Linearization) -> Linearization:
     base = list(range(linear.base))
     if not base:
         return linear
-    width = OWN_SHARE * np.array([linear.parameters[k].prior[1] for k in base])
+    width = THRESHOLDS.segments.own_share * np.array([linear.parameters[k].prior[1] for k in base])
     chosen = torch.as_tensor(linear.information)
     normal = NormalEquations(
         states=chosen[:, base][:, :, base] + torch.diag(torch.as_tensor(1 / width**2)),

@@ -267,6 +267,12 @@ class FrictionThresholds:
 class SegmentsThresholds:
     """An effect of contact is named under the model's contact law."""
 
+    own_share: float = threshold(
+        0.1,
+        "widths of the prior",
+        "standard deviation of each contact's own friction, contact time and damping: no law of contact is exact, and "
+        "what such deviations explain is no evidence",
+    )
     score: float = threshold(
         22.0,
         "chi2",

@@ -18,6 +18,7 @@ from torch import Tensor
 from ..physics.world import Body, World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import size_of
+from .thresholds import SEGMENT_THRESHOLDS
 
 if TYPE_CHECKING:
     from .segments import Segments
@@ -26,15 +27,7 @@ PhaseName = Literal["flight", "impact", "sliding", "rolling", "sticking", "rest"
 PHASES: tuple[PhaseName, ...] = ("flight", "impact", "sliding", "rolling", "sticking", "rest")
 """All phases."""
 
-IMPACT_WEIGHTS = 3.0
-"""Minimum normal impulse of an impact, in impulses of the weight over a frame; rolling over an edge reaches twice that
-impulse."""
-IMPACT_M_S = 0.05
-"""Minimum change of speed [m/s] of an impact at frames so short that the impulse of the weight is negligible."""
-REST_M_S = 0.02
-"""Maximum speed [m/s] of the surface of a body at rest, in addition to the noise."""
-ROUND_SHARE = 0.5
-"""Minimum radius of the touching sphere, as a share of the body's size, for rolling: a cube sticks on its corner."""
+LIMITS = SEGMENT_THRESHOLDS.phases
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +62,7 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
     steps = seen.times_s.diff(dim=1)
     normal = (record.impulse_n_s * record.normal).sum(-1)  # (B, T, C)
     speeds = _surface_speeds(world, rollout.velocity_m_s, rollout.omega_body_rad_s)
-    limit = REST_M_S + contact.noise.position_m / steps.median() * 0.5
+    limit = LIMITS.rest_m_s + contact.noise.position_m / steps.median() * 0.5
     weight = world.gravity[0].norm() * torch.cat((steps[:, :1], steps), 1)
     mass = min(float(world.bodies[k].mass[0]) for k in world.free)
     total, slides = normal.sum(-1), (normal * record.sliding).sum(-1)
@@ -83,7 +76,7 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
             impulse = float(total[item, k])
             if impulse <= 0:
                 names.append("flight")
-            elif impulse > mass * max(IMPACT_WEIGHTS * float(weight[item, k]), IMPACT_M_S):
+            elif impulse > mass * max(LIMITS.impact_weights * float(weight[item, k]), LIMITS.impact_m_s):
                 names.append("impact")
             elif float(speeds[item, k]) < float(limit):
                 names.append("rest")
@@ -110,7 +103,7 @@ def _round_share(world: World, body_a: Tensor, normal: Tensor) -> Tensor:
     large = []
     for index, body in enumerate(world.bodies):
         chosen = slice(None) if body.on_plane is None else body.on_plane
-        big = (body.radii[0] > ROUND_SHARE * size_of(body))[chosen]
+        big = (body.radii[0] > LIMITS.round_share * size_of(body))[chosen]
         points = int((body_a == index).sum())
         large.append(big if len(big) == points else torch.zeros(points, dtype=torch.bool))
     mask = torch.cat(large).to(normal) if large else normal.new_zeros(normal.shape[-1])

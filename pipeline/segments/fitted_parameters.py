@@ -9,9 +9,9 @@ import torch
 from ...schemas import FittedParameter
 from ..optimization.uncertainty import REACH
 from ..physics.parameters import Parameter
+from .thresholds import SEGMENT_THRESHOLDS
 
-UNOBSERVABLE_SHARE = 0.8
-"""Ratio of the standard error to the prior's width above which a parameter is called not observable."""
+LIMITS = SEGMENT_THRESHOLDS.preparation
 
 
 def fitted_parameter(parameter: Parameter, coordinate: float, std: float, reach: float = REACH) -> FittedParameter:
@@ -30,7 +30,7 @@ def fitted_parameter(parameter: Parameter, coordinate: float, std: float, reach:
     )
     estimate = min(max(estimate, parameter.bounds[0]), parameter.bounds[1])  # rounding may lead past a bound
     state = "on_bound" if min(coordinate - low, high - coordinate) < 1e-6 * (high - low) else "fitted"
-    if std > UNOBSERVABLE_SHARE * parameter.prior[1]:
+    if std > LIMITS.unobservable_share * parameter.prior[1]:
         state = "not_observable"
     factor = "factor of the second moment of mass given or derived before; " if ".moment_" in parameter.name else ""
     return FittedParameter(

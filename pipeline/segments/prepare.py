@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -25,13 +24,6 @@ from .segments import Kind, Segments
 from .thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.preparation
-
-if TYPE_CHECKING:
-    pass
-
-SMEARED = 3
-"""Frames on both sides of a contact that count as contact where the noise is correlated: a filter of seven frames
-smears impacts this far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +270,9 @@ def _model_correlated_noise(state: _State) -> None:
 def _smeared(whole: Observations, contact: Tensor) -> Tensor:
     """Return the frames (E, T) into which a filter smears contacts."""
     seen = whole.seen.amax(-1) > 0
-    near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * SMEARED + 1, 1, SMEARED)
+    near = torch.nn.functional.max_pool1d(
+        (contact & seen).double()[:, None], 2 * LIMITS.smeared_frames + 1, 1, LIMITS.smeared_frames
+    )
     return near[:, 0] > 0
 
 

@@ -13,9 +13,9 @@ from ..physics.parameters import Parameter
 from ..physics.world import State
 from ..trajectories.residuals import STATE_SIZE, retract, state_prior
 from .segments import START_FRAMES, Segments, line_state
+from .thresholds import SEGMENT_THRESHOLDS
 
-BAD_FIT = 1.3
-"""Chi2 / dof above which a contact segment is fitted again from other starts."""
+LIMITS = SEGMENT_THRESHOLDS.preparation
 DRAWS, STARTS = 32, 3
 """States drawn about the fitted one, and number of the best starts (drawn ones and straight lines) that are fitted.
 Which corner strikes first makes separate minima; the residual of a wrong one would be attributed to the model (pitfall
@@ -65,7 +65,7 @@ def fit_states(
     for seed in range(searches):
         share = cost / segments.dof.clamp_min(1.0)
         usual = 1.0 if thorough else float(share.nanmedian().clamp_min(1.0))
-        bad = torch.nonzero(share > BAD_FIT * usual)[:, 0].tolist()
+        bad = torch.nonzero(share > LIMITS.bad_fit * usual)[:, 0].tolist()
         if not bad:
             break
         best, cost = _searched(best, cost, bad, parameters, given, seed, thorough)

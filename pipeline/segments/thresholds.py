@@ -121,6 +121,39 @@ class PreparationThresholds:
     robust_excess: float = threshold(
         20.0, "chi2", "scale of the robust loss of a contact segment", "study of diagnosis, section 3"
     )
+    smeared_frames: int = threshold(
+        3,
+        "frames",
+        "frames next to a contact that count as contact where errors are correlated",
+        "by argument: a filter of seven frames",
+        "after longer filters impacts are smeared further",
+    )
+    bad_fit: float = threshold(1.3, "1", "chi2 of a contact segment, in usual ones, from which it is fitted again")
+    unobservable_share: float = threshold(
+        0.8, "widths of the prior", "standard error from which a parameter is called not observable"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseThresholds:
+    """A contact is an impact, rest, rolling or sticking."""
+
+    impact_weights: float = threshold(
+        3.0,
+        "impulses of the weight over a frame",
+        "normal impulse from which a contact is an impact",
+        "by argument: rolling over an edge reaches 2",
+    )
+    impact_m_s: float = threshold(
+        0.05, "m/s", "the same where frames are so short that the impulse of the weight is negligible"
+    )
+    rest_m_s: float = threshold(0.02, "m/s", "speed of a surface at rest, in addition to the noise")
+    round_share: float = threshold(
+        0.5,
+        "sizes",
+        "radius of the touching sphere from which a body rolls",
+        "by argument: a cube sticks on its corner",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,6 +220,8 @@ class SegmentThresholds:
     """Input checks."""
     preparation: PreparationThresholds = PreparationThresholds()
     """Preparation and linearization."""
+    phases: PhaseThresholds = PhaseThresholds()
+    """Phases of contact."""
     sliding_data: SlidingSegmentThresholds = SlidingSegmentThresholds()
     """Sliding segments."""
     impact_data: ImpactDataThresholds = ImpactDataThresholds()

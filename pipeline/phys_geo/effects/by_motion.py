@@ -21,7 +21,7 @@ from ...physics.parameters import DAMPING_RATIO, FRICTION, Parameter
 from ...physics.world import World
 from ...segments.candidates import base_values
 from ...segments.first_contact_fit import EffectEstimate, placed
-from ...segments.fitted_parameters import UNOBSERVABLE_SHARE, fitted_parameter
+from ...segments.fitted_parameters import fitted_parameter
 from ...segments.impact_fit import BASE, ImpactBase, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
@@ -70,7 +70,7 @@ def fit_effect_flights(
     excess = max(prepared.slow, float(linear.chi2.sum() / linear.dof.sum().clamp_min(1.0)), 1.0)
     covariance = few_covariance(information / excess + prior, scores.numpy() / excess, prior)
     std = np.sqrt(np.diag(covariance))
-    if any(s > UNOBSERVABLE_SHARE * p.prior[1] for s, p in zip(std, names, strict=True)):
+    if any(s > SEGMENT_THRESHOLDS.preparation.unobservable_share * p.prior[1] for s, p in zip(std, names, strict=True)):
         return None
     parameters = tuple(
         fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True)

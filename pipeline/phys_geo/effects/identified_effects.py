@@ -14,7 +14,8 @@ from ...physics.effects import ActiveEffect
 from ...physics.parameters import Parameter
 from ...physics.world import World
 from ...segments.first_contact_fit import EffectEstimate, placed
-from ...segments.fitted_parameters import UNOBSERVABLE_SHARE, fitted_parameter
+from ...segments.fitted_parameters import fitted_parameter
+from ...segments.thresholds import SEGMENT_THRESHOLDS
 
 
 def at_neutral(world: World, names: Sequence[str]) -> World:
@@ -55,7 +56,7 @@ def identified_effects(
         information.numpy() / excess + prior_information, score.numpy() / excess, prior_information
     )
     std = np.sqrt(np.diag(covariance))
-    known = std < UNOBSERVABLE_SHARE * np.array([p.prior[1] for p in parameters])
+    known = std < SEGMENT_THRESHOLDS.preparation.unobservable_share * np.array([p.prior[1] for p in parameters])
     identified = {name for name, yes in zip(effect_of, known, strict=True) if yes and name in names}
     kept = [k for k, name in enumerate(effect_of) if name in identified]
     if not kept:

@@ -11,7 +11,7 @@ from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects.registry import BUILT_IN, load_effect
 from cgwm.pipeline.segments.candidates import Candidate
-from cgwm.pipeline.segments.prepare import SMEARED, Prepared, prepare
+from cgwm.pipeline.segments.prepare import LIMITS, Prepared, prepare
 from cgwm.pipeline.trajectories.correlated_noise import (
     WHITE,
     CorrelatedNoise,
@@ -149,7 +149,7 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
     seen = sharp.observations.seen.amax(-1) > 0
     for episode in range(len(sharp.names)):
         contact = np.flatnonzero((~sharp.airborne & seen)[episode].numpy())
-        near = {int(k) + d for k in contact for d in range(-SMEARED, SMEARED + 1)}
+        near = {int(k) + d for k in contact for d in range(-LIMITS.smeared_frames, LIMITS.smeared_frames + 1)}
         flies = set(np.flatnonzero(smeared.airborne[episode].numpy()).tolist())
         # what smoothing lifts above the ground may move the contact by a frame
         assert len(flies & near) <= 2 * max(1, len(contact))
@@ -157,7 +157,7 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
 
 
 def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cgwm.pipeline.segments.prepare.SMEARED", 200)
+    monkeypatch.setattr("cgwm.pipeline.segments.prepare.LIMITS", replace(LIMITS, smeared_frames=200))
     prepared, _ = ready("ball", {}, lasting(0.8, 5))
     assert prepared.noise_model != WHITE and prepared.least_force_m_s2 > 0
     touched = {item.episode for item in prepared.contact_items}
