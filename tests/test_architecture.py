@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -32,9 +33,19 @@ def module_name(path: Path) -> str:
     return ".".join(["cgwm", room, *(part for part in rest if part != "__init__")])
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def import_edges() -> list[import_graph.Import]:
+    return import_graph.imports(import_graph.modules())
+
+
 def imports(path: Path, *, top_level: bool = False) -> Iterator[tuple[int, str]]:
     """Yield line and absolute name of all that a file imports; `TYPE_CHECKING` blocks count as well."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     package = module_name(path) if path.name == "__init__.py" else module_name(path).rpartition(".")[0]
     for node in tree.body if top_level else ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -47,11 +58,10 @@ def imports(path: Path, *, top_level: bool = False) -> Iterator[tuple[int, str]]
             yield from ((node.lineno, f"{target}.{alias.name}") for alias in node.names)
 
 
-def calls(path: Path) -> Iterator[tuple[ast.Call, str]]:
-    """Yield every call in a file with the dotted name of what is called."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Call):
-            yield node, ast.unparse(node.func)
+@cache
+def calls(path: Path) -> list[tuple[ast.Call, str]]:
+    """Return every call in a file with the dotted name of what is called."""
+    return [(node, ast.unparse(node.func)) for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
 
 
 def place(path: Path, line: int) -> str:
@@ -70,13 +80,12 @@ def test_imports_run_one_way() -> None:
 
 
 def test_rooms_import_lower_floors_only() -> None:
-    found = import_graph.modules()
-    assert import_graph.upward(import_graph.imports(found), found) == []
+    assert import_graph.upward(import_edges(), import_graph.modules()) == []
 
 
 @pytest.mark.parametrize("level", ["modules", "rooms"])
 def test_imports_form_no_circles(level: str) -> None:
-    assert import_graph.circles(import_graph.imports(import_graph.modules()), level) == []
+    assert import_graph.circles(import_edges(), level) == []
 
 
 def test_an_upward_import_is_found_with_both_floors() -> None:
@@ -90,8 +99,7 @@ def test_an_upward_import_is_found_with_both_floors() -> None:
 
 
 def test_diagnose_reaches_few_modules() -> None:
-    edges = import_graph.imports(import_graph.modules())
-    assert len(import_graph.reach(edges, "cli.diagnose")) <= 117
+    assert len(import_graph.reach(import_edges(), "cli.diagnose")) <= 117
 
 
 def test_the_rooms_import_each_other_relatively() -> None:
@@ -99,7 +107,7 @@ def test_the_rooms_import_each_other_relatively() -> None:
     wrong = [
         place(path, node.lineno)
         for path in FILES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(path))
         for name in (
             [alias.name for alias in node.names]
             if isinstance(node, ast.Import)
@@ -182,7 +190,7 @@ def test_only_the_command_line_prints_on_stdout() -> None:
 @pytest.mark.parametrize("path", [path for path in FILES if path.name == "__init__.py"], ids=module_name)
 def test_all_is_complete(path: Path) -> None:
     module = importlib.import_module(module_name(path))
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     exported = getattr(module, "__all__", [])
     assert [name for name in exported if not hasattr(module, name)] == []
     assert len(exported) == len(set(exported))

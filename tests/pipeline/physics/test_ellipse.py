@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.physics import Body, Rollout, simulate
+from cgwm.pipeline.physics import Body, Rollout, State, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.friction_ellipse import FLATTEST, Ellipse
 from cgwm.pipeline.physics.impulse_solver import in_disc
@@ -27,9 +28,13 @@ def matrix(a: float, b: float, mu: float = MU) -> np.ndarray:
     return np.array([[mu + a, b], [b, mu - a]])
 
 
-def slid(body: Body, effects: tuple[ActiveEffect, ...], velocity: tuple[float, float], duration: float) -> Rollout:
+def slid(
+    body: Body, effects: tuple[ActiveEffect, ...], velocities: Sequence[tuple[float, float]], duration: float
+) -> Rollout:
+    """Roll out a slide for each velocity, all in one batch."""
     lowest = float((body.radii - body.centers[..., 2]).amax())
-    state = state_of(((0.0, 0.0, lowest - G * 0.004**2), UP, (*velocity, 0.0), (0.0, 0.0, 0.0)))
+    at = (0.0, 0.0, lowest - G * 0.004**2)
+    state = State.joined(*(state_of((at, UP, (*velocity, 0.0), (0.0, 0.0, 0.0))) for velocity in velocities))
     return simulate(replace(world_of(body, contact=law(MU)), effects=effects), state, times(duration))
 
 
@@ -84,20 +89,20 @@ def test_without_a_grain_it_is_the_disc() -> None:
     torch.testing.assert_close(with_it.position_m, without.position_m, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("heading", HEADINGS)
-@pytest.mark.parametrize("values", [(0.1, 0.0), (-0.1, 0.08)])
-def test_an_oblique_slide_is_curved(heading: tuple[float, float], values: tuple[float, float]) -> None:
+def test_an_oblique_slide_is_curved() -> None:
     """A flat box follows dv/dt = -g M^2 v / |M v|, which at first pushes it across by g |2 (A t) across t|."""
-    M, at = matrix(*values), times(0.15).numpy()
-    rollout = slid(box_body(half=(0.05, 0.05, 0.002)), (grain(*values),), heading, 0.15)
-    path = rollout.position_m[0, :, 0, :2].numpy()
-    assert np.abs(path - expected(M, heading, at)).max() < 5e-5
-    straight = expected(MU * np.eye(2), heading, at)
-    assert np.abs(path - straight).max() > 5e-3
+    slides = [(heading, values) for heading in HEADINGS for values in ((0.1, 0.0), (-0.1, 0.08))]
+    a, b = torch.tensor([values for _, values in slides], dtype=F64).T
+    at = times(0.15).numpy()
+    rollout = slid(box_body(half=(0.05, 0.05, 0.002)), (grain(a, b),), [heading for heading, _ in slides], 0.15)
+    for path, (heading, values) in zip(rollout.position_m[:, :, 0, :2].numpy(), slides, strict=True):
+        assert np.abs(path - expected(matrix(*values), heading, at)).max() < 5e-5, (heading, values)
+        straight = expected(MU * np.eye(2), heading, at)
+        assert np.abs(path - straight).max() > 5e-3, (heading, values)
 
 
 def test_a_slide_ends_at_rest_without_a_gain_of_energy() -> None:
-    rollout = slid(box_body(half=(0.05, 0.05, 0.002)), (grain(0.12, 0.1),), (0.3, 0.25), 0.4)
+    rollout = slid(box_body(half=(0.05, 0.05, 0.002)), (grain(0.12, 0.1),), [(0.3, 0.25)], 0.4)
     speed = rollout.velocity_m_s[0, :, 0].norm(dim=-1)
     assert bool((speed[1:] < speed[:-1] + 1e-5).all())
     assert float(speed[-1]) < 1e-6
@@ -121,24 +126,21 @@ def test_a_slope_holds_along_the_rough_way_alone() -> None:
     """tan(15 deg) = 0.268 lies between mu - a = 0.2 and mu + a = 0.4."""
     angle = math.radians(15)
     body = box_body(half=(0.05, 0.05, 0.002))
+    gravity = [[G * math.sin(angle), 0.0, -G * math.cos(angle)], [0.0, G * math.sin(angle), -G * math.cos(angle)]]
+    world = world_of(body, contact=law(MU))
+    world = replace(world, gravity=torch.tensor(gravity, dtype=F64), effects=(grain(0.1, 0.0),))
+    start = state_of(((0, 0, 0.002 - G * 0.004**2), UP, (0, 0, 0), (0, 0, 0)), count=2)
+    rollout = simulate(world, start, times(0.2), None, True)
+    assert rollout.contacts is not None
+    slope = G * (math.sin(angle) - 0.2 * math.cos(angle))
     for axis, moved in ((0, False), (1, True)):
-        gravity = [0.0, 0.0, -G * math.cos(angle)]
-        gravity[axis] = G * math.sin(angle)
-        world = replace(world_of(body, contact=law(MU)), gravity=batch(gravity), effects=(grain(0.1, 0.0),))
-        start = state_of(((0, 0, 0.002 - G * 0.004**2), UP, (0, 0, 0), (0, 0, 0)))
-        record_of = simulate(world, start, times(0.2), None, True)
-        path = record_of.position_m[0, :, 0, axis]
-        slope = G * (math.sin(angle) - 0.2 * math.cos(angle))
-        assert float(path[-1]) == pytest.approx(0.5 * slope * 0.04 if moved else 0.0, rel=0.02, abs=1e-6)
-        assert record_of.contacts is not None
-        pressed = record_of.contacts.impulse_n_s[0, -1, :, 2] > 1e-6
-        assert bool(record_of.contacts.sliding[0, -1][pressed].all()) == moved
+        end = float(rollout.position_m[axis, -1, 0, axis])
+        assert end == pytest.approx(0.5 * slope * 0.04 if moved else 0.0, rel=0.02, abs=1e-6)
+        pressed = rollout.contacts.impulse_n_s[axis, -1, :, 2] > 1e-6
+        assert bool(rollout.contacts.sliding[axis, -1][pressed].all()) == moved
 
 
-@pytest.mark.parametrize(
-    "at", [(0.1, -0.05, MU), pytest.param((0.0, 0.0, MU), marks=pytest.mark.evidence), (0.3, 0.2, MU)]
-)
-def test_derivatives_agree_with_differences(at: tuple[float, float, float]) -> None:
+def test_derivatives_agree_with_differences() -> None:
     start = state_of(((0, 0, 0.0295), UP, (0.7, 0.4, 0.0), (0.0, 0.0, 2.0)))
 
     def end(values: torch.Tensor) -> torch.Tensor:
@@ -147,19 +149,19 @@ def test_derivatives_agree_with_differences(at: tuple[float, float, float]) -> N
         world = replace(world, contact=replace(world.contact, friction=values[:, 2]))
         return simulate(world, start, times(0.04)).position_m[:, -1, 0]
 
-    values = torch.tensor([at], dtype=F64)
-    found = torch.autograd.functional.jacobian(lambda x: end(x)[0], values)[:, 0]
-    steps = 1e-6 * torch.eye(3, dtype=F64)
-    sides = end(torch.cat((values + steps, values - steps)))
-    torch.testing.assert_close(found, (sides[:3] - sides[3:]).T / 2e-6, rtol=1e-4, atol=1e-7)
-    assert float(found[:2].abs().amax(0).min()) > 1e-4
+    values = torch.tensor([(0.1, -0.05, MU), (0.0, 0.0, MU), (0.3, 0.2, MU)], dtype=F64)
+    found = torch.autograd.functional.jacobian(lambda x: end(x).sum(0), values).transpose(0, 1)
+    sides = end(torch.cat([values + sign * 1e-6 * axis for sign in (1, -1) for axis in torch.eye(3, dtype=F64)]))
+    ahead, behind = sides.unflatten(0, (2, 3, 3))
+    torch.testing.assert_close(found, (ahead - behind).permute(1, 2, 0) / 2e-6, rtol=1e-4, atol=1e-7)
+    assert float(found[[0, 2], :2].abs().amax(1).min()) > 1e-4
 
 
-@pytest.mark.parametrize("heading", HEADINGS)
-def test_mujocos_elliptic_cone_says_the_same(heading: tuple[float, float]) -> None:
+def test_mujocos_elliptic_cone_says_the_same() -> None:
     """But for the time ahead, 2 / rate, at which MuJoCo looks at the slip, which is why it is fast here."""
     mujoco = pytest.importorskip("mujoco")
-    M, velocity, at = matrix(-0.15, 0.0), tuple(1.2 * x for x in heading), times(0.15)
+    M, at = matrix(-0.15, 0.0), times(0.15)
+    velocities = [(1.2 * x, 1.2 * y) for x, y in HEADINGS]
     joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
     # its first tangent on a level plane is the world's y
     model = mujoco.MjModel.from_xml_string(
@@ -169,17 +171,19 @@ def test_mujocos_elliptic_cone_says_the_same(heading: tuple[float, float]) -> No
         <pair geom1="p" geom2="g" condim="3" friction="{M[1, 1]} {M[0, 0]} 0.005 0.0001 0.0001" solref="0.004 1"
         solreffriction="0.001 1" solimp="0.95 0.99 0.001"/></contact></mujoco>"""
     )
-    data = mujoco.MjData(model)
-    data.qpos[2] = 0.05
-    mujoco.mj_step(model, data, 1000)
-    data.qpos[:2], data.qvel[:2] = 0.0, velocity
-    theirs = [data.qpos[:2].copy()]
-    for _ in range(len(at) - 1):
-        mujoco.mj_step(model, data, 50)
-        theirs.append(data.qpos[:2].copy())
+    theirs = np.empty((len(velocities), len(at), 2))
+    for velocity, path in zip(velocities, theirs, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[2] = 0.05
+        mujoco.mj_step(model, data, 1000)
+        data.qpos[:2], data.qvel[:2] = 0.0, velocity
+        path[0] = data.qpos[:2]
+        for frame in range(1, len(at)):
+            mujoco.mj_step(model, data, 50)
+            path[frame] = data.qpos[:2]
+    # without a grain as well
+    a = torch.tensor([-0.15] * len(HEADINGS) + [0.0] * len(HEADINGS), dtype=F64)
     body = box_body(half=(0.05, 0.05, 0.002))
-    apart = []
-    for effects in ((grain(-0.15, 0.0),), ()):
-        path = slid(body, effects, (velocity[0], velocity[1]), 0.15).position_m[0, :, 0, :2].numpy()
-        apart.append(float(np.abs(path - np.array(theirs)).max()))
-    assert apart[0] < 0.003 and apart[0] < 0.25 * apart[1], apart
+    ours = slid(body, (grain(a, 0 * a),), 2 * velocities, 0.15).position_m[:, :, 0, :2].numpy()
+    apart, without = np.abs(ours.reshape(2, *theirs.shape) - theirs).max((2, 3))
+    assert (apart < 0.003).all() and (apart < 0.25 * without).all(), (apart, without)

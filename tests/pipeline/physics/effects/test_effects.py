@@ -1,8 +1,9 @@
 """The built-in effects against mechanics, their derivatives against each other, and effects of one's own."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ import torch
 from cgwm.datasets import Track
 from cgwm.pipeline.geometry.rotation import geodesic_angle, quat_multiply, quat_rotate
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
-from cgwm.pipeline.physics import Body, PaperLaw, State, World, simulate
+from cgwm.pipeline.physics import Body, PaperLaw, Rollout, State, World, simulate
 from cgwm.pipeline.physics.effects import (
     ActiveEffect,
     BodyMotion,
+    Effect,
     Poses,
     load_effect,
 )
@@ -55,19 +57,61 @@ def rolled(world: World, state: State, duration_s: float, *effects: ActiveEffect
     return roll_out(replace(world, effects=effects), state, times(duration_s, rate_hz))
 
 
-# Every effect: neutral, and differentiable
+# Every effect: neutral, differentiable, and the same in the kernel; all of them in one batch, as a step takes equally
+# long for one row and for a hundred
+
+
+GROUPS = [[n for n in BUILT_IN if ("driven" in load_effect(n).needs) == driven] for driven in (False, True)]
+"""Effects that can be in one world: in the kernel those of the contact are for a body alone on the ground."""
+ROWS = 3
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch of short motions: high flight; a slide on four corners, with spin; a corner that begins to graze."""
+    """Short motions in one world with all effects of a group, of which each acts in rows of its own.
 
+    The three of each effect: high flight; a slide on four corners, with spin; a corner that begins to graze.
+    """
+
+    effects: tuple[Effect, ...]
     world: World
     state: State
     tracks: Mapping[str, Track] | None = None
 
+    def rows(self, name: str) -> slice:
+        """Return the rows of an effect."""
+        place = [effect.name for effect in self.effects].index(name)
+        return slice(ROWS * place, ROWS * (place + 1))
 
-def scenes(name: str) -> Scenes:
+    def acting(self, x: torch.Tensor) -> World:
+        """Return the world of effects with parameters x (K B, P), in units of their scales, those of the row's own."""
+        copies = len(x) // (ROWS * len(self.effects))
+        effects = []
+        for effect in self.effects:
+            own = torch.zeros(ROWS * len(self.effects), dtype=F64)
+            own[self.rows(effect.name)] = 1.0
+            own = own.repeat(copies)
+            values = {p.name: p.scale * own * x[:, k] for k, p in enumerate(effect.parameters)}
+            if effect.name == "linear_drag":  # what others cannot do without
+                values["c"] = values["c"] + self.drag().repeat(copies)
+            effects.append(ActiveEffect(effect, {**ActiveEffect.of(effect).values, **values}))
+        return replace(self.world, effects=tuple(effects))
+
+    def drag(self) -> torch.Tensor:
+        """Return the linear drag of each row that its effect cannot do without."""
+        needs = torch.tensor(["drag" in effect.needs for effect in self.effects], dtype=F64)
+        return 0.5 * needs.repeat_interleave(ROWS)
+
+    def bare(self) -> World:
+        """Return the world without effects but the drag that some need."""
+        needed = (active("linear_drag", c=self.drag()),) if bool(self.drag().any()) else ()
+        return replace(self.world, effects=needed)
+
+    def sizes(self) -> list[int]:
+        return [len(effect.parameters) for effect in self.effects]
+
+
+def scenes(group: int, *others: Effect) -> Scenes:
     lowest = float(quat_rotate(state_of(((0, 0, 0), TILTED, (0, 0, 0), (0, 0, 0))).quat_wxyz[0], corners()).amin(0)[2])
     grazing = -lowest + 0.001 + 0.0027
     rows = [
@@ -75,8 +119,9 @@ def scenes(name: str) -> Scenes:
         ((0.03, 0.02, 0.02995), UP, (0.5, 0.3, 0.0), (0.3, -0.2, 3.0)),
         ((0.01, 0.03, grazing), TILTED, (0.4, -0.2, -0.15), (2.0, 3.0, 1.0)),
     ]
+    effects = (*(load_effect(name) for name in GROUPS[group]), *others)
     world, tracks = replace(world_of(box_body(radius=0.001)), step_s=STEP_S), None
-    if "driven" in load_effect(name).needs:
+    if any("driven" in effect.needs for effect in effects):
         tip = replace(ball_body(radius=0.01, name="tip"), motion="driven")
         world = replace(world, bodies=(*world.bodies, tip))
         at = np.linspace(-0.1, 0.2, 31) + 0.0045
@@ -84,39 +129,18 @@ def scenes(name: str) -> Scenes:
         tracks = {"tip": Track(at, path)}
     still = ((-0.3, 0.0, 0.5), UP, (0, 0, 0), (0, 0, 0))
     states = [state_of(row, *([still] if tracks else [])) for row in rows]
-    joined = State.joined(*states)
-    return Scenes(world, joined, tracks)
+    return Scenes(effects, world, State.joined(*states * len(effects)), tracks)
 
 
 def corners() -> torch.Tensor:
     return box_body().centers[0]
 
 
-def company(name: str, count: int) -> tuple[ActiveEffect, ...]:
-    """Return the effects that an effect cannot do without."""
-    return (active("linear_drag", c=torch.full((count,), 0.5)),) if "drag" in load_effect(name).needs else ()
-
-
-def motion_of(name: str, there: Scenes):
-    """Return what is measured as a function of the effect's parameters in units of their scales, (3 K, P)."""
-    effect = load_effect(name)
-
-    def function(x: torch.Tensor, repeats: int) -> torch.Tensor:
-        copies = len(x) // 3
-        state = State(*(value.repeat(copies, *[1] * (value.ndim - 1)) for value in vars(there.state).values()))
-        values = {p.name: p.scale * x[:, k] for k, p in enumerate(effect.parameters)}
-        one = ActiveEffect(effect, {**active(name).values, **values})
-        world = replace(there.world, effects=(one, *company(name, 1)))
-        poses = observed(world, state, times(0.02), there.tracks)
-        return torch.cat((poses.position_m[:, 1:].flatten(1), poses.quat_wxyz[:, 1:].flatten(1)), -1)
-
-    return function
-
-
 def test_the_scenes_are_a_flight_a_contact_and_a_graze() -> None:
-    there = scenes("friction_patch")
+    there = scenes(0)
+    first = State(*(value[there.rows("friction_patch")] for value in vars(there.state).values()))
     world = replace(there.world, effects=(active("friction_patch", c_22=0.5),))
-    record = simulate(world, there.state, times(0.02, 1000.0), record_contacts=True).contacts
+    record = simulate(world, first, times(0.02, 1000.0), record_contacts=True).contacts
     assert record is not None
     pushes = record.impulse_n_s[..., 2].sum(-1) > 0
     touching = pushes.sum(1).tolist()
@@ -125,69 +149,107 @@ def test_the_scenes_are_a_flight_a_contact_and_a_graze() -> None:
     assert not bool(pushes[2, :5].any())
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
-@pytest.mark.parametrize("at", [pytest.param(0.0, marks=pytest.mark.evidence), 0.7])
-def test_derivatives_agree_in_flight_in_contact_and_grazing(name: str, at: float) -> None:
-    effect, there = load_effect(name), scenes(name)
-    function = motion_of(name, there)
-    size = len(effect.parameters)
-    x = at * torch.linspace(1.0, 0.5, size, dtype=F64).repeat(3, 1)
+@dataclass(frozen=True)
+class Derivatives:
+    """Derivatives of the poses by the parameters of each row's effect, in units of their scales."""
+
+    forward: torch.Tensor
+    """Of forward mode, (B, M, P)."""
+    weights: torch.Tensor
+    """Of a random combination of the outputs, (B, M)."""
+    backward: torch.Tensor
+    """Of that combination, in reverse mode, (B, P)."""
+    numeric: torch.Tensor
+    """Differences, one-sided where a parameter may not be negative, (B, M, P)."""
+
+
+@cache
+def derivatives(group: int, at: float) -> Derivatives:
+    there = scenes(group)
+    size, count = max(there.sizes()), len(there.state.position_m)
+
+    def function(x: torch.Tensor, repeats: int) -> torch.Tensor:
+        """Return what is measured."""
+        copies = len(x) // count
+        state = State(*(value.repeat(copies, *[1] * (value.ndim - 1)) for value in vars(there.state).values()))
+        poses = observed(there.acting(x), state, times(0.02), there.tracks)
+        return torch.cat((poses.position_m[:, 1:].flatten(1), poses.quat_wxyz[:, 1:].flatten(1)), -1)
+
+    x = torch.zeros(count, size, dtype=F64)
+    for effect, its in zip(there.effects, there.sizes(), strict=True):
+        x[there.rows(effect.name), :its] = at * torch.linspace(1.0, 0.5, its, dtype=F64)
     value, forward = batched_jacobian(function, x)
-    assert bool(torch.isfinite(forward).all())
-    # reverse mode, by one random combination of the outputs
     weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(1), dtype=F64)
     leaf = x.clone().requires_grad_()
     (backward,) = torch.autograd.grad((weights * function(leaf, 1)).sum(), leaf)
-    torch.testing.assert_close(backward, (weights[:, None] @ forward).squeeze(1), atol=1e-11, rtol=1e-8)
-    # finite differences, one-sided where a parameter may not be negative
     h = 1e-4
-    eye = torch.eye(size, dtype=F64)
-    one_sided = at == 0 and all(p.nonnegative for p in effect.parameters)
-    offsets = (0.0, 1.0, 2.0) if one_sided else (-1.0, 1.0)
-    factors = (-1.5, 2.0, -0.5) if one_sided else (-0.5, 0.5)
-    moved = torch.cat([x + k * h * row for k in offsets for row in eye])
+    one_sided = torch.tensor([at == 0 and all(p.nonnegative for p in effect.parameters) for effect in there.effects])
+    one_sided = one_sided.repeat_interleave(ROWS)[:, None]
+    steps = [torch.where(one_sided, k, k - 1.0) for k in (0.0, 1.0, 2.0)]
+    factors = [torch.where(one_sided, a, b) for a, b in ((-1.5, -0.5), (2.0, 0.0), (-0.5, 0.5))]
+    moved = torch.cat([x + h * step * axis for step in steps for axis in torch.eye(size, dtype=F64)])
     with torch.no_grad():
-        ends = function(moved, 1).unflatten(0, (len(offsets), size, 3))
+        ends = function(moved, 1).unflatten(0, (len(steps), size, count))
     numeric = sum(factor * end for factor, end in zip(factors, ends, strict=True)).permute(1, 2, 0) / h
+    return Derivatives(forward, weights, backward, numeric)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("at", [pytest.param(0.0, marks=pytest.mark.evidence), 0.7])
+def test_derivatives_agree_in_flight_in_contact_and_grazing(name: str, at: float) -> None:
+    group = next(k for k, names in enumerate(GROUPS) if name in names)
+    rows, size, found = scenes(group).rows(name), len(load_effect(name).parameters), derivatives(group, at)
+    forward, numeric = found.forward[rows, :, :size], found.numeric[rows, :, :size]
+    assert bool(torch.isfinite(forward).all())
+    combined = (found.weights[rows, None] @ forward).squeeze(1)
+    torch.testing.assert_close(found.backward[rows, :size], combined, atol=1e-11, rtol=1e-8)
     largest = float(forward.abs().max())
     assert largest > 1e-8
     torch.testing.assert_close(forward, numeric, atol=2e-6 * largest + 1e-10, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_every_effect_is_nothing_at_zero(name: str) -> None:
+def test_every_effect_is_nothing_at_zero() -> None:
     """A box that drops on a corner, and a ball that slides until it rolls."""
-    zero = (active(name), *company(name, 1))
+    drag = active("linear_drag", c=0.5)
+
+    def seen(names: Iterable[str], body: Body, row: tuple) -> Poses:
+        effects = (drag, *(active(name) for name in names))
+        return observed(replace(world_of(body), step_s=0.002, effects=effects), state_of(row), times(0.06))
+
     for body, row in (
         (box_body(), ((0.1, 0.05, 0.055), TILTED, (0.3, 0.1, -0.5), (2.0, 1.0, -1.0))),
         (ball_body(), ((0.1, 0.05, 0.0399), UP, (0.4, 0.2, 0.0), (1.0, 2.0, 3.0))),
     ):
-        world = replace(world_of(body), step_s=0.002)
-        plain = observed(replace(world, effects=company(name, 1)), state_of(row), times(0.06))
-        with_it = observed(replace(world, effects=zero), state_of(row), times(0.06))
-        torch.testing.assert_close(with_it.position_m, plain.position_m, atol=1e-13, rtol=0)
-        torch.testing.assert_close(with_it.quat_wxyz, plain.quat_wxyz, atol=1e-13, rtol=0)
+        plain, with_all = seen((), body, row), seen(BUILT_IN, body, row)
+        torch.testing.assert_close(with_all.position_m, plain.position_m, atol=1e-13, rtol=0)
+        torch.testing.assert_close(with_all.quat_wxyz, plain.quat_wxyz, atol=1e-13, rtol=0)
+
+
+@cache
+def in_both_engines(group: int) -> tuple[Scenes, Rollout, Rollout, Rollout]:
+    """Return rollouts of the torch engine, of the kernel, and of the torch engine without the effects."""
+    there = scenes(group, *([ResidualWrench()] if group == 0 else []))
+    shares = 0.7 / torch.arange(1, 1 + max(there.sizes()), dtype=F64)
+    world = there.acting(shares.repeat(len(there.state.position_m), 1))
+    assert lacking(world) is None, "the kernel must have every built-in effect"
+    expected, found, without = (
+        run(at, there.state, times(0.05), there.tracks)
+        for run, at in ((simulate, world), (simulate_on_host, world), (simulate, there.bare()))
+    )
+    return there, expected, found, without
 
 
 @pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler to build the kernel")
 @pytest.mark.parametrize("name", [*BUILT_IN, ResidualWrench.name])
 def test_every_effect_is_the_same_in_the_kernel(name: str) -> None:
     """The formula in torch and the kernel's text agree in flight, in a slide and in a graze, and both act."""
-    effect = ResidualWrench() if name == ResidualWrench.name else load_effect(name)
-    alike = "constant_force" if name == ResidualWrench.name else name
-    there = scenes(alike)
-    values = {p.name: torch.tensor(0.7 * p.scale / (1 + k), dtype=F64) for k, p in enumerate(effect.parameters)}
-    bare = replace(there.world, effects=company(alike, 1))
-    world = replace(bare, effects=(ActiveEffect.of(effect, values, batch(0.0)), *bare.effects))
-    assert lacking(world) is None, "the kernel must have every built-in effect"
-    expected, found, without = (
-        run(at, there.state, times(0.05), there.tracks)
-        for run, at in ((simulate, world), (simulate_on_host, world), (simulate, bare))
-    )
+    there, expected, found, without = in_both_engines(int(name in GROUPS[1]))
+    rows = there.rows(name)
     for key in ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s"):
-        torch.testing.assert_close(getattr(found, key), getattr(expected, key), rtol=1e-9, atol=1e-9)
-    acts = (found.velocity_m_s - without.velocity_m_s).abs().max() > 1e-7
-    acts |= (found.omega_body_rad_s - without.omega_body_rad_s).abs().max() > 1e-7
+        torch.testing.assert_close(getattr(found, key)[rows], getattr(expected, key)[rows], rtol=1e-9, atol=1e-9)
+    acts = (found.velocity_m_s - without.velocity_m_s)[rows].abs().max() > 1e-7
+    acts |= (found.omega_body_rad_s - without.omega_body_rad_s)[rows].abs().max() > 1e-7
+    effect = there.effects[rows.start // ROWS]
     assert bool(acts) == any(effect.has(hook) for hook in ("world", "flow", "wrench", "contact"))
 
 
