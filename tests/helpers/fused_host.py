@@ -113,7 +113,7 @@ WARNINGS += ("-Wno-unused-parameter", "-Wno-unused-variable", "-Wno-array-bounds
 
 
 @cache
-def library(structure: Structure, flags: tuple[str, ...] = ("-O2",)) -> ctypes.CDLL:
+def library(structure: Structure, flags: tuple[str, ...] = ("-O1",)) -> ctypes.CDLL:
     """Return the kernel of a structure, built now or, of the same source and compiler, by an earlier run of tests."""
     assert COMPILER is not None
     source = SHIM + structure.source(host=True) + ENTRY
