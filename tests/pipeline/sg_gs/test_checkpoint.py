@@ -11,12 +11,12 @@ import pytest
 import torch
 from cgwm.datasets.models.fit_inputs import photo_inputs
 from cgwm.datasets.models.model import read_model
-from cgwm.pipeline.fit import fit
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs import optimize as descents
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement
 from cgwm.pipeline.sg_gs.stage import fit_scene
+from cgwm.pipeline.sg_gs.visual_hull import carve
 from cgwm.schemas import InputDataError, UsageError
 from pipeline.sg_gs.test_sg_gs import CONFIG, make_capture
 
@@ -54,12 +54,6 @@ def test_a_state_comes_back_as_it_was(tmp_path):
     assert checkpoint.read("ball colours", torch.device("cpu")) is None
 
 
-def test_nothing_is_written_by_a_short_fit(tmp_path, capture, monkeypatch):
-    monkeypatch.setattr(bodies, "refine", unrefined)
-    fit(capture.root, tmp_path / "model", "sg-gs", splat_config=CONFIG.model_copy(update={"iterations": 4}))
-    assert [path.name for path in tmp_path.iterdir()] == ["model"]
-
-
 ADAPTIVE = {"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1}
 
 
@@ -68,7 +62,11 @@ def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monke
     config = CONFIG.model_copy(update={"iterations": 12, "joint": False, **settings})
     monkeypatch.setattr(mcmc, "REFINED_EVERY", 10)
     monkeypatch.setattr(bodies, "refine", unrefined)
-    whole = fit_scene(capture, config)
+    hulls = []
+    # of the same photos each time
+    monkeypatch.setattr(bodies, "carve", lambda *given: (hulls or hulls.append(carve(*given)) or hulls)[0])
+    whole = fit_scene(capture, config, Checkpoint(tmp_path / "short", MADE_OF))
+    assert not list(tmp_path.iterdir())  # nothing is written by a short fit
     for stopped_after in (3, 5):  # again and again, in the midst of one descent or another
         written = 0
 
@@ -94,6 +92,7 @@ def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monke
     assert sum(steps) < sum((3, 6, 9)[: len(steps)])  # shape, colours, background: it did not begin again
     np.testing.assert_array_equal(resumed.bodies["ball"].visual.means, whole.bodies["ball"].visual.means)
     np.testing.assert_array_equal(resumed.bodies["ball"].visual.colors, whole.bodies["ball"].visual.colors)
+    np.testing.assert_array_equal(resumed.bodies["ball"].collision.means, whole.bodies["ball"].collision.means)
     np.testing.assert_array_equal(resumed.scene.means, whole.scene.means)
     np.testing.assert_array_equal(resumed.scene.scales, whole.scene.scales)
     assert resumed.record["ball"]["appearance_loss"] == whole.record["ball"]["appearance_loss"]

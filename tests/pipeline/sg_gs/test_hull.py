@@ -62,7 +62,7 @@ def test_mass_properties_of_the_hull(hull):
 
 def test_the_ground_cuts_what_no_view_sees(hull):
     ground = Ground(offset_m=0.05)
-    cut = carve(silhouettes(40), ground)
+    cut = carve(silhouettes(12), ground)
     assert cut.surface[:, 2].min() == pytest.approx(0.05, abs=1e-9)
     assert hull.surface[:, 2].min() < 0.035
 

@@ -180,12 +180,9 @@ def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result, refine
     np.testing.assert_array_equal(adapted.bodies["ball"].visual.means, result.bodies["ball"].visual.means)
 
 
-def test_psnr_rises_and_the_same_seed_gives_the_same_spheres(capture, result, quick):
-    few, again = (fit_scene(capture, CONFIG.model_copy(update={"iterations": 2})) for _ in range(2))
+def test_psnr_rises(capture, result, quick):
+    few = fit_scene(capture, CONFIG.model_copy(update={"iterations": 2}))
     assert result.record["held_out"]["psnr_db"] > few.record["held_out"]["psnr_db"] + 0.5
-    np.testing.assert_array_equal(again.bodies["ball"].visual.colors, few.bodies["ball"].visual.colors)
-    np.testing.assert_array_equal(again.bodies["ball"].collision.means, few.bodies["ball"].collision.means)
-    np.testing.assert_array_equal(again.scene.means, few.scene.means)
 
 
 def test_the_body_is_where_it_stood(result):

@@ -8,6 +8,8 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.sg_gs import bodies
+from cgwm.pipeline.sg_gs.depth_refinement import Refinement
 from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
@@ -20,7 +22,9 @@ VISUAL = CONFIG.model_copy(update={"collision": "visual", "iterations": 8})
 def model(tmp_path_factory):
     root = tmp_path_factory.mktemp("visual")
     make_capture(root / "tiny")
-    fit(root / "tiny", root / "model", "sg-gs", splat_config=VISUAL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bodies, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))  # as `quick` does
+        fit(root / "tiny", root / "model", "sg-gs", splat_config=VISUAL)
     return read_model(root / "model")
 
 
