@@ -52,10 +52,9 @@ def compare(
 
     if not warmup_s > 0:
         raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
-    from ..pipeline.compare.page_file import default_page, shows_the_same
+    from ..pipeline.compare.page import default_page
 
-    page = out or default_page(models)
-    overwrite = overwrite or (out is None and shows_the_same(page, models, capture))
+    page = out or default_page(models, split)
     emit(work(models, capture, split, page, warmup_s, device, overwrite, accept_units), _summary)
 
 

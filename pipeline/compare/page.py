@@ -3,35 +3,43 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ...schemas import PHASES, CompareResult, ErrorSummary, ModelComparison, PairedDifference
-from ..report.page import facts, fixed, number, page, paragraph, section, table, text
+from ..report.page import cautions, facts, fixed, number, page, paragraph, section, table, text
+from ..report.page_file import made_of, page_beside, short_names
 from ..trajectories.segmentation import CONTACT_S, FLIGHT_S
 from .error_ladder import LADDER_WORDS, error_ladder
 from .model_comparison import ComparedModel
-from .page_file import page_title
 from .paired_difference import LEAST_EPISODES
 from .player import REPLAY_SCRIPT, REPLAY_STYLE, Replay, replay_of
 from .short_horizon_errors import FREEDOMS
 from .wrench_chart import wrench_data, wrench_section
 
 _MM = 1e3
-_TINTS = {
-    "flight": "#cfdff3",
-    "impact": "#e58a78",
-    "sliding": "#f3cf8f",
-    "rolling": "#bfe3c4",
-    "sticking": "#cfc3e8",
-    "rest": "#e3e5e9",
-}
 HOTTEST = 5.0
 """Residual, in units of the noise, that is drawn in full colour."""
 
 
+def default_page(models: Sequence[Path], split: str = "test") -> Path:
+    """Return the page's path by default: beside the first model, named after the models."""
+    names = [name.replace("/", "-") for name in short_names([os.fspath(model) for model in models])]
+    return page_beside(models[0], f"compare-{'-'.join([*names, *([split] if split != 'test' else [])])}.html")
+
+
+def mark_of(page: Path, models: Sequence[Path], capture: Path, split: str) -> str:
+    """Return by what the page of a comparison is recognised, see `page_file.made_of`."""
+    return made_of(page, "compare", [*models, capture], split)
+
+
 def comparison_html(
-    result: CompareResult, models: Sequence[ComparedModel], footage: Mapping[str, list[dict[str, Any]]]
+    result: CompareResult,
+    models: Sequence[ComparedModel],
+    footage: Mapping[str, list[dict[str, Any]]],
+    mark: str = "",
 ) -> str:
     """Return the HTML page of a comparison.
 
@@ -39,6 +47,7 @@ def comparison_html(
         result: The figures.
         models: The models that they come from, in the same order.
         footage: Sheets of frames by episode, see `frames.footage_of`.
+        mark: By what the page is recognised, see `mark_of`.
     """
     names = [one.short_name for one in models]
     replay = replay_of(models, _by_interest(result, footage))
@@ -48,7 +57,7 @@ def comparison_html(
         f"<h1>cgwm compare · {text(result.capture)} · split {text(result.split)}</h1>",
         f'<p class="verdict">{text(result.verdict)}</p>',
         f'<div class="cards">{"".join(_card(m, n) for m, n in zip(result.models, names, strict=True))}</div>',
-        f'<div class="warnings">{"".join(paragraph(words) for words in warned)}</div>' if warned else "",
+        cautions(warned),
         _ladder(result, names),
         _player(replay, bool(footage)),
         _worst(result, names),
@@ -58,7 +67,8 @@ def comparison_html(
         _provenance(result, models),
         f'<script type="application/json" id="replay-data">{_embedded(data)}</script>',
     ]
-    return page(page_title(names, result.capture), [part for part in body if part], REPLAY_STYLE, REPLAY_SCRIPT)
+    title = f"cgwm compare: {', '.join(names)} on {Path(result.capture).name or result.capture}"
+    return page(title, [part for part in body if part], REPLAY_STYLE, REPLAY_SCRIPT, mark)
 
 
 def _embedded(data: object) -> str:
@@ -125,7 +135,7 @@ def _models(result: CompareResult, names: Sequence[str]) -> str:
     rows += [_baseline_row(name, figures) for name, figures in result.models[0].baselines.items()]
     shown = [k for k in range(len(header)) if k < 2 or any(row[k] != "–" for row in rows)]
     header, rows = [header[k] for k in shown], [[row[k] for k in shown] for row in rows]
-    return _sortable(header, rows, range(2, len(header)))
+    return table(header, rows, range(2, len(header)), sorts=True)
 
 
 def _model_row(model: ModelComparison, name: str) -> list[str]:
@@ -183,7 +193,7 @@ def _interval(pair: PairedDifference) -> str:
 
 
 def _player(replay: Replay, filmed: bool) -> str:
-    phases = "".join(f'<span><i style="background:{_TINTS[name]}"></i>{name}</span>' for name in PHASES)
+    phases = "".join(f'<span><i style="background:var(--{name})"></i>{name}</span>' for name in PHASES)
     curves = "".join(
         f'<div><svg class="chart" data-part="{name}" viewBox="0 0 520 {height}" role="img" aria-label="{label}"></svg>'
         "</div>"
@@ -253,7 +263,7 @@ def _worst(result: CompareResult, names: Sequence[str]) -> str:
         "The segments of the motion with the largest residuals of short predictions. x, y, z: position in the world "
         "frame; rx, ry, rz: rotation about the body's axes. Click a heading to sort."
     )
-    return section("Worst moments", paragraph(words), _sortable(header, rows, (3, 4, 7)))
+    return section("Worst moments", paragraph(words), table(header, rows, (3, 4, 7), sorts=True))
 
 
 def _phases(result: CompareResult, names: Sequence[str]) -> str:
@@ -266,7 +276,7 @@ def _phases(result: CompareResult, names: Sequence[str]) -> str:
                 continue
             rows.append(
                 [
-                    f'<i style="background:{_TINTS[phase]};display:inline-block;width:12px;height:12px"></i> {phase}',
+                    f'<i style="background:var(--{phase});display:inline-block;width:12px;height:12px"></i> {phase}',
                     text(name),
                     str(figures.frames),
                     number(figures.reduced_chi2),
@@ -287,7 +297,9 @@ def _phases(result: CompareResult, names: Sequence[str]) -> str:
         "complete. Noise that the manifest does not give is estimated from the roughness of the tracks, which "
         "underestimates it for smoothed tracks."
     )
-    return section("By phase and degree of freedom", paragraph(words), _sortable(header, rows, range(2, len(header))))
+    return section(
+        "By phase and degree of freedom", paragraph(words), table(header, rows, range(2, len(header)), sorts=True)
+    )
 
 
 def _heat(value: float | None) -> str:
@@ -317,11 +329,7 @@ def _episodes(result: CompareResult, models: Sequence[ComparedModel]) -> str:
             ]
         rows.append(row)
     words = "Open-loop errors, averaged over the frames after the warm-up; χ²: reduced χ² of the short predictions."
-    return section("By episode", paragraph(words), _sortable(header, rows, range(2, len(header))))
-
-
-def _sortable(header: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[int]) -> str:
-    return table(header, rows, numeric).replace("<table>", '<table class="sortable">', 1)
+    return section("By episode", paragraph(words), table(header, rows, range(2, len(header)), sorts=True))
 
 
 def _provenance(result: CompareResult, models: Sequence[ComparedModel]) -> str:

@@ -20,6 +20,7 @@ from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
 from ..evaluate.work import LESS, evaluation_parts
 from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
+from ..report.page_file import short_names, shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..runtime.work_budget import motion_doubt, within_budget
@@ -28,8 +29,7 @@ from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import after_release
 from .frames import footage_of
 from .model_comparison import ComparedModel
-from .page import comparison_html
-from .page_file import short_names
+from .page import comparison_html, mark_of
 from .paired_difference import paired_difference
 from .residual_wrenches import wrench_points
 from .short_horizon_errors import short_errors
@@ -68,7 +68,7 @@ def compare(
         out: The page to write; None writes none.
         warmup_s: Length of the start of an episode that the models may see [s].
         device: Device that renders images: auto, cpu or cuda.
-        overwrite: Replace what is at `out`.
+        overwrite: Replace what is at `out`; a page of the same models, capture and split is replaced in any case.
         accept_units: Do not refuse units and frames of the capture that its motion contradicts.
 
     Raises:
@@ -77,7 +77,10 @@ def compare(
         NotConvergedError: If a rollout diverges.
     """
     resolve_device(device)  # refuse a wrong device now, not after minutes
+    mark = ""
     if out is not None:
+        mark = mark_of(out, models, capture, split)
+        overwrite = overwrite or shows_the_same(out, mark)
         refuse_output(out, "page", overwrite)
     _refuse_twice(models)
     loaded = [(str(path), read_model(path)) for path in models]
@@ -90,7 +93,7 @@ def compare(
     result = comparison.result.model_copy(update={"report": str(out)})
     footage = footage_of(comparison.models, source, device)
     with new_file(out, "page", overwrite) as path:
-        path.write_text(comparison_html(result, comparison.models, footage), encoding="utf-8")
+        path.write_text(comparison_html(result, comparison.models, footage, mark), encoding="utf-8")
     return result
 
 

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import html
 import math
+import os
+import re
 from collections.abc import Sequence
 from importlib.resources import files
+from pathlib import Path
+from urllib.parse import quote
 
 NEGLIGIBLE = 1e-12
 """Largest magnitude that is written as zero, as rounding error, in any unit that occurs."""
+LEAST_SECTIONS = 3
+"""Minimum number of sections for a list of contents."""
+MOST_COLUMNS = 3
+"""Largest number of columns that a narrow screen shows side by side; of wider tables it shows each row as a list."""
+_HEADING = re.compile(r'<h2 id="([^"]+)">(.*?)</h2>')
 
 
 def read_asset(module: str, name: str) -> str:
@@ -25,23 +34,26 @@ STYLE = read_asset(__name__, "page.css")
 SCRIPT = read_asset(__name__, "page.js")
 
 
-def page(title: str, body: Sequence[str], style: str = "", script: str = "") -> str:
-    """Return a whole HTML document.
+def page(title: str, body: Sequence[str], style: str = "", script: str = "", made_of: str = "") -> str:
+    """Return a whole HTML document, with a list of contents before its first section.
 
     Args:
         title: Title in the browser's title bar.
         body: Pieces of HTML, in order.
         style: Additional rules for the style sheet.
         script: Script that runs after that of every page.
+        made_of: What the page shows, see `page_file.made_of`; the same command replaces a page of the same.
     """
+    mark = f'<meta name="cgwm-made-of" content="{text(made_of)}">\n' if made_of else ""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<meta name="generator" content="cgwm">\n'
+        f"{mark}"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         # The page needs nothing from the network, so it may not ask for anything either.
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
         "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n"
         f"<title>{text(title)}</title>\n<style>{STYLE}{style}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(body)
+        + "\n".join(_with_contents(body))
         + f"\n</main>\n<script>{SCRIPT}{script}</script>\n</body>\n</html>\n"
     )
 
@@ -52,8 +64,39 @@ def text(value: object) -> str:
 
 
 def section(title: str, *pieces: str) -> str:
-    """Return a section with its heading; empty pieces are omitted."""
-    return "\n".join(["<section>", f"<h2>{text(title)}</h2>", *(piece for piece in pieces if piece), "</section>"])
+    """Return a section with its heading, which the list of contents links to; empty pieces are omitted."""
+    heading = f'<h2 id="{_anchor(title)}">{text(title)}</h2>'
+    return "\n".join(["<section>", heading, *(piece for piece in pieces if piece), "</section>"])
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "section"
+
+
+def _with_contents(body: Sequence[str]) -> list[str]:
+    """Return the pieces of a page with a list of contents before the first section, if there are several."""
+    found = [heading for piece in body for heading in _HEADING.findall(piece)]
+    if len(found) < LEAST_SECTIONS:
+        return list(body)
+    first = next(k for k, piece in enumerate(body) if _HEADING.search(piece))
+    links = "".join(f'<a href="#{anchor}">{title}</a>' for anchor, title in found)
+    return [*body[:first], f'<nav class="contents" aria-label="contents">{links}</nav>', *body[first:]]
+
+
+def link(words: str, target: Path | str, page: Path) -> str:
+    """Return a link from a page on disk to a file or folder beside it, which stays right if both are moved together."""
+    way = os.path.relpath(os.path.realpath(target), os.path.realpath(page.parent))
+    return f'<a href="{text(quote(way))}">{text(words)}</a>'
+
+
+def command(words: str) -> str:
+    """Return a command to type, as it would be typed."""
+    return f"<pre><code>{text(words)}</code></pre>"
+
+
+def cautions(messages: Sequence[str]) -> str:
+    """Return the box of warnings; empty without any."""
+    return f'<div class="warnings">{"".join(paragraph(words) for words in messages)}</div>' if messages else ""
 
 
 def paragraph(words: str, style: str = "") -> str:
@@ -63,7 +106,11 @@ def paragraph(words: str, style: str = "") -> str:
 
 
 def table(
-    header: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[int] = (), strong: Sequence[int] = ()
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: Sequence[int] = (),
+    strong: Sequence[int] = (),
+    sorts: bool = False,
 ) -> str:
     """Return a table whose cells are HTML.
 
@@ -72,14 +119,27 @@ def table(
         rows: Cells by row.
         numeric: Indices of the columns that are aligned to the right.
         strong: Indices of the rows in bold.
+        sorts: A click on a heading sorts the rows.
     """
+    wide = len(header) > MOST_COLUMNS
 
     def cells(tag: str, row: Sequence[str]) -> str:
-        return "".join(f"<{tag}{' class=num' if k in numeric else ''}>{cell}</{tag}>" for k, cell in enumerate(row))
+        return "".join(
+            f"<{tag}{' class=num' if k in numeric else ''}{_label(header[k]) if wide and tag == 'td' else ''}>"
+            f"{cell}</{tag}>"
+            for k, cell in enumerate(row)
+        )
 
     lines = [f"<tr{' class=strong' if i in strong else ''}>{cells('td', row)}</tr>" for i, row in enumerate(rows)]
     head = f"<thead><tr>{cells('th', [text(name) for name in header])}</tr></thead>"
-    return f'<div class="scroll"><table>{head}<tbody>{"".join(lines)}</tbody></table></div>'
+    kinds = " ".join([*["wide"] * wide, *["sortable"] * sorts])
+    mark = f' class="{kinds}"' if kinds else ""
+    return f'<div class="scroll"><table{mark}>{head}<tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _label(name: str) -> str:
+    """Return the attribute from which a narrow screen takes the name of a cell's column."""
+    return f' data-label="{text(name)}"'
 
 
 def facts(rows: Sequence[tuple[str, str]]) -> str:

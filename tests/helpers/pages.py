@@ -34,7 +34,8 @@ class Tags(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         if tag not in self.EMPTY:
             self.open.append(tag)
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        loaded = [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        self.addresses += [value for value in loaded if not value.startswith("#")]  # a place in the page itself
 
     def handle_endtag(self, tag: str) -> None:
         if tag in self.EMPTY:

@@ -1,39 +1,10 @@
 (() => {
 const root = document.getElementById("replay"), block = document.getElementById("replay-data");
-for (const table of document.querySelectorAll("table.sortable")) {
-  const heads = [...table.tHead.rows[0].cells];
-  const key = cell => {
-    const words = cell.textContent.trim().replace(/\u2212/g, "-"), number = parseFloat(words);
-    return Number.isNaN(number) ? words : number;
-  };
-  heads.forEach((head, column) => {
-    head.tabIndex = 0;
-    const sort = () => {
-      const down = head.getAttribute("aria-sort") === "ascending";
-      heads.forEach(other => other.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", down ? "descending" : "ascending");
-      const rows = [...table.tBodies[0].rows];
-      const compare = (a, b) => {
-        const x = key(a.cells[column]), y = key(b.cells[column]);
-        if (typeof x !== typeof y) return typeof x === "number" ? -1 : 1;  // numbers first
-        const order = typeof x === "number" ? x - y : x.localeCompare(y);
-        return down ? -order : order;
-      };
-      rows.sort(compare).forEach(row => table.tBodies[0].append(row));
-    };
-    head.addEventListener("click", sort);
-    head.addEventListener("keydown", event => { if (event.key === "Enter") sort(); });
-  });
-}
 if (!root || !block) return;
 const data = JSON.parse(block.textContent), L = 1e-4;
 const style = getComputedStyle(document.documentElement);
-const colors = data.models.map((_, k) => style.getPropertyValue("--m" + k % 6).trim());
-const ink = "#1d2129", soft = "#5b6472";
-const tints = { flight: "#cfdff3", impact: "#e58a78", sliding: "#f3cf8f", rolling: "#bfe3c4", sticking: "#cfc3e8",
-  rest: "#e3e5e9" };
-const marks = { flight: "#1f5fa8", impact: "#b3261e", sliding: "#c46a1b", rolling: "#1d7a46", sticking: "#8e3b8e",
-  rest: "#8a919c" };
+const paint = name => style.getPropertyValue("--" + name).trim();  // live: the scheme may change
+const color = k => paint("m" + k % 6);
 const shown = data.models.map(() => true);
 let at = 0, frame = 0, timer = null, began = 0;
 const find = name => root.querySelector("[data-part=" + name + "]");
@@ -45,7 +16,7 @@ const nearest = (times, t) => times.reduce((best, v, k) => Math.abs(v - t) < Mat
 data.episodes.forEach((e, k) => picker.append(new Option(e.name, k)));
 data.models.forEach((name, k) => {
   const button = document.createElement("button");
-  button.type = "button"; button.textContent = name; button.style.borderLeftColor = colors[k];
+  button.type = "button"; button.textContent = name; button.style.borderLeftColor = "var(--m" + k % 6 + ")";
   button.setAttribute("aria-pressed", "true");
   button.addEventListener("click", () => {
     shown[k] = !shown[k]; button.setAttribute("aria-pressed", String(shown[k])); prepare(); draw();
@@ -121,7 +92,7 @@ function view(canvas, vertical) {
   const mid = (low[0] + high[0]) / 2, x0 = left + (width - left - 8) / 2;
   const middle = (low[vertical] + high[vertical]) / 2, y0 = 8 + tall / 2;
   const place = p => [x0 + s * (dot(U, p) - mid), y0 - s * (dot(V, p) - middle)];
-  g.font = "11px system-ui, sans-serif"; g.fillStyle = soft; g.strokeStyle = "#e6e8ec"; g.lineWidth = 1;
+  g.font = "11px system-ui, sans-serif"; g.fillStyle = paint("soft"); g.strokeStyle = paint("grid"); g.lineWidth = 1;
   const grid = step(Math.max(high[0] - low[0], high[vertical] - low[vertical]));
   const words = v => (Math.abs(v) < 1e-9 ? 0 : v).toFixed(grid < 0.1 ? 2 : 1).replace("-", "−");
   const from = mid - (x0 - left) / s, to = mid + (width - 8 - x0) / s;
@@ -140,7 +111,7 @@ function view(canvas, vertical) {
   g.save(); g.beginPath(); g.rect(left, 8, width - left - 8, tall); g.clip();
   if (vertical === 2 && data.ground) {
     const y = y0 - s * (data.ground.offset / Math.hypot(...data.ground.normal) - middle);
-    g.strokeStyle = "#a9b0bb"; g.lineWidth = 2;
+    g.strokeStyle = paint("ground"); g.lineWidth = 2;
     g.beginPath(); g.moveTo(left, y); g.lineTo(width, y); g.stroke();
   }
   const trail = (list, count, b, color, until, dots) => {
@@ -174,7 +145,7 @@ function view(canvas, vertical) {
     }
     const outline = hull(corners);
     g.beginPath(); outline.forEach((c, i) => i ? g.lineTo(...c) : g.moveTo(...c)); g.closePath();
-    if (filled) { g.fillStyle = "rgba(29,33,41,.10)"; g.fill(); }
+    if (filled) { g.fillStyle = paint("body"); g.fill(); }
     g.strokeStyle = color; g.lineWidth = filled ? 1.6 : 1.8; g.stroke();
     g.lineWidth = 0.7; g.beginPath();
     for (const [a, b] of shape.edges) { g.moveTo(...corners[a]); g.lineTo(...corners[b]); }
@@ -186,16 +157,16 @@ function view(canvas, vertical) {
     g.stroke();
   };
   const count = e.free.length;
-  for (const name in e.others) body(name, e.others[name].p, e.others[name].q, frame, "#8a919c", true);
-  e.free.forEach((_, b) => trail(e.p, count, b, "#9aa1ab", 1e9, true));
+  for (const name in e.others) body(name, e.others[name].p, e.others[name].q, frame, paint("frozen"), true);
+  e.free.forEach((_, b) => trail(e.p, count, b, paint("frozen"), 1e9, true));
   e.models.forEach((m, j) => {
     if (!m || !shown[j]) return;
-    g.globalAlpha = 0.35; e.free.forEach((_, b) => trail(m.p, count, b, colors[j], 1e9, false));
-    g.globalAlpha = 1; e.free.forEach((_, b) => trail(m.p, count, b, colors[j], frame, false));
+    g.globalAlpha = 0.35; e.free.forEach((_, b) => trail(m.p, count, b, color(j), 1e9, false));
+    g.globalAlpha = 1; e.free.forEach((_, b) => trail(m.p, count, b, color(j), frame, false));
   });
-  e.free.forEach((name, b) => body(name, e.p, e.q, frame * count + b, ink, true));
+  e.free.forEach((name, b) => body(name, e.p, e.q, frame * count + b, paint("ink"), true));
   e.models.forEach((m, j) => {
-    if (m && shown[j]) e.free.forEach((name, b) => body(name, m.p, m.q, frame * count + b, colors[j], false));
+    if (m && shown[j]) e.free.forEach((name, b) => body(name, m.p, m.q, frame * count + b, color(j), false));
   });
   g.restore();
 }
@@ -234,7 +205,7 @@ function curve(name, title, pick, floor, reference) {
       if (v === null) { joined = false; return; }
       path += (joined ? "L" : "M") + across(e.t[k]).toFixed(1) + " " + y(v).toFixed(1); joined = true;
     });
-    out += '<path class="line" style="stroke:' + colors[j] + '" d="' + path + '"/>';
+    out += '<path class="line" style="stroke:var(--m' + j % 6 + ')" d="' + path + '"/>';
   });
   svg.innerHTML = out + '<line class="now" y1="' + TOP + '" y2="' + (H - BOTTOM) + '"/>';
 }
@@ -249,7 +220,7 @@ function phases() {
     const a = k ? (e.t[k - 1] + t) / 2 : t, b = k + 1 < e.t.length ? (t + e.t[k + 1]) / 2 : t;
     const name = data.phases[own.phase[k]];
     out += '<rect class="bar" x="' + across(a) + '" y="2" width="' + (across(b) - across(a) + 0.3)
-      + '" height="14" fill="' + tints[name] + '"><title>' + name + "</title></rect>";
+      + '" height="14" fill="var(--' + name + ')"><title>' + name + "</title></rect>";
   });
   svg.innerHTML = out + '<line class="now" y1="0" y2="18"/>';
 }
@@ -369,6 +340,7 @@ const go = (name, time) => {
 for (const button of document.querySelectorAll("button.go"))
   button.addEventListener("click", () => go(button.dataset.episode, Number(button.dataset.time)));
 window.addEventListener("resize", draw);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 choose(0);
 
 // Residual wrenches against coordinates
@@ -386,7 +358,7 @@ const phasePicker = part("phase");
 options(phasePicker, ["all phases", ...data.phases]);
 const present = new Set(data.wrench.models.flat().map(p => data.phases[p.ph]));
 part("marks").innerHTML = data.phases.filter(name => present.has(name))
-  .map(name => '<span><i style="background:' + marks[name] + '"></i>' + name + "</span>").join("");
+  .map(name => '<span><i style="background:' + 'var(--in-' + name + ')' + '"></i>' + name + "</span>").join("");
 function scatter() {
   const [m, kind, c, ph] = ["model", "kind", "coordinate", "phase"].map(name => Number(part(name).value));
   const points = data.wrench.models[m].filter(p => p.a[kind] !== null && p.c[c] !== null && (!ph || p.ph === ph - 1));
@@ -410,7 +382,7 @@ function scatter() {
     out += '<text x="' + X(v) + '" y="' + (h - 16) + '" text-anchor="middle">' + +v.toPrecision(3) + "</text>";
   out += '<line class="zero" x1="' + l + '" x2="' + (w - r) + '" y1="' + Y(0) + '" y2="' + Y(0) + '"/>';
   points.forEach((p, k) => {
-    const x = X(p.c[c]), color = marks[data.phases[p.ph]], a = p.a[kind], s = p.s[kind];
+    const x = X(p.c[c]), color = "var(--in-" + data.phases[p.ph] + ")", a = p.a[kind], s = p.s[kind];
     out += '<line class="error" style="stroke:' + color + '" x1="' + x + '" x2="' + x + '" y1="' + Y(a - s)
       + '" y2="' + Y(a + s) + '"/><circle data-k="' + k + '" cx="' + x + '" cy="' + Y(a) + '" r="3" style="fill:'
       + color + '"><title>episode ' + escaped(p.e) + ", " + p.t.toFixed(3) + " s, " + data.phases[p.ph] + ": "
