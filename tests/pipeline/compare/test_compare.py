@@ -14,7 +14,7 @@ from cgwm.datasets.capture.tracks import Track, write_tracks
 from cgwm.datasets.io.atomic import new_directory, sha256
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.pipeline.compare.error_ladder import Rung, ladder_svg
-from cgwm.pipeline.compare.page_file import default_page, shows_the_same
+from cgwm.pipeline.compare.page import default_page, mark_of
 from cgwm.pipeline.compare.paired_difference import LEAST_EPISODES, paired_difference
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.compare.stage import Comparison, compare, compare_models
@@ -22,6 +22,7 @@ from cgwm.pipeline.compare.verdict import comparison_verdict
 from cgwm.pipeline.evaluate import evaluate
 from cgwm.pipeline.evaluate.prediction import Motion
 from cgwm.pipeline.physics import State, World, simulate
+from cgwm.pipeline.report.page_file import shows_the_same
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PHASES, CompareResult, EffectModel, UsageError
 from helpers.pages import Tags, clicked
@@ -340,18 +341,24 @@ def test_the_page_is_beside_the_models_and_in_no_output(folder: Path, tmp_path: 
         (made / "model").mkdir()
     assert default_page([tmp_path / "dataset" / "model"]) == tmp_path / "compare-model.html"
     assert default_page([Path("a/m"), Path("b/m")]) == Path("a/compare-a-m-b-m.html")
+    assert default_page([Path("m0")], "train") == Path("compare-m0-train.html")
 
 
 def test_a_page_of_the_same_comparison_is_replaced_without_asking_and_nothing_else(
     page: Path, folder: Path, tmp_path: Path
 ) -> None:
-    models = [folder / "slippery", folder / "true"]
-    assert shows_the_same(page, models, folder / "capture")
-    assert not shows_the_same(page, models[:1], folder / "capture")
-    assert not shows_the_same(page, models[::-1], folder / "capture")
-    assert not shows_the_same(page, models, folder / "another")
-    assert not shows_the_same(tmp_path / "none.html", models, folder / "capture")
-    assert not shows_the_same(tmp_path, models, folder / "capture")
+    models, capture = [folder / "slippery", folder / "true"], folder / "capture"
+
+    def known(page: Path, models: list[Path], capture: Path, split: str = "test") -> bool:
+        return shows_the_same(page, mark_of(page, models, capture, split))
+
+    assert known(page, models, capture)
+    assert not known(page, models[:1], capture)
+    assert not known(page, models[::-1], capture)
+    assert not known(page, models, folder / "another")
+    assert not known(page, models, capture, "train")
+    assert not known(tmp_path / "none.html", models, capture)
+    assert not known(tmp_path, models, capture)
 
 
 def test_the_command_can_be_typed_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,9 @@ from cgwm.pipeline.demo.truth_tables import sphere_distance, true_parameters
 from cgwm.pipeline.demo.verdict import targets_of, verdict_text
 from cgwm.pipeline.rendering.contact_sheets import FrameStrip, RolloutTile, small_png, telling, tiles
 from cgwm.pipeline.report.charts import Chart, Line, chart_svg, decades, interval_svg
-from cgwm.pipeline.report.page import number
+from cgwm.pipeline.report.page import command, link, number, section, table
+from cgwm.pipeline.report.page import page as whole
+from cgwm.pipeline.report.plots import Bar, Plot, Series, bars, plot_svg
 from cgwm.schemas import (
     BodyCheck,
     CalibrationCheck,
@@ -341,3 +343,42 @@ def test_numbers() -> None:
         "10.0",
         "0.100",
     ]
+
+
+def test_a_page_lists_its_contents_and_each_entry_leads_to_a_section() -> None:
+    made = whole("t", ["<h1>t</h1>", *(section(name, "x") for name in ("One", "Two & three", "Four"))])
+    anchors = re.findall(r'<a href="#([^"]+)">', made)
+    assert anchors == ["one", "two-three", "four"]
+    assert all(f'<h2 id="{anchor}">' in made for anchor in anchors)
+    assert made.index("<nav") < made.index("<section>")
+    assert "<nav" not in whole("t", [section("One", "x"), section("Two", "x")])
+
+
+def test_a_wide_table_names_the_column_of_each_cell_and_a_narrow_one_does_not() -> None:
+    assert table(["a", "b", "c", "d"], [["1", "2", "3", "4"]]).count("data-label") == 4
+    assert "data-label" not in table(["a", "b", "c"], [["1", "2", "3"]])
+    assert 'class="wide sortable"' in table(["a", "b", "<c>", "d"], [["1"] * 4], sorts=True)
+
+
+def test_links_are_relative_to_the_page_and_commands_are_text(tmp_path: Path) -> None:
+    assert link("m & 0", tmp_path / "a b" / "m0", tmp_path / "p" / "x.html") == '<a href="../a%20b/m0">m &amp; 0</a>'
+    assert command("cgwm fit <x>") == "<pre><code>cgwm fit &lt;x&gt;</code></pre>"
+
+
+def test_a_plot_places_its_points_and_interrupts_lines_where_nothing_is_known() -> None:
+    line = Series(name="l", points=[(0, 0), (1, 1), (2, float("nan")), (3, 3), (4, 4)])
+    made = plot_svg(Plot(title="t", x="x", series=[line], equal=True))
+    path = re.search(r'stroke-width:2" d="([^"]+)"', made)
+    assert path is not None
+    (x0, y0), (x1, y1), (x3, y3), _ = [tuple(map(float, p.split())) for p in re.split("[ML]", path[1])[1:]]
+    assert path[1].count("M") == 2
+    assert (x3 - x0, y0 - y3) == pytest.approx((3 * (x1 - x0), 3 * (y0 - y1)), abs=0.3)
+    assert x1 - x0 == pytest.approx(y0 - y1, abs=0.2)
+    assert plot_svg(Plot(title="t", x="x", series=[Series(name="l", points=[])])) == ""
+
+
+def test_bars_are_in_proportion_and_none_is_negative() -> None:
+    made = bars(
+        [Bar(name="a", value=4, words="4"), Bar(name="b", value=1, words="1"), Bar(name="c", value=-1, words="-1")]
+    )
+    assert re.findall(r"width:([\d.]+)%", made) == ["100.0", "25.0", "0.0"]
