@@ -111,6 +111,8 @@ def _summary(model: ModelFile, out: Path, kept: bool = False) -> str:
         lines.append(
             table([_row(p) for p in model.parameters], ["parameter", "estimate", "95 % interval", "unit", "state"])
         )
+    if model.choice is not None:
+        lines.append(model.choice.sentence)
     return "\n".join([*lines, *warnings(model.warnings)])
 
 

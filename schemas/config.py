@@ -84,9 +84,13 @@ class PhysConfig(FileModel):
     """Whether the colliding spheres that touch are refined with the images, through the motion alone."""
     effects: tuple[str, ...] = ()
     """Effects to add to the model and to fit: names of built-in ones, or `path/to/file.py:ClassName`."""
-    mass_distribution: bool = False
-    """Fit where the mass of free bodies is, too: its centre and second moments, from 8 tracked episodes or more. What
-    the capture gives of them is then only the start."""
+    mass_distribution: bool | Literal["auto"] = "auto"
+    """Whether it is fitted where the mass of free bodies is: its centre and second moments, from 8 tracked episodes or
+    more. What the capture gives of them is then only the start. auto: where held-out training tosses are predicted
+    better."""
+    length_scale: bool | Literal["auto"] = "auto"
+    """Whether the scale of the measured positions is fitted, as the effect `length_scale`. auto: where held-out
+    training tosses are predicted better, and better than with another gravity, clock or drag."""
 
     @field_validator("effects")
     @classmethod

@@ -103,6 +103,30 @@ class Correlation(FileModel):
         return self
 
 
+class HeldOutFall(FileModel):
+    """How much better held-out episodes are predicted when parts are fitted, too."""
+
+    parts: tuple[str, ...]
+    """Names of the parts."""
+    share: Value
+    """Fall of the misfit, as a share of the misfit without them."""
+    std_error: NonNegative
+    """Its standard error, from the scatter between episodes."""
+
+
+class FitChoice(FileModel):
+    """What a fit to tracks estimates beside the contact, chosen by cross-validation inside the training split."""
+
+    episodes: Annotated[int, Field(ge=2)]
+    """Number of episodes of the cross-validation."""
+    chosen: tuple[str, ...]
+    """Parts that were chosen: centre_of_mass, second_moments, length_scale."""
+    tested: tuple[HeldOutFall, ...]
+    """Each set of parts that was compared."""
+    sentence: str
+    """The choice in words."""
+
+
 class BodyModel(FileModel):
     """A body of the model. Files are names in the model's directory."""
 
@@ -218,6 +242,8 @@ class ModelFile(FileModel):
     solver: Solver = Solver()
     measurement_std: dict[str, Deviation] = {}
     """position_m and rotation_rad: the measurement noise, given or estimated."""
+    choice: FitChoice | None = None
+    """What the fit chose to estimate; None where its settings or data left nothing to choose."""
     scene: str | None = None
     """Background spheres (PLY, world frame), where there are any."""
     exposures: dict[str, Exposure] = {}

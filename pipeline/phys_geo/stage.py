@@ -30,6 +30,7 @@ from ..runtime.work_budget import motion_doubt, within_budget
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .tracks.contact_result import PhysicsFit
+from .tracks.part_choice import SCALE
 from .work import LESS, fit_parts
 
 
@@ -55,7 +56,7 @@ def fit_motion(
     ready = replace(model, file=_physics_start(model, capture, config))
     started = time.perf_counter()
     found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
-    found = replace(found, warnings=(*found.warnings, *warnings))
+    found = replace(found, warnings=(*found.warnings, *found.record.unconverged(), *warnings))
     seconds = round(time.perf_counter() - started, 2)
     record = found.record.to_json() | {"seconds": seconds, "supervise": config.supervise}
     record |= {"warnings": list(found.warnings)}
@@ -111,12 +112,13 @@ def _fitted_motion(
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
         return replace(found, warnings=(*found.warnings, *warnings))
-    if config.mass_distribution:
-        raise UsageError(
-            f"phys-geo.mass_distribution with --supervise {config.supervise}: images do not identify it.",
-            "--supervise tracks.",
-            "fit to tracks, or leave phys-geo.mass_distribution at false.",
-        )
+    for name in ("mass_distribution", "length_scale"):
+        if getattr(config, name) is True:
+            raise UsageError(
+                f"phys-geo.{name} with --supervise {config.supervise}: images do not identify it.",
+                "--supervise tracks.",
+                f"fit to tracks, or leave phys-geo.{name} at auto.",
+            )
     from .images.image_fit import fit_physics_from_images
 
     spans = [max(_video_s(capture, name), 0.0) for name in capture.episodes(split)]
@@ -161,6 +163,8 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     fresh = {parameter.name for parameter in found.parameters}
     kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
     correlations = [block for block in file.correlations if not fresh & set(block.parameters)]
+    added = (SCALE,) if any(p.name.startswith(f"{SCALE}.") for p in found.parameters) else ()
+    effects = with_effects(file.effects, added)
     ground = file.ground
     if ground is not None and found.ground_offset_m is not None:
         ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
@@ -172,13 +176,14 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
             "parameters": (*found.parameters, *kept),
             "correlations": (*found.correlations, *correlations),
             "effects": fitted_effects(
-                file.effects,
-                {e.name: effect_of(e).name for e in file.effects},
+                effects,
+                {e.name: effect_of(e).name for e in effects},
                 found.parameters,
                 found.constants,
                 {} if found.effects is None else found.effects.own_values,
                 {} if found.effects is None else found.effects.spread,
             ),
+            "choice": found.record.choice,
             "measurement_std": {"position_m": found.noise.position_m, "rotation_rad": found.noise.rotation_rad},
             "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
         }

@@ -102,32 +102,15 @@ def fit_first_contacts(
     Raises:
         NotConvergedError: If the rollouts diverge at the start.
     """
-    picked, windows, _ = windows_of(world, episodes, None if whole_flight else LEAD_FRAMES, after_s)
-    observations = Observations.of(world, picked, windows)
     start, count = [*wanted, *along], len(wanted)
     names = [parameter for parameter, _ in start]
-    position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
-    residuals = TrajectoryResiduals(
-        world=world,
-        parameters=names,
-        observations=observations,
-        position_std_m=position_std,
-        rotation_std_rad=rotation_std,
-    )
-    solution = minimise(
-        residuals,
-        torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity),
-        torch.zeros(len(observations.names), STATE_SIZE * len(observations.free)).to(world.gravity),
-        torch.tensor([parameter.limits for parameter in names]).to(world.gravity),
-        robust_scale=ROBUST_SCALE,
-        iterations=ITERATIONS,
-        prior_information=state_prior(len(observations.free)),
-        shared_prior=_prior(names, count, world.gravity),
-    )
+    residuals = window_residuals(world, episodes, names, noise, None if whole_flight else LEAD_FRAMES, after_s)
+    coordinates = torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity)
+    solution = solved_windows(residuals, coordinates, None, _prior(names, count, world.gravity), ITERATIONS)
     covariance = _covariance(solution, residuals)
     std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
-    record = {"windows": len(observations.names), "costs": solution.costs, "converged": solution.converged}
+    record = {"windows": len(residuals.observations.names), "costs": solution.costs, "converged": solution.converged}
     return EffectEstimate(
         world=placed(world, found, coordinates),
         parameters=tuple(
@@ -138,17 +121,85 @@ def fit_first_contacts(
     )
 
 
+def window_residuals(
+    world: World,
+    episodes: Sequence[Episode],
+    names: Sequence[Parameter],
+    noise: Noise,
+    lead_frames: int | None,
+    after_s: float,
+) -> TrajectoryResiduals:
+    """Return the residuals of the windows around first contacts; see :func:`fit_first_contacts`.
+
+    Args:
+        world: The world.
+        episodes: Name and tracks by body of each episode.
+        names: Parameters that are varied.
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
+        lead_frames: Frames before the contact; None for all.
+        after_s: Time [s] that a window continues after it.
+    """
+    picked, windows, _ = windows_of(world, episodes, lead_frames, after_s)
+    position_std, rotation_std = (float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True))
+    return TrajectoryResiduals(
+        world=world,
+        parameters=names,
+        observations=Observations.of(world, picked, windows),
+        position_std_m=position_std,
+        rotation_std_rad=rotation_std,
+    )
+
+
+def solved_windows(
+    residuals: TrajectoryResiduals,
+    shared: Tensor,
+    states: Tensor | None,
+    shared_prior: tuple[Tensor, Tensor],
+    iterations: int,
+) -> Solution:
+    """Return the robust fit of parameters and the windows' states; with 0 iterations, the linearization at the start.
+
+    Args:
+        residuals: Those of the windows (B).
+        shared: Start of the parameters, in fitted coordinates, shape (P,).
+        states: Start of the changes of the states, shape (B, S); None for 0.
+        shared_prior: Centre (P,) and information (P,) of the prior on the parameters.
+        iterations: Maximum number of steps.
+
+    Raises:
+        NotConvergedError: If the rollouts diverge at the start.
+    """
+    seen = residuals.observations
+    if states is None:
+        states = torch.zeros(len(seen.names), STATE_SIZE * len(seen.free)).to(shared)
+    return minimise(
+        residuals,
+        shared,
+        states,
+        torch.tensor([parameter.limits for parameter in residuals.parameters]).to(shared),
+        robust_scale=ROBUST_SCALE,
+        iterations=iterations,
+        prior_information=state_prior(len(seen.free)),
+        shared_prior=shared_prior,
+    )
+
+
 def _covariance(solution: Solution, residuals: TrajectoryResiduals) -> Array:
     """Return the covariance (P, P) of fitted coordinates; with few episodes at least that from the residuals."""
-    observations = residuals.observations
     covariance = few_covariance(solution.information.numpy(), solution.scores.numpy())
-    if len(observations.names) >= ENOUGH_EPISODES:
+    if len(residuals.observations.names) >= ENOUGH_EPISODES:
         return covariance
-    rows, _ = residuals(solution.shared, solution.states, False)
-    errors = WindowErrors.of(rows, solution, observations, np.zeros(len(observations.names), bool))
-    factor, dof = errors.factor(len(residuals.parameters))
+    factor, dof = error_factor(residuals, solution)
     missed = factor * (student_quantile(0.975, dof) / REACH) ** 2 * inverse(solution.information.numpy())
     return _wider(covariance, missed)
+
+
+def error_factor(residuals: TrajectoryResiduals, solution: Solution) -> tuple[float, float]:
+    """Return the factor by which the windows' error variance exceeds the assumed one, and its degrees of freedom."""
+    rows, _ = residuals(solution.shared, solution.states, False)
+    windows = residuals.observations
+    errors = WindowErrors.of(rows, solution, windows, np.zeros(len(windows.names), bool))
+    return errors.factor(len(residuals.parameters))
 
 
 def _prior(parameters: Sequence[Parameter], wanted: int, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -213,6 +213,28 @@ class ImpactDataThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ChoiceThresholds:
+    """A fit estimates more than the contact: mass distribution, scale of lengths."""
+
+    level: float = threshold(
+        0.01,
+        "1",
+        "level of the t test of the held-out gains of the episodes",
+        "by argument: seven sets are compared",
+        "0 of 36 captures of 10 or 30 tosses with nothing hidden choose a part: 12 of this engine, 24 of MuJoCo",
+        (0, 36),
+    )
+    least_share: float = threshold(
+        0.02,
+        "1",
+        "smallest fall of the held-out misfit, as a share, for which a parameter is added",
+        BY_ARGUMENT,
+        "of MuJoCo's softest contact, a scale explains 1 % beyond chance in 2 of 6",
+    )
+    least_episodes: int = threshold(8, "episodes", "fewest tosses with measured rotation", BY_ARGUMENT)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentThresholds:
     """All thresholds on segments that decide a verdict."""
 
@@ -226,6 +248,8 @@ class SegmentThresholds:
     """Sliding segments."""
     impact_data: ImpactDataThresholds = ImpactDataThresholds()
     """Impacts of a ball."""
+    choice: ChoiceThresholds = ChoiceThresholds()
+    """What a fit estimates."""
 
 
 SEGMENT_THRESHOLDS = SegmentThresholds()

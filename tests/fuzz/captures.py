@@ -70,6 +70,7 @@ def settings(root: Path) -> None:
     (root / "fit.toml").write_text(
         "[phys-geo]\nseed = 0\nstep_s = 0.003\npopulation = 8\ngenerations = 2\niterations = 1\nwarmup_s = 0.1\n"
         'image_size = 320\ngeometry = true\nsupervise = "tracks"\neffects = []\nmass_distribution = false\n'
+        'length_scale = "auto"\n'
         "[sg-gs]\niterations = 2\nimage_size = 32\nturntable = false\nmax_body_spheres = 40\n"
         "max_scene_spheres = 40\nmax_collision_spheres = 20\ntest_every = 2\nradius_factor = 2.0\n"
     )

@@ -1,7 +1,8 @@
 """The stage phys-geo on measured tracks: contact parameters, and where asked for effects and the mass distribution.
 
 1. The noise of the tracks, given or estimated from them.
-2. Where it is asked for, the mass distribution (`inertia_fit.py`), then the effects of the world (`effect_fit.py`).
+2. What held-out tosses ask for beside the contact (`part_choice.py`): where it is chosen or asked for, the mass
+   distribution (`inertia_fit.py`), then the effects of the world (`effect_fit.py`), a scale of lengths among them.
 3. Initial states from each episode's warm-up, fitted with the model itself.
 4. A global search (adaptive importance sampling) on the open-loop error, many rollouts at once (`open_loop_search.py`):
    the model's purpose is to predict long unseen motion, and this error has several minima. The estimate is the mean
@@ -23,8 +24,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ....datasets.capture.tracks import Episode, Track
-from ....schemas import InputDataError, PhysConfig
+from ....schemas import FitChoice, InputDataError, PhysConfig
 from ...optimization.importance_sampling import episode_covariance
+from ...physics.effects import ActiveEffect, load_effect
 from ...physics.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_TIME,
@@ -44,8 +46,9 @@ from ...trajectories.track_noise import Noise, estimate_noise
 from ..effects.effect_fit import fit_effects
 from .contact_result import ContactEstimate, FitRecord, PhysicsFit, absolute_ground, physics_fit
 from .contact_shooting import ShootingEpisodes, shoot_contact
-from .inertia_fit import fit_mass_distribution
+from .inertia_fit import MASS_PARTS, fit_mass_distribution
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
+from .part_choice import SCALE, asked_parts, choose_parts
 
 MAX_SPAN_S = 0.8
 """Maximum duration of an episode in the fit, from its start [s]: after a dozen impacts the motion carries no
@@ -97,6 +100,7 @@ def fit_physics(
         noise_estimated=data.noise_estimated,
         mass_distribution=None if ready.mass is None else ready.mass.record,
         effects=None if ready.effects is None else ready.effects.record,
+        choice=ready.choice,
     )
     if data.airborne:
         found = _never_touching(ready, batch, data.noise, record)
@@ -170,6 +174,8 @@ class _Ready:
     """Mass distribution, where it was fitted."""
     effects: EffectEstimate | None
     """Effects, where they were fitted."""
+    choice: FitChoice | None
+    """What was chosen to be fitted."""
 
     @property
     def parameters(self) -> list[Parameter]:
@@ -190,11 +196,8 @@ def _fitted_before(
     height = world.ground_normal is not None and len(data.episodes) >= ENOUGH_EPISODES
     names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
     start = [(p, _start(world, p) if warm_started else p.prior[0]) for p in names]
-    mass: EffectEstimate | None = None
+    world, mass, choice = _with_chosen_parts(world, data, config, start)
     effects: EffectEstimate | None = None
-    if config.mass_distribution:
-        mass = fit_mass_distribution(world, data.episodes, start, data.noise)
-        world = mass.world
     if effect_parameters(world):
         # flight needs no contact and no short steps
         at = world_for("flight", world, data.noise.position_m) if data.airborne else world
@@ -203,7 +206,31 @@ def _fitted_before(
         start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
         if effects.ground is not None:  # bodies at rest identify it better than the ends of rollouts
             start = [(p, value) for p, value in start if p in CONTACT_PARAMETERS]
-    return _Ready(world=world, start=start, mass=mass, effects=effects)
+    return _Ready(world=world, start=start, mass=mass, effects=effects, choice=choice)
+
+
+def _with_chosen_parts(
+    world: World, data: _FitData, config: PhysConfig, start: Sequence[tuple[Parameter, float]]
+) -> tuple[World, EffectEstimate | None, FitChoice | None]:
+    """Return the world with the mass distribution and an unfitted scale that are chosen or asked for, with the choice.
+
+    Args:
+        world: The world.
+        data: The episodes.
+        config: The stage's settings.
+        start: Contact parameters, and their start.
+    """
+    choice = None if data.airborne else choose_parts(world, data.episodes, data.noise, config)
+    parts = {*asked_parts(config), *(() if choice is None else choice.chosen)}
+    mass: EffectEstimate | None = None
+    wanted = [part for part in MASS_PARTS if part in parts]
+    if wanted:
+        mass = fit_mass_distribution(world, data.episodes, start, data.noise, wanted)
+        world = mass.world
+    if SCALE in parts and all(active.effect.name != SCALE for active in world.effects):
+        scale = ActiveEffect.of(load_effect(SCALE), {}, world.gravity)
+        world = replace(world, effects=(*world.effects, scale))
+    return world, mass, choice
 
 
 def _with_initial_states(world: World, data: _FitData, warmup_s: float) -> SearchBatch:

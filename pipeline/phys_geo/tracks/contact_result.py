@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 
 from ....datasets.capture.tracks import Track
 from ....datasets.shapes.ply import Splats
-from ....schemas import ContactParameters, Correlation, FittedParameter
+from ....schemas import ContactParameters, Correlation, FitChoice, FittedParameter
 from ...optimization.uncertainty import correlation_of
 from ...physics.contact_law import restitution
 from ...physics.parameters import GROUND_SHIFT, Parameter
@@ -87,6 +87,8 @@ class FitRecord:
     """Record of the fit of the mass distribution, where there was one."""
     effects: dict[str, Any] | None = None
     """Record of the fit of the effects, where there was one."""
+    choice: FitChoice | None = None
+    """What was chosen to be fitted, where there was a choice."""
     search_open_loop_m: list[float] | None = None
     """Lowest open-loop error [m] after each generation of the search."""
     search_effective_samples: float | None = None
@@ -95,6 +97,22 @@ class FitRecord:
     """Course of multiple shooting, where it was used."""
     images: dict[str, Any] = field(default_factory=dict)
     """Entries of a fit to videos."""
+
+    def unconverged(self) -> list[str]:
+        """Return a warning for each part of the fit whose descent ended at its limit of steps."""
+        parts = {
+            "the mass distribution": _converged(self.mass_distribution),
+            "the effects": _converged(self.effects),
+            "the contact parameters (multiple shooting)": self.shooting is None
+            or self.shooting.converged
+            or not self.shooting.kept,
+        }
+        return [
+            f"the fit of {part} did not converge within its steps: its estimates may be off by more than their "
+            "intervals. Fit more or cleaner episodes, or pass a larger --set phys-geo.iterations."
+            for part, ended in parts.items()
+            if not ended
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return the entries for `fit.json`, without those of steps that were not taken."""
@@ -107,11 +125,20 @@ class FitRecord:
         optional = {
             "mass_distribution": self.mass_distribution,
             "effects": self.effects,
+            "choice": None if self.choice is None else self.choice.model_dump(mode="json"),
             "search_open_loop_m": self.search_open_loop_m,
             "search_effective_samples": self.search_effective_samples,
         }
         record |= {name: value for name, value in optional.items() if value is not None}
         return record | ({} if self.shooting is None else self.shooting.to_json()) | self.images
+
+
+def _converged(record: Mapping[str, Any] | None) -> bool:
+    """Return whether the fits of a record, and of those that it holds, converged as far as they say."""
+    if record is None:
+        return True
+    inner = (_converged(value) for value in record.values() if isinstance(value, Mapping))
+    return bool(record.get("converged", True)) and all(inner)
 
 
 @dataclass(frozen=True, kw_only=True)
