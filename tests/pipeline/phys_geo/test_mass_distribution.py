@@ -1,6 +1,7 @@
 """Where a body's mass is: any second moments are those of a body, and a hidden weight is found from impacts."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,15 @@ import pytest
 import torch
 from cgwm.datasets import Track
 from cgwm.datasets.capture.manifest import write_manifest
-from cgwm.datasets.capture.tracks import tracks_csv
+from cgwm.datasets.capture.tracks import Episode, tracks_csv
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
+from cgwm.pipeline.phys_geo.tracks.contact_result import FitRecord
 from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
+from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
+from cgwm.pipeline.segments.held_out_gain import FOLDS, ContactLinearization
 from cgwm.pipeline.synthesize.parameters import draw_parameters
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import (
@@ -43,19 +47,21 @@ def weighted_world():
     return apply_parameters(world_of(box_body(), contact=law(), step_s=STEP_S), parameters, batch((*COM_M, *MOMENTS)))
 
 
-def tosses(count: int) -> list[tuple[str, dict[str, Track]]]:
+@cache
+def tosses(count: int, weighted: bool = True) -> list[Episode]:
+    world = weighted_world() if weighted else world_of(box_body(), contact=law(), step_s=STEP_S)
     rng = np.random.default_rng(0)
     episodes = []
     for number in range(count):
         quat, spin = rng.standard_normal(4), 8 * rng.standard_normal(3)
         start = state_of(((0, 0, 0.11), tuple(quat), (0.5, 0.2, -0.7), tuple(spin)))
-        rollout = simulate(weighted_world(), start, times(0.2, 120))
+        rollout = simulate(world, start, times(0.2, 120))
         position = rollout.position_m[0, :, 0].numpy()
         turned = Rotation.from_quat(rollout.quat_wxyz[0, :, 0].numpy(), scalar_first=True)
         turned = turned * Rotation.from_rotvec(NOISE[1] * rng.standard_normal(position.shape))
         noisy = position + NOISE[0] * rng.standard_normal(position.shape)
         track = Track(rollout.times_s.numpy(), noisy, turned.as_quat(scalar_first=True))
-        episodes.append((str(number), {"box": track}))
+        episodes.append(Episode(str(number), {"box": track}))
     return episodes
 
 
@@ -91,10 +97,63 @@ def test_a_hidden_weight_is_found_from_tosses() -> None:
     torch.testing.assert_close(found.world.bodies[0].inertia, expected.inertia, rtol=0.1, atol=1e-5)
 
 
+def chosen(world, episodes, **settings) -> tuple[str, ...] | None:
+    choice = choose_parts(world, episodes, NOISE, PhysConfig(**settings))
+    return None if choice is None else choice.chosen
+
+
+def test_held_out_tosses_choose_a_hidden_weight_and_nothing_else() -> None:
+    """A box with a weight needs its centre of mass; one without, fitted to the same kind of tosses, needs nothing."""
+    plain = world_of(box_body(), step_s=STEP_S)
+    found = chosen(plain, tosses(10)) or ()
+    assert "centre_of_mass" in found and "length_scale" not in found
+    assert chosen(plain, tosses(10, weighted=False)) == ()
+
+
+def test_nothing_is_chosen_from_few_tosses_or_against_the_settings() -> None:
+    plain = world_of(box_body(), step_s=STEP_S)
+    assert chosen(plain, tosses(10)[:7]) is None
+    assert chosen(plain, tosses(10), mass_distribution=False, length_scale=False) is None
+    centroids = [Episode(name, {"box": replace(tracks["box"], quat_wxyz=None)}) for name, tracks in tosses(10)[:8]]
+    assert chosen(plain, centroids) is None
+
+
+def test_gains_are_those_of_a_step_from_other_episodes() -> None:
+    """Of exactly quadratic misfits: the gain is the fall at the others' optimum, and below 0 for noise alone."""
+    rng = np.random.default_rng(3)
+    truth, slopes = np.array([0.5, -1.0]), rng.standard_normal((40, 6, 2))
+    information = slopes.transpose(0, 2, 1) @ slopes
+
+    def linear(at: np.ndarray) -> ContactLinearization:
+        rows = slopes @ at + rng.standard_normal((40, 6))
+        return ContactLinearization(
+            names=("a", "b"),
+            base=1,
+            information=information,
+            score=(slopes.transpose(0, 2, 1) @ rows[..., None])[..., 0],
+            prior=(np.zeros(2), np.full(2, 1e-9)),
+            excess=1.0,
+            misfit=float((rows**2).sum()) / 2,
+        )
+
+    found = linear(truth).gain([1])
+    expected = 0.5 * sum(m[1, 1] - m[0, 1] ** 2 / m[0, 0] for m in information)
+    assert found.matters and found.by_episode.sum() == pytest.approx(expected, rel=0.3)
+    null = np.mean([linear(np.array([0.5, 0.0])).gain([1]).by_episode.sum() for _ in range(200)])
+    assert null == pytest.approx(-0.5 * FOLDS / (FOLDS - 1), abs=0.15)
+
+
+def test_a_part_that_did_not_converge_is_a_warning() -> None:
+    record = FitRecord(episodes=8, search_episodes=8, noise_estimated=NOISE, mass_distribution={"converged": True})
+    assert record.unconverged() == []
+    (text,) = replace(record, effects={"in_flight": {"costs": []}, "converged": False}).unconverged()
+    assert text.startswith("the fit of the effects did not converge within its steps")
+
+
 def test_few_episodes_and_centroids_are_refused() -> None:
     with pytest.raises(InputDataError, match="7 of 7 episodes"):
-        fit_mass_distribution(world_of(box_body()), tosses(7), CONTACT, NOISE)
-    centroids = [(name, {"box": replace(tracks["box"], quat_wxyz=None)}) for name, tracks in tosses(8)]
+        fit_mass_distribution(world_of(box_body()), tosses(10)[:7], CONTACT, NOISE)
+    centroids = [Episode(name, {"box": replace(tracks["box"], quat_wxyz=None)}) for name, tracks in tosses(10)[:8]]
     with pytest.raises(InputDataError, match="0 of 8 episodes"):
         fit_mass_distribution(world_of(box_body()), centroids, CONTACT, NOISE)
 
@@ -103,7 +162,7 @@ def test_few_episodes_and_centroids_are_refused() -> None:
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("weighted") / "capture"
     (root / "tracks").mkdir(parents=True)
-    episodes = tosses(8)
+    episodes = tosses(10)[:8]
     for name, tracks in episodes:
         (root / "tracks" / f"{name}.csv").write_text(tracks_csv(tracks), encoding="utf-8")
     box = Body(name="box", mass_kg=0.4, shape=Shape(box=BoxShape(half_extents_m=(0.05, 0.04, 0.03))))
