@@ -16,7 +16,7 @@ help:
 	@echo 'make test      lint, type check and tests, as the continuous integration runs them'
 	@echo 'make install   only install cgwm into $(VENV)/ (the two above do it by themselves)'
 	@echo 'make lint      ruff and pyright alone'
-	@echo 'make same      compare what this tree computes with the outputs of a reference commit (tools/same.py)'
+	@echo 'make same      compare what this tree computes with the outputs of the last commit (tools/same.py)'
 	@echo 'make graph     print the import graph of the rooms, and draw it: docs/import-graph.svg'
 	@echo 'make docs      build the documentation as a site that is read offline: build/docs/index.html'
 	@echo 'make evidence  the measurements that take longer than tests may; resumable, results in out/evidence/'

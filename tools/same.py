@@ -8,13 +8,13 @@ source tree can be imported. Everything that they write is compared:
 - text files and HTML pages line by line and element by element, exactly, style sheets and scripts included;
 - other files by byte.
 
-`MASKS` and `FOLDERS` name the parts of values that may differ, `REWORDED` the texts whose words may: their numbers are
-compared. The report counts what each of these let pass. Three checks need no outputs: no test of the reference may be
-missing except `DROPPED_TESTS`; no function of the tests may have lost a check; and the wheel of this tree has exactly
-the files of its packages.
+`MASKS` and `FOLDERS` name the parts of values that may differ; the report counts what each of these let pass. Three
+checks need no outputs: no test of the reference may be missing, no function of the tests may have lost a check, and the
+wheel of this tree has exactly the files of its packages.
 
-Outputs are kept in `build/same/`. Those of the reference are made again when the reference or an installed package
-changes; `--again` compares the kept outputs of the last run without running anything.
+The reference is the last commit; `--reference` names another. Outputs are kept in `build/same/`. Those of the reference
+are made again when the reference or an installed package changes; `--again` compares the kept outputs of the last run
+without running anything.
 """
 
 from __future__ import annotations
@@ -41,11 +41,12 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build" / "same"
-REFERENCE = "af3142a"
-"""Commit whose outputs count."""
+REFERENCE = "HEAD"
+"""Commit whose outputs count, where no other is named."""
 
 MASKS: Sequence[tuple[str, str, str]] = (
     (r"\.json.*\.(seconds|seconds_by_step\.\w+|frames_per_s)$", r"[\d.e+-]+", "wall times"),
+    (r"\.cgwm-output\.json\.files\.", r"^[0-9a-f]{64}$", "hashes of files, which are compared themselves"),
     (r"\.(cgwm|creator)$", r"\d+(\.\d+)*\S*", "the version of cgwm itself"),
 )
 """Parts of values that may differ: a pattern of the place (file and key), one of the part of its text, the reason."""
@@ -54,64 +55,15 @@ FOLDERS = (
     "the folder in which a tree ran: the rest of the path is compared",
 )
 """Part that may differ in every text, and the reason."""
-GENERATOR = '<meta name="generator" content="cgwm">'
-"""Element by which a page is recognised as cgwm's own, which the reference does not write."""
-ADDED_LINES: Mapping[str, str] = {
-    r"^cgwm \w+ \['--trust-effects'\]": "the option --trust-effects",
-    r"^cgwm \w+ \['--accept-units'\]": "the option --accept-units",
-}
-"""Lines of texts (a pattern) that only this tree writes, with the reason."""
-ADDED_VALUES: Mapping[str, str] = {
-    r"\.provenance\.input_sha256\.(parent model|video \S+|images|masks)$": "hashes of photos, videos and the parent",
-    r"^validate-capture\.stdout\.json\.facts\.inconsistencies$": "what the motion contradicts",
-}
-"""Fields of JSON (a pattern of the place) that only this tree writes, with the reason."""
-ADDED_ENTRIES: Mapping[str, str] = {
-    r"their acceleration is \([^)]*\) m/s2 \(median of \d+ windows\); gravity is": "warnings about units and frames",
-}
-"""Entries of lists of texts (a pattern of the text) that only this tree writes, with the reason."""
-NUMBER = r"[-+−]?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
-REWORDED: Mapping[str, str] = {
-    r"^mine\.py": "the template of `effects new`: comments, and parameters by keyword",
-    r"^effects-new\.stdout\.txt": "the next step that `effects new` names",
-    r"^effects-\w+\.stdout\.json.*\.(summary|reveals|source)$": "the descriptions of effects",
-    r"\.json.*\.warnings\.\d+$": "the warnings of fits",
-    r"\.json.*\.(faults\.\d+|failures\.\d+\.text)$": "the faults that `validate` names",
-    r"^diagnose\d\.stdout\.json\.sentence$": "the verdict of `diagnose`",
-    r"^compare\.stdout\.json\.verdict$": "the verdict of `compare`",
-    r"^compare\.html text in <(p|title)\b": "the paragraphs and the title of the comparison page",
-}
-"""Texts (a pattern of the place) whose words may differ, with the reason; their numbers may not."""
-ROUNDED: Sequence[tuple[str, float, str]] = (
-    (r"\.h5:data/demo_\d+/bodies/contact_torque,", 1e-15, "rotation matrices of scipy: torques of contacts"),
-    (r"^(ds/dataset\.json\.shards\.0|synthesize\.stdout\.json)\.sha256$", 0.0, "the hash of the shard with them"),
-)
-"""Where a library replaced code: a pattern of the place, the relative difference that passes, and the reason."""
-ADDED_FILES: Mapping[str, str] = {r"(^|/)\.cgwm-output\.json$": "the record of an output directory"}
-"""Files (a pattern of their names) that only this tree writes, with the reason."""
-DROPPED_TESTS: Mapping[str, str] = {
-    r"^test_(all_is_complete|docstring_examples_run)\[cgwm\.": "named by the module, which has moved",
-    r"^test_the_commands_exist\[": "named by a line of the README, which became pages",
-    r"^test_(errors_and_exit_codes|the_outcome_is_said_plainly|the_page_has_the_numbers)\[": "by a reworded message",
-    r"^test_(a_wrong_plan_is_told_with_its_line|inadmissible_parameters_are_refused)\[": "by a reworded message",
-    r"^test_a_rollout_that_diverges_names_environment_and_step_and_leaves_its_start$": "the start is in the message",
-    r"^test_(a_plan_repeats_itself|capture_opens_and_manifest_validates)$": "by scene",
-    r"^test_same_arguments_same_bytes\[": "the film of one plan; that plans repeat is a test of its own",
-    r"\[(.*-)?(triton|cuda)(-.*)?\]$": "the GPU renderer has one kind of kernels",
-}
-"""Tests (a pattern of their names) that this tree need not have, with the reason."""
-DROPPED_CHECKS: Mapping[str, str] = {
-    r"^test_a_rollout_that_diverges_names_environment_and_step_and_leaves_its_start$": "another test, by another name",
-    r"^test_(colmap_faults|models)$": "one check in a loop over more faults",
-}
-"""Functions of the tests that may have fewer checks than in the reference, with the reason."""
 
 INPUTS = """
 import sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[2])
-import diagnosis_data, test_sg_gs, tiny_capture
-from cgwm.datasets.scenes.hidden import cases, make_capture
+tests = Path(sys.argv[2])
+sys.path[:0] = [str(tests), str(tests.parent / "benchmarks"), str(tests / "pipeline" / "sg_gs")]
+import test_sg_gs
+from helpers import tiny_capture
+from hidden_effects import UNKNOWN, cases, make_capture
 root = Path(sys.argv[1])
 tiny_capture.write_tiny_capture(root / "tiny")
 tiny_capture.write_tiny_capture(root / "tracked")
@@ -125,13 +77,12 @@ wanted = ("/ball/quadratic_drag/large", "/cube/com_offset/large", "/cube/torsion
 chosen = [next(c for n, c in every.items() if w in "/" + n) for w in wanted]
 nulls = [c for n, c in every.items() if not c.effects]
 chosen += [next(c for c in nulls if c.thing == thing) for thing in ("ball", "cube")]
-from cgwm.datasets.scenes.hidden import UNKNOWN
 chosen += [next(c for n, c in every.items() if c.effects == (UNKNOWN[0],) and "large" in n)]
 for k, case in enumerate(chosen):
     make_capture(root / f"hidden{k}", case)
     (root / f"hidden{k}.truth.json").unlink()
 """
-"""Makes the captures, with helpers of the reference's tests."""
+"""Makes the captures, with helpers of the reference's tests and benchmarks."""
 
 FAST = (
     "--set phys-geo.step_s=0.003 --set phys-geo.population=8 --set phys-geo.generations=2 --set phys-geo.iterations=1"
@@ -281,19 +232,11 @@ class Differences:
 
     def __init__(self, rounding: float) -> None:
         self.rounding, self.lines, self.failed = rounding, [], 0
-        reasons = [f"masked: {reason}" for *_, reason in (*MASKS, FOLDERS)]
-        reasons += [f"reworded: {reason}" for reason in REWORDED.values()]
-        reasons += [f"rounded: {reason}" for *_, reason in ROUNDED]
-        reasons += [f"added: {reason}" for reason in ADDED_FILES.values()]
-        self.passed = Counter(dict.fromkeys(reasons, 0))
+        self.passed = Counter({f"masked: {reason}": 0 for *_, reason in (*MASKS, FOLDERS)})
 
     def add(self, place: str, one: Any, other: Any) -> None:
         """Add a difference; numbers within the rounding are printed and pass."""
         note = ""
-        for pattern, limit, reason in ROUNDED:
-            if re.search(pattern, place) and (limit == 0.0 or abs(one - other) <= limit * abs(one)):
-                self.passed[f"rounded: {reason}"] += 1
-                return
         if _is_number(one) and _is_number(other):
             relative = abs(one - other) / max(abs(one), abs(other), 1e-300)
             note = f" (relative {relative:.2e})"
@@ -311,8 +254,8 @@ class Differences:
         if isinstance(one, dict) and isinstance(other, dict):
             for name in sorted({*one, *other}):
                 if name in one and name in other:
-                    self.values(f"{place}.{name}", one[name], self.without_added_entries(other[name]))
-                elif name in one or not self.is_added(f"{place}.{name}"):
+                    self.values(f"{place}.{name}", one[name], other[name])
+                else:
                     self.add(f"{place}.{name}", one.get(name, "absent"), other.get(name, "absent"))
         elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
             for k, (a, b) in enumerate(zip(one, other, strict=True)):
@@ -335,38 +278,15 @@ class Differences:
             else:
                 self.add(place, one, other)
 
-    def is_added(self, place: str) -> bool:
-        """Return whether a field is one of `ADDED_VALUES`, which are counted."""
-        reason = next((reason for pattern, reason in ADDED_VALUES.items() if re.search(pattern, place)), None)
-        if reason is not None:
-            self.passed[f"added: {reason}"] += 1
-        return reason is not None
-
-    def without_added_entries(self, value: Any) -> Any:
-        """Return a value, of a list the entries that are none of `ADDED_ENTRIES`, which are counted."""
-        if not isinstance(value, list):
-            return value
-        for pattern, reason in ADDED_ENTRIES.items():
-            kept = [entry for entry in value if not (isinstance(entry, str) and re.search(pattern, entry))]
-            self.passed[f"added: {reason}"] += len(value) - len(kept)
-            value = kept
-        return value
-
     def words(self, place: str, one: str, other: str) -> None:
-        """Compare two texts but for the folders in their paths, and for their words where `REWORDED` has the place."""
+        """Compare two texts but for the folders in their paths."""
         if one == other:
             return
         one, other = (re.sub(FOLDERS[0], "", text) for text in (one, other))
         if one == other:
             self.passed[f"masked: {FOLDERS[1]}"] += 1
             return
-        reason = next((reason for pattern, reason in REWORDED.items() if re.search(pattern, place)), None)
-        if reason is None:
-            self.add(place, one, other)
-        elif re.findall(NUMBER, one) != re.findall(NUMBER, other):
-            self.add(f"{place} (numbers in a reworded text)", one, other)
-        else:
-            self.passed[f"reworded: {reason}"] += 1
+        self.add(place, one, other)
 
     def files(self, place: str, one: Path, other: Path) -> None:
         """Compare two files by what their kind says."""
@@ -386,19 +306,10 @@ class Differences:
         elif one.suffix == ".py":
             self.words(f"{place} code", *map(code_of, texts))
         else:
-            self.lists(f"{place} line", texts[0].splitlines(), self.without_added(texts[1].splitlines()))
-
-    def without_added(self, lines: list[str]) -> list[str]:
-        """Return lines without those of `ADDED_LINES`, which are counted."""
-        for pattern, reason in ADDED_LINES.items():
-            kept = [line for line in lines if not re.search(pattern, line)]
-            self.passed[f"added: {reason}"] += len(lines) - len(kept)
-            lines = kept
-        return lines
+            self.lists(f"{place} line", *(text.splitlines() for text in texts))
 
     def pages(self, place: str, one: str, other: str) -> None:
         """Compare two HTML pages: tags with their attributes, texts, style sheets, scripts, and data as JSON."""
-        other = other.replace(GENERATOR + "\n", "")
         data = [re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.S) for page in (one, other)]
         self.values(f"{place} data", *([json.loads(text) for text in texts] for texts in data))
         parts = [
@@ -455,17 +366,11 @@ class Differences:
                         scale = max(float(np.abs(x.astype(float)).max()), 1e-300)
                         self.add(f"{where}, largest number and with the largest difference", scale, scale + gap)
 
-    def names(
-        self, kind: str, reference: Mapping[str, int], here: Mapping[str, int], dropped: Mapping[str, str]
-    ) -> None:
-        """Compare how often names occur: none may occur less often, unless a pattern in `dropped` has it."""
+    def names(self, kind: str, reference: Mapping[str, int], here: Mapping[str, int]) -> None:
+        """Compare how often names occur: none may occur less often."""
         for name, count in reference.items():
             if here.get(name, 0) < count:
-                reason = next((reason for pattern, reason in dropped.items() if re.search(pattern, name)), None)
-                if reason is None:
-                    self.add(f"{kind} {name}", f"{count}", f"{here.get(name, 0)}")
-                else:
-                    self.passed[f"dropped {kind}: {reason}"] += 1
+                self.add(f"{kind} {name}", f"{count}", f"{here.get(name, 0)}")
 
     def wheel(self, tree: Path, wheel: Path) -> None:
         """Compare the files of a wheel with those of the packages' folders in the source tree: each once, no others."""
@@ -561,11 +466,7 @@ def main() -> int:
     if (candidate / "out").exists():
         names = [set(files_in(folder / "out")) for folder in (reference, candidate)]
         for name in sorted(names[0] ^ names[1]):
-            reason = next((reason for pattern, reason in ADDED_FILES.items() if re.search(pattern, name)), None)
-            if reason is not None and name in names[1]:
-                found.passed[f"added: {reason}"] += 1
-            else:
-                found.add(name, name in names[0], name in names[1])
+            found.add(name, name in names[0], name in names[1])
         for name in sorted(names[0] & names[1]):
             found.files(name, reference / "out" / name, candidate / "out" / name)
         print(f"compared {len(names[0] & names[1])} files")
@@ -574,9 +475,9 @@ def main() -> int:
         tests.append(Counter(json.loads((folder / "tests.json").read_text())))
         functions.append(dict.fromkeys((name.partition("[")[0] for name in tests[-1]), 1))
         checks.append(checks_of(folder / "tree"))
-    found.names("test", tests[0], tests[1], DROPPED_TESTS)
-    found.names("test function", functions[0], functions[1], DROPPED_TESTS)
-    found.names("checks in", checks[0], checks[1], DROPPED_CHECKS)
+    found.names("test", tests[0], tests[1])
+    found.names("test function", functions[0], functions[1])
+    found.names("checks in", checks[0], checks[1])
     for kind, counts in (("tests", tests), ("checks in the functions of tests", checks)):
         print(f"{kind}: {counts[0].total()} -> {counts[1].total()}")
     found.wheel(candidate / "tree", next((candidate / "wheel").glob("*.whl")))
