@@ -109,7 +109,17 @@ __device__ inline Quat multiply(Quat a, Quat b) {
     return q;
 }
 __device__ inline Quat normalized(Quat q) {
-    Real s = inverse_root(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z);
+    Real norm2 = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
+#if HOST && !SINGLE
+    Real off = norm2 - Real(1), s;
+    if (plain(off) < 1e-6 && plain(off) > -1e-6) {  // by a series, exact to rounding, without root and division
+        s = Real(1) - off * (Real(0.5) - Number(0.375) * off);
+    } else {
+        s = inverse_root(norm2);
+    }
+#else
+    Real s = inverse_root(norm2);
+#endif
     Quat unit = {s * q.w, s * q.x, s * q.y, s * q.z};
     return unit;
 }
@@ -122,6 +132,14 @@ __device__ inline Quat quat_exp(Vec v) {
                  (Real(Number(-1.0 / 720)) + half2 * Number(1.0 / 40320))));
         sinc = Real(Number(0.5)) + half2 * (Real(Number(-1.0 / 12)) + half2 * (Real(Number(1.0 / 240)) + half2 *
                (Real(Number(-1.0 / 10080)) + half2 * Number(1.0 / 725760))));
+#elif HOST
+    if (plain(angle2) < Number(0.04)) {  // exact to double precision, in a third of the time of a sine
+        Real half2 = Number(0.25) * angle2;
+        cosine = Real(1) + half2 * (Real(Number(-1.0 / 2)) + half2 * (Real(Number(1.0 / 24)) + half2 *
+                 (Real(Number(-1.0 / 720)) + half2 * (Real(Number(1.0 / 40320)) + half2 * Number(-1.0 / 3628800)))));
+        sinc = Real(Number(0.5)) + half2 * (Real(Number(-1.0 / 12)) + half2 * (Real(Number(1.0 / 240)) + half2 *
+               (Real(Number(-1.0 / 10080)) + half2 * (Real(Number(1.0 / 725760)) +
+                                                      half2 * Number(-1.0 / 79833600)))));
 #else
     if (plain(angle2) < Number(1e-8)) {  // the series is exact to double precision
         cosine = Real(1) - Number(0.125) * angle2;

@@ -101,8 +101,15 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
     put_in(c.ellipse, along, x, y);
     return vec(x + c.steady_x, y + c.steady_y, along);
 #else
+    Real most = friction_of(law, c) * along;
+#if HOST
+    // where the contact sticks, a predicted branch takes the root and the division out of the chain of iterations
+    bool sticks = plain(wanted2) < Number(1 - 1e-6) * plain(most) * plain(most) - Number(1e-24);
+#else
+    const bool sticks = false;
+#endif
     // the tiny number keeps the derivative of a contact without impulses finite
-    Real scale = friction_of(law, c) * along * inverse_root(wanted2 + Real(Number(1e-24)));
+    Real scale = sticks ? Real(1) : most * inverse_root(wanted2 + Real(Number(1e-24)));
     scale = at_most(scale, Number(1));
 #if PAIRED
     return along * c.normal + scale * wanted;
