@@ -20,7 +20,6 @@ from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...optimization.least_squares import Descent, Policy, descend
 from ...optimization.levenberg_marquardt import robust_loss
-from ...optimization.marginal_covariance import marginal_covariance
 from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ...physics.engine import ragged_rollout, rollouts_at_once
 from ...physics.engine import rollout as rolled_out
@@ -31,6 +30,7 @@ from ...physics.world import State, World
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import retract, state_prior
 from ...trajectories.track_noise import Noise
+from .segment_chains import Chains
 from .shooting_segments import TiedSegments
 
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
@@ -172,11 +172,11 @@ class Shooting:
         return sorted(shots, key=lambda shot: shot.cost)
 
     def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[ShootingFit, State]:
-        changes = torch.zeros(self.tie.numel()).to(shared)
-        start = Point(values=torch.cat([shared, changes])[None], states=_as_item(states))
-        end = descend(_TiedProblem(self), start, Policy(iterations=iterations, relative=TOLERANCE))
-        states = _from_item(end.point.states)
-        return self._shot(end, end.point.values[0, : len(shared)], states), states
+        problem = _TiedProblem(self)
+        start = Point(values=shared[None], states=problem.by_chain(states))
+        end = descend(problem, start, Policy(iterations=iterations, relative=TOLERANCE))
+        states = problem.by_segment(end.point.states)
+        return self._shot(end, end.point.values[0], states), states
 
     def _allowed(self, shared: Tensor, states: State) -> Tensor:
         """Return the standard deviations (B, S) of the difference of states where segments meet."""
@@ -196,13 +196,12 @@ class Shooting:
         return torch.nan_to_num(torch.stack(columns, 1), nan=1.0).repeat_interleave(3, 1)
 
     def _shot(self, end: Descent, shared: Tensor, states: State) -> ShootingFit:
-        count = len(shared)
         names = self.segments.names
         first = [row for row, name in enumerate(names) if row == 0 or names[row - 1] != name]
         misfit, chi2 = self._misfits(shared, states)
         shot = ShootingFit(
             shared=shared,
-            covariance=marginal_covariance(end.information()[0], count),
+            covariance=torch.linalg.pinv(end.information()[0], hermitian=True),
             state=states.at(first),
             cost=float(end.cost[0]) if bool(end.cost[0].isfinite()) else math.inf,
             costs=end.costs,
@@ -311,81 +310,62 @@ class Shooting:
         slopes = (every[1 : half + 1] - every[half + 1 :]) / (2 * steps[:, None, None])
         return every[0], torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 
-    def normal_equations(self, shared: Tensor, states: State) -> NormalEquations:
-        """Return the normal equations of one item by parameters and all states (P + B S), which ties couple."""
-        batch, size, count = *self.tie.shape, len(shared)
+    def normal_equations(self, shared: Tensor, states: State, chains: Chains) -> NormalEquations:
+        """Return the normal equations of chains by parameters and the states of their segments."""
+        size = self.tie.shape[1]
         rows, jacobian = self._differences(shared, states)
         frames, ties = self._split(rows)
         cost, weight, tie_weight = _losses(frames, ties)
-        total = count + batch * size
-        matrix, slope = torch.zeros(total, total).to(shared), torch.zeros(total).to(shared)
-        weak_prior = state_prior(len(self.segments.free)).to(shared) * 1e-3
-        for row in range(batch):
-            here = torch.cat([torch.arange(count), torch.arange(size) + count + row * size])
-            local = jacobian[row, :-size].unflatten(0, (-1, 6))
-            weighted = (weight[row, :, None, None] * local).flatten(0, 1)
-            flat = local.flatten(0, 1)
-            matrix[here[:, None], here] += weighted.T @ flat
-            slope[here] += weighted.T @ frames[row].flatten()
-            matrix[here[count:], here[count:]] += weak_prior
-            after = int(self.following[row])
-            if after >= 0:
-                there = torch.cat([here, torch.arange(size) + count + after * size])
-                leading = torch.cat([jacobian[row, -size:], -torch.eye(size).to(shared)], 1) / self.tie[row][:, None]
-                matrix[there[:, None], there] += tie_weight[row] * leading.T @ leading
-                slope[there] += tie_weight[row] * leading.T @ ties[row]
-        return NormalEquations.of_parameters(matrix[None], -slope[None], cost[None])
+        local = jacobian[:, :-size]
+        weighted = (weight[..., None, None] * local.unflatten(1, (-1, 6))).flatten(1, 2).mT
+        next_state = -torch.eye(size).to(shared).expand(len(jacobian), -1, -1)
+        leading = torch.cat([jacobian[:, -size:], next_state], -1) / self.tie[..., None]
+        pulled = (tie_weight * (self.following >= 0))[:, None, None] * leading.mT
+        return chains.normal_equations(
+            (weighted @ local, (weighted @ rows[:, :-size, None])[..., 0]),
+            (pulled @ leading, (pulled @ ties[..., None])[..., 0]),
+            state_prior(len(self.segments.free)).to(shared) * 1e-3,
+            cost,
+        )
 
 
 class _TiedProblem(Problem):
-    """The parameters of a problem and the changes of all states, as the parameters of one group.
-
-    Ties couple the states of neighbouring segments, so that none of them is eliminated. The states themselves are the
-    state of the only item.
-    """
+    """The parameters of a problem as one group, and chains of tied segments, whose states are eliminated."""
 
     def __init__(self, shooting: Shooting) -> None:
         prior = shooting.prior
-        self.shooting, self.count = shooting, len(prior.mean)
-        still = torch.zeros(shooting.tie.numel()).to(prior.mean)
-        far = torch.full_like(still, torch.inf)
-        self.owner = torch.zeros(1, dtype=torch.long)
-        self.box = Box.within(
-            torch.cat([prior.bounds, torch.stack([-far, far], 1)]),
-            torch.cat([prior.mean, still]),
-            torch.cat([1 / prior.std.square(), still]),
-        )
+        self.shooting, self.chains = shooting, Chains.of(shooting.following)
+        self.owner = torch.zeros(len(self.chains.segment), dtype=torch.long)
+        self.box = Box.within(prior.bounds, prior.mean, 1 / prior.std.square())
 
     def costs(self, point: Point, rows: Rows) -> Tensor:
-        """Return the robust cost (1,)."""
+        """Return the robust cost of each chain (C,)."""
         del rows
-        found = self.shooting._residuals(point.values[0, : self.count], _from_item(point.states))
-        return _losses(*found)[0][None]
+        found = self.shooting._residuals(point.values[0], self.by_segment(point.states))
+        return self.chains.summed(_losses(*found)[0])
 
     def linearised(self, point: Point, rows: Rows) -> NormalEquations:
         """Return the normal equations."""
         del rows
-        return self.shooting.normal_equations(point.values[0, : self.count], _from_item(point.states))
+        return self.shooting.normal_equations(point.values[0], self.by_segment(point.states), self.chains)
 
     def moved(self, point: Point, values: Tensor, step: Tensor, rows: Rows) -> tuple[Tensor, ...]:
-        """Return the states moved by the changes among the values (1, P + B S)."""
-        del step, rows
-        change = (values - point.values)[0, self.count :].view_as(self.shooting.tie)
-        return _as_item(retract(_from_item(point.states), change, self.shooting.segments.free))
+        """Return the states of the chains moved by steps (C, M S)."""
+        del values, rows
+        change = self.chains.by_segment(step.unflatten(1, (self.chains.segment.shape[1], -1)))
+        return self.by_chain(retract(self.by_segment(point.states), change, self.shooting.segments.free))
 
+    def by_chain(self, states: State) -> tuple[Tensor, ...]:
+        """Return the states (B) of segments as those of chains."""
+        return tuple(self.chains.by_chain(value) for value in states.tensors)
 
-def _as_item(states: State) -> tuple[Tensor, ...]:
-    """Return the states of all segments as the state of one item."""
-    return tuple(value[None] for value in states.tensors)
-
-
-def _from_item(states: tuple[Tensor, ...]) -> State:
-    """Return the states of all segments from the state of one item."""
-    return State(*(value[0] for value in states))
+    def by_segment(self, states: tuple[Tensor, ...]) -> State:
+        """Return the states of chains as those of segments (B)."""
+        return State(*(self.chains.by_segment(value) for value in states))
 
 
 def _losses(frames: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the cost of residuals of frames (B, F, 6) and ties (B, S), and their robust weights (B, F) and (B,)."""
+    """Return costs (B,) of residuals of frames (B, F, 6) and ties (B, S), and robust weights (B, F) and (B,)."""
     loss, weight = robust_loss(frames.square().sum(-1), ROBUST_SCALE)
     tie_loss, tie_weight = robust_loss(ties.square().sum(-1), 2 * ROBUST_SCALE)
-    return loss.sum() + tie_loss.sum(), weight, tie_weight
+    return loss.sum(-1) + tie_loss, weight, tie_weight
