@@ -24,8 +24,13 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-LONGEST = ("test_fused.py", "test_effects.py", "test_shards.py", "test_rollout_batches.py", "test_physics.py")
-"""Files that take 20 s or more of one core, the longest first."""
+LONGEST = (
+    "test_fused.py", "test_calibrate.py", "test_separation.py", "test_diagnosis.py", "test_sg_gs.py", "test_compare.py",
+    "test_scenes.py", "test_export.py", "test_fuzz.py", "test_validate.py", "test_fit_effects.py", "test_estimation.py",
+    "test_next_throw.py", "test_diagnosis_impacts.py", "test_effects.py", "test_physics.py", "test_ellipse.py",
+    "test_honest_supervision.py", "test_photos.py", "test_visual_collision.py", "test_shards.py",
+)  # fmt: skip
+"""Files that take 8 s or more of one core, the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

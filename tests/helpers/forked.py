@@ -124,8 +124,10 @@ class Forked:
             try:
                 atexit._run_exitfuncs()
                 sys.stdout.flush()
-                sys.stderr.flush()
+            except BaseException:  # Python says this, too, when it ends
+                traceback.print_exc()
             finally:
+                sys.stderr.flush()
                 os._exit(code)
 
 

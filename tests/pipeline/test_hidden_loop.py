@@ -29,7 +29,8 @@ def said(*words: object) -> dict:
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == QUICKEST else pytest.mark.evidence) for n in HIDDEN])
 def test_what_is_hidden_is_found_added_and_the_error_falls(name: str, tmp_path: Path) -> None:
     capture, first, second = tmp_path / "capture", tmp_path / "m0", tmp_path / "m1"
-    make_capture(capture, replace(CASES[f"development/{name}/0"], test=2))
+    case = replace(CASES[f"development/{name}/0"], test=2)
+    make_capture(capture, replace(case, train=3) if name == QUICKEST else case)
     said("fit", capture, "--out", first)
     found = said("diagnose", first, capture)
     assert found["verdict"] in ("missing_effect", "not_separable")

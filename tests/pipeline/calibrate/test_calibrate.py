@@ -192,10 +192,13 @@ def test_existing_cameras_are_kept_without_overwrite(scene, report):
     assert "--overwrite" in str(error.value)
 
 
-def test_two_runs_give_the_same_bytes(scene, report):
-    before = (scene / "cameras.json").read_bytes()
-    calibrate(scene, CONFIG, overwrite=True)
-    assert (scene / "cameras.json").read_bytes() == before
+def test_two_runs_give_the_same_bytes(scene, tmp_path):
+    few, written = CalibrateConfig(max_features=400), []
+    root = _fresh(scene, tmp_path, photos=4)
+    for overwrite in (False, True):
+        calibrate(root, few, overwrite=overwrite)
+        written.append((root / "cameras.json").read_bytes())
+    assert written[0] == written[1]
 
 
 def test_without_scale_the_ground_is_the_dominant_plane(scene, report, tmp_path):
@@ -274,7 +277,7 @@ def test_a_rejected_model_is_followed_by_another_seed_on_the_same_matches(scene,
 
 
 def test_self_check_on_a_real_model_and_the_same_model_broken(scene, tmp_path):
-    names = sorted(path.name for path in (scene / "images" / "walk").iterdir())
+    names = sorted(path.name for path in (scene / "images" / "walk").iterdir())[:6]
     for name in names:
         (tmp_path / name.replace(" ", "")).write_bytes((scene / "images" / "walk" / name).read_bytes())
     images = [colmap.SfmImage(name.replace(" ", ""), "photos") for name in names]

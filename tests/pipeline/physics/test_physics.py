@@ -57,10 +57,10 @@ def test_a_driven_body_pushes_a_free_one_and_follows_its_command() -> None:
     world = world_of(box, tip, step_s=0.002)
     command = Track(np.array([0.0, 1.0]), np.array([[-0.08, 0, 0.02], [0.02, 0, 0.02]]))
     start = state_of(((0, 0, 0.02), UP, (0, 0, 0), (0, 0, 0)), ((-0.08, 0, 0.02), UP, (0, 0, 0), (0, 0, 0)))
-    rollout = simulate(world, start, times(1.0, 20), {"tip": command})
+    rollout = simulate(world, start, times(0.6, 20), {"tip": command})
     torch.testing.assert_close(rollout.position_m[0, :, 1, 0], -0.08 + 0.1 * rollout.times_s, atol=1e-12, rtol=0)
-    # the tip's surface ends at 0.032 and the box is 0.04 long on that side; the spheres of a face leave dents in it
-    assert float(rollout.position_m[0, -1, 0, 0]) == pytest.approx(0.072, abs=0.004)
+    # the tip's surface ends at -0.008 and the box is 0.04 long on that side; the spheres of a face leave dents in it
+    assert float(rollout.position_m[0, -1, 0, 0]) == pytest.approx(0.032, abs=0.004)
 
 
 def test_a_velocity_command_is_integrated_and_is_what_the_body_does() -> None:
@@ -111,8 +111,9 @@ def test_derivatives_of_a_rollout_match_finite_differences(until: float) -> None
     torch.testing.assert_close(value, end(x, 1), atol=1e-13, rtol=0)
     numeric = (ends[:5] - ends[5:]).T / (2 * step)
     torch.testing.assert_close(jacobian[0], numeric, atol=2e-5, rtol=2e-4)
-    reverse = torch.autograd.functional.jacobian(lambda y: end(y, 1)[0], x)[:, 0]
-    torch.testing.assert_close(jacobian[0], reverse, atol=1e-8, rtol=1e-8)
+    weights = torch.randn(value.shape[1], generator=torch.Generator().manual_seed(0), dtype=F64)
+    reverse = torch.autograd.functional.jacobian(lambda y: weights @ end(y, 1)[0], x)[0]
+    torch.testing.assert_close(weights @ jacobian[0], reverse, atol=1e-8, rtol=1e-8)
 
 
 def test_rollouts_of_a_batch_do_not_see_each_other() -> None:

@@ -5,8 +5,8 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -30,12 +30,10 @@ from cgwm.pipeline.view.scene_at import LONGEST_ARROW, background_from, radius_m
 from cgwm.pipeline.view.viewer import FIELD_OF_VIEW_RAD
 from cgwm.schemas import Light, SamplingPlan, SynthesizeConfig, UsageError
 from helpers.browser import Page, chromium
+from helpers.forked import Forked
 from helpers.small_model import HALF, small_model, write_small_model
 
 CONFIG = SynthesizeConfig(rollouts=2, duration_s=0.5, width=64, height=48, device="cpu", seed=5)
-RUN = (  # a parent in the background may have had SIGINT ignored, which a child inherits
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from cgwm.cli import main; main()"
-)
 VISER = importlib.util.find_spec("viser") is not None
 needs_viser = pytest.mark.skipif(not VISER, reason="viser is not installed: pip install 'cgwm[view]'")
 
@@ -273,30 +271,27 @@ def test_a_viser_that_cannot_be_guarded_is_not_used(dataset: Path, monkeypatch: 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Callable[[Path], str]]:
     """Start `cgwm view` on a free port; yield a function that returns its URL; end it by Ctrl-C, cleanly."""
-    started: list[subprocess.Popen[str]] = []
+    started: list[Forked] = []
 
     def serve(thing: Path) -> str:
-        command = [sys.executable, "-c", RUN, "view", str(thing), "--port", "0", "--no-open"]
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=tmp_path,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
+        process = Forked("view", thing, "--port", "0", "--no-open", before=lambda: os.chdir(tmp_path))
         started.append(process)
-        assert process.stdout is not None and process.stderr is not None
-        line = process.stdout.readline()
+        end = time.monotonic() + 60
+        while not process.printed()[0].endswith("\n"):
+            assert process.poll() is None and time.monotonic() < end, process.printed()
+            time.sleep(0.02)
+        line = process.printed()[0]
         found = re.fullmatch(r"Showing .* at (http://127\.0\.0\.1:\d+/[\w-]{32}/) \(Ctrl-C ends it\)\.\n", line)
-        assert found, line + process.stderr.read()
+        assert found, process.printed()
         return found[1]
 
     yield serve
     for process in started:
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
-        assert (process.returncode, out, err) == (0, "", "")
+        with process:
+            first = process.printed()[0]
+            process.send_signal(signal.SIGINT)
+            done = process.ended(30)
+            assert (done.returncode, done.stdout, done.stderr) == (0, first, "")
 
 
 def red(page: Page) -> np.ndarray:

@@ -9,7 +9,7 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.phys_geo.images import image_fit, video_episodes
+from cgwm.pipeline.phys_geo.images import image_fit, pose_search, pose_tracking, video_episodes
 from cgwm.pipeline.phys_geo.images.contact_spheres import MOVED_STD_M, ContactSpheres, dense_times
 from cgwm.pipeline.phys_geo.images.end_to_end import PATIENCE, ImageObjective, refine_end_to_end
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker
@@ -30,6 +30,8 @@ SHORT = 7
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
+    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 2)
+    monkeypatch.setattr(pose_search, "KEPT", 2)
 
 
 @pytest.fixture(scope="module")
