@@ -30,8 +30,7 @@ from ...physics.world import State, World
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import retract, state_prior
 from ...trajectories.track_noise import Noise
-from .segment_chains import Chains
-from .shooting_segments import TiedSegments
+from .shooting_segments import Chains, TiedSegments
 
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """Standard deviation of a tie over flight: position [m], rotation [rad], velocity [m/s], angular velocity [rad/s]."""
