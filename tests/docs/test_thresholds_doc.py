@@ -121,6 +121,7 @@ SEGMENT_NUMERICS = {
         "residual_wrench.WINDOW_S",
         "sliding_segments.SIDE_S, SIDE_FRAMES",
     ),
+    "defines a held-out score": ("held_out_gain.FOLDS",),
     "error of a contact law in a fit of effects; widens intervals": ("first_contact_fit.MODEL_ERROR",),
 }
 """Numbers of modules in `pipeline/segments` outside of the table, by the reason why they decide no verdict."""
