@@ -226,6 +226,30 @@ def _changes_spring(touch: Touch, law: ContactLaw) -> bool:
     return any(own.data_ptr() != given.data_ptr() for own, given in same)
 
 
+def changes_rebound(world: World) -> bool:
+    """Return whether contact effects of a world change the speed of a rebound: its spring, its damper, or by a pull."""
+    law, effects = contact_law(world), [active for active in world.effects if active.effect.phase == "contact"]
+    if _pulling(effects):
+        return True
+    like = world.gravity
+    touch = Touch(
+        ground=True,
+        position=torch.zeros(1, 1, 3).to(like),
+        normal=torch.tensor([[[0.0, 0.0, 1.0]]]).to(like),
+        gap=torch.zeros(1, 1).to(like),
+        velocity=torch.tensor([[[1.0, 0.0, -1.0]]]).to(like),
+        spin_rad_s=torch.ones(1, 3).to(like),
+        step_s=STEP * law.contact_time_s[:1, None],
+        friction=law.friction[:1, None],
+        contact_time_s=law.contact_time_s[:1, None],
+        damping_ratio=law.damping_ratio[:1, None],
+    )
+    for active in effects:
+        if active.effect.has("contact"):
+            touch = active.effect.contact(active.values, touch)
+    return _changes_spring(touch, law)
+
+
 def _pulling(effects: Sequence[ActiveEffect]) -> bool:
     """Return whether any contact effect applies a wrench."""
     return any(active.effect.phase == "contact" and active.effect.has("wrench") for active in effects)

@@ -235,6 +235,29 @@ class ChoiceThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BounceThresholds:
+    """A turn of a ball's height is a bounce, and which frames beside it belong to its flights."""
+
+    near_m: float = threshold(0.03, "m", "height over the ground, beside the fall in one frame, up to which it bounces")
+    slowest_m_s: float = threshold(0.4, "m/s", "slowest fall before a bounce")
+    least_rise: float = threshold(0.1, "1", "slowest rise after it, as a share of the fall")
+    least_frames: int = threshold(4, "frames", "fewest of a flight on each side of a bounce")
+    apart_s: float = threshold(0.004, "s", "time about the lowest frame that may lie within the contact")
+    longest_s: float = threshold(
+        0.3, "s", "longest part of a flight that gives the speed at a bounce", "drag and spin change with the speed"
+    )
+    least_restitution: float = threshold(
+        0.2,
+        "1",
+        "restitution from which flights give it; below, most impacts have no flight after them",
+        BY_ARGUMENT,
+    )
+    most_error: float = threshold(
+        0.1, "1", "standard error of the restitution up to which bounces give it", BY_ARGUMENT
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentThresholds:
     """All thresholds on segments that decide a verdict."""
 
@@ -250,6 +273,8 @@ class SegmentThresholds:
     """Impacts of a ball."""
     choice: ChoiceThresholds = ChoiceThresholds()
     """What a fit estimates."""
+    bounce: BounceThresholds = BounceThresholds()
+    """Bounces of a ball, with or without its orientation."""
 
 
 SEGMENT_THRESHOLDS = SegmentThresholds()

@@ -122,6 +122,17 @@ SEGMENT_NUMERICS = {
         "sliding_segments.SIDE_S, SIDE_FRAMES",
     ),
     "defines a held-out score": ("held_out_gain.FOLDS",),
+    "width of a prior of a nuisance, or size of a sample of flights": (
+        "restitution_fit.DRAG_PRIOR",
+        "restitution_fit.LIFT_MEAN",
+        "restitution_fit.NOISE_PRIOR",
+        "restitution_fit.SHAKEN_MEAN, MUCH_SHAKEN",
+        "restitution_fit.GROUND_STD, CONTACT_PRIOR",
+        "restitution_fit.SCATTER_PRIOR",
+        "restitution_fit.SHAKEN_S",
+        "restitution_fit.MOST_FLIGHTS",
+        "restitution_fit.MOST_FRAMES",
+    ),
     "error of a contact law in a fit of effects; widens intervals": ("first_contact_fit.MODEL_ERROR",),
 }
 """Numbers of modules in `pipeline/segments` outside of the table, by the reason why they decide no verdict."""

@@ -1,13 +1,15 @@
 """The stage phys-geo on measured tracks: contact parameters, and where asked for effects and the mass distribution.
 
 1. The noise of the tracks, given or estimated from them.
-2. What held-out tosses ask for beside the contact (`part_choice.py`): where it is chosen or asked for, the mass
+2. The damping of a ball from the heights on both sides of its bounces (`segments/restitution_fit.py`): the search takes
+   a missing drag, a late rebound and the prior for restitution.
+3. What held-out tosses ask for beside the contact (`part_choice.py`): where it is chosen or asked for, the mass
    distribution (`inertia_fit.py`), then the effects of the world (`effect_fit.py`), a scale of lengths among them.
-3. Initial states from each episode's warm-up, fitted with the model itself.
-4. A global search (adaptive importance sampling) on the open-loop error, many rollouts at once (`open_loop_search.py`):
+4. Initial states from each episode's warm-up, fitted with the model itself.
+5. A global search (adaptive importance sampling) on the open-loop error, many rollouts at once (`open_loop_search.py`):
    the model's purpose is to predict long unseen motion, and this error has several minima. The estimate is the mean
    over the samples that predict about equally well, not the best single sample.
-5. With few episodes, multiple shooting from several starts, the search's among them (`contact_shooting.py`): states and
+6. With few episodes, multiple shooting from several starts, the search's among them (`contact_shooting.py`): states and
    parameters together, with soft ties between short segments that absorb errors of the contact model. With many
    episodes the search alone: their mean error is smooth, and their scatter gives the intervals.
 
@@ -39,12 +41,22 @@ from ...physics.world import World
 from ...runtime.resources import one_torch_thread
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings
+from ...segments.restitution_fit import RestitutionFit, restitution_of
 from ...segments.segments import world_for
 from ...trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from ...trajectories.observations import Observations
+from ...trajectories.segmentation import whole_episodes
 from ...trajectories.track_noise import Noise, estimate_noise
 from ..effects.effect_fit import fit_effects
-from .contact_result import ContactEstimate, FitRecord, PhysicsFit, absolute_ground, physics_fit
+from .bounce_damping import damping_of, with_bounces
+from .contact_result import (
+    ContactEstimate,
+    FitRecord,
+    PhysicsFit,
+    absolute_ground,
+    physics_fit,
+    with_damping,
+)
 from .contact_shooting import ShootingEpisodes, shoot_contact
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
@@ -101,11 +113,14 @@ def fit_physics(
         mass_distribution=None if ready.mass is None else ready.mass.record,
         effects=None if ready.effects is None else ready.effects.record,
         choice=ready.choice,
+        bounces=None if data.bounces is None else data.bounces.to_json(),
     )
     if data.airborne:
         found = _never_touching(ready, batch, data.noise, record)
     else:
         estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
+        if data.bounces is not None:
+            estimate = with_damping(estimate, damping_of(data.bounces))
         found = physics_fit(ready.world, estimate, data.noise, record)
     return _completed(found, ready)
 
@@ -135,6 +150,8 @@ class _FitData:
     """Noise estimated from the tracks: position [m], rotation [rad]."""
     noise: Noise
     """Noise that the fit assumes, given or estimated: position [m], rotation [rad]."""
+    bounces: RestitutionFit | None
+    """Restitution of the bounces of a ball, where its tracks have some."""
     airborne: bool
     """Whether the only free body touches nothing in any of the frames."""
 
@@ -158,6 +175,7 @@ class _FitData:
             spans=spans,
             noise_estimated=estimated,
             noise=Noise(noise[0] or estimated[0], noise[1] or estimated[1]),
+            bounces=None if airborne else restitution_of(world, whole_episodes(world, episodes)),
             airborne=airborne,
         )
 
@@ -196,6 +214,7 @@ def _fitted_before(
     height = world.ground_normal is not None and len(data.episodes) >= ENOUGH_EPISODES
     names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
     start = [(p, _start(world, p) if warm_started else p.prior[0]) for p in names]
+    world, start = with_bounces(world, start, data.bounces)
     world, mass, choice = _with_chosen_parts(world, data, config, start)
     effects: EffectEstimate | None = None
     if effect_parameters(world):

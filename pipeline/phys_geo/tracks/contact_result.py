@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ from ....datasets.shapes.ply import Splats
 from ....schemas import ContactParameters, Correlation, FitChoice, FittedParameter
 from ...optimization.uncertainty import correlation_of
 from ...physics.contact_law import restitution
-from ...physics.parameters import GROUND_SHIFT, Parameter
+from ...physics.parameters import CONTACT_PARAMETERS, DAMPING_RATIO, GROUND_SHIFT, Parameter
 from ...physics.world import State, World
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings, fitted_parameter
 from ...trajectories.track_noise import Noise
+from .bounce_damping import BounceDamping
 from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
 
 
@@ -35,6 +36,22 @@ class ContactEstimate:
     """Covariance of the estimate, shape (P, P)."""
     starts: dict[str, tuple[float, State]] = field(default_factory=dict)
     """Time [s] and state of the first frame of each episode, by its name, where shooting found it."""
+    bounces: BounceDamping | None = None
+    """Damping ratio, where the bounces of a ball gave it."""
+
+
+def with_damping(estimate: ContactEstimate, damping: BounceDamping) -> ContactEstimate:
+    """Return an estimate of the other contact parameters, completed by a damping ratio of its own."""
+    place = CONTACT_PARAMETERS.index(DAMPING_RATIO)
+    covariance = np.insert(np.insert(estimate.covariance, place, 0.0, 0), place, 0.0, 1)
+    covariance[place, place] = damping.variance
+    return replace(
+        estimate,
+        parameters=[*estimate.parameters[:place], DAMPING_RATIO, *estimate.parameters[place:]],
+        values=np.insert(estimate.values, place, damping.value),
+        covariance=covariance,
+        bounces=damping,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +106,8 @@ class FitRecord:
     """Record of the fit of the effects, where there was one."""
     choice: FitChoice | None = None
     """What was chosen to be fitted, where there was a choice."""
+    bounces: dict[str, Any] | None = None
+    """Record of the restitution of a ball's bounces, where these gave it."""
     search_open_loop_m: list[float] | None = None
     """Lowest open-loop error [m] after each generation of the search."""
     search_effective_samples: float | None = None
@@ -126,6 +145,7 @@ class FitRecord:
             "mass_distribution": self.mass_distribution,
             "effects": self.effects,
             "choice": None if self.choice is None else self.choice.model_dump(mode="json"),
+            "bounces": self.bounces,
             "search_open_loop_m": self.search_open_loop_m,
             "search_effective_samples": self.search_effective_samples,
         }
@@ -185,6 +205,8 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
     names, covariance = list(estimate.parameters), estimate.covariance
     std = np.sqrt(np.diag(covariance))
     fitted = [_parameter(p, z, s) for p, z, s in zip(names, estimate.values, std, strict=True)]
+    if estimate.bounces is not None:
+        fitted = [_from_bounces(p, estimate.bounces.bounces) if p.name == DAMPING_RATIO.name else p for p in fitted]
     warnings = bound_warnings(names, fitted)
     if GROUND_SHIFT in names and world.ground_offset is not None:
         fitted[-1] = absolute_ground(fitted[-1], float(world.ground_offset[0]))
@@ -246,6 +268,13 @@ def _parameter(parameter: Parameter, coordinate: float, std: float) -> FittedPar
     centre, width = parameter.prior
     prior = f"normal{' in its logarithm' if parameter.logarithmic else ''} about {centre:g}, std {width:g}"
     return fitted_parameter(parameter, coordinate, std).model_copy(update={"prior": prior})
+
+
+def _from_bounces(found: FittedParameter, count: int) -> FittedParameter:
+    """Return the damping ratio without the prior, which bounces do not need."""
+    note = f"from the heights on both sides of {count} bounces"
+    state = "fitted" if found.state == "not_observable" else found.state
+    return found.model_copy(update={"prior": None, "note": note, "state": state})
 
 
 def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:
