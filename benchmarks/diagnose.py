@@ -4,6 +4,7 @@
     python benchmarks/diagnose.py --stage report8 --table [--record]
     python benchmarks/diagnose.py --list odd               # what is unlike the plan: noise, protocols, bodies
     python benchmarks/diagnose.py --list video             # six captures with videos only
+    python benchmarks/diagnose.py --list real-like --stage development --nulls 3 --repeats 6   # see missing_effects.py
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
 
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
@@ -52,6 +53,7 @@ from hidden_effects import (
     odd_cases,
     rough_cases,
 )
+from real_like import STAGES as REAL_STAGES
 from store import Store, timed
 
 FAMILIES: tuple[set[str], ...] = (
@@ -64,6 +66,7 @@ FAMILIES: tuple[set[str], ...] = (
     {"rolling_resistance", "torsional_friction", "spin_damping"},
 )
 """Effects that do much the same: to name one for another is a smaller fault."""
+LISTS = ("all", "rough", "odd", "drake", "video", "real-like")
 RIGHT = ("exact", "class", "exact, and more", "class, and more")
 COLUMNS = (*RIGHT, "among", "family", "wrong", "unexplained", "silent", "refused")
 """among: said to be not separable from others of contact, which is honest, and not right; family: one of them alone."""
@@ -146,14 +149,15 @@ def measure(case: Case, refit: bool) -> dict[str, Any]:
             "judged": mark,
             "seconds": seconds,
             "truth": [{key: effect[key] for key in ("name", "values")} for effect in truth["effects"]],
-            "found": _brief(found),
+            "found": brief(found),
         }
         if refit and mark in RIGHT and found["selected"]:
-            row |= _added(capture, base, Path(folder) / "m1", found["selected"], physics)
+            row |= added(capture, base, Path(folder) / "m1", found["selected"], physics)
         return row
 
 
-def _brief(found: dict[str, Any]) -> dict[str, Any]:
+def brief(found: dict[str, Any]) -> dict[str, Any]:
+    """Return what is kept of a diagnosis."""
     if "refused" in found:
         return found
     keys = ("verdict", "selected", "aliases", "remaining_unexplained", "contact_chi2", "flight_before", "flight_after")
@@ -168,7 +172,7 @@ def _brief(found: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _added(capture: Path, base: Path, child: Path, effects: Sequence[str], physics: PhysConfig) -> dict[str, Any]:
+def added(capture: Path, base: Path, child: Path, effects: Sequence[str], physics: PhysConfig) -> dict[str, Any]:
     """Fit the model again with the effects, and return the errors on the test split before and after."""
     config = physics.model_copy(update={"effects": tuple(effects)})
     began = time.process_time()
@@ -257,16 +261,16 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             named = ", ".join(said.get("selected", ())) or said.get("refused", row.get("failed", ""))[:80]
             lines.append(f"- {row['case']}: {row['judged']} ({said.get('verdict', 'no verdict')} {named})")
     lines += [f"- {row['case']}: the fit failed ({row['failed'][:80]})" for row in rows if "failed" in row]
-    added = [row for row in rows if "errors" in row]
+    refitted = [row for row in rows if "errors" in row]
     for key in ("open_loop_m", "state_fitted_m"):
-        pairs = [(row["errors"]["before"][key], row["errors"]["after"][key]) for row in added]
+        pairs = [(row["errors"]["before"][key], row["errors"]["after"][key]) for row in refitted]
         ratios = [after / before for before, after in pairs if before and after]
         if ratios:
             low, middle, high = np.percentile(ratios, (25, 50, 75))
             lines.append(
                 f"\nTest split after / before, {key}: median {middle:.2f} ({low:.2f} to {high:.2f}), n {len(ratios)}"
             )
-    held = [yes for row in added for yes in _covered(row)]
+    held = [yes for row in refitted for yes in covered(row)]
     if held:
         lines.append(f"\n95 % intervals of the added numbers that hold the truth: {sum(held)} of {len(held)}.")
     silent = [(row["case"], above) for row in rows if (above := _above_its_limit(row)) is not None]
@@ -296,7 +300,7 @@ def _above_its_limit(row: dict[str, Any]) -> bool | None:
     return any(abs(values.get(name, values.get("change", 0.0))) > size for name, size in sizes.items())
 
 
-def _covered(row: dict[str, Any]) -> list[bool]:
+def covered(row: dict[str, Any]) -> list[bool]:
     """Return for each number of the added effects that the truth has by the same name whether its interval holds it."""
     found = []
     for effect in row["truth"]:
@@ -308,13 +312,25 @@ def _covered(row: dict[str, Any]) -> list[bool]:
     return found
 
 
+def _real_like(given: argparse.Namespace) -> int:
+    """Run cgwm alone on the real-like cases; `missing_effects.py` has its rivals, too."""
+    import missing_effects
+
+    numbers = {"--stage": given.stage, "--nulls": given.nulls, "--workers": given.workers, "--seconds": given.seconds}
+    numbers |= {"--only": given.only, "--each": given.repeats, "--store": given.store, "--contenders": "cgwm"}
+    words = [str(word) for pair in numbers.items() if pair[1] not in (None, "") for word in pair]
+    words += ["--any-commit"] * given.any_commit
+    return missing_effects.main(["table" if given.table else "run", *words])
+
+
 def main() -> int:
     """Measure what is missing of the cases, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--stage", choices=STAGES, default="development")
-    parser.add_argument("--list", choices=("all", "rough", "odd", "drake", "video"), default="all", help="which cases")
+    stages = dict.fromkeys((*STAGES, *REAL_STAGES))
+    parser.add_argument("--stage", choices=stages, default="development", help="report1 to report3: of real-like alone")
+    parser.add_argument("--list", choices=LISTS, default="all", help="which cases")
     parser.add_argument("--nulls", type=int, default=200)
-    parser.add_argument("--repeats", type=int, default=1, help="seeds of each effect, pair and unknown")
+    parser.add_argument("--repeats", type=int, default=None, help="seeds of each effect, pair and unknown; of each row")
     parser.add_argument("--only", default="", help="cases whose names contain this")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after this time")
@@ -329,13 +345,17 @@ def main() -> int:
     part = given.list != "all" or given.only or not given.nulls or not given.stage.startswith("report")
     if given.record and part:
         parser.error("--record wants a whole report: --stage report..., with nulls, and neither --list nor --only.")
+    if given.list == "real-like":
+        return _real_like(given)
+    if given.stage not in STAGES:
+        parser.error(f"stage {given.stage} is one of --list real-like alone.")
     if given.time:
         for line in timing(given.device):
             print(line, flush=True)
         return 0
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     if given.list == "all":
-        chosen = cases(given.stage, given.repeats, given.nulls)
+        chosen = cases(given.stage, given.repeats or 1, given.nulls)
     elif given.list == "drake":
         chosen = drake_cases(given.stage, nulls=given.nulls)
     else:
@@ -356,7 +376,7 @@ def main() -> int:
             return 1
         command = shlex.join(word for word in ("python", "benchmarks/diagnose.py", *sys.argv[1:]) if word != "--record")
         acts = {name: entry.acts for name, entry in EFFECTS.items()}
-        record_figures(rows, acts=acts.__getitem__, bound=_bound, covered=_covered, command=command)
+        record_figures(rows, acts=acts.__getitem__, bound=_bound, covered=covered, command=command)
     return 0
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from cgwm.datasets.capture.manifest import write_manifest
 from cgwm.datasets.capture.tracks import Track, tracks_csv
 from cgwm.datasets.io.atomic import new_directory, new_file
+from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 from cgwm.datasets.synthetic.hidden_effects.case import Case
 from cgwm.datasets.synthetic.hidden_effects.mechanics import Hidden, Mechanics, Motion, Start, build
 from cgwm.datasets.synthetic.hidden_effects.protocol import draw_start, motions
@@ -139,6 +140,7 @@ def _truth(
         "name": case.name,
         "row": case.row,
         "group": case.group,
+        "engine_name": case.engine,
         "thing": case.thing,
         "seed": case.seed,
         "protocol": body.protocol,
@@ -149,6 +151,7 @@ def _truth(
                 "name": one.effect.name,
                 "values": one.effect.values,
                 "form": one.effect.form,
+                "unknown": EFFECTS[one.effect.name].acts == "unknown",
                 "comes_with": list(one.effect.comes_with),
                 **one.facts(),
             }

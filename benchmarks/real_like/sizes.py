@@ -8,7 +8,8 @@ and orientations are measured, in angles over the slow error about an axis. Look
 - effects of contact: all of the episodes that begin on the ground (slides, a ball's rolls); for restitution and
   adhesion 0.2 s from the first touch on, since a tumbling body forgets where it came from;
 
-the ratio of a capture is that of its second strongest training episode. No draw is discarded: where a ratio cannot be
+the ratio of a capture is that of its second strongest training episode, of the strongest where fewer than three are
+looked at. No draw is discarded: where a ratio cannot be
 reached (a friction cannot be negative), the effect has its largest size and the truth the ratio that it reached.
 """
 
@@ -136,7 +137,7 @@ def _ratio(
         if bench.turned:
             far = max(far, _turned(rotation, true_rotation) / bench.errors.slow_rad)
         ratios.append(far)
-    return sorted(ratios)[-2] if len(ratios) > 1 else ratios[0]
+    return sorted(ratios)[-2 if len(ratios) > 2 else -1]
 
 
 def _turned(rotation: Array, without: Array) -> float:

@@ -1,0 +1,91 @@
+"""The benchmark of real-like captures: how answers are scored, what is carried, and that the generator stands alone."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from real_like.errors import Errors, draw_errors, noise
+from real_like.plan import STAGES, real_cases
+from real_like.score import judge, wilson
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def truth(*names: str, carried: tuple[str, ...] = (), unknown: bool = False) -> dict[str, object]:
+    effects = [{"name": name, "ratio": 10.0, "comes_with": [], "unknown": unknown} for name in names]
+    return {"effects": effects, "errors": {"carried": list(carried)}, "engine": {"comes_with": []}}
+
+
+@pytest.mark.parametrize(
+    ("hidden", "named", "aliases", "mark"),
+    [
+        (("wind",), ["wind"], [], "right"),
+        (("wind",), ["linear_drag"], [["linear_drag", "wind"]], "right"),
+        (("wind",), ["linear_drag"], [["linear_drag", "wind", "adhesion"]], "among"),
+        (("wind",), ["linear_drag"], [], "wrong"),
+        (("wind",), ["wind", "adhesion"], [], "right, and more"),
+        (("wind", "adhesion"), ["wind"], [], "part"),
+        (("wind",), [], [], "silent"),
+        ((), [], [], "right"),
+        ((), ["wind"], [], "wrong"),
+    ],
+)
+def test_a_name_is_right_alone_or_in_its_class_and_nothing_wrong_beside(
+    hidden: tuple[str, ...], named: list[str], aliases: list[list[str]], mark: str
+) -> None:
+    assert judge(truth(*hidden), {"named": named, "aliases": aliases})["mark"] == mark
+
+
+def test_what_tracks_carry_may_be_named_and_only_as_what_it_is() -> None:
+    tilted = truth(carried=("slow", "tilt"))
+    assert judge(tilted, {"named": ["gravity_tilt@episode"]})["mark"] == "right"
+    assert judge(tilted, {"named": ["gravity_tilt"]})["mark"] == "wrong"
+    assert judge(truth(), {"named": ["gravity_tilt@episode"]})["mark"] == "wrong"
+    assert judge(truth(carried=("scale",)), {"named": ["length_scale@group"]})["mark"] == "right"
+
+
+def test_an_effect_in_no_library_is_right_when_said_to_be_unexplained() -> None:
+    gust = truth("gust", unknown=True)
+    assert judge(gust, {"named": [], "unexplained": True})["mark"] == "right"
+    assert judge(gust, {"named": ["wind"], "unexplained": True})["mark"] == "wrong"
+    assert judge(gust, None)["mark"] == "silent"
+
+
+def test_the_interval_of_a_rate_is_wilsons() -> None:
+    # Brown, Cai & DasGupta 2001: 0 of 200 gives z^2 / (n + z^2) as the upper end
+    assert wilson(0, 200) == pytest.approx((0.0, 3.8415 / 203.8415), abs=1e-5)
+    assert wilson(50, 100) == pytest.approx((0.4038, 0.5962), abs=1e-4)
+
+
+def test_slow_errors_have_the_size_and_the_correlation_that_the_truth_says() -> None:
+    given = Errors(white_m=0.0, white_rad=0.0, slow_m=1e-3, slow_rad=1e-2, slow_s=0.02, slow_kind="ou")
+    times, rng = np.arange(400) / 100, np.random.default_rng(0)
+    drawn = np.stack([noise(given, times, rng)[0] for _ in range(40)])
+    assert drawn.std() == pytest.approx(1e-3, rel=0.05)
+    correlation = (drawn[:, 2:] * drawn[:, :-2]).mean() / drawn.var()
+    assert correlation == pytest.approx(np.exp(-1), abs=0.05)
+
+
+def test_every_capture_carries_something_beside_the_slow_error_and_never_both_levels() -> None:
+    for seed in range(200):
+        carried = draw_errors(np.random.default_rng(seed), 100.0).carried()
+        assert carried[0] == "slow" and 2 <= len(carried) <= 5
+        assert not {"tilt", "height"} <= set(carried)
+
+
+def test_seeds_of_development_and_reports_are_apart_and_do_not_depend_on_the_numbers() -> None:
+    seeds = {stage: {case.name: case.seed for case in real_cases(stage, 12, 12)} for stage in STAGES}
+    assert all(seed % 2 == (stage != "development") for stage, own in seeds.items() for seed in own.values())
+    few = {case.name: case.seed for case in real_cases("report1", 3, 6)}
+    assert few.items() <= seeds["report1"].items()
+
+
+def test_the_generator_does_not_load_what_judges() -> None:
+    code = "import sys, real_like.record; print([m for m in sys.modules if m.startswith('cgwm.pipeline')])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, capture_output=True, text=True, check=True,
+                          env={"PYTHONPATH": ":".join([str(BENCHMARKS), *sys.path])})  # fmt: skip
+    assert done.stdout.strip() == "[]"
