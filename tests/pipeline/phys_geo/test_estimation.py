@@ -16,7 +16,8 @@ from cgwm.pipeline.optimization.levenberg_marquardt import minimise
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.phys_geo.tracks.contact_result import _derived
-from cgwm.pipeline.physics import restitution, simulate
+from cgwm.pipeline.physics import restitution
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
 from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
@@ -33,7 +34,7 @@ def toss(seed: int, contact=None, duration_s: float = 0.4, height: float = 0.09)
     rng = np.random.default_rng(seed)
     quat = np.array([1.0, 0.25, 0.1, 0.0]) + 0.1 * rng.standard_normal(4)
     start = state_of(((0, 0, height), tuple(quat), (0.4, 0.1, -0.6), tuple(0.8 * rng.standard_normal(3))))
-    rollout = simulate(world_of(box_body(), contact=contact or law()), start, times(duration_s, 120))
+    rollout = roll_out(world_of(box_body(), contact=contact or law()), start, times(duration_s, 120))
     position = rollout.position_m[0, :, 0].numpy() + NOISE[0] * rng.standard_normal((len(rollout.times_s), 3))
     turned = Rotation.from_quat(rollout.quat_wxyz[0, :, 0].numpy(), scalar_first=True)
     turned = turned * Rotation.from_rotvec(NOISE[1] * rng.standard_normal(position.shape))

@@ -18,8 +18,9 @@ from cgwm.pipeline.phys_geo.effects.by_motion import fit_effect_flights
 from cgwm.pipeline.phys_geo.effects.effect_fit import fit_effects
 from cgwm.pipeline.phys_geo.effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from cgwm.pipeline.phys_geo.tracks import contact_shooting, open_loop_search
-from cgwm.pipeline.physics import ContactLaw, World, simulate
+from cgwm.pipeline.physics import ContactLaw, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, effect_parameters
 from cgwm.pipeline.segments import first_contact_fit
@@ -42,7 +43,7 @@ def thrown(world: World, count: int, noise_m: float = 5e-4) -> list[tuple[str, d
     for item in range(count):
         quat = torch.randn(4, generator=generator, dtype=F64)
         start = state_of(((0, 0, 0.4), tuple(quat.tolist()), (3.0, 0.5 * item - 1, 0.5), (3.0, -2.0, 1.0)))
-        rollout = simulate(world, start, times(0.5, 60.0))
+        rollout = roll_out(world, start, times(0.5, 60.0))
         position = rollout.position_m[0, :, 0]
         position = position + noise_m * torch.randn(position.shape, generator=generator, dtype=F64)
         track = Track(rollout.times_s.numpy(), position.numpy(), rollout.quat_wxyz[0, :, 0].numpy())
@@ -112,7 +113,7 @@ def test_a_models_effects_act_in_its_world_and_a_wrong_parameter_is_refused(tmp_
         *[((0, 0, 5.0 * k + 5), (1, 0, 0, 0), (1.0, 0, 0), (0, 0, 0)) for k in range(len(worlds[0].bodies))]
     )
     free = worlds[0].free[0]
-    ends = [float(simulate(world, start, times(0.2)).velocity_m_s[0, -1, free, 0]) for world in worlds]
+    ends = [float(roll_out(world, start, times(0.2)).velocity_m_s[0, -1, free, 0]) for world in worlds]
     assert ends == [pytest.approx(1.0), pytest.approx(np.exp(-0.4), rel=1e-2)]
     wrong = model.file.model_copy(update={"effects": (EffectModel(name="linear_drag", parameters={"k": 2.0}),)})
     with pytest.raises(InputDataError, match="linear_drag has no k; it has c"):
@@ -122,7 +123,7 @@ def test_a_models_effects_act_in_its_world_and_a_wrong_parameter_is_refused(tmp_
 def test_a_measurement_effect_changes_what_is_seen_and_not_what_happens() -> None:
     world = replace(boxes(), effects=(active("length_scale", s=0.02),))
     start = state_of(((0.5, 0, 1.0), (1, 0, 0, 0), (1.0, 0, 0), (0, 0, 0)))
-    true, seen = simulate(world, start, times(0.3)), measure(world, start, times(0.3))
+    true, seen = roll_out(world, start, times(0.3)), measure(world, start, times(0.3))
     torch.testing.assert_close(seen.position_m, 1.02 * true.position_m, atol=1e-12, rtol=0)
     torch.testing.assert_close(seen.velocity_m_s, true.velocity_m_s, atol=0, rtol=0)
 
@@ -162,7 +163,7 @@ def test_up_is_against_gravity_on_a_slope_too() -> None:
     world = replace(boxes(), effects=(active("buoyancy", b=1.0),))
     slope = torch.tensor([0.6, 0.0, 0.8], dtype=F64)
     start = state_of(((0, 0, 5.0), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
-    rollout = simulate(replace(world, ground_normal=slope), start, times(0.1))
+    rollout = roll_out(replace(world, ground_normal=slope), start, times(0.1))
     assert rollout.velocity_m_s[0, -1, 0].tolist() == pytest.approx([0, 0, -0.881], abs=1e-9)
 
 

@@ -15,7 +15,7 @@ from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_result import FitRecord
 from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
 from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts
-from cgwm.pipeline.physics import simulate
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
 from cgwm.pipeline.segments.held_out_gain import FOLDS, ContactLinearization
 from cgwm.pipeline.synthesize.parameters import draw_parameters
@@ -55,7 +55,7 @@ def tosses(count: int, weighted: bool = True) -> list[Episode]:
     for number in range(count):
         quat, spin = rng.standard_normal(4), 8 * rng.standard_normal(3)
         start = state_of(((0, 0, 0.11), tuple(quat), (0.5, 0.2, -0.7), tuple(spin)))
-        rollout = simulate(world, start, times(0.2, 120))
+        rollout = roll_out(world, start, times(0.2, 120))
         position = rollout.position_m[0, :, 0].numpy()
         turned = Rotation.from_quat(rollout.quat_wxyz[0, :, 0].numpy(), scalar_first=True)
         turned = turned * Rotation.from_rotvec(NOISE[1] * rng.standard_normal(position.shape))

@@ -10,7 +10,8 @@ import torch
 from cgwm.datasets.capture.spin import require_told_spin
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.geometry.rotation import continuous_turns, quat_exp, quat_log, quat_multiply
-from cgwm.pipeline.physics import State, World, simulate
+from cgwm.pipeline.physics import State, World
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -32,7 +33,7 @@ def spun(turn_rad: float, frames: int) -> tuple[World, Track, torch.Tensor]:
         omega[None, None],
     )
     times = np.arange(frames) / RATE_HZ
-    rollout = simulate(world, state, torch.tensor(times))
+    rollout = roll_out(world, state, torch.tensor(times))
     return world, Track(times, rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy()), omega
 
 
