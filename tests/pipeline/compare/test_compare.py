@@ -21,8 +21,7 @@ from cgwm.pipeline.compare.stage import Comparison, compare, compare_models
 from cgwm.pipeline.compare.verdict import comparison_verdict
 from cgwm.pipeline.evaluate import evaluate
 from cgwm.pipeline.evaluate.prediction import Motion
-from cgwm.pipeline.physics import State, World
-from cgwm.pipeline.physics.engine import rollout as roll_out
+from cgwm.pipeline.physics import State, World, simulate
 from cgwm.pipeline.report.page_file import shows_the_same
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PHASES, CompareResult, EffectModel, UsageError
@@ -181,7 +180,7 @@ def flights(root: Path, model: Model, turned: bool = True) -> Path:
             torch.tensor([[[0.5 - 0.2 * seed, 0.3, 2.5]]]).double(),
             torch.tensor([[[1.0, 0.5 * seed, 0.0]]]).double(),
         )
-        rollout = roll_out(World.from_model(model), state, torch.tensor(times))
+        rollout = simulate(World.from_model(model), state, torch.tensor(times))
         motion = Motion(rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy())
         write_tracks(path, {"cube": measured(times, motion, seed, turned)}, overwrite=True)
     return root
@@ -237,7 +236,7 @@ def test_a_driven_body_and_two_free_ones(tmp_path: Path) -> None:
     rest = torch.tensor([[[0.0, 0, HALF - 2e-4], [0, 0, 0], [0.0, 0.4, HALF - 2e-4]]]).double()
     unturned = torch.tensor([[[1.0, 0.0, 0.0, 0.0]] * 3]).double()
     state = State(rest, unturned, torch.zeros(1, 3, 3).double(), torch.zeros(1, 3, 3).double())
-    rollout = roll_out(World.from_model(model), state, torch.tensor(times), {"tip": command})
+    rollout = simulate(World.from_model(model), state, torch.tensor(times), {"tip": command})
     tracks = {"tip": command}
     for seed, (place, name) in enumerate(((0, "cube"), (2, "other"))):
         own = [rollout.position_m[0, :, [place]].numpy(), rollout.quat_wxyz[0, :, [place]].numpy()]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
+from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.optimization.importance_sampling import (
     NormalPrior,
     SearchResult,
@@ -146,7 +147,7 @@ def test_one_toss_gives_back_the_parameters_that_made_it() -> None:
     true = law(friction=0.25, contact_time_s=0.004, damping_ratio=0.4)
     start = world_of(box_body(), contact=law(friction=0.5, damping_ratio=0.2))
     config = PhysConfig(population=48, generations=6)
-    fit = fit_physics(start, [("000", {"box": toss(3, true, duration_s=0.2)})], config, NOISE)
+    fit = fit_physics(start, [Episode("000", {"box": toss(3, true, duration_s=0.2)})], config, NOISE)
     assert fit.record.to_json()["kept"] == "shooting"  # the model explains its own motion down to the noise
     found = {parameter.name: parameter for parameter in fit.parameters}
     for name, value in (("friction", 0.25), ("damping_ratio", 0.4)):
@@ -163,7 +164,7 @@ def test_one_toss_gives_back_the_parameters_that_made_it() -> None:
 
 def test_two_fits_with_one_seed_are_identical(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
-    episodes = [("000", {"box": toss(3, duration_s=0.15)})]
+    episodes = [Episode("000", {"box": toss(3, duration_s=0.15)})]
     config = PhysConfig(population=8, generations=2, iterations=1, seed=5, step_s=0.002)
     first, second = (fit_physics(world_of(box_body()), episodes, config, NOISE) for _ in range(2))
     assert first.parameters == second.parameters
@@ -172,7 +173,7 @@ def test_two_fits_with_one_seed_are_identical(monkeypatch: pytest.MonkeyPatch) -
 def test_friction_of_a_body_that_never_touches_is_not_observable() -> None:
     world = world_of(box_body())
     flight = toss(1, duration_s=0.15, height=2.0)
-    fit = fit_physics(world, [("000", {"box": flight})], PhysConfig(population=48, generations=3), NOISE)
+    fit = fit_physics(world, [Episode("000", {"box": flight})], PhysConfig(population=48, generations=3), NOISE)
     assert {p.name: p.state for p in fit.parameters}["friction"] == "not_observable"
     assert any("friction is not observable" in warning and "sliding" in warning for warning in fit.warnings)
     assert any("nothing touches anything" in warning for warning in fit.warnings)
@@ -180,7 +181,7 @@ def test_friction_of_a_body_that_never_touches_is_not_observable() -> None:
 
 def test_many_flights_alone_tell_nothing_about_contact() -> None:
     """The scatter of episodes that never touch is none, and would make a tight interval about a chance value."""
-    flights = [(str(seed), {"box": toss(seed, duration_s=0.15, height=2.0)}) for seed in range(8)]
+    flights = [Episode(str(seed), {"box": toss(seed, duration_s=0.15, height=2.0)}) for seed in range(8)]
     fit = fit_physics(world_of(box_body(), ground=False), flights, PhysConfig(population=12, generations=2), NOISE)
     states = {p.name: p.state for p in fit.parameters}
     assert all(states[name] == "not_observable" for name in ("friction", "contact_time_s", "damping_ratio"))
@@ -206,7 +207,7 @@ def test_errors_that_last_for_many_frames_count_as_noise_of_a_flying_centroid() 
 
 def test_many_tosses_give_the_ground_height_too() -> None:
     """From eight episodes on the ground's height is fitted, with an interval from the scatter between episodes."""
-    tosses = [(str(seed), {"box": toss(seed, duration_s=0.25)}) for seed in range(8)]
+    tosses = [Episode(str(seed), {"box": toss(seed, duration_s=0.25)}) for seed in range(8)]
     lowered = replace(world_of(box_body()), ground_offset=torch.tensor([0.001], dtype=F64))
     fit = fit_physics(lowered, tosses, PhysConfig(population=12, generations=5), NOISE)
     found = {parameter.name: parameter for parameter in fit.parameters}
@@ -224,7 +225,7 @@ def test_intervals_cover_the_truth() -> None:
     true = {"friction": 0.3, "damping_ratio": 0.3}
     hits = dict.fromkeys(true, 0)
     for seed in range(20):
-        fit = fit_physics(world_of(box_body()), [("0", {"box": toss(100 + seed)})], PhysConfig(seed=seed), NOISE)
+        fit = fit_physics(world_of(box_body()), [Episode("0", {"box": toss(100 + seed)})], PhysConfig(seed=seed), NOISE)
         for parameter in fit.parameters:
             if parameter.name in true and parameter.interval_95 is not None:
                 low, high = parameter.interval_95
