@@ -56,6 +56,7 @@ from .demo import (
     ImagesOnlyFit,
     SplatCheck,
 )
+from .described import NotDescribed
 from .diagnose import (
     ContactLimit,
     DiagnoseResult,
@@ -183,6 +184,7 @@ __all__ = [
     "MysteryResult",
     "NextExperiment",
     "NotConvergedError",
+    "NotDescribed",
     "NotEnoughMemoryError",
     "NotEnoughSpaceError",
     "Outcome",

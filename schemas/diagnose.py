@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from .base import FileModel
+from .described import NotDescribed
 
-Verdict = Literal["missing_effect", "none_missing", "not_separable", "unexplained"]
+Verdict = Literal["missing_effect", "none_missing", "not_separable", "unexplained", "not_described"]
 
 
 class EffectParameterEstimate(FileModel):
@@ -157,6 +158,8 @@ class DiagnoseResult(FileModel):
     selected: tuple[str, ...] = ()
     """What to pass to `fit --effects`; one name of a group that cannot be told apart."""
     remaining_unexplained: bool = False
+    not_described: NotDescribed | None = None
+    """Why the model does not describe the motion at all; None where it does."""
     ranking: tuple[RankedEffect, ...] = ()
     aliases: tuple[tuple[str, ...], ...] = ()
     """Groups of effects that these data cannot tell apart, a selected one the first of each."""

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from .base import FileModel
 from .capture import Ground, Name, Pose, Shape, physical_inertia
+from .described import NotDescribed
 from .quantities import (
     ContactTime,
     DampingRatio,
@@ -244,6 +245,8 @@ class ModelFile(FileModel):
     """position_m and rotation_rad: the measurement noise, given or estimated."""
     choice: FitChoice | None = None
     """What the fit chose to estimate; None where its settings or data left nothing to choose."""
+    not_described: NotDescribed | None = None
+    """Why the model does not describe the motion that it was fitted to; None where it does."""
     scene: str | None = None
     """Background spheres (PLY, world frame), where there are any."""
     exposures: dict[str, Exposure] = {}

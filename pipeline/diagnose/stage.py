@@ -20,6 +20,7 @@ from ...schemas import (
     FlightTest,
     InputDataError,
     LawTerm,
+    NotDescribed,
     RankedEffect,
     ResidualLaw,
     UsageError,
@@ -31,6 +32,7 @@ from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.candidates import Candidate, admissible
+from ..segments.described_motion import not_described
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
@@ -90,6 +92,8 @@ def diagnose(
     opened = Capture.open(capture, splits=(split,), accept_units=accepted)
     world, prepared = prepared_world(loaded, opened, split, device, accepted)
     result = report(prepared, world, library, compared)
+    episodes = diagnosed_episodes(loaded, opened, split).episodes
+    result = _first_of_all(result, not_described(world, episodes, prepared.noise))
     if save_law_to is None:
         return result
     saved = save_law(result, save_law_to, overwrite)
@@ -172,6 +176,19 @@ def report(
         not_tested=dict(sorted(refused.items())),
         warnings=tuple(warnings),
     )
+
+
+def _first_of_all(result: DiagnoseResult, useless: NotDescribed | None) -> DiagnoseResult:
+    """Return the result with what comes first: that the model does not describe the motion at all.
+
+    A missing effect may be the reason that a body which stands still is nearer; it stays the verdict then.
+    """
+    if useless is None:
+        return result
+    update = {"not_described": useless, "sentence": f"{useless.sentence} {result.sentence}"}
+    if useless.never_touches or not result.selected:
+        update |= {"verdict": "not_described", "sentence": useless.sentence, "selected": (), "aliases": ()}
+    return result.model_copy(update=update)
 
 
 def library_of(candidates: Sequence[str]) -> list[Candidate]:

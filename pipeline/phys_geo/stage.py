@@ -27,6 +27,7 @@ from ..physics.world import World, inertia_elements
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from ..runtime.work_budget import motion_doubt, within_budget
+from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .tracks.contact_result import PhysicsFit
@@ -63,6 +64,9 @@ def fit_motion(
     fitted = _merge(ready.file, found)
     fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
     ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
+    if config.supervise == "tracks":
+        described = not_described(World.from_model(ready), track_episodes(capture, split), found.noise)
+        ready = replace(ready, file=ready.file.model_copy(update={"not_described": described}))
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
         ready = _with_appearance(ready, capture, split, config, found)
     return ready

@@ -258,6 +258,24 @@ class BounceThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DescribedThresholds:
+    """A model does not describe the motion at all."""
+
+    longest_s: float = threshold(1.5, "s", "part of an episode that is predicted", BY_ARGUMENT)
+    times_worse: float = threshold(
+        2.0, "1", "open-loop error in units of that of a body that stands still or keeps its velocity", BY_ARGUMENT
+    )
+    sizes_worse: float = threshold(0.1, "sizes", "tolerance of `times_worse` in addition", BY_ARGUMENT)
+    episodes_worse: float = threshold(0.75, "1", "share of the episodes in which it has to be so", BY_ARGUMENT)
+    touch_m: float = threshold(1e-4, "m", "change of the predicted motion by contact that is one", BY_ARGUMENT)
+    level_s: float = threshold(0.2, "s", "time at one height that shows a support", BY_ARGUMENT)
+    level_share: float = threshold(
+        0.3, "1", "change of height that is none, as a share of that of free fall about its highest point", BY_ARGUMENT
+    )
+    turn_m_s: float = threshold(0.2, "m/s", "speed from falling to rising within three frames: a bounce", BY_ARGUMENT)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentThresholds:
     """All thresholds on segments that decide a verdict."""
 
@@ -275,6 +293,8 @@ class SegmentThresholds:
     """What a fit estimates."""
     bounce: BounceThresholds = BounceThresholds()
     """Bounces of a ball, with or without its orientation."""
+    described: DescribedThresholds = DescribedThresholds()
+    """Whether a model describes the motion."""
 
 
 SEGMENT_THRESHOLDS = SegmentThresholds()

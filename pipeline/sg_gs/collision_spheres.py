@@ -142,6 +142,13 @@ def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = N
     _add_cover(chosen, solid, points, normals, max_spheres - fill)
     if isinstance(solid, Volume):
         _add_fill(chosen, solid, max_spheres)
+    if chosen.count == 0:
+        raise InputDataError(
+            f"no sphere fits inside a shape of {size:.3g} m: it is thinner than "
+            f"{1e3 * solid.tolerance:.2g} mm, to which its volume is resolved.",
+            "solid shapes that are not thin for their length.",
+            "divide a long thin body into shorter ones, or give it spheres: shape = { splats = { path = ... } }.",
+        )
     centers, radii = chosen.arrays()
     gap = np.abs(union_distance(centers, radii, points)).max()
     beyond = float((solid.at(centers) + radii).max())
@@ -220,7 +227,7 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
             continue
         chosen.add(centers[index], float(radii[index]))
         gap = np.minimum(gap, reach[index])
-    while chosen.count < limit and gap.max() > _MOST_TOLERANCE * size:
+    while chosen.count < limit and len(radii) and gap.max() > _MOST_TOLERANCE * size:
         worst = int(np.argmax(gap))
         index = int(np.argmin(reach[:, worst]))
         if reach[index, worst] >= gap[worst]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..physics.smooth_distance import union_distance
-from ..physics.world import World
+from ..physics.world import Body, World
 from .observations import START_FRAMES, Observations, straight_line
 from .residuals import STATE_SIZE, TrajectoryResiduals, retract, state_prior
 from .track_noise import Noise
@@ -44,9 +44,21 @@ def clearance(world: World, observations: Observations) -> Tensor:
                 distance, _ = union_distance(points, centers[:, frame], body.radii.expand(len(points), -1), width=1e-3)
                 columns.append((distance - other.radii).amin(-1))
             gaps.append(torch.stack(columns, 1))
+        for other in world.bodies:
+            if other.motion == "fixed" and other.place is not None:
+                gaps.append(_gap_to_fixed(other, centers, body.radii))
     if not gaps:
         return torch.full_like(observations.times_s, torch.inf)
     return torch.stack(gaps).amin(0)
+
+
+def _gap_to_fixed(other: Body, centers: Tensor, radii: Tensor) -> Tensor:
+    """Return the smallest gap (B, T) [m] of spheres (B, T, n, 3), of radii (1, n), to those of a fixed body."""
+    assert other.place is not None
+    place = other.place.reshape(-1, 7)[:1]
+    points = place[:, None, :3] + other.centers[:1] @ quat_to_matrix(place[:, 3:]).transpose(-1, -2)
+    away = torch.cdist(centers.flatten(0, -2), points[0]) - other.radii[:1]
+    return (away.amin(-1).view(centers.shape[:-1]) - radii[0]).amin(-1)
 
 
 def flight_frames(world: World, observations: Observations) -> Tensor:

@@ -104,7 +104,11 @@ SEGMENT_NUMERICS = {
         "segments.LEAST_STEP_S",
         "sliding_residuals.TIME_S",
     ),
-    "size of a batch": ("first_contact_fit.MAX_WINDOWS", "linearization.PART_ROLLOUTS"),
+    "size of a batch": (
+        "described_motion.MAX_EPISODES",
+        "first_contact_fit.MAX_WINDOWS",
+        "linearization.PART_ROLLOUTS",
+    ),
     "keeps a matrix regular": (
         "mixed_model.LEAST_SHARE",
         "random_effects.STATE_INFORMATION",
@@ -113,6 +117,7 @@ SEGMENT_NUMERICS = {
         "sliding_descent.WEAK",
     ),
     "length of the motion that is looked at": (
+        "described_motion.WARMUP_S",
         "first_contact_fit.AFTER_S",
         "first_contact_fit.CONTACT_S",
         "first_contact_fit.LEAD_FRAMES",
