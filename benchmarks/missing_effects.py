@@ -2,7 +2,7 @@
 
     python benchmarks/missing_effects.py run --stage development --each 6 --nulls 3     # some 40 captures
     python benchmarks/missing_effects.py run --stage report1 --workers 16 --seconds 220   # again, until 0 are left
-    python benchmarks/missing_effects.py table --stage report1 [--plot FILE.png]
+    python benchmarks/missing_effects.py table --stage report1 [--plot FILE.png] [--record]
     python benchmarks/missing_effects.py export OUT --stage development --each 6 --nulls 3
 
 The captures are those of `real_like`; each contender is one file of `contenders/` (`effects_base.py` is its interface):
@@ -42,7 +42,10 @@ CONTENDERS: dict[str, Callable[[], EffectNamer]] = {
 def answer(contender: str, case: RealCase, captures: Path) -> dict[str, Any]:
     """Return what a contender says of a case; its capture is made unless it is there."""
     capture, truth = made(case, captures)
-    found = CONTENDERS[contender]().names(capture)
+    try:
+        found = CONTENDERS[contender]().names(capture)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        return {"case": case.name, "truth": truth, "failed": f"{type(error).__name__}: {error}"}
     said = {"named": list(found.named), "aliases": [list(group) for group in found.aliases]}
     return {"case": case.name, "truth": truth, "answer": {**said, "unexplained": found.unexplained}, **found.details}
 
@@ -94,14 +97,14 @@ def report(rows: Sequence[dict[str, Any]], planned: Sequence[tuple[str, RealCase
         own = {row["case"]: row for row in rows if row["contender"] == who}
         answered = {name: row for name, row in own.items() if "answer" in row}
         lines += [f"## {who}", ""]
-        if answered:
-            truths = {name: row["truth"] for name, row in answered.items()}
+        truths = {name: row["truth"] for name, row in own.items() if "truth" in row}
+        if truths:
             lines += [table(truths, {name: row["answer"] for name, row in answered.items()}), ""]
         refused = [row for row in answered.values() if "refused" in row]
         if refused:
             lines.append(f"{len(refused)} captures were refused: they count as answered by nothing.")
         failed = [row for row in own.values() if "failed" in row]
-        lines += [f"- {row['case']}: failed ({row['failed'][:100]})" for row in failed]
+        lines += [f"- {row['case']}: failed, as if answered by nothing ({row['failed'][:100]})" for row in failed]
         lines += _not_run(wanted, own)
         lines += _added(list(answered.values()))
         seconds = [row["cpu_s"] for row in answered.values()]
@@ -182,7 +185,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     parser.add_argument("--plot", type=Path, default=None, help="of table: draw recall against the ratio")
+    parser.add_argument("--record", action="store_true", help="of table: write a whole report's figures to results/")
     given = parser.parse_args(words)
+    if given.record and (given.only or not given.stage.startswith("report") or given.each < 150 or given.nulls < 200):
+        parser.error("--record wants a whole report: --stage report..., without --only, 150 of each row, 200 nulls.")
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     chosen = [case for case in real_cases(given.stage, given.nulls, given.each) if given.only in case.name]
     captures = given.captures or ROOT / "out" / "real_like" / given.stage
@@ -210,7 +216,20 @@ def main(words: Sequence[str] | None = None) -> int:
     print(report(rows, planned))
     if given.plot:
         plot(rows, given.plot)
+    if given.record and not _recorded(rows, planned, given.stage):
+        return 1
     return 3 if left else 0
+
+
+def _recorded(rows: Sequence[dict[str, Any]], planned: Sequence[tuple[str, RealCase]], stage: str) -> bool:
+    """Write the figures of a whole report into benchmarks/results/; return False if captures are missing."""
+    absent = len(planned) - sum("truth" in row for row in rows)
+    if absent:
+        print(f"{absent} answers are missing or failed: nothing is recorded.", file=sys.stderr)
+        return False
+    figures: Any = import_module("missing_effects_figures")
+    figures.record_figures(rows, f"python benchmarks/missing_effects.py run --stage {stage} --workers 16")
+    return True
 
 
 def _mixed(chosen: Sequence[RealCase]) -> list[RealCase]:

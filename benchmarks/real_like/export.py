@@ -29,7 +29,7 @@ README = """# What is missing? {count} motions of a body over level ground, meas
    `{{"c0000": {{"named": ["wind"], "aliases": [["wind", "linear_drag"]], "unexplained": false}}}}`
    (`aliases`: groups that you cannot tell apart; `wind@episode`, `wind@group`: a value for each episode or session).
 4. `python score.py truth/truth.json answers.json` prints the table; its docstring has the rules. It needs numpy.
-5. Open `truth/` last. If you change your tool then, report on another export: other seeds are a word away.
+5. Open `truth/` last. Whoever changes a tool after that reports on an export of another `--stage`, with other seeds.
 """
 
 

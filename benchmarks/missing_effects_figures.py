@@ -1,0 +1,78 @@
+"""The figures of `missing_effects.py` that docs/results.md shows: bars are cgwm's, rivals have the same rows beside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from real_like.score import RIGHT, judge, ratio_of, wilson
+from render_results import record
+
+LARGE_RATIO = 300**0.5
+"""From this multiple of the slow error on an effect counts as large: the middle of 3 to 100 on a log scale."""
+MOST_FALSE_NULLS, MOST_WRONG_UNKNOWN, LEAST_LARGE, LEAST_SMALL, LEAST_PAIRS = 0.02, 0.05, 0.9, 0.8, 0.8
+Row = dict[str, Any]
+
+
+def record_figures(rows: Sequence[Row], command: str) -> None:
+    """Record the figures of a whole report, all contenders, in benchmarks/results/diagnose.jsonl."""
+    for who in dict.fromkeys(row["contender"] for row in rows):
+        own = [row for row in rows if row["contender"] == who]
+        for figure in figures(who, own):
+            record("diagnose", command=command, **figure)
+
+
+def figures(who: str, rows: Sequence[Row]) -> Iterator[Row]:
+    """Yield the figures of one contender as the arguments of `record`; what failed counts as answered by nothing."""
+    judged = [(row["truth"], judge(row["truth"], row.get("answer"))) for row in rows]
+    single = [pair for pair in judged if pair[0]["row"] in ("flight", "measurement")]
+    large = [mark["mark"] in RIGHT for truth, mark in single if (ratio_of(truth) or 0.0) >= LARGE_RATIO]
+    small = [mark["mark"] in RIGHT for truth, mark in single if (ratio_of(truth) or 0.0) < LARGE_RATIO]
+    text = "real-like, effects of flight and measurement"
+    yield _least(who, f"{text} that move a body by 17 slow errors or more, named", large, LEAST_LARGE)
+    yield _least(who, f"{text} that move it by less, named", small, LEAST_SMALL)
+    yield _least(who, "real-like, effects of contact, named", _right(judged, "contact"), None)
+    yield _least(who, "real-like, pairs of effects, both named", _right(judged, "pair"), LEAST_PAIRS)
+    unknown = [bool(mark["false"]) for truth, mark in judged if truth["row"] == "unknown"]
+    yield _most(who, "real-like, effects in no library that get a wrong name", unknown, MOST_WRONG_UNKNOWN)
+    for engine in sorted({truth["engine_name"] for truth, _ in judged}):
+        alarms = [
+            bool(mark["false"]) for truth, mark in judged if truth["row"] == "null" and truth["engine_name"] == engine
+        ]
+        yield _most(who, f"real-like, nothing hidden, motions of {engine}: a wrong name", alarms, MOST_FALSE_NULLS)
+    wrong = [bool(mark["false"]) for _, mark in judged]
+    yield _most(who, "real-like, all captures: a wrong name", wrong, None)
+
+
+def _right(judged: Sequence[tuple[Row, Row]], row: str) -> list[bool]:
+    return [mark["mark"] in RIGHT for truth, mark in judged if truth["row"] == row]
+
+
+def _least(who: str, figure: str, marks: Sequence[bool], bar: float | None) -> Row:
+    low, high = wilson(sum(marks), len(marks))
+    bar = bar if who == "cgwm" and marks else None
+    proven = "" if bar is None else ", proven" if low >= bar else ", not proven"
+    met = None if bar is None else sum(marks) >= bar * len(marks)
+    return _figure(who, figure, marks, (low, high), "" if bar is None else f"{100 * bar:g} %", met, proven)
+
+
+def _most(who: str, figure: str, marks: Sequence[bool], bar: float | None) -> Row:
+    low, high = wilson(sum(marks), len(marks))
+    bar = bar if who == "cgwm" and marks else None
+    proven = "" if bar is None else ", proven" if high <= bar else ", not proven"
+    met = None if bar is None else sum(marks) <= bar * len(marks)
+    return _figure(who, figure, marks, (low, high), "" if bar is None else f"at most {100 * bar:g} %", met, proven)
+
+
+def _figure(
+    who: str, figure: str, marks: Sequence[bool], interval: tuple[float, float], target: str, met: bool | None,
+    proven: str,
+) -> Row:  # fmt: skip
+    share = f" ({100 * sum(marks) / len(marks):.0f} %)" if marks else ""
+    return {
+        "figure": figure if who == "cgwm" else f"{figure} ({who})",
+        "value": f"{sum(marks)} of {len(marks)}{share}",
+        "target": target,
+        "met": met,
+        "note": f"95 % interval {100 * interval[0]:.1f} to {100 * interval[1]:.1f} %{proven}",
+    }
