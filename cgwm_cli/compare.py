@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import Emit
+from .execution import Emit, loading
 from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, trust
 from .verb import verb
 
@@ -47,7 +47,8 @@ def compare(
 ) -> None:
     """Compare models on measured motion: where and when each fails, as figures and as an HTML page."""
     trust(trust_effects)
-    from ..pipeline.compare import compare as work
+    with loading():
+        from ..pipeline.compare import compare as work
     from ..schemas import UsageError
 
     if not warmup_s > 0:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .execution import Emit
+from .execution import Emit, loading
 from .options import AnyDevice, Overwrite
 from .verb import verb
 
@@ -36,11 +36,13 @@ def demo(
 ) -> None:
     """Run the whole pipeline on a simulated scene, and write a report."""
     if scene == "mystery":
-        from ..pipeline.demo import run_mystery
+        with loading():
+            from ..pipeline.demo import run_mystery
 
         emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
         return
-    from ..pipeline.demo import run_demo
+    with loading():
+        from ..pipeline.demo import run_demo
 
     emit(run_demo(out, scene, seed, renderer, device, overwrite), lambda result: _summary(result, out))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import Emit
+from .execution import Emit, loading
 from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, trust
 from .verb import verb
 
@@ -69,7 +69,8 @@ def diagnose(
 ) -> None:
     """Find the missing physical or measurement effect, and those that these data cannot distinguish from it."""
     trust(trust_effects)
-    from ..pipeline.diagnose import diagnose as work
+    with loading():
+        from ..pipeline.diagnose import diagnose as work
 
     wanted = [name.strip() for name in candidates.split(",") if name.strip()]
     emit(work(model, capture, split, wanted, throws, save_law, overwrite, device, accept_units), _summary)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .execution import Emit
+from .execution import Emit, loading
 from .options import AcceptUnits, AnyDevice, TrustEffects, trust
 from .verb import verb
 
@@ -32,7 +32,8 @@ def evaluate(
 ) -> None:
     """Evaluate a model against measurements: open-loop errors of position, rotation and image."""
     trust(trust_effects)
-    from ..pipeline.evaluate import evaluate as work
+    with loading():
+        from ..pipeline.evaluate import evaluate as work
     from ..schemas import UsageError
 
     if not warmup_s > 0:

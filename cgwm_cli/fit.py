@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .execution import Emit
+from .execution import Emit, loading
 from .options import AcceptUnits, ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects, trust
 from .verb import verb
 
@@ -80,7 +80,8 @@ def fit(
 ) -> None:
     """Fit a world model to a capture: shape and appearance (sg-gs), then physics (phys-geo)."""
     trust(trust_effects)
-    from ..pipeline.fit import fit_or_keep as work
+    with loading():
+        from ..pipeline.fit import fit_or_keep as work
     from ..schemas import PhysConfig, SplatConfig
     from .settings import StageSettings
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import Emit, typed
+from .execution import Emit, loading, typed
 from .options import ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects, trust
 from .verb import verb
 
@@ -91,7 +91,8 @@ def synthesize(
     elif out is None:
         raise UsageError("--out is missing.", todo="name the directory to write: --out DATASET.")
     elif shards is None and ray is None and workers == 1:
-        from ..pipeline.synthesize import synthesize as work
+        with loading():
+            from ..pipeline.synthesize import synthesize as work
 
         done = work(model, out, settings, overwrite, resume, preview)
         emit(done, lambda found: (_plan(found) if plan is not None else "") + _summary(found, settings.shards))
