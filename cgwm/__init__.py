@@ -41,6 +41,7 @@ _PUBLIC = {
     "import_pinwm": ".datasets.importers.pinwm",
     "import_rosbag": ".datasets.importers.rosbag",
     "import_tum": ".datasets.importers.tum",
+    "improve": ".pipeline.improve",
     "merge": ".pipeline.synthesize",
     "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from .pipeline.evaluate import evaluate
     from .pipeline.export import export
     from .pipeline.fit import fit
+    from .pipeline.improve import improve
     from .pipeline.runtime.doctor import doctor
     from .pipeline.synthesize import (
         merge,
@@ -134,6 +136,7 @@ __all__ = [
     "import_pinwm",
     "import_rosbag",
     "import_tum",
+    "improve",
     "merge",
     "open_view",
     "read_model",

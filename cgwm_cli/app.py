@@ -16,6 +16,7 @@ from .eval import evaluate
 from .export import export
 from .fit import fit
 from .import_ import import_capture
+from .improve import improve
 from .merge import merge
 from .synthesize import synthesize
 from .validate import validate
@@ -31,9 +32,10 @@ VERBS = (
     ("eval", evaluate, "Evaluate a model against measurements."),
     ("compare", compare, "Compare models: where and when each fails."),
     ("diagnose", diagnose, "Find the effect that a model lacks."),
+    ("improve", improve, "Fit, diagnose, add and refit until nothing helps."),
     ("import", import_capture, "Convert recordings in another format to a capture."),
     ("export", export, "Convert a dataset or model to another tool's format."),
-    ("validate", validate, "Check a capture, a model or a dataset."),
+    ("validate", validate, "Check a capture, model, dataset or ladder."),
     ("doctor", doctor, "Report what this machine has and what would be used."),
 )
 

@@ -1,4 +1,4 @@
-"""The verb `cgwm validate`: check a capture, model or dataset."""
+"""The verb `cgwm validate`: check a capture, model, dataset or ladder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 
 def validate(
-    thing: Annotated[Path, typer.Argument(metavar="THING", help="A capture, model or dataset.", show_default=False)],
+    thing: Annotated[
+        Path, typer.Argument(metavar="THING", help="A capture, model, dataset or ladder.", show_default=False)
+    ],
     sample: Annotated[
         int | None,
         typer.Option(
@@ -28,7 +30,7 @@ def validate(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Check a capture, a model or a dataset: schema, units, finite numbers, hashes."""
+    """Check a capture, a model, a dataset or a ladder of models: schema, units, finite numbers, hashes."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.validate import validate as work
 

@@ -84,6 +84,17 @@ from .errors import (
 )
 from .exports import ExportFormat, ExportResult
 from .imports import ImportResult
+from .improve import (
+    IMPROVE_FORMAT,
+    ErrorRatio,
+    ImproveConfig,
+    ImproveResult,
+    ImproveStep,
+    ImproveTest,
+    ImproveTestFigures,
+    ImproveTestStep,
+    ImproveTrial,
+)
 from .model import (
     MODEL_FORMAT,
     BodyModel,
@@ -110,6 +121,7 @@ __all__ = [
     "CAMERAS_FORMAT",
     "CAPTURE_FORMAT",
     "DATASET_FORMAT",
+    "IMPROVE_FORMAT",
     "MODEL_FORMAT",
     "PHASES",
     "QUATERNION_NORM_TOLERANCE",
@@ -150,6 +162,7 @@ __all__ = [
     "EpisodeCurves",
     "EpisodeErrors",
     "ErrorCurve",
+    "ErrorRatio",
     "ErrorSummary",
     "EvalResult",
     "ExportFormat",
@@ -168,6 +181,13 @@ __all__ = [
     "ImageVerdict",
     "ImagesOnlyFit",
     "ImportResult",
+    "ImproveConfig",
+    "ImproveResult",
+    "ImproveStep",
+    "ImproveTest",
+    "ImproveTestFigures",
+    "ImproveTestStep",
+    "ImproveTrial",
     "IndexEntry",
     "InputDataError",
     "InterruptedWork",

@@ -17,7 +17,7 @@ from fuzz.subjects import Library
 from fuzz.tables import judged, must_accept, must_refuse
 
 QUICK = ("tracks", "model", "cameras.json", "csv", "hdf5", "tum", "jugglebot", "dataset without images")
-SLOW = {"fit", "diagnose", "view", "synthesize", "compare", "calibrate", "bop", "rosbag"}
+SLOW = {"fit", "diagnose", "improve", "view", "synthesize", "compare", "calibrate", "bop", "rosbag"}
 HEAVY = ("merged dataset", "filmed", "video file", "things")
 """Subjects that take seconds to make; `test_outputs.py` has the table of what `--overwrite` may replace."""
 VERBS = ("validate", "import", "merge")

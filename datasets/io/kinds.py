@@ -1,4 +1,4 @@
-"""Detection of the kind of a directory: capture, model or dataset."""
+"""Detection of the kind of a directory: capture, model, dataset or ladder of models."""
 
 from __future__ import annotations
 
@@ -7,18 +7,24 @@ from typing import Literal
 
 from ...schemas import CAPTURE_FORMAT, InputDataError
 
-Kind = Literal["capture", "model", "dataset"]
+Kind = Literal["capture", "model", "dataset", "ladder"]
 
-_MARKS: dict[Kind, str] = {"capture": "capture.toml", "model": "model.json", "dataset": "dataset.json"}
+_MARKS: dict[Kind, str] = {
+    "capture": "capture.toml",
+    "model": "model.json",
+    "dataset": "dataset.json",
+    "ladder": "improve.json",
+}
 _USED_BY: dict[Kind, str] = {
     "capture": "cgwm calibrate, fit, compare and diagnose take one",
     "model": "cgwm synthesize, eval and compare take one",
     "dataset": "cgwm eval takes one as its target",
+    "ladder": "cgwm validate takes one, the other commands one of its models",
 }
 
 
 def kind_of(path: Path | str) -> Kind | None:
-    """Return the kind of a directory from the files in it, or None if it is none of the three."""
+    """Return the kind of a directory from the files in it, or None if it is none of these."""
     path = Path(path)
     return next((kind for kind, mark in _MARKS.items() if path.is_dir() and any(path.glob(mark))), None)
 

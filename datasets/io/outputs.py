@@ -31,8 +31,8 @@ _HASHED_BYTES = 1 << 16
 _HEAD_BYTES = 1 << 12
 
 DirectoryKind = Literal[
-    "model", "dataset", "capture", "demo", "LeRobot dataset", "BOP dataset", "nerfstudio capture", "COLMAP model",
-    "splat folder",
+    "model", "dataset", "capture", "demo", "ladder", "LeRobot dataset", "BOP dataset", "nerfstudio capture",
+    "COLMAP model", "splat folder",
 ]  # fmt: skip
 FileKind = Literal[
     "page", "MJCF file", "glTF file", "splat file", "index", "effect", "effect template", "calibration", "truth",

@@ -56,7 +56,7 @@ def held_out_loss(segments: Segments, world: World) -> float:
     parameters = base_parameters(world, segments.kind)
     at = segments.in_world(world)
     values = _by_others(at, parameters, base_values(world, parameters))
-    fitted, late = _continued(at, parameters, values)
+    fitted, late = continued(at, parameters, values)
     away = fitted.residuals(parameters, values, jacobian=False)[0].unflatten(1, (late.shape[1], -1))
     loss = 0.0
     for measured, columns in (
@@ -84,13 +84,13 @@ def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tens
 
 def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> float:
     """Return the mean position error [m] of the frames that the states are not fitted to."""
-    fitted, late = _continued(segments, parameters, values)
+    fitted, late = continued(segments, parameters, values)
     away = (fitted.positions(parameters, values) - segments.observations.position_m).norm(dim=-1)
     late = segments.observations.seen * late
     return float((away * late).sum() / late.sum().clamp_min(1.0))
 
 
-def _continued(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> tuple[Segments, Tensor]:
+def continued(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> tuple[Segments, Tensor]:
     """Fit the states to the first frames, and return the segments and the mask (B, T, 1) of the other frames."""
     observed = segments.observations
     known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])

@@ -1,4 +1,4 @@
-"""The stage validate (`cgwm validate`): check that a capture, model or dataset is correct."""
+"""The stage validate (`cgwm validate`): check that a capture, model, dataset or ladder of models is correct."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ...schemas.validation import ValidationReport
 def validate(
     thing: Path | str, sample: int | None = None, seed: int = 0, accept_units: bool = False
 ) -> ValidationReport:
-    """Check a capture, a model or a dataset.
+    """Check a capture, a model, a dataset, or the ladder of models of `cgwm improve`.
 
     Args:
-        thing: CAPTURE, MODEL or DATASET.
+        thing: CAPTURE, MODEL, DATASET, or the directory of a ladder.
         sample: Number of rollouts of a dataset to check, drawn at random; None checks all.
         seed: Seed of that draw.
         accept_units: Do not refuse units and frames of a capture that its motion contradicts.
@@ -30,24 +30,30 @@ def validate(
         ...).
 
     Raises:
-        InputDataError: If the directory is none of the three, a file in it cannot be read, or a capture is wrong; the
+        InputDataError: If the directory is none of these, a file in it cannot be read, or a capture is wrong; the
             message lists all faults of the capture, because the user has to correct them.
         UsageError: If a sample is requested of a capture or model.
     """
     path = Path(thing)
     kind = kind_of(path)
-    if sample is not None and kind in ("capture", "model"):
+    if sample is not None and kind in ("capture", "model", "ladder"):
         raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
     if kind == "capture":
         return validate_capture(path, accept_units)
     if kind == "model":
         return validate_model(path)
+    if kind == "ladder":
+        from .ladder import validate_ladder
+
+        return validate_ladder(path, validate_model)
     if kind == "dataset":
         from .dataset import validate_dataset
 
         return validate_dataset(path, sample, seed)
-    found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset"
-    raise InputDataError(f"{path}: {found}.", "a directory with capture.toml, model.json or dataset.json.")
+    found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset, nor a ladder"
+    raise InputDataError(
+        f"{path}: {found}.", "a directory with capture.toml, model.json, dataset.json or improve.json."
+    )
 
 
 def validate_capture(path: Path | str, accept_units: bool = False) -> ValidationReport:

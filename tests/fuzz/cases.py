@@ -56,6 +56,7 @@ class Verdict:
 
 
 SETTINGS = {
+    "improve": ("improve.steps", "improve.folds", "phys-geo.step_s", "phys-geo.effects", "phys-geo.supervise"),
     "fit": (
         "phys-geo.step_s",
         "phys-geo.population",
@@ -85,6 +86,7 @@ OPTIONS = {
     "eval": ("--split", "--warmup-s", "--trust-effects"),
     "compare": ("--split", "--warmup-s"),
     "diagnose": ("--split", "--candidates", "--throws", "--trust-effects"),
+    "improve": ("--split", "--steps", "--from", "--candidates", "--throws", "--config", "--seed"),
     "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--duration"),
     "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body"),
     "view": ("--port", "--host"),

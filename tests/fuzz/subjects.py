@@ -83,6 +83,7 @@ FIT = command("fit capture --out OUT --stage phys-geo", *FAST_FIT, weight=0.5)
 EVAL = command("eval model capture")
 COMPARE = command("compare model capture --out OUT.html", weight=0.7)
 DIAGNOSE = command("diagnose model capture --split look", weight=0.3)
+IMPROVE = command("improve capture --from model --split look --steps 1 --out OUT", *FAST_FIT, weight=0.1)
 SPLATS = command("fit capture --out OUT", *FAST_SPLATS, weight=0.3)
 FIT_IMAGES = command(
     "fit capture --out OUT --stage phys-geo --from model --supervise images --set phys-geo.image_size=32",
@@ -116,7 +117,7 @@ def imports(words: str) -> tuple[Command, ...]:
 SUBJECTS = {
     subject.name: subject
     for subject in (
-        Subject("tracks", "captures", tracks, (VALIDATE, FIT, EVAL, COMPARE, DIAGNOSE), ("capture/**/*",), 3),
+        Subject("tracks", "captures", tracks, (VALIDATE, FIT, EVAL, COMPARE, DIAGNOSE, IMPROVE), ("capture/**/*",), 3),
         Subject("photos", "captures", photographed, (VALIDATE, SPLATS), ("capture/**/*",), 2),
         Subject("filmed", "captures", filmed, (VALIDATE, FIT_IMAGES), ("capture/**/*",), 1),
         Subject("video file", "captures", video_file, (VALIDATE, FIT_IMAGES), ("capture/videos/**/*.mp4",), 0.5),

@@ -133,6 +133,13 @@ def _mjcf(folder: Path) -> Command:
     return Command(words=words, out=("out.xml",))
 
 
+def _improve(folder: Path) -> Command:
+    capture, model = write_capture(folder / "capture", 3), write_small_model(folder / "model")
+    words = ["improve", str(capture), "--from", str(model), "--split", "test", "--steps", "1"]
+    words += ["--out", str(folder / "out"), *FAST, *_settings("improve.folds=2")]
+    return Command(words=words, out=("out",), again=("--resume",), check=(["validate", str(folder / "out")],))
+
+
 def _import(folder: Path) -> Command:
     capture = write_capture(folder / "source", 6)
     words = ["import", "csv", str(capture / "tracks"), "--out", str(folder / "out")]
@@ -154,6 +161,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export mjcf": _mjcf,
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
     "import csv": _import,
+    "improve": _improve,
 }
 
 

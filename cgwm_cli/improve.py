@@ -1,0 +1,106 @@
+"""The verb `cgwm improve`: fit, diagnose, add and refit until nothing helps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .execution import Emit
+from .options import AcceptUnits, ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects, trust
+from .verb import verb
+
+if TYPE_CHECKING:
+    from ..schemas import ErrorRatio, ImproveResult, ImproveStep
+
+
+@verb
+def improve(
+    emit: Emit,
+    capture: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="The capture, with tracks.", show_default=False)
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", metavar="DIR", help="The directory to write: all models and a page.",
+                     show_default=False),
+    ],
+    parent: Annotated[
+        Path | None, typer.Option("--from", metavar="MODEL", help="Start from a fitted model, which is not changed.")
+    ] = None,
+    split: Annotated[str, typer.Option("--split", metavar="NAME", help="The episodes that decide.")] = "train",
+    steps: Annotated[
+        int | None, typer.Option("--steps", metavar="N", show_default="6", help="Largest number of added models.")
+    ] = None,
+    candidates: Annotated[
+        str,
+        typer.Option("--candidates", metavar="FILE.py:CLASS,...",
+                     help="Custom effects, in addition to the built-in ones.", show_default=False),
+    ] = "",
+    throws: Annotated[
+        Path | None,
+        typer.Option("--throws", metavar="FILE",
+                     help="Candidates for the next throw: a TOML file of [[throws]] tables.",
+                     show_default="about 30 that can be thrown by hand"),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted ladder of DIR; keep a finished one.")
+    ] = False,
+    seed: Seed = None,
+    device: Device = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    trust_effects: TrustEffects = "",
+    accept_units: AcceptUnits = False,
+) -> None:  # fmt: skip
+    """Fit a model, diagnose it, add what helps to predict unseen episodes, and repeat until nothing does."""
+    trust(trust_effects)
+    from ..pipeline.improve import improve as work
+    from ..schemas import ImproveConfig, PhysConfig, SplatConfig
+    from .settings import StageSettings
+
+    settings = StageSettings({"improve": ImproveConfig, "sg-gs": SplatConfig, "phys-geo": PhysConfig}, config, set_)
+    numbers = settings.configure("improve", ImproveConfig, steps=steps)
+    splats = settings.configure("sg-gs", SplatConfig, seed=seed, device=device)
+    physics = settings.configure("phys-geo", PhysConfig, seed=seed, device=device)
+    wanted = [name.strip() for name in candidates.split(",") if name.strip()]
+    result = work(
+        capture, out, parent, split, numbers, splats, physics, wanted, throws, overwrite, resume, accept_units
+    )
+    emit(result, lambda found: _summary(found, out))
+
+
+def _summary(result: ImproveResult, out: Path) -> str:
+    from .output import table, warnings
+
+    rows = [[result.models[0], "", "", ""]]
+    rows += [_row(step, result) for step in result.steps if step.added]
+    last = result.steps[-1] if result.steps else None
+    lines = [
+        result.sentence,
+        table(rows, ["model", "added", "error after / before, unseen", "the same, test"]),
+        *([f"{last.model}: {last.sentence}"] if last is not None and not last.added else []),
+    ]
+    next_ = next((one for step in reversed(result.steps) if (one := step.next_experiment) is not None), None)
+    if next_ is not None:
+        lines.append(f"Measure next, to distinguish {' and '.join(next_.separates)}: {next_.what}.")
+    lines += [*warnings(result.warnings), f"Page: {out / result.page}"]
+    if len(result.models) > 1:
+        lines.append(f"Next: cgwm compare {out / result.models[0]} {out / result.models[-1]} {result.capture}")
+    return "\n".join(lines)
+
+
+def _row(step: ImproveStep, result: ImproveResult) -> list[str]:
+    judged = next((one.typical_error for one in step.tried if one.helps and one.effects == step.added), None)
+    tests = result.test.steps if result.test is not None else ()
+    tested = next((one.typical_error for one in tests if (one.model, one.than) == (step.next_model, step.model)), None)
+    return [step.next_model or "", ", ".join(step.added), _ratio(judged), _ratio(tested)]
+
+
+def _ratio(ratio: ErrorRatio | None) -> str:
+    if ratio is None:
+        return "-"
+    span = ratio.interval_95
+    return f"{ratio.ratio:.2f}" + (f" ({span[0]:.2f} to {span[1]:.2f})" if span else "")

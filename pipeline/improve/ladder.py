@@ -1,0 +1,218 @@
+"""The ladder of models: diagnose, try what is proposed on unseen episodes, add what helps, and fit the next model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ...datasets.capture.tracks import Episode
+from ...datasets.io.progress import note
+from ...datasets.models.model import Model, read_model
+from ...schemas import (
+    DiagnoseResult,
+    FileModel,
+    FittedParameter,
+    ImproveConfig,
+    ImproveStep,
+    ImproveTrial,
+    InputDataError,
+    NotConvergedError,
+    PhysConfig,
+    UsageError,
+)
+from ..diagnose.experiments import Experiment
+from ..diagnose.stage import prepared_world, report
+from ..fit import fit
+from ..physics.effects.registry import effect_of
+from ..runtime.resources import one_torch_thread
+from ..segments.candidates import Candidate
+from ..segments.prepare import Prepared
+from .folds import ReadOnce, fitted_without
+from .held_out_errors import error_ratio, prepared_episodes, typical_errors
+from .ladder_files import LadderFiles
+from .proposals import Proposal, proposals_of
+
+LEAST_FALL = 0.02
+"""Smallest fall of the error for an addition: parameters that are fitted to each unseen episode, like its state, take
+away about one per cent of any error."""
+
+Stopped = Literal["nothing_helps", "nothing_proposed", "steps", "not_diagnosed"]
+
+
+class FoldErrors(FileModel):
+    """Errors of the models that are fitted without one fold each, on that fold."""
+
+    errors: dict[str, float]
+    """Typical error by episode, in units of the noise."""
+    failure: str = ""
+    """The message of a fit that failed."""
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """A ladder that has ended."""
+
+    steps: tuple[ImproveStep, ...]
+    """The diagnosis of each model, and what was done about it."""
+    models: tuple[str, ...]
+    """Folders of the models."""
+    stopped: Stopped
+    """Why it ended."""
+    refusal: str = ""
+    """Why the last model could not be diagnosed."""
+
+
+@dataclass(kw_only=True)
+class Climb:
+    """What all steps of a ladder share."""
+
+    capture: ReadOnce
+    """The capture, restricted to the split."""
+    split: str
+    """Name of the split on which everything is decided."""
+    files: LadderFiles
+    """Where models and decisions are kept."""
+    folds: tuple[tuple[str, ...], ...]
+    """Episodes of each part of the cross-validation."""
+    config: ImproveConfig
+    """Numbers of steps and folds."""
+    physics: PhysConfig
+    """Settings of each fit."""
+    library: Sequence[Candidate]
+    """Candidates of the diagnosis."""
+    throws: Sequence[Experiment]
+    """Experiments to choose the next one from."""
+    accept_units: bool
+    """Whether the capture's units are right although its motion contradicts them."""
+    prepared: dict[int, tuple[list[Episode], Prepared]] = field(default_factory=dict)
+    """Segments of each fold, cut once for all models."""
+
+    def run(self) -> Ladder:
+        """Climb from the model `m0` until nothing helps, and return the ladder.
+
+        Raises:
+            InputDataError: If the first model cannot be diagnosed.
+        """
+        steps: list[ImproveStep] = []
+        models, base = ["m0"], "m0"
+        while True:
+            number, name = len(steps), models[-1]
+            note(f"improve: diagnose {name}")
+            try:
+                found = self.files.document(
+                    f"diagnosis-{number}.json", DiagnoseResult, lambda name=name: self._diagnosis(name)
+                )
+            except InputDataError as error:
+                if not steps:
+                    raise
+                return Ladder(tuple(steps), tuple(models), "not_diagnosed", error.found)
+            step = ImproveStep(**found.model_dump(), model=name)
+            if number == self.config.steps:
+                return Ladder((*steps, step), tuple(models), "steps")
+            tried, best = self._tried(number, base, found)
+            if best is None:
+                ended = "nothing_helps" if tried else "nothing_proposed"
+                return Ladder((*steps, step.model_copy(update={"tried": tried})), tuple(models), ended)
+            base, proposal = best
+            added = self._next_model(number, name, proposal)
+            update = {
+                "tried": tried,
+                "added": proposal.names,
+                "next_model": added.root.name if added.root else None,
+                "next_parameters": _parameters_of(added, proposal),
+            }
+            steps.append(step.model_copy(update=update))
+            models.append(f"m{number + 1}")
+
+    @one_torch_thread()
+    def _diagnosis(self, name: str) -> DiagnoseResult:
+        device, model = self.physics.device, read_model(self.files / name)
+        world, prepared = prepared_world(model, self.capture, self.split, device, self.accept_units)
+        return report(prepared, world, self.library, self.throws)
+
+    def _tried(
+        self, number: int, base: str, found: DiagnoseResult
+    ) -> tuple[tuple[ImproveTrial, ...], tuple[str, Proposal] | None]:
+        """Try the proposals of a diagnosis group by group, until an addition of one helps.
+
+        Args:
+            number: Number of the step.
+            base: Name of the models that are fitted without a fold each, at this step.
+            found: The diagnosis.
+
+        Returns:
+            All trials, and the best addition with the name of its models without a fold; None if none helps.
+        """
+        present = tuple(effect.name for effect in read_model(self.files / f"m{number}").file.effects)
+        groups = proposals_of(found, present, self.files / f"law_{number}.py")
+        tried: list[ImproveTrial] = []
+        for group in groups:
+            helping: list[tuple[float, str, Proposal]] = []
+            for proposal in group:
+                name = f"m{number}-{len(tried)}"
+                trial = self._trial(base, name, proposal)
+                tried.append(trial)
+                if trial.helps and trial.typical_error is not None:
+                    helping.append((trial.typical_error.ratio, name, proposal))
+            if helping:
+                _, name, proposal = min(helping, key=lambda one: one[0])
+                return tuple(tried), (name, proposal)
+        return tuple(tried), None
+
+    def _trial(self, base: str, name: str, proposal: Proposal) -> ImproveTrial:
+        """Add effects to the models without a fold, and compare the errors on the folds."""
+        note(f"improve: try {', '.join(proposal.names)} on unseen episodes")
+        before = self._fold_errors(base, "m0", ())
+        after = self._fold_errors(name, base, proposal.effects)
+        ratio = error_ratio(before.errors, after.errors) if not before.failure and not after.failure else None
+        span = None if ratio is None else ratio.interval_95
+        return ImproveTrial(
+            effects=proposal.names,
+            why=proposal.why,
+            typical_error=ratio,
+            helps=ratio is not None and span is not None and span[1] < 1 and ratio.ratio <= 1 - LEAST_FALL,
+            failure=before.failure or after.failure,
+        )
+
+    def _fold_errors(self, name: str, base: str, effects: Sequence[str]) -> FoldErrors:
+        """Return the errors of models that are each fitted without a fold, from those without it at the step before."""
+        return self.files.document(f"errors-{name}.json", FoldErrors, lambda: self._measured(name, base, effects))
+
+    def _measured(self, name: str, base: str, effects: Sequence[str]) -> FoldErrors:
+        errors: dict[str, float] = {}
+        config = self.physics.model_copy(update={"effects": tuple(effects)})
+        for number, fold in enumerate(self.folds):
+            # the first models without a fold start from the first model, all others from the ones before them
+            start = self.files / ("m0" if name == base else f"folds/{base}-{number}")
+            try:
+                model = fitted_without(
+                    fold, read_model(start), self.capture, self.split, config, self.files / f"folds/{name}-{number}"
+                )
+                if number not in self.prepared:
+                    self.prepared[number] = prepared_episodes(
+                        read_model(self.files / f"folds/m0-{number}"), self.capture, fold
+                    )
+                errors |= typical_errors(model, self.capture, *self.prepared[number])
+            except (NotConvergedError, InputDataError, UsageError) as error:
+                return FoldErrors(errors={}, failure=error.found)
+        return FoldErrors(errors=errors)
+
+    def _next_model(self, number: int, name: str, proposal: Proposal) -> Model:
+        """Fit the next model of the ladder to the whole split."""
+        out = self.files / f"m{number + 1}"
+        note(f"improve: fit {out.name} with {', '.join(proposal.names)}")
+        config = self.physics.model_copy(update={"effects": proposal.effects})
+        root: Path = self.capture.root
+        fit(
+            root, out, "phys-geo", self.files / name, self.split, None, config, resume=True,
+            accept_units=self.accept_units,
+        )  # fmt: skip
+        return read_model(out)
+
+
+def _parameters_of(model: Model, proposal: Proposal) -> tuple[FittedParameter, ...]:
+    """Return the parameters of added effects in a model."""
+    names = {effect_of(e).name for e in model.file.effects if e.name.rpartition("/")[2] in proposal.names}
+    return tuple(p for p in model.file.parameters if p.name.partition(".")[0] in names)

@@ -1,0 +1,89 @@
+"""Files of an unfinished ladder, in the directory `DIR.checkpoint` beside the output; an interrupted one continues.
+
+Each file and each model gets its name when it is complete, and is read back from disk, so that a ladder that continues
+works on the same numbers as one that was never interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from ...datasets.io.atomic import remove_directory, replaced_file
+from ...schemas import FileModel, UsageError, read_json
+
+DocumentT = TypeVar("DocumentT", bound=FileModel)
+
+_KEY = "made_of.json"
+
+
+class LadderFiles:
+    """Directory of an unfinished ladder.
+
+    Args:
+        out: The directory that the ladder gets when it is complete.
+        made_of: Inputs and settings by name; a ladder of other ones is not continued.
+        resume: Continue an interrupted one.
+        overwrite: Begin again where an interrupted one is.
+
+    Raises:
+        UsageError: If the directory holds something else, or an interrupted ladder and neither is set, or one that was
+            made of something else.
+    """
+
+    def __init__(self, out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool) -> None:
+        self._out, self.path = out, self.path_of(out)
+        if (self.path / _KEY).is_file():
+            if not resume and not overwrite:
+                raise UsageError(
+                    f"{self.path} holds a ladder of {out} that was interrupted.",
+                    todo="pass --resume to go on with it, or --overwrite to begin again.",
+                )
+            if overwrite and not resume:
+                self.remove()
+            else:
+                self._refuse_others(made_of)
+        elif self.path.exists() and any(not entry.name.startswith(f".{_KEY}.") for entry in self.path.iterdir()):
+            raise UsageError(
+                f"{self.path} is in the way: an unfinished ladder goes there, and it holds none.",
+                todo="move it, or choose another --out.",
+            )
+        if not (self.path / _KEY).is_file():
+            self.path.mkdir(parents=True, exist_ok=True)
+            with replaced_file(self.path / _KEY) as path:
+                path.write_text(json.dumps(dict(made_of), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+    @staticmethod
+    def path_of(out: Path) -> Path:
+        """Return the directory of an unfinished ladder."""
+        return out.with_name(f"{out.name}.checkpoint")
+
+    def __truediv__(self, name: str) -> Path:
+        """Return the path of a file or model of the ladder."""
+        return self.path / name
+
+    def document(self, name: str, kind: type[DocumentT], make: Callable[[], DocumentT]) -> DocumentT:
+        """Return a document from its file; it is made and written first if there is none."""
+        path = self.path / name
+        if not path.is_file():
+            made = make().model_dump_json(indent=1) + "\n"
+            with replaced_file(path) as partial:
+                partial.write_text(made, encoding="utf-8")
+        return read_json(path, kind)
+
+    def remove(self) -> None:
+        """Remove the directory, when the ladder is complete or is to begin again."""
+        if (self.path / _KEY).is_file():
+            remove_directory(self.path, self._out)
+
+    def _refuse_others(self, made_of: Mapping[str, str]) -> None:
+        found = json.loads((self.path / _KEY).read_text(encoding="utf-8"))
+        names = sorted(name for name in {*found, *made_of} if found.get(name) != made_of.get(name))
+        if names:
+            raise UsageError(
+                f"{self.path} was made with other {', '.join(names)}.",
+                "the same command, on the same capture, with --resume.",
+                "pass what was passed before, or --overwrite to begin again.",
+            )

@@ -1,0 +1,275 @@
+"""The page of a ladder: what was missing at each step, the evidence, the errors on unseen episodes, what remains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...schemas import ErrorRatio, FittedParameter, ImproveResult, ImproveStep, ImproveTest
+from ..report.page import cautions, command, facts, fixed, link, number, page, paragraph, section, table, text
+from ..report.plots import Bar, bars
+from .wording import WHY, ratio_words, trial_words
+
+PAGE = "improve.html"
+RANKED = 6
+"""Number of candidates that are shown of a ranking."""
+_MM = 1e3
+
+
+def ladder_html(result: ImproveResult, out: Path) -> str:
+    """Return the HTML page of a ladder.
+
+    Args:
+        result: The ladder.
+        out: Its directory.
+    """
+    ladder = [step for step in result.steps if step.added]
+    ends = [step for step in result.steps if not step.added]
+    body = [
+        f"<h1>cgwm improve · {text(Path(result.capture).name)} · {result.episodes} episodes of split "
+        f"{text(result.split)}</h1>",
+        f'<p class="verdict">{text(result.sentence)}</p>',
+        _cards(result.test),
+        cautions(result.warnings),
+        _overview(result, ladder),
+        *(_step(number, step, result.test) for number, step in enumerate(ladder, 1)),
+        *(_remains(step, result) for step in ends),
+        _measure_next(result.steps),
+        _commands(result, out),
+        _judged(result),
+        _provenance(result, out),
+    ]
+    title = f"cgwm improve: {Path(result.capture).name}"
+    return page(title, [piece for piece in body if piece])
+
+
+def _cards(test: ImproveTest | None) -> str:
+    """Return the cards of the errors on the test episodes, of the last model and of the first."""
+    if test is None:
+        return ""
+    first, last = test.models[0], test.models[-1]
+    known = [
+        ("predictions", first.typical_error, last.typical_error, 1.0, "times the noise"),
+        ("open loop", first.translation_error_m.median, last.translation_error_m.median, _MM, "mm"),
+    ]
+    if first.state_fitted_residual_m is not None and last.state_fitted_residual_m is not None:
+        residuals = (first.state_fitted_residual_m.median, last.state_fitted_residual_m.median)
+        known.append(("state-fitted residual", *residuals, _MM, "mm"))
+    cards = [
+        f'<div class="card"><div>{name}</div><div class="value">{number(after * scale)} {unit}</div>'
+        f"<dl><dt>{text(first.model)}</dt><dd>{number(before * scale)} {unit}</dd>"
+        f"<dt>test episodes</dt><dd>{test.episodes}</dd></dl></div>"
+        for name, before, after, scale, unit in known
+        if before is not None and after is not None
+    ]
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _overview(result: ImproveResult, ladder: Sequence[ImproveStep]) -> str:
+    test = result.test
+    tested = {one.model: one for one in test.models} if test is not None else {}
+    rows = []
+    for k, name in enumerate(result.models):
+        one = tested.get(name)
+        added = "as fitted" if k == 0 else ", ".join(ladder[k - 1].added)
+        judged = None if k == 0 else _accepted(ladder[k - 1])
+        tests = _test_ratio(test, name, result.models[k - 1]) if k else None
+        rows.append(
+            [
+                text(name),
+                text(added),
+                _ratio(judged),
+                _ratio(tests),
+                fixed(one.translation_error_m.median if one else None, 1, _MM),
+                fixed(one.state_fitted_residual_m.median if one and one.state_fitted_residual_m else None, 1, _MM),
+                number(one.typical_error if one else None),
+            ]
+        )
+    header = ["model", "added", "ratio, cross-validated", "ratio, test", "open loop [mm]", "state-fitted [mm]"]
+    words = (
+        "Ratio: prediction error after the step over that before it, geometric mean over episodes, with its "
+        "95 % interval. Cross-validated: episodes of the split that decides, each predicted by a model that was not "
+        "fitted to it. The last columns are medians over the test episodes."
+    )
+    chart = [
+        Bar(
+            name=f"{name}, test" if one.typical_error is not None else name,
+            value=one.typical_error or 0.0,
+            words=f"{number(one.typical_error)} times the noise",
+            strong=name == result.models[-1],
+        )
+        for name, one in tested.items()
+    ]
+    drawn = [paragraph("Typical prediction error of the test episodes:"), bars(chart)] if chart else []
+    return section("The ladder", paragraph(words), table([*header, "prediction [noise]"], rows, (4, 5, 6)), *drawn)
+
+
+def _accepted(step: ImproveStep) -> ErrorRatio | None:
+    """Return the cross-validated ratio of the addition that a step has made."""
+    return next((one.typical_error for one in step.tried if one.helps and one.effects == step.added), None)
+
+
+def _test_ratio(test: ImproveTest | None, model: str, than: str) -> ErrorRatio | None:
+    steps = () if test is None else test.steps
+    return next((one.typical_error for one in steps if (one.model, one.than) == (model, than)), None)
+
+
+def _ratio(ratio: ErrorRatio | None) -> str:
+    if ratio is None:
+        return "–"
+    span = ratio.interval_95
+    return number(ratio.ratio) + (f" ({number(span[0])} to {number(span[1])})" if span else " (no interval)")
+
+
+def _step(number_: int, step: ImproveStep, test: ImproveTest | None) -> str:
+    """Return the section of a step that has added something."""
+    judged, tested = _accepted(step), _test_ratio(test, step.next_model or "", step.model)
+    figures = [f"Unseen episodes of the split, prediction error: {ratio_words(judged)}."] if judged else []
+    figures += [f"Test episodes: {ratio_words(tested)}."] if tested else []
+    return section(
+        f"Step {number_}: {', '.join(step.added)}",
+        paragraph(f"What {step.model} lacks. {step.sentence}"),
+        *map(paragraph, figures),
+        _parameters(step.next_parameters),
+        "<h3>Evidence</h3>",
+        _ranking(step),
+        _rivals(step),
+        _trials(step),
+        _law(step),
+    )
+
+
+def _parameters(parameters: Sequence[FittedParameter]) -> str:
+    rows = [
+        [
+            f"<code>{text(p.name)}</code>",
+            number(p.estimate),
+            f"{number(p.interval_95[0])} to {number(p.interval_95[1])}" if p.interval_95 else "–",
+            text(p.unit),
+        ]
+        for p in parameters
+    ]
+    return table(["parameter", "estimate", "95 % interval", "unit"], rows, (1, 2)) if rows else ""
+
+
+def _ranking(step: ImproveStep) -> str:
+    rows = [
+        [
+            text(entry.effect),
+            text(", ".join(entry.acts_in)),
+            "0" if entry.score_p == 0 else number(entry.score_p, 2),
+            number(entry.delta_bic),
+            f"{fixed(entry.cv_error_before_m, 2, _MM)} → {fixed(entry.cv_error_after_m, 2, _MM)}"
+            if entry.cv_error_after_m is not None
+            else "–",
+            "; ".join(f"{text(p.name)} = {number(p.estimate)} ± {number(p.std_error, 2)} {text(p.unit)}"
+                      for p in entry.parameters[:3]),
+        ]
+        for entry in step.ranking[:RANKED]
+    ]  # fmt: skip
+    if not rows:
+        return paragraph("No candidate was tested.", "soft")
+    strong = [k for k, entry in enumerate(step.ranking[:RANKED]) if entry.effect in step.selected]
+    header = ["candidate", "acts in", "p", "change of BIC", "held-out error [mm]", "estimate"]
+    return table(header, rows, (2, 3), strong)
+
+
+def _rivals(step: ImproveStep) -> str:
+    if not step.aliases:
+        return ""
+    listed = "; ".join(f"{group[0]}: {', '.join(group[1:])}" for group in step.aliases)
+    return paragraph(f"Rivals that these data cannot separate from what was named. {listed}.")
+
+
+def _trials(step: ImproveStep) -> str:
+    if not step.tried:
+        return ""
+    rows = [
+        [
+            text(", ".join(trial.effects)),
+            text(WHY[trial.why]),
+            _ratio(trial.typical_error),
+            "–" if trial.typical_error is None else f"{trial.typical_error.better} of {trial.typical_error.episodes}",
+            text(trial_words(trial)),
+        ]
+        for trial in step.tried
+    ]
+    header = ["tried", "why", "error after / before, unseen", "better in", "outcome"]
+    return "<h3>Tried on unseen episodes</h3>" + table(header, rows, strong=_helped(step))
+
+
+def _helped(step: ImproveStep) -> list[int]:
+    return [k for k, trial in enumerate(step.tried) if trial.helps and trial.effects == step.added]
+
+
+def _law(step: ImproveStep) -> str:
+    law = step.residual_law
+    if law is None or not law.terms:
+        return ""
+    terms = ", ".join(f"{number(t.coefficient)} ± {number(t.std_error, 2)} {t.unit} [{t.term}]" for t in law.terms)
+    return paragraph(f"Law of the residual force, by regression: {terms}. What is left of it has a mean chi2 of "
+                     f"{number(law.left_chi2)} (1: noise).")  # fmt: skip
+
+
+def _remains(step: ImproveStep, result: ImproveResult) -> str:
+    """Return the section of the diagnosis to which nothing was added."""
+    blind = [limit.effect for limit in step.contact_limits if not limit.sizes]
+    flight = step.flight_before
+    pieces = [paragraph(f"Diagnosis of {step.model}. {step.sentence}")]
+    if result.refusal:
+        pieces.append(paragraph(f"It could not be diagnosed again: {result.refusal}"))
+    if flight is not None:
+        pieces.append(
+            paragraph(f"Mean chi2 of the residual in flight: {number(flight.statistic)}, where 1 is noise alone.")
+        )
+    if blind:
+        pieces.append(paragraph(f"Hardly detectable in these contacts: {', '.join(blind)}."))
+    return section("What remains", *pieces, _rivals(step), _law(step), _trials(step), _ranking(step))
+
+
+def _measure_next(steps: Sequence[ImproveStep]) -> str:
+    """Return the last experiment that a diagnosis has proposed."""
+    found = next((one for step in reversed(steps) if (one := step.next_experiment) is not None), None)
+    if found is None:
+        return ""
+    rows = [[text(entry["rank"]), text(entry["what"]), number(entry.get("order_of_magnitude"), 2)]
+            for entry in found.ranked[:3]]  # fmt: skip
+    words = f"To distinguish {' and '.join(found.separates)}: {found.what}."
+    more = table(["rank", "experiment", "expected gain [nats]"], rows, (2,)) if rows else ""
+    left = paragraph(f"None of them separates {', '.join(found.not_separated)}.") if found.not_separated else ""
+    return section("What to measure next", paragraph(words), more, left)
+
+
+def _commands(result: ImproveResult, out: Path) -> str:
+    first, last = out / result.models[0], out / result.models[-1]
+    listed = [command(f"cgwm compare {first} {last} {result.capture}")] if first != last else []
+    listed.append(command(f"cgwm synthesize {last} --out DATASET"))
+    links = ", ".join(link(name, out / name, out / PAGE) for name in result.models)
+    return section("Models and commands", f"<p>Models: {links}. Every other command accepts them.</p>", *listed)
+
+
+def _judged(result: ImproveResult) -> str:
+    words = (
+        f"The {result.episodes} episodes of split '{result.split}' were divided into {len(result.folds)} parts. For "
+        "each part and each addition all parameters were fitted to the other parts, and the part was predicted. An "
+        "addition stays if the error of these predictions falls by at least 2 %, and the 95 % interval of the ratio "
+        "lies below 1. The diagnosis that proposes additions sees the whole split, so that these intervals are a "
+        "little too short; those of the test episodes are not, as they have decided nothing."
+    )
+    short = (
+        "Prediction error: the motion is cut into segments of flight and contact; the state of each is fitted to its "
+        "first half, and the second half is predicted. Frames are averaged on a logarithmic scale, so that a few "
+        "impacts do not outweigh a long flight. The unit is the noise of the measurement; the error of the fitted "
+        "state is included, so that a perfect model has an error above 1."
+    )
+    return section("How it was judged", paragraph(words), paragraph(short))
+
+
+def _provenance(result: ImproveResult, out: Path) -> str:
+    rows = [
+        ("capture", text(result.capture)),
+        ("versions", text(", ".join(f"{name} {version}" for name, version in result.versions.items()))),
+        ("figures", link("improve.json", out / "improve.json", out / PAGE)),
+    ]
+    rows += [(name, f'<code class="long">{text(digest)}</code>') for name, digest in result.model_sha256.items()]
+    return section("Provenance", facts(rows))
