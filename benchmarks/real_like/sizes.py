@@ -29,6 +29,7 @@ from .errors import Errors, between
 
 LEAST_RATIO, MOST_RATIO = 3.0, 100.0
 MOST_SIZE = {"anisotropic_friction": 1.0, "inertia_shape": 1.8, "friction_patch": 1.3, "com_offset": 2.0}
+MOST_SIZE |= {"marker_offset": 1.5}
 """The largest size, in usual large ones; 3 for all others."""
 _LOOKED_AT = 4
 _STEPS = 4

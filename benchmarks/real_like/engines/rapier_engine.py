@@ -18,6 +18,8 @@ from cgwm.datasets.synthetic.hidden_effects.rotation import rotation_of
 from cgwm.datasets.synthetic.hidden_effects.things import Thing, restitution_of
 
 STEP_S = 1e-3
+_BOUNCE_M_S = 0.05
+"""Change of the velocity in a step beyond gravity's from which on it was a contact: no effect pushes so hard."""
 _NEEDS_FORCE = ("rolling_resistance", "torsional_friction", "anisotropic_friction")
 
 
@@ -38,6 +40,7 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
     middles, radius = mechanics.thing.spheres
     count = int(np.ceil(length_s / STEP_S)) + 1
     poses, touching, unknown = np.empty((count, 7)), np.zeros(count, bool), np.full(len(middles), np.nan)
+    gravity_m_s, last = mechanics.gravity_m_s2 * STEP_S, None
     for step in range(count):
         place, turn = body.translation, body.rotation
         position = np.array([place.x, place.y, place.z])
@@ -45,11 +48,15 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
         quat /= np.linalg.norm(quat)
         rotation = rotation_of(quat)
         poses[step] = np.concatenate((position, quat))
+        speed = body.linvel
+        moving = np.array([speed.x, speed.y, speed.z])  # of the centre of mass
         touching[step] = position[2] + (middles @ rotation.T)[:, 2].min() < radius + 1e-4
+        # a bounce within one step leaves no pose on the ground
+        touching[step] |= last is not None and float(np.abs(moving - last - gravity_m_s).max()) > _BOUNCE_M_S
+        last = moving
         if pushes:
-            spin, speed = body.angvel, body.linvel
+            spin = body.angvel
             omega = rotation.T @ np.array([spin.x, spin.y, spin.z])
-            moving = np.array([speed.x, speed.y, speed.z])  # of the centre of mass
             velocity = moving - rotation @ np.cross(omega, mechanics.com_m)
             moment = reader.moment(step * STEP_S, position, quat, velocity, omega, unknown)
             force, torque = (np.sum(parts, axis=0) for parts in zip(*(p(moment) for p in pushes), strict=True))
