@@ -29,12 +29,13 @@ install: $(VENV)/linked
 demo: install
 	$(BIN)/cgwm demo $(OUT) --overwrite
 
-# One thread a worker: the tensors of tests are too small to share out, and the workers share the cores.
+# One thread a worker: the tensors of tests are too small to share out, and the workers share the cores. Bytecode is kept
+# whatever the environment says: without it each process of the tests compiles what it imports, a worker for five seconds.
 # The checks of the text run meanwhile, one after the other; what they print is shown after the tests.
 test: install
 	@mkdir -p build && rm -f build/lint.log
 	@{ $(CHECKS); } > build/lint.log 2>&1 & checks=$$!; \
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder; tests=$$?; \
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder; tests=$$?; \
 	wait $$checks; checks=$$?; cat build/lint.log; \
 	[ $$tests = 0 ] || echo 'make test: pytest failed' >&2; [ $$checks = 0 ] || echo 'make test: ruff or pyright failed' >&2; \
 	[ $$tests = 0 ] && [ $$checks = 0 ]

@@ -175,7 +175,7 @@ def test_recording_contacts_changes_no_motion_where_the_ground_sees_fewer_sphere
     world = world_of(replace(body, on_plane=on_plane))
     start = state_of(((0, 0, 0.1), (0.9, 0.3, 0.2, 0.1), (0.3, 0.1, -0.5), (2.0, 1.0, -1.0)), count=2)
     plain, recorded, every = (
-        simulate(one, start, times(0.4), record_contacts=record)
+        simulate(one, start, times(0.25), record_contacts=record)
         for one, record in ((world, False), (world, True), (world_of(body), False))
     )
     torch.testing.assert_close(plain.position_m, recorded.position_m, rtol=0, atol=1e-9)
