@@ -22,7 +22,7 @@ _OPTIONS = {
     "pinwm": ("train",),
     "jugglebot": ("only", *_SPLITS),
     "balldrops": ("only",),
-    "csv": ("columns", "length_unit", "time_unit", *_TRACKS),
+    "csv": ("columns", "length_unit", "time_unit", "spin_frame", *_TRACKS),
     "tum": ("length_unit", "time_unit", *_TRACKS),
     "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
     "rosbag": ("topic", *_TRACKS),
@@ -79,7 +79,7 @@ def import_capture(
         typer.Option(
             "--columns",
             metavar="KEY=NAME,...",
-            help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz); "
+            help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz, wx .. wz); "
             "hdf5: names of datasets (time, position, quat_wxyz, quat_xyzw).",
             show_default=False,
         ),
@@ -91,6 +91,10 @@ def import_capture(
     time_unit: Annotated[
         Literal["s", "ms", "us", "ns"] | None,
         typer.Option("--time-unit", help="csv, tum, hdf5: unit of times (s).", show_default=False),
+    ] = None,
+    spin_frame: Annotated[
+        Literal["world", "body"] | None,
+        typer.Option("--spin-frame", help="csv: axes of measured angular velocities beside orientations."),
     ] = None,
     body: Annotated[
         str | None, typer.Option("--body", help="Name of the body, if the data have none.", show_default=False)
@@ -106,7 +110,7 @@ def import_capture(
 ) -> None:
     """Convert recordings in another format to a capture."""
     given = {"train": train, "test": test, "seed": seed, "only": only, "columns": columns, "body": body, "up": up}
-    given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic}
+    given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic, "spin_frame": spin_frame}
     words = {name: value for name, value in given.items() if value is not None}
     refuse_foreign(words, _OPTIONS[format_], format_, "omit it.")
     emit(_imported(format_, source, out, words, overwrite), _summary)

@@ -42,7 +42,7 @@ class Track:
     velocity_m_s: Array | None = None
     """Velocity of the body frame's origin [m/s], world frame, shape (T, 3), or None."""
     omega_body_rad_s: Array | None = None
-    """Angular velocity [rad/s], BODY frame, shape (T, 3), or None."""
+    """Angular velocity [rad/s], BODY frame, shape (T, 3), or None; of a centroid along the axes of the world."""
 
     def __len__(self) -> int:
         return len(self.time_s)

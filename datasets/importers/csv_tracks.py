@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...schemas import InputDataError, did_you_mean
 from ...schemas.imports import ImportResult
@@ -23,15 +24,20 @@ from .recordings import SI, Units, read_text, require_name, track_files, write_t
 
 Array = NDArray[np.float64]
 
-COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz")
-"""Quantities that a column may contain; `body` and the four of the orientation are optional."""
+COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
+"""Quantities that a column may contain; `body`, the orientation (q, four) and the spin (w, three) are optional."""
 _REQUIRED = ("time", "px", "py", "pz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
+_SPIN = ("wx", "wy", "wz")
 _NAMES = {
     "time": ("time", "t", "timestamp", "timestamps", "stamp"),
     "body": ("body", "object", "rigid_body"),
     **{f"p{axis}": (f"p{axis}", axis, f"t{axis}", f"pos_{axis}", f"position_{axis}") for axis in "xyz"},
     **{f"q{part}": (f"q{part}", f"q_{part}", f"quat_{part}", f"orientation_{part}") for part in "wxyz"},
+    **{
+        f"w{axis}": (f"w{axis}", f"w{axis}_rad", f"omega_{axis}", f"omega_{axis}_rad", f"angular_velocity_{axis}")
+        for axis in "xyz"
+    },
 }
 _UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
 _LENGTHS, _TIMES = ("m", "cm", "mm", "in"), ("s", "ms", "us", "ns")
@@ -45,6 +51,7 @@ def import_csv(
     units: Units = SI,
     body: str = "body",
     up: Literal["z", "y"] = "z",
+    spin_frame: Literal["world", "body"] | None = None,
     n_train: int | None = None,
     n_test: int | None = None,
     seed: int = 0,
@@ -63,6 +70,8 @@ def import_csv(
         units: Units of the numbers, if the column names do not contain them.
         body: Name of the body, if there is no column for it.
         up: Axis that points up; gravity is set opposite to it, and the coordinates are kept.
+        spin_frame: Frame of measured angular velocities; where orientations are measured too,
+            they are read only if it is named, and without orientations the frame is the world's.
         n_train: Number of episodes to fit on; None: 60 %.
         n_test: Number of episodes to test on; None: the others.
         seed: Seed of the permutation.
@@ -81,7 +90,7 @@ def import_csv(
                 )
         files = track_files(Path(source), (".csv",))
         left_out: Counter[str] = Counter()
-        tracks = (_tracks(path, columns or {}, units, body, left_out) for path in files)
+        tracks = (_tracks(path, columns or {}, units, body, left_out, spin_frame) for path in files)
         result = write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
     return result.model_copy(update={"warnings": _left_out_warnings(left_out, len(files))})
 
@@ -102,11 +111,19 @@ def _left_out_warnings(left_out: Counter[str], files: int) -> tuple[str, ...]:
         return ()
     places = {name: "" if count == files else f" (in {count} of {files} files)" for name, count in left_out.items()}
     named = ", ".join(f"{shown(name)}{place}" for name, place in places.items())
-    return (f"columns that were not read: {named}. Read are time, body, px, py, pz and qw, qx, qy, qz.",)
+    return (
+        f"columns that were not read: {named}. Read are time, body, px, py, pz, qw, qx, qy, qz and "
+        "wx, wy, wz (rad/s; beside orientations with --spin-frame).",
+    )
 
 
 def _tracks(
-    path: Path, columns: Mapping[str, str], units: Units, body: str, left_out: Counter[str]
+    path: Path,
+    columns: Mapping[str, str],
+    units: Units,
+    body: str,
+    left_out: Counter[str],
+    spin_frame: Literal["world", "body"] | None,
 ) -> dict[str, Track]:
     """Return the tracks of a file, and count its columns that are not read in `left_out`."""
     text = read_text(path)
@@ -115,16 +132,50 @@ def _tracks(
     rows = csv_rows(path, text, separator)
     names = next(rows, (0, []))[1]
     header = _header(path, names, columns, units)
+    if spin_frame is None and _QUATERNION[0] in header.index:  # nothing says along which axes
+        header = replace(header, index={key: k for key, k in header.index.items() if key not in _SPIN})
     left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
     by_body = _samples(path, header, len(names), rows, body)
     if not by_body:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
     tracks = {}
     for name, values in by_body.items():
-        table = np.array(values)
-        quat = table[:, 4:8] if table.shape[1] > 4 else None
-        tracks[name] = header.units.track(f"{path}: {name}", table[:, 0], table[:, 1:4], quat)
+        parts = _Parts.of(header, np.array(values))
+        track = header.units.track(f"{path}: {name}", parts.time, parts.position, parts.quat, parts.omega)
+        tracks[name] = _with_body_spin(track) if spin_frame == "world" else track
     return tracks
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The numbers of a body's samples, in the units of the file."""
+
+    time: Array
+    """Times, shape (T,)."""
+    position: Array
+    """Positions, shape (T, 3)."""
+    quat: Array | None
+    """Orientations, shape (T, 4)."""
+    omega: Array | None
+    """Angular velocities, shape (T, 3)."""
+
+    @staticmethod
+    def of(header: _Header, table: Array) -> _Parts:
+        """Divide a table whose columns are in the order of `COLUMNS`, without those that the file lacks."""
+        spins = _SPIN[0] in header.index
+        end = table.shape[1] - (3 if spins else 0)
+        return _Parts(table[:, 0], table[:, 1:4], table[:, 4:8] if end > 4 else None, table[:, end:] if spins else None)
+
+
+def _with_body_spin(track: Track) -> Track:
+    """Return the track with its angular velocities, given along the world's axes, along those of the body.
+
+    Without orientations they stay as they are, which is what a track file then holds.
+    """
+    if track.quat_wxyz is None or track.omega_body_rad_s is None:
+        return track
+    turned = Rotation.from_quat(track.quat_wxyz, scalar_first=True).inv().apply(track.omega_body_rad_s)
+    return replace(track, omega_body_rad_s=turned)
 
 
 def _samples(
@@ -169,14 +220,16 @@ def _is_number(text: str) -> bool:
 
 
 def _require_columns(path: Path, names: list[str], index: Mapping[str, int]) -> None:
-    """Check that time and position have columns, and either all or none of the orientation."""
+    """Check that time and position have columns, and either all or none of the orientation and of the spin."""
     lacking = [key for key in _REQUIRED if key not in index]
-    if not lacking and any(key in index for key in _QUATERNION):
-        lacking = [key for key in _QUATERNION if key not in index]
+    group = _QUATERNION
+    for some in (_QUATERNION, _SPIN):
+        if not lacking and any(key in index for key in some):
+            group, lacking = some, [key for key in some if key not in index]
     if lacking:
         raise InputDataError(
             f"{path}: no column for '{lacking[0]}' among {', '.join(names) or 'none'}.",
-            f"a header line with {', '.join(_REQUIRED)}, and all of {', '.join(_QUATERNION)} or none.",
+            f"a header line with {', '.join(_REQUIRED)}, and all of {', '.join(group)} or none.",
             f"name it: --columns {lacking[0]}=NAME.",
         )
 

@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +32,8 @@ _LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
 """Largest time step and largest extent of a path for which numbers without a unit count as seconds and metres."""
+FASTEST_RAD_S = 5000.0
+"""Largest angular velocity [rad/s]: 50 000 turns a minute; larger ones are in degrees."""
 _LONGEST_NAME = 150
 """Maximum length of the name of an episode, which becomes that of a file."""
 _TRAIN_SHARE = 0.6
@@ -71,7 +73,14 @@ class Units:
     time: TimeUnit | None = None
     """Unit of times."""
 
-    def track(self, where: str, time: Array, position: Array, quat_wxyz: Array | None = None) -> Track:
+    def track(
+        self,
+        where: str,
+        time: Array,
+        position: Array,
+        quat_wxyz: Array | None = None,
+        omega_rad_s: Array | None = None,
+    ) -> Track:
         """Return a track in metres and seconds, without a shift of its times.
 
         Samples without a finite position are omitted, as gaps are allowed.
@@ -81,6 +90,7 @@ class Units:
             time: Shape (T,), in the unit of time.
             position: Shape (T, 3), in the unit of length.
             quat_wxyz: Shape (T, 4), or None for a centroid.
+            omega_rad_s: Angular velocity [rad/s] in the frame of a track file, shape (T, 3), or None.
 
         Raises:
             InputDataError: If fewer than two samples are left, times do not increase, are not finite or step so far
@@ -88,6 +98,7 @@ class Units:
         """
         counts = {"times": len(time), "positions": len(position)}
         counts |= {} if quat_wxyz is None else {"orientations": len(quat_wxyz)}
+        counts |= {} if omega_rad_s is None else {"spins": len(omega_rad_s)}
         if len(set(counts.values())) > 1:
             raise InputDataError(
                 f"{where}: {', '.join(f'{count} {name}' for name, count in counts.items())}.", "as many of each."
@@ -107,8 +118,11 @@ class Units:
                 "remove these samples, or take the original.",
             )
         self._check(where, time, position)
+        omega = None if omega_rad_s is None else _spin(where, omega_rad_s[seen])
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
-        track = Track(time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat)
+        track = Track(
+            time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat, omega_body_rad_s=omega
+        )
         for name, unit, values in (("times", "s", track.time_s), ("positions", "m", track.position_m)):
             if (largest := float(np.abs(values).max())) > LARGEST:
                 raise InputDataError(f"{where}: {name} up to {largest:.4g} {unit}.", f"up to {LARGEST:g} {unit}.")
@@ -194,7 +208,7 @@ def require_name(name: str, where: str) -> str:
 def from_zero(tracks: Mapping[str, Track]) -> dict[str, Track]:
     """Return the tracks with the earliest time of all of them as time zero: clocks often count from 1970."""
     first = min(float(track.time_s[0]) for track in tracks.values())
-    return {body: Track(track.time_s - first, track.position_m, track.quat_wxyz) for body, track in tracks.items()}
+    return {body: replace(track, time_s=track.time_s - first) for body, track in tracks.items()}
 
 
 def episode_names(stems: Sequence[str]) -> list[str]:
@@ -300,6 +314,24 @@ def write_recordings(
 def upright(up: Literal["z", "y"]) -> World:
     """Return a world without a ground whose gravity points against an axis; numbers stay as they are."""
     return World(gravity_m_s2=(0.0, 0.0, -9.81) if up == "z" else (0.0, -9.81, 0.0))
+
+
+def _spin(where: str, omega_rad_s: Array) -> Array:
+    """Return measured spins (T, 3), which are known for every sample."""
+    lacking = int(np.count_nonzero(~np.isfinite(omega_rad_s).all(1)))
+    if lacking:
+        raise InputDataError(
+            f"{where}: {lacking} of {len(omega_rad_s)} samples have no finite angular velocity.",
+            "three finite numbers for every sample with a pose, or no such columns.",
+            "fill them in, or remove the columns.",
+        )
+    if (largest := float(np.abs(omega_rad_s).max())) > FASTEST_RAD_S:
+        raise InputDataError(
+            f"{where}: angular velocities up to {largest:.4g} rad/s.",
+            f"up to {FASTEST_RAD_S:g} rad/s.",
+            "convert them to rad/s.",
+        )
+    return omega_rad_s
 
 
 def _unit(where: str, quat_wxyz: Array) -> Array:

@@ -54,6 +54,8 @@ class Observations:
     """1 for measured coordinates, which are those that change anywhere in the track, shape (B, nf, 3)."""
     own_values: dict[str, Tensor] = field(default_factory=dict)
     """Group-specific values (B,) of effects' parameters, by `effect.parameter`."""
+    spun: frozenset[tuple[str, int]] = frozenset()
+    """Episode and column of the free bodies whose spin was measured, and their orientation not."""
 
     def with_own(self, world: World) -> Observations:
         """Return the items with the group-specific parameters that a world has for their episodes."""
@@ -103,8 +105,9 @@ class Observations:
             free=free,
             measured_axes=torch.as_tensor(np.stack([row.axes for row in rows])).to(like),
             own_values=_own(world, [row.name for row in rows]),
+            spun=frozenset((row.name, column) for row in rows for column in row.spins),
         )
-        return replace(partial, state=first_state(world, partial))
+        return replace(partial, state=_spinning(first_state(world, partial), rows, free))
 
     def select(self, items: Sequence[int]) -> Observations:
         """Return some items of the batch."""
@@ -150,6 +153,8 @@ class _Row:
     """1 where the orientation was measured, shape (T, nf)."""
     axes: np.ndarray
     """1 for measured coordinates, shape (nf, 3)."""
+    spins: dict[int, np.ndarray]
+    """By column, the mean measured spin (3,) of the first frames [rad/s], where the orientation was not measured."""
 
     @staticmethod
     def of(world: World, name: str, tracks: dict[str, Track], window: tuple[float, float]) -> _Row:
@@ -158,6 +163,7 @@ class _Row:
         cut = {body: tracks[body].window(*window) for body in bodies if body in tracks}
         times = np.unique(np.concatenate([track.time_s for track in cut.values()]))
         shape = (len(times), len(bodies))
+        spins: dict[int, np.ndarray] = {}
         position, quat = np.zeros((*shape, 3)), np.tile([1.0, 0, 0, 0], (*shape, 1))
         seen, turned, axes = np.zeros(shape), np.zeros(shape), np.ones((len(bodies), 3))
         for column, body in enumerate(bodies):
@@ -168,7 +174,11 @@ class _Row:
                 measured = cut[body].quat_wxyz
                 if measured is not None:
                     quat[at, column], turned[at, column] = measured, 1.0
-        return _Row(name=name, times=times, position=position, quat=quat, seen=seen, turned=turned, axes=axes)
+                elif (spin := cut[body].omega_body_rad_s) is not None:
+                    spins[column] = spin[:START_FRAMES].mean(0)
+        return _Row(
+            name=name, times=times, position=position, quat=quat, seen=seen, turned=turned, axes=axes, spins=spins
+        )
 
     def padded(self, length: int) -> _Row:
         """Return the window extended to a length: the last values repeated, marked as not measured."""
@@ -188,7 +198,20 @@ class _Row:
             seen=np.concatenate((self.seen, zero)),
             turned=np.concatenate((self.turned, zero)),
             axes=self.axes,
+            spins=self.spins,
         )
+
+
+def _spinning(state: State, rows: Sequence[_Row], free: Sequence[int]) -> State:
+    """Return states (B) with the measured spins of bodies whose orientation was not measured, and starts unturned.
+
+    Their body frame is that of the world at the first frame, so that spins along its axes are body-frame ones.
+    """
+    omega = state.omega_body_rad_s.clone()
+    for item, row in enumerate(rows):
+        for column, spin in row.spins.items():
+            omega[item, free[column]] = torch.as_tensor(spin).to(omega)
+    return replace(state, omega_body_rad_s=omega)
 
 
 def first_state(world: World, observations: Observations) -> State:

@@ -204,6 +204,7 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("csv: norm 2", "csv", "csv csv", lambda root: _csv(root, ("qw", "qx", "qy", "qz"), 2)),
     ("csv: a time that is no number", "csv", "csv csv", text("csv/a.csv", _LINE, "\nsoon,")),
     ("csv: a time of 5000 digits", "csv", "csv csv", text("csv/a.csv", _LINE, f"\n{DIGITS},")),
+    ("csv: a spin of two parts", "csv", "csv csv", text("csv/a.csv", "qw,qx,qy,qz", "wx,wy,a,b")),
     ("csv: a time twice", "csv", "csv csv", text("csv/a.csv", _LINE, "\n0.0,")),
     ("csv: a broken link", "csv", "csv csv", kind_of("csv/b.csv", "nowhere")),
     ("csv: a named pipe", "csv", "csv csv", kind_of("csv/b.csv", "fifo")),

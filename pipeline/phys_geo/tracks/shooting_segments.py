@@ -218,7 +218,9 @@ def _moving(world: World, whole: Observations, items: list[int], starts: list[in
                 here, there = whole.quat_wxyz[item, frame, column], whole.quat_wxyz[item, other, column]
                 rates.append(shift / span - (0.0 if fall is None else 0.5 * span * fall))
                 turns.append(quat_log(quat_multiply(quat_conjugate(here), there)) / span)
-            velocity[row, body], omega[row, body] = torch.stack(rates).mean(0), torch.stack(turns).mean(0)
+            velocity[row, body] = torch.stack(rates).mean(0)
+            if bool(whole.has_orientation[item, frame, column]):  # else the spin is that of the first guess
+                omega[row, body] = torch.stack(turns).mean(0)
     return replace(state, velocity_m_s=velocity, omega_body_rad_s=omega)
 
 

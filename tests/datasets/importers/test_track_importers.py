@@ -56,6 +56,43 @@ def track_of(path: Path, episode: str, body: str = "body"):
     return capture.tracks(episode)[body]
 
 
+def spinning(path: Path, quats: bool, spins: np.ndarray, names: str = "wx_rad_s,wy_rad_s,wz_rad_s") -> Path:
+    """Write a CSV file with measured spins."""
+    columns = [TIMES[:, None], POSITIONS, *([QUATS] if quats else []), spins]
+    header = "time,px,py,pz," + ("qw,qx,qy,qz," if quats else "") + names
+    rows = [",".join(map(repr, row)) for row in np.concatenate(columns, axis=1).tolist()]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_measured_spins_are_read_along_named_axes(tmp_path: Path) -> None:
+    spins = np.tile([1.0, 2.0, 3.0], (5, 1))
+    import_csv(spinning(tmp_path / "ball.csv", False, spins), tmp_path / "ball")
+    np.testing.assert_array_equal(track_of(tmp_path / "ball", "ball").omega_body_rad_s, spins)
+    turning = spinning(tmp_path / "box.csv", True, spins)
+    unsaid = import_csv(turning, tmp_path / "unsaid")
+    assert track_of(tmp_path / "unsaid", "box").omega_body_rad_s is None
+    assert "'wx_rad_s', 'wy_rad_s', 'wz_rad_s'" in unsaid.warnings[0] and "--spin-frame" in unsaid.warnings[0]
+    import_csv(turning, tmp_path / "own", spin_frame="body")
+    np.testing.assert_array_equal(track_of(tmp_path / "own", "box").omega_body_rad_s, spins)
+    import_csv(turning, tmp_path / "fixed", spin_frame="world")
+    angle = np.arange(5) * 0.2  # QUATS turn about z
+    expected = [[np.cos(a) + 2 * np.sin(a), 2 * np.cos(a) - np.sin(a), 3.0] for a in angle]
+    np.testing.assert_allclose(track_of(tmp_path / "fixed", "box").omega_body_rad_s, expected, atol=1e-12)
+
+
+def test_spins_that_are_not_whole_are_refused(tmp_path: Path) -> None:
+    spins = np.tile([1.0, 2.0, 3.0], (5, 1))
+    holed = spins.copy()
+    holed[2, 1] = np.nan
+    text = fault(tmp_path, import_csv, spinning(tmp_path / "a.csv", False, holed))
+    assert "1 of 5 samples have no finite angular velocity" in text
+    text = fault(tmp_path, import_csv, spinning(tmp_path / "b.csv", False, spins[:, :2], "wx,wy"))
+    assert "no column for 'wz'" in text and "all of wx, wy, wz or none" in text
+    text = fault(tmp_path, import_csv, spinning(tmp_path / "c.csv", False, 1e4 * spins))
+    assert "angular velocities up to 3e+04 rad/s" in text
+
+
 def same(track, scale: float = 1.0, quats: bool = True) -> None:
     np.testing.assert_allclose(track.time_s, TIMES, atol=1e-12)
     np.testing.assert_allclose(track.position_m, scale * POSITIONS, rtol=1e-12)

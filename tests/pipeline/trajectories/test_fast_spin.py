@@ -47,6 +47,22 @@ def test_the_state_of_a_spinning_body_is_found(turn_rad: float) -> None:
     assert torch.allclose(found.state.omega_body_rad_s[0, 0], omega, rtol=1e-3)
 
 
+def test_the_measured_spin_of_a_centroid_is_its_start() -> None:
+    """Without orientations the spin's columns are along the world's axes; with them the turns count alone."""
+    world, track, omega = spun(0.5, 12)
+    spins = np.tile(omega.numpy(), (12, 1))
+    name = world.bodies[0].name
+    for orientation, expected in ((None, omega), (track.quat_wxyz, omega)):
+        given = spins if orientation is None else 0 * spins
+        measured = replace(track, quat_wxyz=orientation, omega_body_rad_s=given)
+        seen = Observations.of(world, [Episode("a", {name: measured})], [(0.0, 1.0)])
+        assert torch.allclose(seen.state.omega_body_rad_s[0, 0], expected, rtol=1e-2)
+        found, _ = estimate_states(world, seen, warmup_frames(world, seen, 0.1), Noise(1e-4, 1e-3))
+        assert torch.allclose(found.state.omega_body_rad_s[0, 0], expected, rtol=1e-2)
+    silent = Observations.of(world, [Episode("a", {name: replace(track, quat_wxyz=None)})], [(0.0, 1.0)])
+    assert not silent.state.omega_body_rad_s.any() and not silent.spun
+
+
 def test_turns_go_on_beyond_half_a_turn_and_equal_the_logarithm_below() -> None:
     times = torch.arange(9).double() / RATE_HZ
     base, known, middle = quat_exp(torch.tensor([0.3, -0.2, 0.5]).double()), torch.ones(9).double(), torch.tensor(4)
