@@ -62,6 +62,16 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--page",
+            metavar="FILE",
+            help="The page to write (diagnose-MODEL.html beside the model; one of the same model and capture is "
+            "replaced).",
+            show_default=False,
+        ),
+    ] = None,
     device: AnyDevice = "auto",
     overwrite: Overwrite = False,
     trust_effects: TrustEffects = "",
@@ -71,28 +81,34 @@ def diagnose(
     trust(trust_effects)
     with loading():
         from ..pipeline.diagnose import diagnose as work
+        from ..pipeline.diagnose.page import default_page
 
     wanted = [name.strip() for name in candidates.split(",") if name.strip()]
-    emit(work(model, capture, split, wanted, throws, save_law, overwrite, device, accept_units), _summary)
+    place = page or default_page(model, split)
+    result = work(model, capture, split, wanted, throws, save_law, overwrite, device, accept_units, place)
+    emit(result, lambda found: _summary(found, model, capture, split))
 
 
-def _summary(result: DiagnoseResult) -> str:
-    from .output import table, warnings
+def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> str:
+    from ..pipeline.diagnose.next_command import next_command
+    from .output import next_line, table, warnings
 
+    words = next_command(result, model, capture, split)
     rows = [_row(entry) for entry in _shown(result)]
     lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "estimate"])]
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
-        lines.append(
-            f"flight, mean chi2 of the residual: {before:.2f}, with the selected effects {after:.2f} (1: noise)"
-        )
+        added = f", with {' and '.join(result.selected)} {after:.2f}" if result.selected else ""
+        lines.append(f"flight, mean chi2 of the residual: {before:.2f}{added} (1: noise)")
     lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking)]
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
-        lines.append(f"law of the residual: {terms}; explained by {result.residual_law.where}")
+        lines.append(f"law of the residual: {terms}")
     if result.next_experiment is not None:
         lines += _experiment(result.next_experiment)
-    return "\n".join([*lines, *_next_command(result), *warnings(result.warnings)])
+    lines += [f"Wrote {result.saved_law.rpartition(':')[0]}."] if result.saved_law is not None else []
+    lines += [f"Page: {result.report}"] if result.report is not None else []
+    return "\n".join([*lines, *warnings(result.warnings), next_line(*words)])
 
 
 def _shown(result: DiagnoseResult) -> list[RankedEffect]:
@@ -111,17 +127,6 @@ def _held_out_errors(ranking: Sequence[RankedEffect]) -> list[str]:
         if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
             errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
             lines.append(f"{entry.effect}: error of short predictions in episodes held out from its fit {errors}")
-    return lines
-
-
-def _next_command(result: DiagnoseResult) -> list[str]:
-    """Return the file of the residual's law, if one was written, and the command that fits the found effects."""
-    lines = []
-    if result.saved_law is not None:
-        lines.append(f"Wrote {result.saved_law.rpartition(':')[0]}.")
-    added = [*result.selected, *([result.saved_law] if result.saved_law is not None else [])]
-    if added:
-        lines.append(f"Next: cgwm fit CAPTURE --from MODEL --effects {','.join(added)} --out NEW")
     return lines
 
 

@@ -106,9 +106,9 @@ def _summary(model: ModelFile, out: Path, kept: bool = False) -> str:
 
     bodies = ", ".join(f"{body.name} ({body.motion})" for body in model.bodies)
     state = "with physics" if model.contact else "shape and appearance only, without physics"
-    verb = "Already complete, kept:" if kept else "Fitted"
+    head = f"{out} is already the result of this command" if kept else f"Fitted {out}"
     useless = [] if model.not_described is None else [model.not_described.sentence]
-    lines = [*useless, f"{verb} {out}: {bodies}; {state}."]
+    lines = [*useless, f"{head}: {bodies}; {state}."]
     if model.parameters:
         lines.append(
             table([_row(p) for p in model.parameters], ["parameter", "estimate", "95 % interval", "unit", "state"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 
 
@@ -46,6 +47,15 @@ def millimetres(value_m: float | None) -> str:
 def warnings(messages: Sequence[str]) -> list[str]:
     """Write warnings as lines of a summary."""
     return [f"warning: {message}" for message in messages]
+
+
+def next_line(*words: object) -> str:
+    """Write the command to type next, quoted as a shell needs it.
+
+    >>> next_line("cgwm", "compare", "my m0", "capture")
+    "Next: cgwm compare 'my m0' capture"
+    """
+    return f"Next: {shlex.join(str(word) for word in words)}"
 
 
 def _pad(cell: str, width: int, right: bool) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -106,10 +107,29 @@ def fit_or_keep(
     resume: bool = False,
     accept_units: bool = False,
 ) -> tuple[ModelFile, bool]:
-    """Fit as :func:`fit` does; return the content of `model.json`, and whether it is that of a model that was kept."""
-    splat_config, phys_config = splat_config or SplatConfig(), phys_config or PhysConfig()
-    out = Path(out)
+    """Fit as :func:`fit` does; return `model.json`, and whether a model of the same inputs and settings was kept."""
+    splat_config, phys_config, out = splat_config or SplatConfig(), phys_config or PhysConfig(), Path(out)
     clean_stale(out)
+    if (out / "model.json").is_file() and not (resume or overwrite):
+        with suppress(UsageError, InputDataError):  # another model: it exists, and that is said below
+            return _fit_or_keep(
+                capture, out, stage, parent, split, splat_config, phys_config, False, True, accept_units
+            )
+    return _fit_or_keep(capture, out, stage, parent, split, splat_config, phys_config, overwrite, resume, accept_units)
+
+
+def _fit_or_keep(
+    capture: Path,
+    out: Path,
+    stage: Stage,
+    parent: Path | None,
+    split: str,
+    splat_config: SplatConfig,
+    phys_config: PhysConfig,
+    overwrite: bool,
+    resume: bool,
+    accept_units: bool,
+) -> tuple[ModelFile, bool]:
     finished = resume and (out / "model.json").is_file()
     if not finished:
         refuse_output(out, "model", overwrite)

@@ -79,6 +79,7 @@ from .errors import (
     NotConvergedError,
     NotEnoughMemoryError,
     NotEnoughSpaceError,
+    OutputExistsError,
     UsageError,
     did_you_mean,
 )
@@ -113,7 +114,7 @@ from .model import (
 )
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
-from .results import EpisodeErrors, ErrorSummary, EvalResult
+from .results import EpisodeErrors, ErrorSummary, EvalResult, KeptOutput
 from .validation import Failure, ValidationReport
 from .view import ViewReport
 
@@ -191,6 +192,7 @@ __all__ = [
     "IndexEntry",
     "InputDataError",
     "InterruptedWork",
+    "KeptOutput",
     "KnownCameraDistance",
     "KnownDistance",
     "LawTerm",
@@ -208,6 +210,7 @@ __all__ = [
     "NotEnoughMemoryError",
     "NotEnoughSpaceError",
     "Outcome",
+    "OutputExistsError",
     "PackageState",
     "PairFigures",
     "PairedDifference",

@@ -94,6 +94,8 @@ class CalibrationReport(FileModel):
     warnings: tuple[str, ...] = ()
     config: CalibrateConfig
     versions: dict[str, str] = {}
+    input_sha256: str = ""
+    """Of the manifest, the photos and the videos; empty where an earlier version wrote the report."""
     wall_time_s: float
 
     def __str__(self) -> str:

@@ -167,6 +167,8 @@ class DiagnoseResult(FileModel):
     residual_law: ResidualLaw | None = None
     saved_law: str | None = None
     """What to pass to `fit --effects` for the residual law, where it was saved."""
+    report: str | None = None
+    """The page that was written."""
     episodes: int
     phases: dict[str, int] = {}
     """Number of frames in flight and in contact."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 from .printable import in_one_line
 
@@ -44,6 +45,14 @@ class UsageError(CgwmError):
     """The command was called in a way that it cannot be (exit code 2)."""
 
     exit_code = 2
+
+
+class OutputExistsError(UsageError):
+    """An output exists and may not be replaced without being asked (exit code 2); `path` is its name."""
+
+    def __init__(self, path: Path, todo: str = "choose another name or pass --overwrite.") -> None:
+        super().__init__(f"{path} exists.", todo=todo)
+        self.path = path
 
 
 class InputDataError(CgwmError):

@@ -7,6 +7,14 @@ from typing import Any
 from .base import FileModel
 
 
+class KeptOutput(FileModel):
+    """What a command prints whose output is there already: nothing was done."""
+
+    output: str
+    """The output, unchanged since the same command wrote it from the same inputs."""
+    kept: bool = True
+
+
 class ErrorSummary(FileModel):
     """Statistics over episodes of an error that was averaged within each episode."""
 

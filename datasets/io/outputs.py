@@ -19,7 +19,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
-from ...schemas import UsageError
+from ...schemas import OutputExistsError, UsageError
 from ...schemas.regular_files import real_path
 from .neighbours import clean_stale
 from .places import require_place
@@ -53,6 +53,8 @@ _ADDED: Mapping[str, re.Pattern[str]] = {
 _INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 _NESTED: ContextVar[bool] = ContextVar("nested", default=False)
 """Whether what is written is a part of an unfinished output."""
+_REQUEST: ContextVar[str] = ContextVar("request", default="")
+"""Digest of what the command was asked for; empty where it is not recorded."""
 _PLACED: list[tuple[Path, int]] = []
 """Final names that outputs of this process were about to get, with the inodes of these."""
 
@@ -134,7 +136,7 @@ def refuse_output(path: Path, kind: DirectoryKind | FileKind, overwrite: bool) -
     clean_stale(path)  # which may give an old output, that a killed command was replacing, its name back
     exists = os.path.lexists(path)
     if exists and not overwrite:
-        raise UsageError(f"{path} exists.", todo="choose another name or pass --overwrite.")
+        raise OutputExistsError(path)
     place = real_path(path)
     if exists:
         _refuse_protected(path, place)
@@ -152,10 +154,34 @@ def refuse_output(path: Path, kind: DirectoryKind | FileKind, overwrite: bool) -
         )
 
 
+def is_own_file(path: Path, kind: FileKind) -> bool:
+    """Return whether a file is one of this kind that cgwm wrote and nobody has changed."""
+    return path.is_file() and path.stat().st_size > 0 and not _file_fault(path, kind)
+
+
+@contextmanager
+def made_for(request: str) -> Iterator[None]:
+    """Record in the output directories of a command which request they answer."""
+    token = _REQUEST.set(request)
+    try:
+        yield
+    finally:
+        _REQUEST.reset(token)
+
+
+def answers(folder: Path, request: str) -> bool:
+    """Return whether a directory is the complete and unchanged output of a request."""
+    record = _read_record(folder)
+    if record is None or record.get("request") != request:
+        return False
+    return not _directory_fault(folder, str(record.get("kind")))
+
+
 def write_record(folder: Path, kind: DirectoryKind) -> None:
     """Record the kind and the files of a complete output directory in it."""
     files = {name: _digest(folder / name) for name in _names(folder)}
-    text = json.dumps({"format": _FORMAT, "kind": kind, "files": files}, indent=0, sort_keys=True)
+    request = {} if _NESTED.get() or not _REQUEST.get() else {"request": _REQUEST.get()}
+    text = json.dumps({"format": _FORMAT, "kind": kind, "files": files} | request, indent=0, sort_keys=True)
     (folder / RECORD).write_text(text + "\n", encoding="utf-8")
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -13,7 +14,7 @@ import numpy as np
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import check_capture
 from ...datasets.capture.sparse_points import POINTS_NAME, write_points
-from ...datasets.io.atomic import temporary_directory
+from ...datasets.io.atomic import sha256, temporary_directory
 from ...datasets.io.file_set import new_files, settle_files
 from ...datasets.io.kinds import refuse_other_kind
 from ...datasets.io.places import require_place
@@ -28,6 +29,7 @@ from ...schemas import (
     PosedVideo,
     Scale,
     UsageError,
+    read_json,
     read_toml,
 )
 from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict
@@ -67,12 +69,17 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
         The verdict on every image, the self-check, the attempts and the scale.
 
     Raises:
-        UsageError: If the capture has cameras and `overwrite` is not set.
+        UsageError: If the capture has other cameras and `overwrite` is not set; those of the same photos, manifest and
+            settings are kept, and their report is returned.
         InputDataError: If the capture, a marker or a marked point is wrong.
         NotConvergedError: If no model passes the self-check, or fewer than half of the photos are registered.
     """
     start = time.monotonic()
     capture_root = Path(capture_root)
+    settle_files(capture_root / CAMERAS_NAME)
+    made_of = _input_sha256(capture_root)
+    if not overwrite and (kept := _finished(capture_root, config, made_of)) is not None:
+        return kept
     capture = _open(capture_root, overwrite)
     require_place(capture_root / CAMERAS_NAME)  # now, not after minutes
     with _room_for_colmap(capture, config), temporary_directory("calibrate", _TEMPORARY) as folder:
@@ -86,11 +93,30 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
         update={
             "marker_residual_m": frame.residual_m if frame else None,
             "warnings": (*warnings, *report.warnings),
+            "input_sha256": made_of,
             "wall_time_s": round(time.monotonic() - start, 3),
         }
     )
     _write(capture_root, cameras, model, report, overwrite)
     return report
+
+
+def _input_sha256(root: Path) -> str:
+    """Return the hash of all that a calibration reads: the manifest, the photos and the videos."""
+    names = [name for name in ("capture.toml", "images", "videos") if (root / name).exists()]
+    return hashlib.sha256("\n".join(f"{name} {sha256(root / name)}" for name in names).encode()).hexdigest()
+
+
+def _finished(root: Path, config: CalibrateConfig, made_of: str) -> CalibrationReport | None:
+    """Return the report of cameras that were estimated from the same inputs with the same settings; None if none is."""
+    path = root / REPORT_NAME
+    if not (path.is_file() and (root / CAMERAS_NAME).is_file()):
+        return None
+    with suppress(InputDataError):
+        report = read_json(path, CalibrationReport)
+        if report.input_sha256 == made_of and report.config == config:
+            return report
+    return None
 
 
 def _room_for_colmap(capture: Capture, config: CalibrateConfig) -> AbstractContextManager[None]:
@@ -102,7 +128,6 @@ def _room_for_colmap(capture: Capture, config: CalibrateConfig) -> AbstractConte
 
 
 def _open(root: Path, overwrite: bool) -> Capture:
-    settle_files(root / CAMERAS_NAME)
     if overwrite:
         # The old cameras may name deleted photos: that is a reason to replace them, not an error.
         refuse_other_kind(root, "capture")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...datasets.io.atomic import new_file
-from ...datasets.io.outputs import refuse_output, signed
+from ...datasets.io.outputs import is_own_file, refuse_output, signed
 from ...schemas import DiagnoseResult, InputDataError, LawTerm, ResidualLaw, UsageError
 from ..physics.effects.registry import BUILT_IN
 
@@ -63,11 +63,13 @@ def require_law_file(path: Path, overwrite: bool) -> None:
     """Raise an error for a file that could not be written, before the diagnosis runs.
 
     Raises:
-        UsageError: If the name does not end with .py, or the file exists and `overwrite` is not set.
+        UsageError: If the name does not end with .py, or the file exists and `overwrite` is not set. A law that cgwm
+            wrote and nobody has changed is compared with the new one first.
     """
     if path.suffix != ".py":
         raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
-    refuse_output(path, "effect", overwrite)
+    if overwrite or not is_own_file(path, "effect"):
+        refuse_output(path, "effect", overwrite)
 
 
 def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str:
@@ -95,8 +97,10 @@ def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str
             "--save-law where something unexplained remains in flight.",
             "leave --save-law out, and see the whole diagnosis.",
         )
-    with new_file(path, "effect", overwrite) as partial:
-        partial.write_text(signed(law_source(law.model_copy(update={"terms": terms}), path)), encoding="utf-8")
+    source = signed(law_source(law.model_copy(update={"terms": terms}), path))
+    if not (is_own_file(path, "effect") and path.read_text(encoding="utf-8") == source):
+        with new_file(path, "effect", overwrite) as partial:
+            partial.write_text(source, encoding="utf-8")
     return f"{path}:{CLASS}"
 
 

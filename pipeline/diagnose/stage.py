@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 import torch
 
 from ...datasets.capture.capture import Capture
-from ...datasets.io.outputs import reads
+from ...datasets.io.atomic import new_file
+from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     ContactLimit,
@@ -28,6 +30,7 @@ from ...schemas import (
 from ..physics.effects.registry import effect_names, load_effect, split_units
 from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
+from ..report.page_file import shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..runtime.work_budget import motion_doubt, within_budget
@@ -42,7 +45,10 @@ from .episodes import diagnosed_episodes
 from .evidence import Evidence
 from .experiments import DEFAULT, Experiment, experiments_of, read_experiments
 from .law_export import require_law_file, save_law
+from .next_command import next_command
 from .next_experiment import next_experiment
+from .page import diagnosis_html, mark_of
+from .pictures import pictures_of
 from .sparse_regression import residual_law
 from .verdict import Findings, find
 from .wording import law_warnings, motion_warnings, sentence, unseen_motion
@@ -62,6 +68,7 @@ def diagnose(
     overwrite: bool = False,
     device: str = "auto",
     accept_units: bool = False,
+    page: Path | None = None,
 ) -> DiagnoseResult:
     """Find the effects that a fitted model lacks to explain measured motions.
 
@@ -77,12 +84,16 @@ def diagnose(
         overwrite: Replace that file.
         device: Device of the rollouts: auto, cpu or cuda. What the kernel does not support runs on the CPU.
         accept_units: Do not refuse units and frames of the capture that its motion contradicts.
+        page: The HTML page to write; None writes none. One of the same model, capture and split is replaced.
 
     Raises:
         InputDataError: If the data do not suffice for a verdict (the message says what is missing), or no residual law
             was found to save.
-        UsageError: If the split or an effect does not exist, or the file exists.
+        UsageError: If the split or an effect does not exist, or a file exists.
     """
+    if page is not None:
+        replaces = overwrite or shows_the_same(page, mark_of(page, model, capture, split))
+        refuse_output(page, "page", replaces)
     if save_law_to is not None:
         require_law_file(save_law_to, overwrite)
     compared = experiments_of(DEFAULT) if throws is None else read_experiments(throws)
@@ -91,13 +102,20 @@ def diagnose(
     accepted = accept_units or loaded.accepts_units
     opened = Capture.open(capture, splits=(split,), accept_units=accepted)
     world, prepared = prepared_world(loaded, opened, split, device, accepted)
-    result = report(prepared, world, library, compared)
+    result, findings = report_and_findings(prepared, world, library, compared)
     episodes = diagnosed_episodes(loaded, opened, split).episodes
     result = _first_of_all(result, not_described(world, episodes, prepared.noise))
-    if save_law_to is None:
+    if save_law_to is not None:
+        result = result.model_copy(update={"saved_law": save_law(result, save_law_to, overwrite)})
+    if page is None:
         return result
-    saved = save_law(result, save_law_to, overwrite)
-    return result.model_copy(update={"saved_law": saved})
+    result = result.model_copy(update={"report": str(page)})
+    pictures = pictures_of(prepared, findings, result)
+    with new_file(page, "page", replaces) as path:
+        then = shlex.join(next_command(result, Path(model), Path(capture), split))
+        html = diagnosis_html(result, pictures, page, Path(model), Path(capture), split, then)
+        path.write_text(html, encoding="utf-8")
+    return result
 
 
 def prepared_world(
@@ -133,7 +151,14 @@ def prepared_world(
 def report(
     prepared: Prepared, world: World, library: Sequence[Candidate], throws: Sequence[Experiment] = ()
 ) -> DiagnoseResult:
-    """Diagnose prepared episodes and return the result document.
+    """Diagnose prepared episodes and return the result document; see :func:`report_and_findings`."""
+    return report_and_findings(prepared, world, library, throws)[0]
+
+
+def report_and_findings(
+    prepared: Prepared, world: World, library: Sequence[Candidate], throws: Sequence[Experiment] = ()
+) -> tuple[DiagnoseResult, Findings]:
+    """Diagnose prepared episodes and return the result document with the findings that it tells of.
 
     Args:
         prepared: The episodes.
@@ -157,7 +182,7 @@ def report(
     law = _law(prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
-    return DiagnoseResult(
+    document = DiagnoseResult(
         verdict=findings.verdict,
         sentence=sentence(findings, law) + unseen_motion(prepared),
         selected=selected,
@@ -176,6 +201,7 @@ def report(
         not_tested=dict(sorted(refused.items())),
         warnings=tuple(warnings),
     )
+    return document, findings
 
 
 def _first_of_all(result: DiagnoseResult, useless: NotDescribed | None) -> DiagnoseResult:

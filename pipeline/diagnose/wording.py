@@ -6,6 +6,23 @@ from ...schemas import ResidualLaw
 from ..segments.prepare import Prepared
 from .verdict import Findings
 
+_ORGANISED = {
+    "constant": "In these flights, one constant force explains more of it than any coordinate does.",
+    "time": "It changes most clearly with the time within an episode.",
+    "x": "It changes most clearly with the place along x.",
+    "y": "It changes most clearly with the place along y.",
+    "height": "It changes most clearly with the height.",
+    "heading": "It changes most clearly with the direction of motion.",
+    "speed": "It changes most clearly with the speed.",
+    "spin": "It changes most clearly with the spin.",
+    "episode": "It differs most clearly from episode to episode.",
+}
+
+
+def organised(coordinate: str) -> str:
+    """Return as a sentence what a residual force follows; its coordinate is one of `Covariate.coordinate`."""
+    return _ORGANISED[coordinate]
+
 
 def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     """Return the verdict as one or two sentences.
@@ -18,8 +35,8 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     if findings.verdict == "none_missing":
         return "Nothing is missing that these data could show."
     if findings.verdict == "unexplained":
-        where = f"; the covariate that explains most of it is {law.where}" if law is not None else ""
-        return f"Something is missing in flight, and none of the candidates explains it{where}."
+        where = f" {organised(law.where)}" if law is not None else ""
+        return f"Something is missing in flight, and none of the candidates explains it.{where}"
     words = []
     for one in findings.chosen:
         others = [e.candidate.spec for e in one.equals[1:]]

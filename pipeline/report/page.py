@@ -94,6 +94,11 @@ def command(words: str) -> str:
     return f"<pre><code>{text(words)}</code></pre>"
 
 
+def folded(summary: str, *pieces: str) -> str:
+    """Return pieces that are shown on a click."""
+    return f"<details><summary>{text(summary)}</summary>{''.join(pieces)}</details>"
+
+
 def cautions(messages: Sequence[str]) -> str:
     """Return the box of warnings; empty without any."""
     return f'<div class="warnings">{"".join(paragraph(words) for words in messages)}</div>' if messages else ""

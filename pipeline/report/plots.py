@@ -14,6 +14,8 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 12, 26, 40
 _TICKS = 5
 _MARGIN = 0.04
 """Share of the range that is left free at either end of an axis."""
+_LARGEST_ERROR = 2.0
+"""Error bars are in the range up to this many times the median; longer ones are drawn to its end."""
 _TALLEST, _FLATTEST = 1.2, 0.3
 """Limits of height over width of a plot with equal scales."""
 
@@ -43,17 +45,16 @@ def bars(rows: Sequence[Bar], full: float | None = None) -> str:
         rows: The bars.
         full: Value of a bar of full length; None for the largest.
     """
-    full = full or max((row.value for row in rows), default=0.0) or 1.0
+    full = full or max((row.value for row in rows if row.value > 0), default=1.0)
     lines = []
     for row in rows:
         width = 100 * min(max(row.value / full, 0.0), 1.0)
         mark = " strong" if row.strong else ""
         lines.append(
-            f'<span class="name{mark}">{text(row.name)}</span><span class="track{mark}">'
+            f'<div class="row"><span class="name{mark}">{text(row.name)}</span><span class="track{mark}">'
             f'<i style="width:{width:.1f}%"></i></span><span class="value{mark}">{text(row.words)}</span>'
         )
-        if row.note:
-            lines.append(f'<span class="note">{text(row.note)}</span>')
+        lines.append(f'<span class="note">{text(row.note)}</span></div>' if row.note else "</div>")
     return f'<div class="barlist">{"".join(lines)}</div>'
 
 
@@ -154,10 +155,12 @@ def _axes(plot: Plot) -> _Axes | None:
     columns: tuple[list[float], list[float]] = ([], [])
     for series in plot.series:
         errors = series.errors or [0.0] * len(series.points)
+        most = _LARGEST_ERROR * sorted(errors)[len(errors) // 2] if errors else 0.0
         for (x, y), error in zip(series.points, errors, strict=True):
             if math.isfinite(x) and math.isfinite(y):
                 columns[0].append(x)
-                columns[1].extend([y - error, y + error] if math.isfinite(error) else [y])
+                size = min(error, most) if math.isfinite(error) else 0.0
+                columns[1].extend([y - size, y + size])
     if not columns[0]:
         return None
     columns[1].extend([0.0] * plot.zero + [y for _, y in plot.ground])
@@ -166,18 +169,20 @@ def _axes(plot: Plot) -> _Axes | None:
         low, high = min(values), max(values)
         margin = _MARGIN * (high - low) or abs(high) * _MARGIN or 1.0
         ranges.append([low - margin, high + margin])
-    height = plot.height
-    if plot.equal:
-        inner = plot.width - _LEFT - _RIGHT
-        wide, tall = (high - low for low, high in ranges)
-        ratio = min(max(tall / wide, _FLATTEST), _TALLEST)
-        height = round(inner * ratio) + _TOP + _BOTTOM
-        scale = max(wide, tall / ratio)  # metres over the whole width
-        for axis, size in ((0, scale), (1, scale * ratio)):
-            middle = 0.5 * sum(ranges[axis])
-            ranges[axis] = [middle - 0.5 * size, middle + 0.5 * size]
+    height = _equalised(ranges, plot.width) if plot.equal else plot.height
     (x0, x1), (y0, y1) = ranges
     return _Axes((x0, y0), (x1, y1), plot.width, height)
+
+
+def _equalised(ranges: list[list[float]], width: int) -> int:
+    """Widen one of two ranges until both have the same scale, and return the height of the drawing."""
+    wide, tall = (high - low for low, high in ranges)
+    ratio = min(max(tall / wide, _FLATTEST), _TALLEST)
+    scale = max(wide, tall / ratio)  # metres over the whole width
+    for axis, size in ((0, scale), (1, scale * ratio)):
+        middle = 0.5 * sum(ranges[axis])
+        ranges[axis] = [middle - 0.5 * size, middle + 0.5 * size]
+    return round((width - _LEFT - _RIGHT) * ratio) + _TOP + _BOTTOM
 
 
 def _grid(axes: _Axes) -> list[str]:

@@ -16,7 +16,7 @@ from typing import Any
 from ...datasets.io.outputs import reads
 from ...datasets.io.progress import progress
 from ...datasets.rollouts.dataset import refuse_existing_shards
-from ...datasets.rollouts.shards import shard_range
+from ...datasets.rollouts.shards import shard_name, shard_range
 from ...schemas import (
     CgwmError,
     DamagedShardError,
@@ -90,7 +90,8 @@ def synthesize_shards(
     """
     began = time.perf_counter()
     shard_indices(config)
-    if not (resume or overwrite):
+    complete = all((out / shard_name(k, config.shards)).is_file() for k in range(config.shards))
+    if not (resume or overwrite or complete):  # a complete dataset of the same command is kept, see `synthesize`
         refuse_existing_shards(out, config.shards)
     with checked_work(model, config, config.shards if ray is not None else workers):
         parts = [config.model_copy(update={"shard": shard}) for shard in range(config.shards)]

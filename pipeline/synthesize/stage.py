@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +26,7 @@ from ...datasets.rollouts.dataset import finished_shard, new_dataset, shard_entr
 from ...datasets.rollouts.rollout_writer import RolloutWriter
 from ...datasets.rollouts.rollouts import FrameBlock, RolloutLabels
 from ...datasets.rollouts.shards import contact_count, shard_name, shard_range
-from ...schemas import DatasetSummary, ShardEntry, SynthesizeConfig, UsageError
+from ...schemas import DatasetManifest, DatasetSummary, InputDataError, ShardEntry, SynthesizeConfig, UsageError
 from ..runtime.resources import enough_memory, one_torch_thread
 from ..runtime.timing import Stopwatch
 from .draw import Draw, draw_rollout
@@ -108,7 +108,7 @@ def _written(
     indices = shard_indices(config)
     notes = notes_of(job)
     manifest = manifest_of(model, job, notes)
-    if resume and (kept := finished_shard(out, manifest, config.shard, overwrite)) is not None:
+    if (kept := _kept(out, manifest, config.shard, overwrite, resume)) is not None:
         return _summary(out, job, kept, contact_count(out / kept.file), time.perf_counter() - began, True, notes)
     config_json = json.dumps(manifest.config, sort_keys=True)
     contacts, outcome = 0, _Outcome(Counter(), [])
@@ -129,6 +129,20 @@ def _written(
     stopwatch.seconds["publish"] = time.perf_counter() - ended
     notes += tuple(f"drawn again: {found}" for found in outcome.diverged)
     return _summary(out, job, entries[0], contacts, time.perf_counter() - began, False, notes)
+
+
+def _kept(out: Path, manifest: DatasetManifest, shard: int, overwrite: bool, resume: bool) -> ShardEntry | None:
+    """Return the entry of a shard that is there already, made by the same command or to be kept; None if there is none.
+
+    Without `resume`, another dataset or a damaged shard is there, and refused where the output is begun.
+    """
+    if resume:
+        return finished_shard(out, manifest, shard, overwrite)
+    if overwrite:
+        return None
+    with suppress(UsageError, InputDataError):
+        return finished_shard(out, manifest, shard, overwrite)
+    return None
 
 
 def _summary(

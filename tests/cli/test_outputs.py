@@ -1,6 +1,7 @@
 """`--overwrite` replaces an output of cgwm of the same kind, and never an input or anything else of the user's."""
 
 import hashlib
+import json
 import multiprocessing
 import shutil
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from cgwm.cli.app import app
 from cgwm.datasets.importers.csv_tracks import import_csv
 from cgwm.datasets.importers.hdf5_tracks import import_hdf5
 from cgwm.datasets.models.model import write_model
@@ -23,6 +25,7 @@ from cgwm.pipeline.synthesize.shards import synthesize_shards
 from cgwm.schemas import CgwmError, SynthesizeConfig, UsageError
 from helpers.forked import Forked
 from helpers.small_model import small_model
+from typer.testing import CliRunner, Result
 
 TINY = SynthesizeConfig(rollouts=2, duration_s=0.1, width=20, height=16)
 
@@ -153,7 +156,8 @@ def test_two_commands_that_write_one_output_at_once_do_not_mix_it(things: Path) 
         (other / file.name).write_text(file.read_text().replace(",1,0,0,0", ",0,1,0,0"))
     want = {}
     for source in ("csv", "other"):
-        import_csv(things / source, things / f"by_{source}")
+        said = CliRunner().invoke(app, ["import", "csv", str(things / source), "--out", str(things / f"by_{source}")])
+        assert said.exit_code == 0, said.output
         want[source] = content(things / f"by_{source}")
     for number, overwrite in enumerate(([], ["--overwrite"], ["--overwrite"])):
         out = things / f"out{number // 2}"
@@ -180,3 +184,24 @@ def test_a_link_to_an_input_is_an_input(things: Path) -> None:
     (things / "link").symlink_to(things / "model")
     with pytest.raises(UsageError, match="is an input of this command"):
         synthesize(things / "model", things / "link", TINY, overwrite=True)
+
+
+def test_an_import_typed_twice_is_kept_and_another_one_refused(things: Path) -> None:
+    words = ["import", "csv", str(things / "csv"), "--out", str(things / "twice")]
+
+    def typed(*more: str) -> Result:
+        return CliRunner().invoke(app, [*words, *more])
+
+    assert typed().exit_code == 0
+    before = content(things / "twice")
+    again = typed()
+    assert (again.exit_code, again.stdout) == (0, f"{things / 'twice'} is already the result of this command.\n")
+    assert json.loads(typed("--json").stdout) == {"output": str(things / "twice"), "kept": True}
+    assert content(things / "twice") == before
+    track = next((things / "csv").iterdir())
+    old = track.read_text()
+    track.write_text(old + "\n")
+    assert typed().exit_code == 2
+    track.write_text(old)
+    (things / "twice" / "mine.txt").write_text("mine")
+    assert typed().exit_code == 2

@@ -188,8 +188,14 @@ def test_report_is_beside_the_cameras_and_reads_back(scene, report):
 
 def test_existing_cameras_are_kept_without_overwrite(scene, report):
     with pytest.raises(UsageError, match=r"has cameras already \(9 images, 1 videos; scale: metric\)") as error:
-        calibrate(scene, CONFIG)
+        calibrate(scene, CONFIG.model_copy(update={"seed": CONFIG.seed + 1}))
     assert "--overwrite" in str(error.value)
+
+
+def test_the_same_calibration_again_is_kept(scene, report):
+    before = (scene / "cameras.json").stat().st_mtime_ns
+    assert calibrate(scene, CONFIG) == report
+    assert (scene / "cameras.json").stat().st_mtime_ns == before
 
 
 def test_two_runs_give_the_same_bytes(scene, tmp_path):

@@ -1,0 +1,251 @@
+"""What the page of a diagnosis draws: residual wrenches along a coordinate, and motions with and without an effect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...schemas import DiagnoseResult, NotConvergedError
+from ..physics.rollout import simulate
+from ..physics.world import State, World
+from ..segments.prepare import Prepared
+from ..segments.residual_wrench import ResidualWrenches, covariates_of, wrench_windows
+from .experiments import Experiment
+from .fisher_information import experiment_states
+from .verdict import Findings
+
+Array = NDArray[np.float64]
+
+SHOWN_S = 1.0
+"""Length of a drawn motion [s]."""
+FRAMES = 81
+"""Number of points of a drawn motion."""
+SLIDE = Experiment(
+    on_ground=True,
+    height_m=0.0,
+    speed_m_s=1.0,
+    elevation_deg=0.0,
+    heading_deg=0.0,
+    spin_rad_s=0.0,
+    spin_axis="across",
+    duration_s=SHOWN_S,
+)
+"""The motion that shows an effect in contact."""
+ALONG_AXES = frozenset({"x", "y", "height", "episode"})
+"""Coordinates against which forces are drawn along world axes; against the others along and across the velocity."""
+
+
+@dataclass(frozen=True, eq=False)
+class ForceCurve:
+    """One component of the missing force or torque in windows of flight."""
+
+    name: str
+    """What it is, in words."""
+    values: Array
+    """Acceleration [m/s2] or angular acceleration [rad/s2], shape (n,)."""
+    std: Array
+    """Standard errors, same shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class MissingForce:
+    """The residual wrench against the coordinate that explains most of it."""
+
+    coordinate: str
+    """Name of the coordinate, one of `segments.residual_wrench.COORDINATES`."""
+    same_everywhere: bool
+    """Whether no coordinate explains more of it than one wrench everywhere."""
+    share: float
+    """Share of the excess over the noise that the coordinate explains, 0 to 1."""
+    x: Array
+    """The coordinate in each window, shape (n,)."""
+    force: tuple[ForceCurve, ...]
+    """Three components of the force over mass."""
+    torque: tuple[ForceCurve, ...]
+    """Three components of the torque over inertia; empty where no orientation was measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMotion:
+    """A motion seen from the side."""
+
+    name: str
+    """What it is of."""
+    path: Array
+    """Distance along the start's heading, and height [m], shape (T, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EffectPicture:
+    """The same start with an effect and without it."""
+
+    effect: str
+    """Name of the effect."""
+    start: str
+    """Where the motion starts, in words."""
+    time_s: Array
+    """Times [s], shape (T,)."""
+    motions: tuple[DrawnMotion, DrawnMotion]
+    """With the effect, and without it."""
+    apart_m: Array
+    """Distance between the two [m], shape (T,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """The drawings of one diagnosis."""
+
+    missing: MissingForce | None
+    """The residual wrench of the model; None without flight."""
+    left: MissingForce | None
+    """That with the named effects, against the same coordinate; None where none is named."""
+    effects: tuple[EffectPicture, ...]
+    """What each named effect does to a motion; effects of the measurement move nothing and are not in it."""
+    throw: tuple[DrawnMotion, ...]
+    """The next experiment; empty where none is proposed."""
+
+
+def pictures_of(prepared: Prepared, findings: Findings, result: DiagnoseResult) -> Pictures:
+    """Return what the page draws of a diagnosis."""
+    before = _windows(prepared, findings.base)
+    missing = None if before is None else _missing(before, prepared.has_orientation)
+    after = _windows(prepared, findings.world) if result.selected and missing is not None else None
+    left = None
+    if after is not None and missing is not None:
+        left = _missing(after, prepared.has_orientation, missing.coordinate)
+    named = [one.evidence.name for one in findings.chosen] if result.selected else []
+    drawn = [_picture(prepared, findings.world, name) for name in named]
+    return Pictures(missing, left, tuple(one for one in drawn if one is not None), _throw(findings.world, result))
+
+
+def _windows(prepared: Prepared, world: World) -> ResidualWrenches | None:
+    if prepared.flight is None or len(world.free) != 1:
+        return None
+    return wrench_windows(world, prepared.observations, prepared.flight.items, prepared.noise, prepared.noise_model)
+
+
+def _missing(found: ResidualWrenches, turned: bool, coordinate: str | None = None) -> MissingForce:
+    """Return the wrench against a coordinate; None: the one that explains most of it."""
+    ordered = covariates_of(found)
+    same = ordered[0].coordinate == "constant"
+    chosen = next((c for c in ordered if c.coordinate == coordinate), None)
+    best = chosen or ordered[0]
+    name = "speed" if best.coordinate == "constant" else best.coordinate
+    frames, names = _frames(found, name)
+    x = found.coordinates[name].astype(np.float64)
+    x = np.degrees(x) if name == "heading" else x
+    curves = [_curves(found, 3 * k, frames, names) for k in range(2 if turned else 1)]
+    return MissingForce(
+        coordinate=name,
+        same_everywhere=same,
+        share=best.share,
+        x=x,
+        force=curves[0],
+        torque=curves[1] if turned else (),
+    )
+
+
+def _frames(found: ResidualWrenches, coordinate: str) -> tuple[Array, tuple[str, str, str]]:
+    """Return the axes (n, 3, 3) along which the wrench of each window is drawn, and their names."""
+    count = len(found.velocity)
+    if coordinate in ALONG_AXES:
+        return np.tile(np.eye(3), (count, 1, 1)), ("along x", "along y", "along z")
+    return motion_axes(found.velocity), ("along the velocity", "sideways", "across, upwards")
+
+
+def motion_axes(velocity: Array) -> Array:
+    """Return for each velocity (n, 3) the axes along it, horizontally across it to the left, and across both."""
+    along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-12)
+    side = np.cross([0.0, 0.0, 1.0], along)
+    size = np.linalg.norm(side, axis=1, keepdims=True)
+    side = np.where(size > 1e-6, side / np.maximum(size, 1e-12), [0.0, 1.0, 0.0])
+    return np.stack([along, side, np.cross(along, side)], 1)
+
+
+def _curves(found: ResidualWrenches, first: int, axes: Array, names: Sequence[str]) -> tuple[ForceCurve, ...]:
+    rows = slice(first, first + 3)
+    values = np.einsum("nij,nj->ni", axes, found.wrench[:, rows])
+    spread = np.einsum("nij,njk,nik->ni", axes, found.covariance[:, rows, rows], axes)
+    return tuple(ForceCurve(name, values[:, k], np.sqrt(spread[:, k])) for k, name in enumerate(names))
+
+
+def _picture(prepared: Prepared, world: World, name: str) -> EffectPicture | None:
+    """Return a motion with and without an effect; None for one of the measurement, and where it cannot be simulated."""
+    active = next((one for one in world.effects if one.effect.name == name), None)
+    if active is None or active.effect.phase == "measurement":
+        return None
+    times = torch.linspace(0.0, SHOWN_S, FRAMES).to(world.gravity)
+    if active.effect.phase == "contact" and world.ground_normal is not None:
+        start, words = experiment_states(prepared, world, [SLIDE]), "a body set on the ground at 1 m/s without spin"
+    elif prepared.flight is not None:
+        start, words = _fastest(prepared), "the fastest measured flight"
+    else:
+        return None
+    without = replace(world, effects=tuple(one for one in world.effects if one is not active))
+    try:
+        places = [simulate(one, start, times).position_m[0, :, world.free[0]].double() for one in (world, without)]
+    except NotConvergedError:
+        return None
+    sides = [_from_side(world, start, place) for place in places]
+    motions = DrawnMotion(f"with {name}", sides[0]), DrawnMotion("without it", sides[1])
+    apart = (places[0] - places[1]).norm(dim=1)
+    return EffectPicture(name, words, times.double().numpy(), motions, apart.numpy())
+
+
+def _fastest(prepared: Prepared) -> State:
+    """Return the fitted start (1, nb) of the flight with the largest speed."""
+    assert prepared.flight is not None
+    state = prepared.flight.observations.state
+    item = int(state.velocity_m_s[:, prepared.flight.world.free[0]].norm(dim=1).argmax())
+    return State(**{key: getattr(state, key)[item : item + 1] for key in State.__dataclass_fields__})
+
+
+def _from_side(world: World, start: State, place: Tensor) -> Array:
+    """Return distance along the start's heading and height (T, 2) [m] of a path (T, 3)."""
+    body, up = world.free[0], world.up[0].double()
+    velocity = start.velocity_m_s[0, body].double()
+    level = velocity - (velocity @ up) * up
+    x = torch.tensor([1.0, 0.0, 0.0]).to(up)
+    along = level / level.norm() if float(level.norm()) > 1e-6 else x - (x @ up) * up
+    return torch.stack(((place - place[0]) @ along, place @ up), 1).numpy()
+
+
+def _throw(world: World, result: DiagnoseResult) -> tuple[DrawnMotion, ...]:
+    """Return the next experiment as it would fly with what was found; empty where none is proposed."""
+    found = result.next_experiment
+    if found is None or not found.initial_state or len(world.free) != 1:
+        return ()
+    body, like = world.free[0], world.gravity
+    rows = {key: torch.zeros(1, len(world.bodies), 4 if key == "quat_wxyz" else 3).to(like) for key in
+            State.__dataclass_fields__}  # fmt: skip
+    rows["quat_wxyz"][..., 0] = 1.0
+    for key, row in rows.items():
+        row[0, body] = torch.tensor(found.initial_state[key]).to(row)
+    start = State(**rows)
+    times = torch.linspace(0.0, SHOWN_S, FRAMES).to(like)
+    try:
+        place = simulate(world, start, times).position_m[0, :, body].double()
+    except NotConvergedError:
+        return ()
+    return (DrawnMotion(found.what.partition(";")[0], _from_side(world, start, place)),)
+
+
+def binned_means(x: Array, values: Array, std: Array, bins: int = 4) -> list[tuple[float, float]]:
+    """Return weighted means of equally filled bins along x; empty for fewer than three points a bin."""
+    if len(x) < 3 * bins:
+        return []
+    order = np.argsort(x, kind="stable")
+    floor = float(np.median(std)) * 0.1
+    weight = 1 / (std**2 + floor**2 + 1e-30)
+    means = []
+    for rows in np.array_split(order, bins):
+        total = float(weight[rows].sum())
+        if total > 0 and math.isfinite(total):
+            means.append((float(weight[rows] @ x[rows]) / total, float(weight[rows] @ values[rows]) / total))
+    return means
