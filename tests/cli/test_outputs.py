@@ -27,6 +27,8 @@ from helpers.forked import Forked
 from helpers.small_model import small_model
 from typer.testing import CliRunner, Result
 
+from cgwm import improve
+
 TINY = SynthesizeConfig(rollouts=2, duration_s=0.1, width=20, height=16)
 
 
@@ -77,6 +79,7 @@ COMMANDS: dict[str, tuple[Callable[[Path, Path], object], set[str]]] = {
     "synthesize": (lambda root, out: synthesize(root / "model", out, TINY, overwrite=True), {"dataset", "shards"}),
     "compare": (lambda root, out: compare([root / "model"], root / "capture", out=out, overwrite=True), set()),
     "diagnose": (lambda root, out: diagnose(root / "model", root / "capture", save_law_to=out, overwrite=True), set()),
+    "improve": (lambda root, out: improve(root / "capture", out, overwrite=True), set()),
     "merge": (lambda root, out: merge([root / "shards"], out, overwrite=True), {"dataset", "shards/index.h5"}),
     "merge inside": (lambda root, out: merge([root / "shards"], overwrite=True), set()),
     "demo": (lambda root, out: run_demo(out, overwrite=True), set()),

@@ -1,0 +1,198 @@
+"""The ladder of models: what is proposed, what is accepted, and how its page and files are read again."""
+
+# pyright: reportMissingImports=false
+# until `make install` has linked the room
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.cli.app import app
+from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
+from cgwm.pipeline.improve import improve
+from cgwm.pipeline.improve.folds import folds_of
+from cgwm.pipeline.improve.held_out_errors import error_ratio, typical_error
+from cgwm.pipeline.improve.ladder_files import LadderFiles
+from cgwm.pipeline.improve.page import ladder_html
+from cgwm.pipeline.improve.proposals import proposals_of
+from cgwm.pipeline.validate import validate
+from cgwm.schemas import (
+    DiagnoseResult,
+    ImproveConfig,
+    ImproveResult,
+    ImproveStep,
+    ImproveTrial,
+    InputDataError,
+    LawTerm,
+    PhysConfig,
+    RankedEffect,
+    ResidualLaw,
+    UsageError,
+)
+from helpers.pages import Tags
+from helpers.small_model import write_small_model
+from helpers.thrown_cube import write_capture
+from typer.testing import CliRunner
+
+RANKED = RankedEffect(effect="linear_drag", acts_in=("flight",), judged_in="flight", score_p=1e-9)
+LAW = ResidualLaw(
+    terms=(LawTerm(term="-u", coefficient=0.3, std_error=0.01, unit="1/s"),), left_chi2=1.0, where="speed"
+)
+
+
+def found(verdict: str = "missing_effect", **fields: object) -> DiagnoseResult:
+    return DiagnoseResult.model_validate({"verdict": verdict, "sentence": "said", "episodes": 6, **fields})
+
+
+def test_every_episode_is_in_one_fold() -> None:
+    names = [f"{k:02d}" for k in range(11)]
+    for count in (2, 4, 20):
+        folds = folds_of(names, count)
+        assert sorted(name for fold in folds for name in fold) == names
+        assert len(folds) == min(count, 11)
+        assert max(map(len, folds)) - min(map(len, folds)) <= 1
+
+
+def test_a_ratio_is_that_of_each_episode_and_its_interval_needs_several() -> None:
+    rng = np.random.default_rng(0)
+    before = {f"{k}": float(np.exp(rng.normal(0, 2))) for k in range(12)}
+    after = {name: 0.5 * value * float(np.exp(rng.normal(0, 0.1))) for name, value in before.items()}
+    for count in (2, 4, 12):
+        names = list(before)[:count]
+        ratio = error_ratio({n: before[n] for n in names}, {n: after[n] for n in names})
+        assert ratio is not None and ratio.ratio == pytest.approx(0.5, rel=0.2)
+        assert (ratio.interval_95 is None) == (count == 2)
+        if ratio.interval_95 is not None:
+            assert ratio.interval_95[0] < 0.5 * 1.1 and ratio.ratio < ratio.interval_95[1] < 1
+    same = error_ratio(before, {name: value * float(np.exp(rng.normal(0, 0.3))) for name, value in before.items()})
+    assert same is not None and same.interval_95 is not None and same.interval_95[0] < 1 < same.interval_95[1]
+    assert error_ratio(before, {"other": 1.0}) is None
+
+
+def test_a_few_impacts_do_not_outweigh_a_long_flight() -> None:
+    flight, impact = torch.full((100,), 4.0), torch.full((3,), 1e6)
+    before, after = torch.cat((flight, impact)), torch.cat((0.25 * flight, 2 * impact))
+    assert after.mean() > before.mean()
+    assert typical_error(after) < 0.7 * typical_error(before)
+
+
+def test_what_is_named_comes_first_and_what_is_not_is_tried_where_nothing_is(tmp_path: Path) -> None:
+    law = tmp_path / "law_0.py"
+    named = proposals_of(found(selected=("wind", "linear_drag")), (), law)
+    assert [[p.effects for p in group] for group in named] == [[("wind", "linear_drag")], [("wind",), ("linear_drag",)]]
+    unnamed = found("unexplained", ranking=(RANKED,), residual_law=LAW)
+    ((first, second),) = proposals_of(unnamed, (), law)
+    assert (first.effects, first.why) == (("linear_drag",), "first_of_the_ranking")
+    assert (second.names, second.why) == (("law_0.py:ResidualLaw",), "law")
+    assert law.is_file()
+    assert proposals_of(unnamed, ("linear_drag@group", "effects/law_0.py:ResidualLaw"), law) == []
+    assert proposals_of(found("none_missing"), (), law) == []
+    weak = found("unexplained", ranking=(RANKED.model_copy(update={"score_p": 0.1}),))
+    assert proposals_of(weak, (), law) == []
+
+
+def test_an_unfinished_ladder_is_continued_by_the_same_command_only(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    files = LadderFiles(out, {"split": "train"}, resume=False, overwrite=False)
+    files.document("one.json", ImproveConfig, lambda: ImproveConfig(steps=3))
+    with pytest.raises(UsageError, match="was interrupted"):
+        LadderFiles(out, {"split": "train"}, resume=False, overwrite=False)
+    with pytest.raises(UsageError, match="other split"):
+        LadderFiles(out, {"split": "look"}, resume=True, overwrite=False)
+    again = LadderFiles(out, {"split": "train"}, resume=True, overwrite=False)
+    assert again.document("one.json", ImproveConfig, ImproveConfig).steps == 3
+    assert not (LadderFiles(out, {}, resume=False, overwrite=True) / "one.json").exists()
+    again.remove()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_improved_is_refused_before_any_work(tmp_path: Path) -> None:
+    capture, model = write_capture(tmp_path / "capture", 3), write_small_model(tmp_path / "model")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    for arguments, message in (
+        ({"out": tmp_path / "mine"}, "exists"),
+        ({"out": tmp_path / "mine", "overwrite": True}, "holds no ladder"),
+        ({"phys_config": PhysConfig(supervise="images")}, "judged on measured tracks"),
+        ({"parent": model, "phys_config": PhysConfig(effects=("wind",))}, "with a model to start from"),
+        ({"split": "nowhere"}, "no split 'nowhere'"),
+        ({"candidates": ("wind@episode",)}, "one value for all episodes"),
+    ):
+        with pytest.raises((UsageError, InputDataError), match=re.escape(message)):
+            improve(capture, **{"out": tmp_path / "out", "split": "test", **arguments})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "mine", "model"]
+
+
+@pytest.fixture
+def ladder(tmp_path: Path) -> Path:
+    """A ladder of one model, to which nothing was added."""
+    out = tmp_path / "ladder"
+    out.mkdir()
+    write_small_model(out / "m0")
+    trial = ImproveTrial(effects=("<b>",), why="selected", helps=False, typical_error=None, failure="<i>no</i>")
+    step = ImproveStep(**found(ranking=(RANKED,)).model_dump(), model="m0", tried=(trial,))
+    result = ImproveResult(
+        capture="<script>",
+        split="train",
+        episodes=2,
+        folds=(("a",), ("b",)),
+        models=("m0",),
+        model_sha256={"m0": sha256(out / "m0" / "model.json")},
+        sentence="Nothing <was> added.",
+        stopped="nothing_helps",
+        steps=(step,),
+        page="improve.html",
+    )
+    (out / "improve.json").write_text(result.model_dump_json())
+    (out / "improve.html").write_text(ladder_html(result, out))
+    return out
+
+
+def test_the_page_is_whole_and_takes_no_text_for_html(ladder: Path) -> None:
+    text = (ladder / "improve.html").read_text()
+    for words in ("<b>", "<i>", "<was>", "http://", "https://"):
+        assert words not in text
+    tags = Tags()
+    tags.feed(text)
+    assert (tags.faults, tags.open) == ([], [])
+    assert set(tags.addresses) == {"m0", "improve.json"}
+
+
+def test_a_ladder_is_validated_with_its_models(ladder: Path) -> None:
+    assert validate(ladder).faults == ()
+    document = json.loads((ladder / "improve.json").read_text())
+    for change, words in (
+        ({"model_sha256": {"m0": 64 * "0"}}, "another content"),
+        ({"models": ["m0", "m1"]}, "the model m1 is missing"),
+        ({"folds": [["a"], ["a"]]}, "2 episodes, not 2 different"),
+        ({"page": "other.html"}, "the page other.html is missing"),
+    ):
+        (ladder / "improve.json").write_text(json.dumps(document | change))
+        assert any(words in fault for fault in validate(ladder).faults), words
+    for change in ({"models": ["../m0"]}, {"added": 1}, {"episodes": "2"}):
+        (ladder / "improve.json").write_text(json.dumps(document | change))
+        with pytest.raises(InputDataError):
+            validate(ladder)
+
+
+@pytest.mark.evidence
+def test_hidden_drag_is_added_and_test_errors_fall_in_the_same_ladder_after_an_interruption(tmp_path: Path) -> None:
+    (case,) = (one for one in cases("development") if one.name == "development/ball/quadratic_drag/large/0")
+    make_capture(tmp_path / "capture", replace(case, test=4))
+    words = ["improve", str(tmp_path / "capture"), "--out", str(tmp_path / "ladder"), "--json"]
+    said = CliRunner().invoke(app, words)
+    assert said.exit_code == 0, said.output
+    result = json.loads(said.stdout)
+    assert [step["added"] for step in result["steps"] if step["added"]] == [["quadratic_drag"]]
+    first, last = result["test"]["models"]
+    assert last["translation_error_m"]["median"] < 0.5 * first["translation_error_m"]["median"]
+    assert validate(tmp_path / "ladder").faults == ()
+    kept = (tmp_path / "ladder" / "improve.json").read_bytes()
+    assert CliRunner().invoke(app, words).exit_code == 2
+    assert json.loads(CliRunner().invoke(app, [*words, "--resume"]).stdout) == result
+    assert (tmp_path / "ladder" / "improve.json").read_bytes() == kept
