@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_serializer, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, model_serializer, model_validator
 
 from .base import FileModel, read_toml
 
@@ -91,6 +91,8 @@ class Distribution(FileModel):
 class RejectionRules(FileModel):
     """Rollouts that are drawn again. A rule that is left out rejects nothing."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)  # `plan_toml` writes them as comments
+
     off_table_m: Annotated[float, Field(gt=0, le=1e8)] | None = None
     """A free body's middle gets farther than this from where the photos show it, measured along the ground [m]."""
     no_contact: bool = False
@@ -107,6 +109,8 @@ class RejectionRules(FileModel):
 
 class SamplingPlan(FileModel):
     """Distributions that rollouts are drawn from; what is left out follows from the bodies."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)  # `plan_toml` writes them as comments
 
     start: Literal["auto", "throw", "rest", "slide"] = "auto"
     """How free bodies begin: thrown through the air, resting as in the photos, or sliding on the ground. auto: at rest

@@ -219,7 +219,8 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
     reach = _gaps(centers, radii, points)
     queue = [(-float(np.maximum(gap - row, 0).sum()), index) for index, row in enumerate(reach)]
     heapq.heapify(queue)
-    while chosen.count < limit and queue and gap.mean() > _MEAN_TOLERANCE * size:
+    mean = gap.mean()
+    while chosen.count < limit and queue and mean > _MEAN_TOLERANCE * size:
         _, index = heapq.heappop(queue)
         worth = float(np.maximum(gap - reach[index], 0).sum())
         if queue and worth < -queue[0][0]:
@@ -227,6 +228,7 @@ def _add_cover(chosen: _Chosen, solid: Solid, points: Array, normals: Array, lim
             continue
         chosen.add(centers[index], float(radii[index]))
         gap = np.minimum(gap, reach[index])
+        mean = gap.mean()
     while chosen.count < limit and len(radii) and gap.max() > _MOST_TOLERANCE * size:
         worst = int(np.argmax(gap))
         index = int(np.argmin(reach[:, worst]))
