@@ -12,7 +12,7 @@ from .options import AcceptUnits, ConfigFile, Device, Overwrite, Seed, Settings,
 from .verb import verb
 
 if TYPE_CHECKING:
-    from ..schemas import ErrorRatio, ImproveResult, ImproveStep
+    from ..schemas import ErrorRatio, ImproveResult, ImproveStep, ImproveTestStep, ImproveTrial
 
 
 @verb
@@ -93,14 +93,20 @@ def _summary(result: ImproveResult, out: Path) -> str:
 
 
 def _row(step: ImproveStep, result: ImproveResult) -> list[str]:
-    judged = next((one.typical_error for one in step.tried if one.helps and one.effects == step.added), None)
+    judged = next((one for one in step.tried if one.helps and one.effects == step.added), None)
     tests = result.test.steps if result.test is not None else ()
-    tested = next((one.typical_error for one in tests if (one.model, one.than) == (step.next_model, step.model)), None)
-    return [step.next_model or "", ", ".join(step.added), _ratio(judged), _ratio(tested)]
+    tested = next((one for one in tests if (one.model, one.than) == (step.next_model, step.model)), None)
+    return [step.next_model or "", ", ".join(step.added), _ratios(judged), _ratios(tested)]
 
 
-def _ratio(ratio: ErrorRatio | None) -> str:
-    if ratio is None:
+def _ratios(found: ImproveTrial | ImproveTestStep | None) -> str:
+    """Return the ratios of errors in flight and in contact, with their intervals."""
+    if found is None:
         return "-"
+    known = [(kind, one) for kind, one in (("flight", found.flight), ("contact", found.contact)) if one is not None]
+    return ", ".join(f"{kind} {_ratio(one)}" for kind, one in known) or "-"
+
+
+def _ratio(ratio: ErrorRatio) -> str:
     span = ratio.interval_95
     return f"{ratio.ratio:.2f}" + (f" ({span[0]:.2f} to {span[1]:.2f})" if span else "")

@@ -46,10 +46,13 @@ class ImproveTrial(FileModel):
     effects: tuple[str, ...]
     """What was passed to `fit --effects`; a law by the name of its file in the model."""
     why: Reason
-    typical_error: ErrorRatio | None = None
-    """Of predictions of half segments, in units of the noise; null where the fit failed."""
+    flight: ErrorRatio | None = None
+    """Of predictions of the second halves of flights, in units of the noise; null without flight or where the fit
+    failed."""
+    contact: ErrorRatio | None = None
+    """The same of segments with contact."""
     helps: bool
-    """Whether the error falls beyond chance, by at least the least fall."""
+    """Whether one of the two falls beyond chance, by at least the least fall, and none rises beyond chance."""
     failure: str = ""
     """The message of a fit that failed."""
 
@@ -77,8 +80,10 @@ class ImproveTestFigures(FileModel):
     state_fitted_residual_m: ErrorSummary | None = None
     reduced_chi2: float | None = None
     """Of short predictions."""
-    typical_error: float | None = None
-    """Of predictions of half segments, in units of the noise, median over the episodes."""
+    flight: float | None = None
+    """Of predictions of half segments of flight, in units of the noise, median over the episodes."""
+    contact: float | None = None
+    """The same of segments with contact."""
 
 
 class ImproveTestStep(FileModel):
@@ -86,7 +91,8 @@ class ImproveTestStep(FileModel):
 
     model: str
     than: str
-    typical_error: ErrorRatio | None = None
+    flight: ErrorRatio | None = None
+    contact: ErrorRatio | None = None
     translation_error_m: ErrorRatio | None = None
     state_fitted_residual_m: ErrorRatio | None = None
 

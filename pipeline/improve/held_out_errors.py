@@ -12,7 +12,7 @@ from torch import Tensor
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode
 from ...datasets.models.model import Model
-from ...schemas import ErrorRatio
+from ...schemas import ErrorRatio, FileModel
 from ..compare.paired_difference import LEAST_EPISODES, RESAMPLES
 from ..compare.short_horizon_errors import DIVERGED
 from ..diagnose.cross_validation import continued
@@ -30,6 +30,19 @@ LEAST_FOR_STUDENT = 3
 """Minimum number of episodes for an interval by Student's t, which assumes normal logarithms of the ratios."""
 
 
+class HeldOutErrors(FileModel):
+    """Typical prediction errors by episode, in units of the measurement noise; without those that have no such part."""
+
+    flight: dict[str, float]
+    contact: dict[str, float]
+    failure: str = ""
+    """The message of a fit that failed."""
+
+    def joined(self, other: HeldOutErrors) -> HeldOutErrors:
+        """Return the errors of these episodes and of others."""
+        return HeldOutErrors(flight=self.flight | other.flight, contact=self.contact | other.contact)
+
+
 @one_torch_thread()
 def prepared_episodes(model: Model, capture: Capture, names: Sequence[str]) -> tuple[list[Episode], Prepared]:
     """Return episodes and their segments, which are the same for all models that are compared on them."""
@@ -39,8 +52,8 @@ def prepared_episodes(model: Model, capture: Capture, names: Sequence[str]) -> t
 
 
 @one_torch_thread()
-def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], prepared: Prepared) -> dict[str, float]:
-    """Return the typical prediction error of each episode, in units of the measurement noise.
+def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], prepared: Prepared) -> HeldOutErrors:
+    """Return the typical prediction errors of each episode, in units of the measurement noise.
 
     The state of a segment of flight or contact is fitted to its first half, and the second half is predicted.
     Parameters that differ from episode to episode are fitted to these, with the spread that the model's fit has found.
@@ -59,7 +72,7 @@ def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], 
         seen=prepared.observations.seen,
         has_orientation=prepared.observations.has_orientation,
     )
-    squares: dict[str, list[Tensor]] = {}
+    errors: dict[str, dict[str, float]] = {}
     kinds: tuple[tuple[Kind, Sequence[Segment]], ...] = (
         ("flight", () if prepared.flight is None else prepared.flight.items),
         ("contact", prepared.contact_items),
@@ -67,10 +80,12 @@ def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], 
     for kind, items in kinds:
         if items:
             segments = fit_states(Segments.of(kind, world, whole, items, prepared.noise))
+            squares: dict[str, list[Tensor]] = {}
             for item, mean in zip(items, _late_squares(segments), strict=True):
                 squares.setdefault(episodes[item.episode].name, []).append(mean)
-    found = {name: torch.cat(values) for name, values in squares.items()}
-    return {name: typical_error(values) for name, values in found.items() if len(values)}
+            joined = {name: torch.cat(values) for name, values in squares.items()}
+            errors[kind] = {name: typical_error(values) for name, values in joined.items() if len(values)}
+    return HeldOutErrors(flight=errors.get("flight", {}), contact=errors.get("contact", {}))
 
 
 def _late_squares(segments: Segments) -> list[Tensor]:

@@ -12,7 +12,7 @@ from ...datasets.io.progress import note
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     DiagnoseResult,
-    FileModel,
+    ErrorRatio,
     FittedParameter,
     ImproveConfig,
     ImproveStep,
@@ -30,7 +30,7 @@ from ..runtime.resources import one_torch_thread
 from ..segments.candidates import Candidate
 from ..segments.prepare import Prepared
 from .folds import ReadOnce, fitted_without
-from .held_out_errors import error_ratio, prepared_episodes, typical_errors
+from .held_out_errors import HeldOutErrors, error_ratio, prepared_episodes, typical_errors
 from .ladder_files import LadderFiles
 from .proposals import Proposal, proposals_of
 
@@ -39,15 +39,6 @@ LEAST_FALL = 0.02
 away about one per cent of any error."""
 
 Stopped = Literal["nothing_helps", "nothing_proposed", "steps", "not_diagnosed"]
-
-
-class FoldErrors(FileModel):
-    """Errors of the models that are fitted without one fold each, on that fold."""
-
-    errors: dict[str, float]
-    """Typical error by episode, in units of the noise."""
-    failure: str = ""
-    """The message of a fit that failed."""
 
 
 @dataclass(frozen=True)
@@ -149,13 +140,14 @@ class Climb:
         groups = proposals_of(found, present, self.files / f"law_{number}.py")
         tried: list[ImproveTrial] = []
         for group in groups:
-            helping: list[tuple[float, str, Proposal]] = []
+            helping: list[tuple[float, str, Proposal]] = []  # by the smaller one of their ratios
             for proposal in group:
                 name = f"m{number}-{len(tried)}"
                 trial = self._trial(base, name, proposal)
                 tried.append(trial)
-                if trial.helps and trial.typical_error is not None:
-                    helping.append((trial.typical_error.ratio, name, proposal))
+                if trial.helps:
+                    ratios = [one.ratio for one in (trial.flight, trial.contact) if one is not None]
+                    helping.append((min(ratios), name, proposal))
             if helping:
                 _, name, proposal = min(helping, key=lambda one: one[0])
                 return tuple(tried), (name, proposal)
@@ -166,22 +158,24 @@ class Climb:
         note(f"improve: try {', '.join(proposal.names)} on unseen episodes")
         before = self._fold_errors(base, "m0", ())
         after = self._fold_errors(name, base, proposal.effects)
-        ratio = error_ratio(before.errors, after.errors) if not before.failure and not after.failure else None
-        span = None if ratio is None else ratio.interval_95
+        failure = before.failure or after.failure
+        flight = None if failure else error_ratio(before.flight, after.flight)
+        contact = None if failure else error_ratio(before.contact, after.contact)
         return ImproveTrial(
             effects=proposal.names,
             why=proposal.why,
-            typical_error=ratio,
-            helps=ratio is not None and span is not None and span[1] < 1 and ratio.ratio <= 1 - LEAST_FALL,
-            failure=before.failure or after.failure,
+            flight=flight,
+            contact=contact,
+            helps=helps(flight, contact),
+            failure=failure,
         )
 
-    def _fold_errors(self, name: str, base: str, effects: Sequence[str]) -> FoldErrors:
+    def _fold_errors(self, name: str, base: str, effects: Sequence[str]) -> HeldOutErrors:
         """Return the errors of models that are each fitted without a fold, from those without it at the step before."""
-        return self.files.document(f"errors-{name}.json", FoldErrors, lambda: self._measured(name, base, effects))
+        return self.files.document(f"errors-{name}.json", HeldOutErrors, lambda: self._measured(name, base, effects))
 
-    def _measured(self, name: str, base: str, effects: Sequence[str]) -> FoldErrors:
-        errors: dict[str, float] = {}
+    def _measured(self, name: str, base: str, effects: Sequence[str]) -> HeldOutErrors:
+        errors = HeldOutErrors(flight={}, contact={})
         config = self.physics.model_copy(update={"effects": tuple(effects)})
         for number, fold in enumerate(self.folds):
             # the first models without a fold start from the first model, all others from the ones before them
@@ -194,10 +188,10 @@ class Climb:
                     self.prepared[number] = prepared_episodes(
                         read_model(self.files / f"folds/m0-{number}"), self.capture, fold
                     )
-                errors |= typical_errors(model, self.capture, *self.prepared[number])
+                errors = errors.joined(typical_errors(model, self.capture, *self.prepared[number]))
             except (NotConvergedError, InputDataError, UsageError) as error:
-                return FoldErrors(errors={}, failure=error.found)
-        return FoldErrors(errors=errors)
+                return HeldOutErrors(flight={}, contact={}, failure=error.found)
+        return errors
 
     def _next_model(self, number: int, name: str, proposal: Proposal) -> Model:
         """Fit the next model of the ladder to the whole split."""
@@ -210,6 +204,14 @@ class Climb:
             accept_units=self.accept_units,
         )  # fmt: skip
         return read_model(out)
+
+
+def helps(flight: ErrorRatio | None, contact: ErrorRatio | None) -> bool:
+    """Return whether an error falls beyond chance and by `LEAST_FALL`, in flight or in contact, and neither rises."""
+    spans = [(one.ratio, one.interval_95) for one in (flight, contact) if one is not None]
+    if any(span is not None and span[0] > 1 for _, span in spans):
+        return False
+    return any(span is not None and span[1] < 1 and ratio <= 1 - LEAST_FALL for ratio, span in spans)
 
 
 def _parameters_of(model: Model, proposal: Proposal) -> tuple[FittedParameter, ...]:

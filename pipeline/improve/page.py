@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...schemas import ErrorRatio, FittedParameter, ImproveResult, ImproveStep, ImproveTest
+from ...schemas import (
+    ErrorRatio,
+    FittedParameter,
+    ImproveResult,
+    ImproveStep,
+    ImproveTest,
+    ImproveTestStep,
+    ImproveTrial,
+)
 from ..report.page import cautions, command, facts, fixed, link, number, page, paragraph, section, table, text
 from ..report.plots import Bar, bars
 from .wording import WHY, ratio_words, trial_words
@@ -49,7 +57,8 @@ def _cards(test: ImproveTest | None) -> str:
         return ""
     first, last = test.models[0], test.models[-1]
     known = [
-        ("predictions", first.typical_error, last.typical_error, 1.0, "times the noise"),
+        ("prediction in flight [noise]", first.flight, last.flight, 1.0, ""),
+        ("prediction in contact [noise]", first.contact, last.contact, 1.0, ""),
         ("open loop", first.translation_error_m.median, last.translation_error_m.median, _MM, "mm"),
     ]
     if first.state_fitted_residual_m is not None and last.state_fitted_residual_m is not None:
@@ -73,16 +82,17 @@ def _overview(result: ImproveResult, ladder: Sequence[ImproveStep]) -> str:
         one = tested.get(name)
         added = "as fitted" if k == 0 else ", ".join(ladder[k - 1].added)
         judged = None if k == 0 else _accepted(ladder[k - 1])
-        tests = _test_ratio(test, name, result.models[k - 1]) if k else None
+        tests = _tested(test, name, result.models[k - 1]) if k else None
         rows.append(
             [
                 text(name),
                 text(added),
-                _ratio(judged),
-                _ratio(tests),
+                _ratios(judged),
+                _ratios(tests),
                 fixed(one.translation_error_m.median if one else None, 1, _MM),
                 fixed(one.state_fitted_residual_m.median if one and one.state_fitted_residual_m else None, 1, _MM),
-                number(one.typical_error if one else None),
+                number(one.flight if one else None),
+                number(one.contact if one else None),
             ]
         )
     header = ["model", "added", "ratio, cross-validated", "ratio, test", "open loop [mm]", "state-fitted [mm]"]
@@ -91,41 +101,50 @@ def _overview(result: ImproveResult, ladder: Sequence[ImproveStep]) -> str:
         "95 % interval. Cross-validated: episodes of the split that decides, each predicted by a model that was not "
         "fitted to it. The last columns are medians over the test episodes."
     )
-    chart = [
-        Bar(
-            name=f"{name}, test" if one.typical_error is not None else name,
-            value=one.typical_error or 0.0,
-            words=f"{number(one.typical_error)} times the noise",
-            strong=name == result.models[-1],
-        )
-        for name, one in tested.items()
-    ]
-    drawn = [paragraph("Typical prediction error of the test episodes:"), bars(chart)] if chart else []
-    return section("The ladder", paragraph(words), table([*header, "prediction [noise]"], rows, (4, 5, 6)), *drawn)
+    charts = []
+    for kind in ("flight", "contact"):
+        known = [(name, value) for name, one in tested.items() if (value := getattr(one, kind)) is not None]
+        rows_ = [
+            Bar(name=name, value=v, words=f"{number(v)} times the noise", strong=name == result.models[-1])
+            for name, v in known
+        ]
+        charts += [paragraph(f"Prediction error of the test episodes in {kind}:"), bars(rows_)] if rows_ else []
+    header += ["flight [noise]", "contact [noise]"]
+    return section("The ladder", paragraph(words), table(header, rows, (4, 5, 6, 7)), *charts)
 
 
-def _accepted(step: ImproveStep) -> ErrorRatio | None:
-    """Return the cross-validated ratio of the addition that a step has made."""
-    return next((one.typical_error for one in step.tried if one.helps and one.effects == step.added), None)
+def _accepted(step: ImproveStep) -> ImproveTrial | None:
+    """Return the trial of the addition that a step has made."""
+    return next((one for one in step.tried if one.helps and one.effects == step.added), None)
 
 
-def _test_ratio(test: ImproveTest | None, model: str, than: str) -> ErrorRatio | None:
+def _tested(test: ImproveTest | None, model: str, than: str) -> ImproveTestStep | None:
     steps = () if test is None else test.steps
-    return next((one.typical_error for one in steps if (one.model, one.than) == (model, than)), None)
+    return next((one for one in steps if (one.model, one.than) == (model, than)), None)
 
 
-def _ratio(ratio: ErrorRatio | None) -> str:
-    if ratio is None:
+def _ratios(found: ImproveTrial | ImproveTestStep | None) -> str:
+    """Return the ratios in flight and in contact with their intervals."""
+    if found is None:
         return "–"
+    known = [(kind, one) for kind, one in (("flight", found.flight), ("contact", found.contact)) if one is not None]
+    return "<br>".join(f"{kind} {_ratio(one)}" for kind, one in known) or "–"
+
+
+def _ratio(ratio: ErrorRatio) -> str:
     span = ratio.interval_95
     return number(ratio.ratio) + (f" ({number(span[0])} to {number(span[1])})" if span else " (no interval)")
 
 
 def _step(number_: int, step: ImproveStep, test: ImproveTest | None) -> str:
     """Return the section of a step that has added something."""
-    judged, tested = _accepted(step), _test_ratio(test, step.next_model or "", step.model)
-    figures = [f"Unseen episodes of the split, prediction error: {ratio_words(judged)}."] if judged else []
-    figures += [f"Test episodes: {ratio_words(tested)}."] if tested else []
+    judged, tested = _accepted(step), _tested(test, step.next_model or "", step.model)
+    figures = [
+        f"{where}, prediction error in {kind}: {ratio_words(ratio)}."
+        for where, found in (("Unseen episodes of the split", judged), ("Test episodes", tested))
+        for kind in ("flight", "contact")
+        if found is not None and (ratio := getattr(found, kind)) is not None
+    ]
     return section(
         f"Step {number_}: {', '.join(step.added)}",
         paragraph(f"What {step.model} lacks. {step.sentence}"),
@@ -188,13 +207,12 @@ def _trials(step: ImproveStep) -> str:
         [
             text(", ".join(trial.effects)),
             text(WHY[trial.why]),
-            _ratio(trial.typical_error),
-            "–" if trial.typical_error is None else f"{trial.typical_error.better} of {trial.typical_error.episodes}",
+            _ratios(trial),
             text(trial_words(trial)),
         ]
         for trial in step.tried
     ]
-    header = ["tried", "why", "error after / before, unseen", "better in", "outcome"]
+    header = ["tried", "why", "error after / before, unseen", "outcome"]
     return "<h3>Tried on unseen episodes</h3>" + table(header, rows, strong=_helped(step))
 
 
@@ -252,9 +270,10 @@ def _judged(result: ImproveResult) -> str:
     words = (
         f"The {result.episodes} episodes of split '{result.split}' were divided into {len(result.folds)} parts. For "
         "each part and each addition all parameters were fitted to the other parts, and the part was predicted. An "
-        "addition stays if the error of these predictions falls by at least 2 %, and the 95 % interval of the ratio "
-        "lies below 1. The diagnosis that proposes additions sees the whole split, so that these intervals are a "
-        "little too short; those of the test episodes are not, as they have decided nothing."
+        "addition stays if the error of these predictions falls by at least 2 % in flight or in contact, with a 95 % "
+        "interval of the ratio below 1, and rises beyond chance in neither. The diagnosis that proposes additions "
+        "sees the whole split, so that these intervals are a little too short; those of the test episodes are not, as "
+        "they have decided nothing."
     )
     short = (
         "Prediction error: the motion is cut into segments of flight and contact; the state of each is fitted to its "

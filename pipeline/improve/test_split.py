@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from ...datasets.models.model import read_model
 from ...schemas import ImproveTest, ImproveTestFigures, ImproveTestStep
 from ..compare.model_comparison import ComparedModel
 from ..compare.stage import compare_models
-from .held_out_errors import error_ratio, prepared_episodes, typical_errors
+from .held_out_errors import HeldOutErrors, error_ratio, prepared_episodes, typical_errors
 
 TEST = "test"
 
@@ -42,7 +42,7 @@ def tested(folder: Path, names: Sequence[str], capture: Path, device: str, accep
     shared = [name for name in opened.episodes(TEST) if name in found.models[0].short]
     prepared = prepared_episodes(models[0], opened, shared)
     errors = [
-        {"typical": typical_errors(model, opened, *prepared), **_errors(compared)}
+        {**_kinds(typical_errors(model, opened, *prepared)), **_errors(compared)}
         for model, compared in zip(models, found.models, strict=True)
     ]
     pairs = [(k, k - 1) for k in range(1, len(names))] + ([(len(names) - 1, 0)] if len(names) > 2 else [])
@@ -57,7 +57,8 @@ def tested(folder: Path, names: Sequence[str], capture: Path, device: str, accep
                 rotation_error_deg=one.rotation_error_deg,
                 state_fitted_residual_m=one.state_fitted_residual_m,
                 reduced_chi2=one.reduced_chi2,
-                typical_error=float(np.median(list(known))) if (known := errors[k]["typical"].values()) else None,
+                flight=_median(errors[k]["flight"]),
+                contact=_median(errors[k]["contact"]),
             )
             for k, one in enumerate(found.result.models)
         ),
@@ -65,7 +66,8 @@ def tested(folder: Path, names: Sequence[str], capture: Path, device: str, accep
             ImproveTestStep(
                 model=names[k],
                 than=names[j],
-                typical_error=error_ratio(errors[j]["typical"], errors[k]["typical"]),
+                flight=error_ratio(errors[j]["flight"], errors[k]["flight"]),
+                contact=error_ratio(errors[j]["contact"], errors[k]["contact"]),
                 translation_error_m=error_ratio(errors[j]["open_loop"], errors[k]["open_loop"]),
                 state_fitted_residual_m=error_ratio(errors[j]["fitted"], errors[k]["fitted"]),
             )
@@ -73,6 +75,14 @@ def tested(folder: Path, names: Sequence[str], capture: Path, device: str, accep
         ),
         measurement_std=found.result.measurement_std,
     )
+
+
+def _kinds(errors: HeldOutErrors) -> dict[str, dict[str, float]]:
+    return {"flight": errors.flight, "contact": errors.contact}
+
+
+def _median(errors: Mapping[str, float]) -> float | None:
+    return float(np.median(list(errors.values()))) if errors else None
 
 
 def _errors(model: ComparedModel) -> dict[str, dict[str, float]]:

@@ -28,7 +28,8 @@ def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
     if test is not None and test.steps:
         overall = test.steps[-1]
         for ratio, name, scale, unit in (
-            (overall.typical_error, "prediction error of half segments", 1.0, "times the noise"),
+            (overall.flight, "prediction error in flight", 1.0, "times the noise"),
+            (overall.contact, "in contact", 1.0, "times the noise"),
             (overall.translation_error_m, "open-loop error of whole episodes", 1e3, "mm"),
         ):
             if ratio is not None:
@@ -65,10 +66,12 @@ def trial_words(trial: ImproveTrial) -> str:
         return "the fit failed"
     if trial.helps:
         return "helps"
-    ratio = trial.typical_error
-    if ratio is None or ratio.interval_95 is None:
+    spans = [one.interval_95 for one in (trial.flight, trial.contact) if one is not None and one.interval_95]
+    if not spans:
         return "too few episodes to tell"
-    return "may be chance" if ratio.interval_95[1] >= 1 else f"less than {LEAST_FALL:.0%}"
+    if any(low > 1 for low, _ in spans):
+        return "makes predictions worse"
+    return "may be chance" if all(high >= 1 for _, high in spans) else f"less than {LEAST_FALL:.0%}"
 
 
 def warnings_of(ladder: Ladder, test: ImproveTest | None, folds: Sequence[Sequence[str]]) -> tuple[str, ...]:

@@ -17,12 +17,14 @@ from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
 from cgwm.pipeline.improve import improve
 from cgwm.pipeline.improve.folds import folds_of
 from cgwm.pipeline.improve.held_out_errors import error_ratio, typical_error
+from cgwm.pipeline.improve.ladder import helps
 from cgwm.pipeline.improve.ladder_files import LadderFiles
 from cgwm.pipeline.improve.page import ladder_html
 from cgwm.pipeline.improve.proposals import proposals_of
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     DiagnoseResult,
+    ErrorRatio,
     ImproveConfig,
     ImproveResult,
     ImproveStep,
@@ -72,6 +74,17 @@ def test_a_ratio_is_that_of_each_episode_and_its_interval_needs_several() -> Non
     same = error_ratio(before, {name: value * float(np.exp(rng.normal(0, 0.3))) for name, value in before.items()})
     assert same is not None and same.interval_95 is not None and same.interval_95[0] < 1 < same.interval_95[1]
     assert error_ratio(before, {"other": 1.0}) is None
+
+
+def test_an_addition_helps_if_one_error_falls_beyond_chance_and_none_rises() -> None:
+    def ratio(value: float, low: float, high: float) -> ErrorRatio:
+        return ErrorRatio(episodes=8, better=4, before=1.0, after=value, ratio=value, interval_95=(low, high))
+
+    falls, chance, rises = ratio(0.5, 0.4, 0.7), ratio(0.9, 0.7, 1.1), ratio(1.3, 1.1, 1.6)
+    assert helps(falls, chance) and helps(None, falls)
+    assert not helps(falls, rises) and not helps(chance, None) and not helps(None, None)
+    assert not helps(ratio(0.99, 0.985, 0.995), None)
+    assert not helps(falls.model_copy(update={"interval_95": None}), None)
 
 
 def test_a_few_impacts_do_not_outweigh_a_long_flight() -> None:
@@ -134,7 +147,7 @@ def ladder(tmp_path: Path) -> Path:
     out = tmp_path / "ladder"
     out.mkdir()
     write_small_model(out / "m0")
-    trial = ImproveTrial(effects=("<b>",), why="selected", helps=False, typical_error=None, failure="<i>no</i>")
+    trial = ImproveTrial(effects=("<b>",), why="selected", helps=False, failure="<i>no</i>")
     step = ImproveStep(**found(ranking=(RANKED,)).model_dump(), model="m0", tried=(trial,))
     result = ImproveResult(
         capture="<script>",
