@@ -59,6 +59,7 @@ NUMERICS = {
     "pictures.FRAMES": "points of a drawn line",
     "pictures.SHOWN_S": "length of a drawn motion",
     "pictures.SLIDE": "the motion that is drawn for an effect in contact",
+    "rebound_by_slip.WEAK": "width of a prior of a nuisance",
     "robust_fit.FALL": "end of a descent",
     "robust_fit.ITERATIONS": "end of a descent",
     "robust_fit.STEPS": "lengths of a step that are tried",

@@ -26,6 +26,7 @@ from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ..evidence import Evidence
 from ..thresholds import THRESHOLDS, ImpactThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
+from .rebound_by_slip import gains_beside_slip
 
 Array = NDArray[np.float64]
 
@@ -153,5 +154,11 @@ class _Fits:
         """Return the evidence with its gains in held-out episodes."""
         variant = variant_of(one, (v for v, _ in self.found), self.candidates)
         fit = next(fit for own, fit in self.found if own is variant)
-        gains = self.base.gains(self.base.beside(variant)[0], fit.values) / float(self.spread.max())
-        return replace(one, gains=tuple(gains.tolist()))
+        problem = self.base.beside(variant)[0]
+        gains = self.base.gains(problem, fit.values) / float(self.spread.max())
+        alone = replace(one, gains=tuple(gains.tolist()))
+        if int(np.argmax((self.base.fit.chi2 - fit.chi2) / self.spread)) > 0:
+            return alone
+        # an effect on the rebound has to predict what slip does not
+        beside = gains_beside_slip(self.base, problem, fit) / float(self.spread[0])
+        return min(alone, replace(one, gains=tuple(beside.tolist())), key=lambda found: found.gain_t)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, selected, with_effect
-from cgwm.pipeline.diagnose.contact_tests.impact import ImpactTest
+from cgwm.pipeline.diagnose.contact_tests.impact import ImpactTest, gains_beside_slip
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
@@ -17,10 +17,10 @@ from cgwm.pipeline.physics.contact_law import restitution
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION
-from cgwm.pipeline.segments.candidates import Candidate
-from cgwm.pipeline.segments.impact_fit import BASE, ImpactProblem, fit_impacts
+from cgwm.pipeline.segments.candidates import Candidate, variants_of
+from cgwm.pipeline.segments.impact_fit import BASE, ImpactBase, ImpactProblem, fit_impacts
 from cgwm.pipeline.segments.impact_law import Impact, after_impact, point_velocity, rebound_speed, within_cone
-from cgwm.pipeline.segments.impact_velocities import measured_impacts
+from cgwm.pipeline.segments.impact_velocities import Impacts, measured_impacts
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from helpers.diagnosis_data import NOISE, Effects, tosses, world_with
 from helpers.worlds import F64, ball_body, law
@@ -219,3 +219,44 @@ def test_a_box_tells_nothing_by_impacts() -> None:
     prepared = prepare(world, tosses(world, 1, count=3))
     assert measured_impacts(prepared, world) is None
     assert ImpactTest().evidence(data_of(prepared, world), LIBRARY) == []
+
+
+def impacts_with_rebound(by_slip: float, by_speed: float) -> Impacts:
+    """Impacts of ten throws, of which the fast ones slip, with log e = log 0.7 - by_slip q - by_speed v."""
+    rng = np.random.default_rng(0)
+    fall = rng.uniform(0.5, 3.0, 30)
+    slip = rng.uniform(0.0, 1.0, 30) * fall * (fall > 1.2)
+    bounce = np.exp(math.log(0.7) - by_slip * slip / (slip + fall) - by_speed * fall + rng.normal(0, 0.01, 30))
+    twists = np.zeros((2, 30, 6))
+    twists[:, :, 0], twists[0, :, 2], twists[1, :, 2] = slip, -fall, bounce * fall
+    twists[1, :, 0] -= 2 / 7 * slip
+    twists[1, :, 4] = 5 / 7 * slip / RADIUS
+    before, after = torch.as_tensor(twists)
+    known = 1e-6 * torch.eye(6, dtype=F64).expand(30, 6, 6)
+    return Impacts(
+        episode=np.repeat(np.arange(10), 3),
+        place=torch.zeros(30, 3, dtype=F64),
+        rotation=torch.eye(3, dtype=F64).expand(30, 3, 3),
+        before=before,
+        after=after,
+        covariance_before=known,
+        covariance_after=known,
+    )
+
+
+@pytest.mark.parametrize(("by_slip", "by_speed"), [(0.4, 0.0), (0.0, 0.1), (0.4, 0.1)])
+def test_a_rebound_that_falls_with_the_slip_is_no_rebound_that_falls_with_the_speed(
+    by_slip: float, by_speed: float
+) -> None:
+    world = world_with("ball")
+    base = ImpactBase.of(world, impacts_with_rebound(by_slip, by_speed))
+    (variant,) = variants_of([LIBRARY[1]], world.gravity[0, :1])
+    problem, start = base.beside(variant)
+    fit = fit_impacts(problem, start, centre=base.centre_of(start))
+    gains = gains_beside_slip(base, problem, fit)
+    error = gains.std(ddof=1) / math.sqrt(len(gains))
+    assert (gains.mean() > 2 * error) == (by_speed > 0)
+    if not by_speed:  # as a law of speed alone it would have been believed
+        alone = base.gains(problem, fit.values)
+        assert alone.sum() > 5
+        assert gains.sum() < 1
