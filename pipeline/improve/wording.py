@@ -29,7 +29,6 @@ def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
         overall = test.steps[-1]
         for ratio, name, scale, unit in (
             (overall.flight, "prediction error in flight", 1.0, "times the noise"),
-            (overall.contact, "in contact", 1.0, "times the noise"),
             (overall.translation_error_m, "open-loop error of whole episodes", 1e3, "mm"),
         ):
             if ratio is not None:
