@@ -32,6 +32,7 @@ from .compare import (
     PairedDifference,
     Phase,
     PhaseFigures,
+    ShortDifference,
     WorstMoment,
 )
 from .config import CalibrateConfig, Device, PhysConfig, SplatConfig, SynthesizeConfig
@@ -232,6 +233,7 @@ __all__ = [
     "Shape",
     "ShardEntry",
     "ShardsSummary",
+    "ShortDifference",
     "Solver",
     "SphereShape",
     "SplatCheck",

@@ -65,6 +65,20 @@ class ModelComparison(OpenLoopErrors):
     """What orders the residual wrench, the most telling coordinate first; empty where nothing is above the noise."""
 
 
+class ShortDifference(FileModel):
+    """Short predictions of two models on the same pieces of motion."""
+
+    frames: int
+    """Frames that both predict."""
+    pieces: int
+    """Pieces of motion, each predicted from the start that fits it best."""
+    reduced_chi2: float
+    than_reduced_chi2: float
+    """Mean square residuals in units of the noise, of the two models."""
+    interval_95: tuple[float, float] | None = None
+    """Of their difference, by resampling the pieces; null where they are too few for it."""
+
+
 class PairedDifference(FileModel):
     """Two models on the same episodes."""
 
@@ -77,6 +91,8 @@ class PairedDifference(FileModel):
     """Median over episodes of the translation error of `model` less that of `than` [m]."""
     interval_95_m: tuple[float, float] | None = None
     """Of that median, by resampling the episodes; null where they are too few for it."""
+    short: ShortDifference | None = None
+    """The same two in short predictions; null where none can be judged."""
 
 
 class CompareResult(FileModel):

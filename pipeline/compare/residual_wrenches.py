@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...schemas import CovariateShare, Phase
 from ..physics.world import World
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import coordinates_of, covariates_of, wrench_windows
+from ..segments.residual_wrench import ResidualWrenches, coordinates_of, covariates_of, motion_axes, wrench_windows
 from ..trajectories.segmentation import Segment
 from .short_horizon_errors import ShortErrors, ShortFit
 
@@ -23,6 +23,8 @@ LEAST_WINDOWS = 8
 """Minimum number of windows of flight for a comparison of four bins."""
 SIGNIFICANT = 0.01
 """Largest p-value at which a coordinate is reported."""
+LEAST_SPIN = 1.0
+"""Smallest spin whose axis counts as known [rad/s]."""
 KNOWN_STD = 1e3
 """Standard error above which a component counts as not measured [m/s2, rad/s2]."""
 
@@ -45,6 +47,11 @@ class WrenchPoint:
     """
     std: Array
     """Standard errors of `acceleration`, same shape; NaN where nothing was measured."""
+    in_motion: Array
+    """Its components along the velocity, horizontally to the left of it, across both (lift), and along omega x velocity
+    [m/s2], and of the torque along the spin [rad/s2], shape (5,); NaN where unknown."""
+    in_motion_std: Array
+    """Their standard errors, same shape."""
     coordinates: Mapping[str, float]
     """Coordinates at its middle: time [s], x, y, height [m], heading [deg], speed [m/s], spin [rad/s]."""
 
@@ -69,21 +76,44 @@ def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list
     if flight is not None:
         std = np.sqrt(np.diagonal(flight.covariance, axis1=1, axis2=2))
         std = np.where(std < KNOWN_STD, std, np.nan)
-        points += _points(flight.segments, flight.coordinates, flight.wrench, std, fit.errors, episodes)
+        moving = _in_motion(flight)
+        points += _points(flight.segments, flight.coordinates, (flight.wrench, std), moving, fit.errors, episodes)
     if fit.contact is not None:
         nothing = np.full((len(fit.contact.items), 6), np.nan)
-        points += _points(fit.contact.items, coordinates_of(fit.contact)[0], nothing, nothing, fit.errors, episodes)
+        unknown = nothing[:, :5], nothing[:, :5]
+        places = coordinates_of(fit.contact)[0]
+        points += _points(fit.contact.items, places, (nothing, nothing), unknown, fit.errors, episodes)
     if flight is None or len(flight.segments) < LEAST_WINDOWS:
         return points, []
     ordered = [one for one in covariates_of(flight) if one.share >= LEAST_SHARE and one.p_value < SIGNIFICANT]
     return points, [CovariateShare(coordinate=one.coordinate, share=one.share) for one in ordered]
 
 
+def _in_motion(found: ResidualWrenches) -> tuple[Array, Array]:
+    """Return the components of `WrenchPoint.in_motion` (n, 5) and their standard errors."""
+    lift = np.cross(found.omega, found.velocity)
+    spin = np.where(np.linalg.norm(found.omega, axis=1, keepdims=True) > LEAST_SPIN, found.omega, np.nan)
+    axes = np.concatenate((motion_axes(found.velocity), _unit(np.where(np.isfinite(spin), lift, np.nan))[:, None]), 1)
+    rows, covariance = slice(0, 3), found.covariance
+    force = np.einsum("nij,nj->ni", axes, found.wrench[:, rows])
+    force_var = np.einsum("nij,njk,nik->ni", axes, covariance[:, rows, rows], axes)
+    turning = _unit(spin)
+    torque = np.einsum("nj,nj->n", turning, found.wrench[:, 3:])
+    torque_var = np.einsum("nj,njk,nk->n", turning, covariance[:, 3:, 3:], turning)
+    values, std = np.c_[force, torque], np.sqrt(np.c_[force_var, torque_var])
+    known = std < KNOWN_STD
+    return np.where(known, values, np.nan), np.where(known, std, np.nan)
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
 def _points(
     segments: Sequence[Segment],
     coordinates: Mapping[str, Array],
-    wrench: Array,
-    std: Array,
+    wrench: tuple[Array, Array],
+    in_motion: tuple[Array, Array],
     errors: Mapping[str, ShortErrors],
     episodes: Sequence[str],
 ) -> list[WrenchPoint]:
@@ -105,8 +135,10 @@ def _points(
                 span_s=(float(times[segment.first]), float(times[segment.last])),
                 phase=one.phase_name(int(one.cause[middle])),
                 misfit=float(np.sqrt(np.nansum(np.square(one.sigmas[rows])) / left)),
-                acceleration=wrench[k],
-                std=std[k],
+                acceleration=wrench[0][k],
+                std=wrench[1][k],
+                in_motion=in_motion[0][k],
+                in_motion_std=in_motion[1][k],
                 coordinates=place,
             )
         )

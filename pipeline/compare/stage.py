@@ -30,7 +30,7 @@ from ..segments.release_detection import after_release
 from .frames import footage_of
 from .model_comparison import ComparedModel
 from .page import comparison_html, mark_of
-from .paired_difference import paired_difference
+from .paired_difference import paired_difference, short_difference
 from .residual_wrenches import wrench_points
 from .short_horizon_errors import short_errors
 from .verdict import comparison_verdict
@@ -224,10 +224,12 @@ def _check(name: str, model: Model, capture: Capture) -> None:
 def _pairs(models: Sequence[ComparedModel]) -> list[PairedDifference]:
     """Return the differences of each model from the one before it and from the first."""
     wanted = [(k, k - 1) for k in range(1, len(models))] + [(k, 0) for k in range(2, len(models))]
-    found = [
-        paired_difference(models[a].name, models[b].name, models[a].errors_m, models[b].errors_m) for a, b in wanted
-    ]
-    return [pair for pair in found if pair is not None]
+    found = []
+    for a, b in wanted:
+        pair = paired_difference(models[a].name, models[b].name, models[a].errors_m, models[b].errors_m)
+        if pair is not None:
+            found.append(pair.model_copy(update={"short": short_difference(models[a].short, models[b].short)}))
+    return found
 
 
 def _fitted_to_them(models: Sequence[ComparedModel], capture: Capture, episodes: Sequence[str]) -> list[str]:

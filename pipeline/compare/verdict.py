@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...schemas import CompareResult, ModelComparison, PairedDifference
+from ...schemas import CompareResult, ModelComparison, PairedDifference, Phase, ShortDifference
 from .paired_difference import LEAST_EPISODES
 
 EXPLAINED = 1.2
@@ -29,10 +29,12 @@ def comparison_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
         other = result.models[0] if subject is not result.models[0] else last
         pair = _pair(result, subject.model, other.model)
         sentences = [_versus(pair, subject, other, result, names)] if pair else [_alone(subject, result, names)]
+        short = _in_short(pair, subject, other, names) if pair else ""
+        sentences = [short, *sentences] if short else sentences
     if result.episodes < LEAST_EPISODES:
         sentences.append(
             f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} too few to decide whether a "
-            "difference is more than chance."
+            "difference of open-loop errors is more than chance."
             if len(result.models) > 1
             else f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} few to judge a model by."
         )
@@ -54,8 +56,52 @@ def _pair(result: CompareResult, model: str, than: str) -> PairedDifference | No
                 better=pair.episodes - pair.better,
                 median_difference_m=-pair.median_difference_m,
                 interval_95_m=None if span is None else (-span[1], -span[0]),
+                short=None if pair.short is None else _reversed(pair.short),
             )
     return None
+
+
+def _reversed(short: ShortDifference) -> ShortDifference:
+    """Return the same difference with the models exchanged."""
+    span = short.interval_95
+    return short.model_copy(
+        update={
+            "reduced_chi2": short.than_reduced_chi2,
+            "than_reduced_chi2": short.reduced_chi2,
+            "interval_95": None if span is None else (-span[1], -span[0]),
+        }
+    )
+
+
+def _in_short(pair: PairedDifference, model: ModelComparison, other: ModelComparison, names: Mapping[str, str]) -> str:
+    """Return how two models differ in short predictions, and in which phase most; empty where nothing is known."""
+    short = pair.short
+    if short is None:
+        return ""
+    change = short.reduced_chi2 - short.than_reduced_chi2
+    good, bad = (model, other) if change < 0 else (other, model)
+    a, b = names[good.model], names[bad.model]
+    least, most = sorted((short.reduced_chi2, short.than_reduced_chi2))
+    figures = (
+        f"over {short.frames} frames, the mean square error of {a} is {least:.3g} times that of the noise, that of {b} "
+        f"{most:.3g}"
+    )
+    if short.interval_95 is None:
+        return f"In short predictions, {figures}."
+    low, high = sorted(abs(value) for value in short.interval_95)
+    if short.interval_95[0] <= 0 <= short.interval_95[1]:
+        return f"In short predictions the two cannot be told apart: {figures}."
+    figures += f" (95 % interval of the difference: {low:.2g} to {high:.2g})"
+    gains = {
+        phase: (mine.reduced_chi2 - theirs.reduced_chi2) * mine.frames
+        for phase, mine in good.by_phase.items()
+        if mine is not None
+        and (theirs := bad.by_phase.get(phase)) is not None
+        and mine.reduced_chi2 is not None
+        and theirs.reduced_chi2 is not None
+    }
+    where = f", most of all {_during(min(gains, key=lambda one: gains[one]))}" if gains else ""
+    return f"{a} is better than {b} in short predictions{where}: {figures}."
 
 
 def _alone(model: ModelComparison, result: CompareResult, names: Mapping[str, str]) -> str:
@@ -97,7 +143,7 @@ def _versus(
 
 
 def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
-    """Return the phase in which short predictions have the largest error, in units of the noise, as a sentence."""
+    """Return the phase in which short predictions miss most beyond the noise, and by how much, as a sentence."""
     if model.reduced_chi2 is None:
         return "Short predictions are not judged: too few consecutive frames allow one."
     known = [
@@ -105,7 +151,7 @@ def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
         for phase, figures in model.by_phase.items()
         if figures is not None and figures.reduced_chi2 is not None and figures.frames >= LEAST_FRAMES
     ]
-    missed = sorted((item for item in known if item[1] > EXPLAINED), key=lambda item: -item[1])
+    missed = sorted((item for item in known if item[1] > EXPLAINED), key=lambda item: -_excess(model, item[0]))
     name = names[model.model]
     if not missed:
         return f"Short predictions of {name} are within the noise in all phases."
@@ -114,6 +160,12 @@ def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
     words = f"Short predictions of {name} still have errors of {times:.1f} times the noise {_during(phase)}"
     words += f" ({_mm(size)})" if size is not None else ""
     return words + (f"; they are within the noise {' and '.join(map(_during, within))}." if within else ".")
+
+
+def _excess(model: ModelComparison, phase: Phase) -> float:
+    """Return the sum of squares of a phase beyond the noise: a misfit of many frames counts more than one of few."""
+    figures = model.by_phase[phase]
+    return 0.0 if figures is None else figures.frames * ((figures.reduced_chi2 or 1.0) - 1.0)
 
 
 def _during(phase: str) -> str:

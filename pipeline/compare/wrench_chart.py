@@ -15,7 +15,7 @@ from .residual_wrenches import LEAST_WINDOWS, WrenchPoint
 UNITS = {"time": "s", "x": "m", "y": "m", "height": "m", "heading": "deg", "speed": "m/s", "spin": "rad/s"}
 """Units of the coordinates, in the order in which they are offered."""
 _MISFIT = 6
-"""Index of the misfit after the components of force and torque."""
+"""Index of the misfit after the components of force and torque in the world frame; those of the motion follow it."""
 MOST_POINTS = 1500
 """Maximum number of points per model; more are subsampled."""
 
@@ -44,7 +44,8 @@ def wrench_section(models: Sequence[ComparedModel]) -> str:
     words = (
         "Each dot is a segment of the motion; click it to see that moment. Misfit: the residual of its short "
         "prediction in units of the noise. In flight, the chart also shows the constant force over mass, and torque "
-        "over inertia, that is missing from the model (± one standard error; world frame); in contact the ground "
+        "over inertia, that is missing from the model (± one standard error): along the axes of the world, along the "
+        "velocity, where a drag shows, and across it, where a lift shows; in contact the ground "
         "balances every force, so none can be estimated. The black line joins weighted means of four bins with equal "
         "numbers of segments; values beyond the scale are drawn at its edge."
     )
@@ -94,6 +95,7 @@ def _thinned(points: Sequence[WrenchPoint]) -> Sequence[WrenchPoint]:
 
 def _point(point: WrenchPoint, names: Sequence[str]) -> dict[str, Any]:
     known = np.isfinite(point.acceleration) & np.isfinite(point.std)
+    moving = list(zip(point.in_motion, point.in_motion_std, strict=True))
     return {
         "e": point.episode,
         "t": round(0.5 * (point.span_s[0] + point.span_s[1]), 4),
@@ -101,7 +103,12 @@ def _point(point: WrenchPoint, names: Sequence[str]) -> dict[str, Any]:
         "a": [
             *(round(float(v), 4) if k else None for v, k in zip(point.acceleration, known, strict=True)),
             round(point.misfit, 3),
+            *(round(float(v), 4) if np.isfinite(v) else None for v, _ in moving),
         ],
-        "s": [*(round(float(v), 4) if k else None for v, k in zip(point.std, known, strict=True)), 0],
+        "s": [
+            *(round(float(v), 4) if k else None for v, k in zip(point.std, known, strict=True)),
+            0,
+            *(round(float(s), 4) if np.isfinite(s) else None for _, s in moving),
+        ],
         "c": [round(float(v), 4) if (v := point.coordinates.get(name)) is not None else None for name in names],
     }

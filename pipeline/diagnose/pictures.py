@@ -15,7 +15,7 @@ from ...schemas import DiagnoseResult, NotConvergedError
 from ..physics.rollout import simulate
 from ..physics.world import State, World
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import ResidualWrenches, covariates_of, wrench_windows
+from ..segments.residual_wrench import ResidualWrenches, covariates_of, motion_axes, wrench_windows
 from .experiments import Experiment
 from .fisher_information import experiment_states
 from .verdict import Findings
@@ -157,15 +157,6 @@ def _frames(found: ResidualWrenches, coordinate: str) -> tuple[Array, tuple[str,
     if coordinate in ALONG_AXES:
         return np.tile(np.eye(3), (count, 1, 1)), ("along x", "along y", "along z")
     return motion_axes(found.velocity), ("along the velocity", "sideways", "across, upwards")
-
-
-def motion_axes(velocity: Array) -> Array:
-    """Return for each velocity (n, 3) the axes along it, horizontally across it to the left, and across both."""
-    along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-12)
-    side = np.cross([0.0, 0.0, 1.0], along)
-    size = np.linalg.norm(side, axis=1, keepdims=True)
-    side = np.where(size > 1e-6, side / np.maximum(size, 1e-12), [0.0, 1.0, 0.0])
-    return np.stack([along, side, np.cross(along, side)], 1)
 
 
 def _curves(found: ResidualWrenches, first: int, axes: Array, names: Sequence[str]) -> tuple[ForceCurve, ...]:

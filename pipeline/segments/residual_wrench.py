@@ -230,6 +230,15 @@ def covariates_of(found: ResidualWrenches) -> list[Covariate]:
     return sorted(results, key=lambda one: -one.share)
 
 
+def motion_axes(velocity: Array) -> Array:
+    """Return for each velocity (n, 3) the axes along it, horizontally across it to the left, and across both."""
+    along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-12)
+    side = np.cross([0.0, 0.0, 1.0], along)
+    size = np.linalg.norm(side, axis=1, keepdims=True)
+    side = np.where(size > 1e-6, side / np.maximum(size, 1e-12), [0.0, 1.0, 0.0])
+    return np.stack([along, side, np.cross(along, side)], 1)
+
+
 def _share(gain: float, excess: float) -> float:
     """Return a gain as a share of the excess, 0 to 1."""
     return float(np.clip(gain / excess, 0.0, 1.0))

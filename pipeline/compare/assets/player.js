@@ -350,7 +350,8 @@ if (!chart || !data.wrench) return;
 const part = name => chart.querySelector("[data-part=" + name + "]"), plot = part("plot");
 const options = (select, names) => names.forEach((name, k) => select.append(new Option(name, k)));
 const kinds = ["missing force x", "missing force y", "missing force z", "missing torque x", "missing torque y",
-  "missing torque z", "misfit"];
+  "missing torque z", "misfit", "missing force along the velocity", "missing force sideways",
+  "missing force across, upwards", "missing force along spin × velocity", "missing torque along the spin"];
 const coordinates = data.wrench.coordinates;
 options(part("model"), data.models); options(part("kind"), kinds);
 options(part("coordinate"), coordinates.map(c => c.name + (c.unit ? " [" + c.unit + "]" : "")));
@@ -362,7 +363,8 @@ part("marks").innerHTML = data.phases.filter(name => present.has(name))
 function scatter() {
   const [m, kind, c, ph] = ["model", "kind", "coordinate", "phase"].map(name => Number(part(name).value));
   const points = data.wrench.models[m].filter(p => p.a[kind] !== null && p.c[c] !== null && (!ph || p.ph === ph - 1));
-  const unit = kind < 3 ? "m/s²" : kind < 6 ? "rad/s²" : "× noise", signed = kind < 6, name = coordinates[c];
+  const unit = kind === 6 ? "× noise" : kind < 3 || kind > 6 && kind < 11 ? "m/s²" : "rad/s²";
+  const signed = kind !== 6, name = coordinates[c];
   chart.dataset.points = points.length;
   if (!points.length) { plot.innerHTML = '<text x="20" y="40">nothing in this phase</text>'; return; }
   const w = 1060, h = 340, l = 62, r = 12, top = 26, b = 40;

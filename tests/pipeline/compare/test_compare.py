@@ -1,6 +1,7 @@
 """Models side by side: a slippery cube against the true one, on throws that the true one made."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,9 +120,12 @@ def test_pairs_and_verdict(result: CompareResult) -> None:
     assert (pair.better, pair.episodes) == (EPISODES, EPISODES)
     assert pair.interval_95_m is not None and pair.interval_95_m[1] < 0
     assert pair.interval_95_m[0] <= pair.median_difference_m <= pair.interval_95_m[1]
-    assert result.verdict.startswith(
-        f"true predicts {EPISODES} of {EPISODES} test episodes better than slippery (median "
-    )
+    short = pair.short
+    assert short is not None and short.frames > 100 and short.reduced_chi2 < 1.5 < short.than_reduced_chi2
+    assert short.interval_95 is not None and short.interval_95[0] < short.interval_95[1] < 0
+    start = "true is better than slippery in short predictions, most of all in "
+    assert re.match(f"{start}(impacts|sliding): over ", result.verdict)  # friction acts in both, and in no flight
+    assert f" true predicts {EPISODES} of {EPISODES} test episodes better than slippery (median " in result.verdict
     assert "chance" not in result.verdict
     assert result.verdict.endswith("Short predictions of true are within the noise in all phases.")
 
@@ -129,12 +133,16 @@ def test_pairs_and_verdict(result: CompareResult) -> None:
 def test_the_verdict_says_when_it_may_be_chance(result: CompareResult) -> None:
     names = {result.models[0].model: "slippery", result.models[1].model: "true"}
     pair = result.pairs[0].model_copy(update={"better": 4, "interval_95_m": (-0.01, 0.002)})
+    assert pair.short is not None
+    unclear = pair.short.model_copy(update={"interval_95": (-0.5, 0.1)})
+    pair = pair.model_copy(update={"short": unclear})
     words = comparison_verdict(result.model_copy(update={"pairs": (pair,)}), names)
+    assert words.startswith("In short predictions the two cannot be told apart: over ")
     assert "true predicts 4 of 6 test episodes better" in words
     assert "may be chance: the 95 % interval of the difference contains zero" in words
     pair = pair.model_copy(update={"episodes": 3, "better": 3, "interval_95_m": None})
     words = comparison_verdict(result.model_copy(update={"pairs": (pair,), "episodes": 3}), names)
-    assert "3 episodes are too few to decide whether a difference is more than chance." in words
+    assert "3 episodes are too few to decide whether a difference of open-loop errors is more than chance." in words
     worse = result.model_copy(update={"models": result.models[:1], "best": result.models[0].model, "pairs": ()})
     words = comparison_verdict(worse, names)
     assert "slippery predicts 6 test episodes with a median error of" in words

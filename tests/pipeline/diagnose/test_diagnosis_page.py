@@ -13,9 +13,9 @@ from cgwm.pipeline.diagnose.pictures import (
     MissingForce,
     Pictures,
     binned_means,
-    motion_axes,
 )
 from cgwm.pipeline.report.page_file import shows_the_same
+from cgwm.pipeline.segments.residual_wrench import motion_axes
 from cgwm.schemas import ContactLimit, DiagnoseResult, EffectParameterEstimate, LawTerm, RankedEffect, ResidualLaw
 from helpers.pages import Tags
 
