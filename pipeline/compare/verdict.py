@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...schemas import CompareResult, ModelComparison, PairedDifference, Phase, ShortDifference
+from ...schemas import CompareResult, ModelComparison, PairedDifference, PhaseFigures, ShortDifference
 from .paired_difference import LEAST_EPISODES
 
 EXPLAINED = 1.2
@@ -147,24 +147,23 @@ def _short(model: ModelComparison, names: Mapping[str, str]) -> str:
     if model.reduced_chi2 is None:
         return "Short predictions are not judged: too few consecutive frames allow one."
     known = [
-        (phase, figures.reduced_chi2**0.5, figures.position_rms_m)
+        (phase, figures.reduced_chi2**0.5, figures.position_rms_m, figures)
         for phase, figures in model.by_phase.items()
         if figures is not None and figures.reduced_chi2 is not None and figures.frames >= LEAST_FRAMES
     ]
-    missed = sorted((item for item in known if item[1] > EXPLAINED), key=lambda item: -_excess(model, item[0]))
+    missed = sorted((item for item in known if item[1] > EXPLAINED), key=lambda item: -_excess(item[3]))
     name = names[model.model]
     if not missed:
         return f"Short predictions of {name} are within the noise in all phases."
-    phase, times, size = missed[0]
-    within = [other for other, multiple, _ in known if multiple <= EXPLAINED]
+    phase, times, size, _ = missed[0]
+    within = [other for other, multiple, *_ in known if multiple <= EXPLAINED]
     words = f"Short predictions of {name} still have errors of {times:.1f} times the noise {_during(phase)}"
     words += f" ({_mm(size)})" if size is not None else ""
     return words + (f"; they are within the noise {' and '.join(map(_during, within))}." if within else ".")
 
 
-def _excess(model: ModelComparison, phase: Phase) -> float:
+def _excess(figures: PhaseFigures | None) -> float:
     """Return the sum of squares of a phase beyond the noise: a misfit of many frames counts more than one of few."""
-    figures = model.by_phase[phase]
     return 0.0 if figures is None else figures.frames * ((figures.reduced_chi2 or 1.0) - 1.0)
 
 
