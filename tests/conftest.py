@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 
@@ -22,6 +23,15 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+def pytest_collection_finish() -> None:
+    """Build the kernels of fits and rollouts with fewer optimisations; tests of the kernels themselves undo it."""
+    if "cgwm.pipeline.physics.fused.host" in sys.modules:
+        from cgwm.pipeline.physics.fused import host
+        from helpers.fused_host import QUICK_FLAGS
+
+        host.FLAGS = QUICK_FLAGS
 
 
 LONGEST = (

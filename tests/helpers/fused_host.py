@@ -9,9 +9,13 @@ import ctypes
 import platform
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
+import pytest
+from cgwm.pipeline.physics.fused import host
 from cgwm.pipeline.physics.fused.structure import Structure
 from cgwm.pipeline.runtime import kernel_build
 from torch import Tensor
@@ -105,6 +109,21 @@ extern "C" void run(PARAMETERS) {
     }
 }
 """
+
+
+PRODUCT_FLAGS = host.FLAGS
+QUICK_FLAGS = tuple("-O1" if flag == "-O3" else flag for flag in PRODUCT_FLAGS)
+"""Those of the product's kernels in tests: the same arithmetic, built in two thirds of the time."""
+
+
+@contextmanager
+def built_as_for_users() -> Iterator[None]:
+    """Build the product's kernels with the flags that users have."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "FLAGS", PRODUCT_FLAGS)
+        host._library.cache_clear()
+        yield
+        host._library.cache_clear()
 
 
 WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-Wno-clobbered", "-Wno-unused-function")

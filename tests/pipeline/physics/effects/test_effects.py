@@ -25,6 +25,7 @@ from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.runtime.kernel_build import compiler
 from cgwm.schemas import UsageError
+from helpers.fused_host import built_as_for_users
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 
 UP = (1.0, 0.0, 0.0, 0.0)
@@ -232,10 +233,9 @@ def in_both_engines(group: int) -> tuple[Scenes, Rollout, Rollout, Rollout]:
     shares = 0.7 / torch.arange(1, 1 + max(there.sizes()), dtype=F64)
     world = there.acting(shares.repeat(len(there.state.position_m), 1))
     assert lacking(world) is None, "the kernel must have every built-in effect"
-    expected, found, without = (
-        run(at, there.state, times(0.05), there.tracks)
-        for run, at in ((simulate, world), (simulate_on_host, world), (simulate, there.bare()))
-    )
+    with built_as_for_users():
+        found = simulate_on_host(world, there.state, times(0.05), there.tracks)
+    expected, without = (simulate(at, there.state, times(0.05), there.tracks) for at in (world, there.bare()))
     return there, expected, found, without
 
 

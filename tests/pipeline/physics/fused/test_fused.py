@@ -577,7 +577,7 @@ def test_the_torch_engine_is_taken_on_a_cpu_without_a_compiler(
 def test_the_kernel_is_taken_on_a_cpu_with_a_compiler(caplog: pytest.LogCaptureFixture) -> None:
     world, state = world_of(box_body()), tossed(3)
     engine._note.cache_clear()
-    with caplog.at_level("INFO", "cgwm"):
+    with caplog.at_level("INFO", "cgwm"), fused_host.built_as_for_users():
         found = engine.rollout(world, state, times(0.2), None, True)
         same_bits(found, simulate_on_host(world, state, times(0.2), None, True))
         agree(simulate(world, state, times(0.2), None, True), found, 1e-9)
