@@ -220,7 +220,10 @@ def _fitted_before(
     if effect_parameters(world):
         # flight needs no contact and no short steps
         at = world_for("flight", world, data.noise.position_m) if data.airborne else world
-        effects = fit_effects(at, data.episodes, [] if data.airborne else start, data.noise, groups)
+        # a scale alone is known far better than it matters from the episodes of the search
+        only_scale = [active.effect.name for active in world.effects] == [SCALE]
+        episodes = data.searched if only_scale else data.episodes
+        effects = fit_effects(at, episodes, [] if data.airborne else start, data.noise, groups)
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
         if effects.ground is not None:  # bodies at rest identify it better than the ends of rollouts
