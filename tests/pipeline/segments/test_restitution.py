@@ -1,0 +1,90 @@
+"""Restitution from the heights on both sides of bounces: exact on exact flights, right under drag and slow errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture.tracks import Episode, Track
+from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of, restitution_of
+from cgwm.pipeline.physics.contact_law import restitution
+from cgwm.pipeline.trajectories.segmentation import whole_episodes
+from helpers.worlds import ball_body, world_of
+
+RADIUS_M, GRAVITY_M_S2, STEP_S = 0.02, 9.81, 1e-3
+
+
+def path(velocity: np.ndarray, duration_s: float, drag_per_m: float, direction: float) -> np.ndarray:
+    """Return positions (n, 3) every `STEP_S` of a ball under gravity and quadratic drag, forwards or backwards."""
+    position, places = np.zeros(3), [np.zeros(3)]
+    for _ in range(int(duration_s / STEP_S) + 1):
+        pull = np.array([0.0, 0.0, -GRAVITY_M_S2]) - drag_per_m * np.linalg.norm(velocity) * velocity
+        middle = velocity + 0.5 * direction * STEP_S * pull
+        position = position + direction * STEP_S * middle
+        velocity = velocity + direction * STEP_S * pull
+        places.append(position)
+    return np.array(places)
+
+
+def bounce(
+    rng: np.random.Generator, rate_hz: float, rebound: float, drag_per_m: float, slow_m: float, ground_m: float = 0.0
+) -> Track:
+    """Return the centroid of a ball for some frames before and after one impact that also slows it sideways."""
+    before = np.array([rng.uniform(0, 3), 0.0, -rng.uniform(1.5, 4.0)])
+    after = before * np.array([0.7, 1.0, -rebound])
+    count, first = (rng.integers(8, 16, 2) * max(1.0, rate_hz / 143)).astype(int), rng.uniform(0, 1 / rate_hz)
+    time = first + np.arange(-count[0], count[1]) / rate_hz
+    sides = (path(before, 0.3, drag_per_m, -1.0), path(after, 0.3, drag_per_m, 1.0))
+    inside = np.arange(len(sides[0])) * STEP_S
+    rows = [[np.interp(abs(t), inside, sides[int(t >= 0)][:, k]) for k in range(3)] for t in time]
+    memory, error = np.exp(-1 / rate_hz / 0.015), rng.normal(0, 1, (len(time), 3))
+    for k in range(1, len(time)):
+        error[k] = memory * error[k - 1] + np.sqrt(1 - memory**2) * error[k]
+    position = np.array(rows) + slow_m * error + np.array([0.0, 0.0, RADIUS_M + ground_m])
+    return Track(time_s=time - time[0], position_m=position, quat_wxyz=None)
+
+
+def fitted(tracks: list[Track]) -> RestitutionFit:
+    """Return the restitution of tracks of one ball over the ground at 0."""
+    world = world_of(ball_body(RADIUS_M))
+    whole = whole_episodes(world, [Episode(str(k), {"ball": track}) for k, track in enumerate(tracks)])
+    found = restitution_of(world, whole)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("rebound", "ground_m"), [(0.5, 0.0), (0.95, 0.003)])
+def test_exact_flights_give_the_exact_restitution(rebound: float, ground_m: float) -> None:
+    rng = np.random.default_rng(0)
+    found = fitted([bounce(rng, 143.0, rebound, 0.0, 0.0, ground_m) for _ in range(4)])
+    assert found.estimate == pytest.approx(rebound, abs=0.003)
+
+
+@pytest.mark.parametrize("rate_hz", [60.0, 143.0, 400.0])
+def test_drag_and_slow_errors_do_not_bias_a_light_ball(rate_hz: float) -> None:
+    rng = np.random.default_rng(1)
+    found = fitted([bounce(rng, rate_hz, 0.95, 0.13, 5e-4) for _ in range(8)])
+    assert found.estimate == pytest.approx(0.95, abs=0.02)
+    assert abs(found.estimate - 0.95) < 3 * found.std_error < 0.06
+    assert found.drag_per_m == pytest.approx(0.13, abs=0.06)
+
+
+def test_damping_has_the_restitution_and_its_error_to_first_order() -> None:
+    rng = np.random.default_rng(2)
+    found = fitted([bounce(rng, 143.0, 0.8, 0.0, 3e-4) for _ in range(4)])
+    damping = damping_of(found)
+    assert float(restitution(torch.tensor(damping.value).exp())) == pytest.approx(found.estimate, abs=1e-5)
+    step = np.sqrt(damping.variance)
+    moved = float(restitution(torch.tensor(damping.value + step).exp()))
+    assert found.estimate - moved == pytest.approx(found.std_error, rel=0.05)
+
+
+def test_a_ball_that_does_not_turn_at_the_ground_has_no_bounce() -> None:
+    world = world_of(ball_body(RADIUS_M))
+    time = np.arange(40) / 143
+    falling = np.column_stack([time, 0 * time, 0.5 + RADIUS_M - 0.5 * GRAVITY_M_S2 * time**2])
+    rolling = np.column_stack([time, 0 * time, RADIUS_M + 0 * time])
+    turning = np.column_stack([time, 0 * time, 0.5 + RADIUS_M + 2 * np.abs(time - time[20])])  # in a hand
+    for position in (falling, rolling, turning):
+        track = Track(time_s=time, position_m=position, quat_wxyz=None)
+        assert restitution_of(world, whole_episodes(world, [Episode("0", {"ball": track})])) is None
