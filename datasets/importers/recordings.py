@@ -96,13 +96,7 @@ class Units:
             InputDataError: If fewer than two samples are left, times do not increase, are not finite or step so far
                 that they are no seconds, positions spread so far that they are no metres, or quaternions are not unit.
         """
-        counts = {"times": len(time), "positions": len(position)}
-        counts |= {} if quat_wxyz is None else {"orientations": len(quat_wxyz)}
-        counts |= {} if omega_rad_s is None else {"spins": len(omega_rad_s)}
-        if len(set(counts.values())) > 1:
-            raise InputDataError(
-                f"{where}: {', '.join(f'{count} {name}' for name, count in counts.items())}.", "as many of each."
-            )
+        _require_as_many(where, times=time, positions=position, orientations=quat_wxyz, spins=omega_rad_s)
         seen = np.asarray(np.isfinite(position).all(1))
         if quat_wxyz is not None:
             seen &= np.isfinite(quat_wxyz).all(1)
@@ -314,6 +308,15 @@ def write_recordings(
 def upright(up: Literal["z", "y"]) -> World:
     """Return a world without a ground whose gravity points against an axis; numbers stay as they are."""
     return World(gravity_m_s2=(0.0, 0.0, -9.81) if up == "z" else (0.0, -9.81, 0.0))
+
+
+def _require_as_many(where: str, **parts: Array | None) -> None:
+    """Refuse parts of a recording, by their name, of different lengths."""
+    counts = {name: len(values) for name, values in parts.items() if values is not None}
+    if len(set(counts.values())) > 1:
+        raise InputDataError(
+            f"{where}: {', '.join(f'{count} {name}' for name, count in counts.items())}.", "as many of each."
+        )
 
 
 def _spin(where: str, omega_rad_s: Array) -> Array:
