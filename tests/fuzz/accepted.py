@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from .captures import write_toss_capture
 from .edits import FIT, Edit, Row, field, nothing, tracks
-from .subjects import SUBJECTS
+from .subjects import IMPROVE, SUBJECTS
 
 VALIDATE = ("validate", "capture")
 G = 9.81
@@ -23,6 +23,7 @@ def rows() -> Iterator[Row]:
             if command.weight >= 0.3 and subject.name not in ("custom effect", "dataset without images"):
                 name = f"{subject.name}: {' '.join(command.words[:4])}"
                 yield Row(name, subject.kind, subject.name, nothing, command.words)
+    yield Row("tracks: improve", "captures", "tracks", nothing, IMPROVE.words)
     for name, build in CAPTURES.items():
         yield Row(f"{name}: validate", "captures", "nothing", build, VALIDATE)
         if name not in NO_FIT:
