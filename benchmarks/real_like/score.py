@@ -100,8 +100,10 @@ def table(truths: dict[str, Any], answers: dict[str, Any]) -> str:
             for engine in sorted({truths[key]["engine_name"] for key in keys}):
                 own = [judged[key] for key in keys if truths[key]["engine_name"] == engine]
                 lines.append(_line(f"null, {engine}", own))
-    lines += ["", "Recall against what the effect moves, in slow errors of the tracks:", ""]
     known = {key for key, truth in truths.items() if truth["row"] in ("flight", "measurement", "contact", "pair")}
+    if not known:
+        return "\n".join(lines)
+    lines += ["", "Recall against what the effect moves, in slow errors of the tracks:", ""]
     named = [row for row in rows if any(truths[key]["row"] == row for key in known)]
     bins = [f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}" for low, high in BINS]
     lines += ["| captures | " + " | ".join(bins) + " |", "|---" * (len(BINS) + 1) + "|"]

@@ -23,15 +23,21 @@ GROUPS: dict[str, tuple[Any, int]] = {
 }
 """Module and law of contact of each group; a module has `simulate`, `facts` and, if it cannot all, `possible`."""
 ENGINE_OF = {name: name.split("_")[0] for name in GROUPS}
-_PACKAGES = {"drake": "pydrake", "dart": "dartpy", "rapier": "rapier3d", "mujoco": "mujoco"}
+_PACKAGES = {
+    "drake": ("drake", "pydrake"),
+    "dart": ("dartpy", "dartpy"),
+    "rapier": ("rapier3d", "rapier3d"),
+    "mujoco": ("mujoco", "mujoco"),
+}
+"""Of each engine: what pip calls its package, and what Python does."""
 COMES_WITH = {"mujoco_graded": ("velocity_restitution",)}
 """Effects that a group's law of contact implies, beside what its engine declares."""
 
 
 def missing(group: str) -> str | None:
     """Return the package that a group's engine needs and that is not installed, or None."""
-    package = _PACKAGES[ENGINE_OF[group]]
-    return None if find_spec(package) else package
+    package, module = _PACKAGES[ENGINE_OF[group]]
+    return None if find_spec(module) else package
 
 
 def can_hide(group: str, name: str) -> bool:
