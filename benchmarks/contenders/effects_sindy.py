@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from .effects_base import Named
 from .effects_formulas import GRAVITY, MAGNET_M, Array, first_touch
 
-THRESHOLD, KEPT, LEAST_SHARE, REGRESSIONS = 0.15, 0.8, 0.1, 20
+THRESHOLD, KEPT, LEAST_SHARE, REGRESSIONS = 0.05, 0.8, 0.05, 20
 _SMOOTHED_S, _SKIPPED_S = 0.1, 0.13
 _EQUAL = (
     ("gravity_scale", "buoyancy", "length_scale", "clock_scale"),

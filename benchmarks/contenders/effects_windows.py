@@ -65,6 +65,8 @@ class Bench:
         self.points, self.radius = (np.zeros((1, 3)), float(half[0])) if self.ball else (signs * (half - 1e-4), 1e-4)
         self.model = mujoco.MjModel.from_xml_string(_xml(self))
         self.data = mujoco.MjData(self.model)
+        # a step that diverges while it is tried is rejected; MuJoCo would write a log into the current folder
+        mujoco.set_mju_user_warning(lambda _: None)
         self.contact = np.array([0.3, 0.3])  # friction, damping ratio
         self.windows = [w for name in opened.episodes("train") for w in self._cut(opened.tracks(name)[body.name])]
         self.oriented = any(window.turn is not None for window in self.windows)
