@@ -235,8 +235,8 @@ def _interval_assumption(shooting: ShootingRecord | None) -> str:
         return f"that one episode contains {ERRORS_PER_EPISODE:g} independent errors of the contact model"
     if shooting.information_over >= 1.05:
         return (
-            "that the errors of the contact model reduce the information of these data by a factor of "
-            f"{shooting.information_over:.2g}"
+            "that the errors of the contact model widen them to "
+            f"{shooting.information_over**0.5:.2g} times what the noise alone would give"
         )
     return "that the contact model is no less accurate in other episodes than in these"
 
