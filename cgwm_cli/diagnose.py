@@ -14,7 +14,7 @@ from .verb import verb
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, RankedEffect
+    from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, RankedEffect, Remaining
 
 SHOWN = 8
 """Number of candidates that are listed; --json has all."""
@@ -95,12 +95,13 @@ def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> 
 
     words = next_command(result, model, capture, split)
     rows = [_row(entry) for entry in _shown(result)]
-    lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "estimate"])]
+    lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "evidence", "estimate"])]
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
         added = f", with {' and '.join(result.selected)} {after:.2f}" if result.selected else ""
         lines.append(f"flight, mean chi2 of the residual: {before:.2f}{added} (1: noise)")
     lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking)]
+    lines += _remaining(result.remaining)
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
         lines.append(f"law of the residual: {terms}")
@@ -128,6 +129,23 @@ def _held_out_errors(ranking: Sequence[RankedEffect]) -> list[str]:
             errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
             lines.append(f"{entry.effect}: error of short predictions in episodes held out from its fit {errors}")
     return lines
+
+
+def _remaining(found: Remaining | None) -> list[str]:
+    """Return what is left in flight, in words, where errors are slow or something repeats."""
+    from .output import millimetres
+
+    if found is None or not (found.slow_position_std_m or found.own_acceleration_std_m_s2 or found.repeats):
+        return []
+    words = [f"{millimetres(found.position_rms_m)} in whole flights"]
+    if found.slow_position_std_m and found.slow_time_s is not None:
+        time = "over the whole flight" if found.slow_time_s > 0.9 else f"within {1e3 * found.slow_time_s:.0f} ms"
+        words.append(f"slow errors of {millimetres(found.slow_position_std_m)} that change {time}")
+    if found.own_acceleration_std_m_s2:
+        words.append(f"accelerations of each flight's own of {found.own_acceleration_std_m_s2:.2g} m/s2")
+    if found.repeats:
+        words.append(f"a part that repeats from episode to episode, by {found.coordinate}")
+    return [f"left in flight: {'; '.join(words)}"]
 
 
 def _limits(limits: tuple[ContactLimit, ...]) -> list[str]:
@@ -159,4 +177,21 @@ def _row(entry: RankedEffect) -> list[str]:
     numbers = ", ".join(f"{p.name} = {p.estimate:.3g} +- {p.std_error:.2g} {p.unit}" for p in entry.parameters[:3])
     if len(entry.parameters) > 3:
         numbers += ", ..."
-    return [entry.effect, ", ".join(entry.acts_in), entry.judged_in, f"{entry.score_p:.2g}", numbers]
+    if entry.spread:
+        name, std = next(iter(entry.spread.items()))
+        numbers += f"; {name} differs by {std:.2g} from episode to episode"
+    return [
+        entry.effect,
+        ", ".join(entry.acts_in),
+        entry.judged_in,
+        f"{entry.score_p:.2g}",
+        _evidence(entry),
+        numbers,
+    ]
+
+
+def _evidence(entry: RankedEffect) -> str:
+    """Return the figure that decides: the fall of BIC in flight, the score in contact; empty without a refit."""
+    if entry.judged_in == "contact" and entry.contact_score is not None:
+        return f"score {entry.contact_score:.0f}"
+    return "" if entry.delta_bic is None else f"BIC {entry.delta_bic:+.0f}"

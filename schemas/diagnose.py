@@ -43,6 +43,37 @@ class RankedEffect(FileModel):
     """Error of predictions in episodes that the effect's numbers were not fitted to, without it and with it [m]."""
     parameters: tuple[EffectParameterEstimate, ...] = ()
     constants: dict[str, float] = {}
+    held_out_nats: float | None = None
+    """Gain of the log-likelihood of held-out episodes by the effect, linearised and summed over episodes; in flight."""
+    held_out_nats_95: tuple[float, float] | None = None
+    """Interval of 95 % of that sum, from its scatter between episodes (Student)."""
+    spread: dict[str, float] = {}
+    """Standard deviation between episodes, by parameter, of an effect with a value for each."""
+    told_apart_by: str | None = None
+    """What rules out the effects that flight does not tell from a selected one; None where nothing does."""
+
+
+class Remaining(FileModel):
+    """What is left in flight beside the selected effects."""
+
+    phase: Literal["flight"] = "flight"
+    position_rms_m: float
+    """Mean distance of measurement and model, with the start of each whole flight fitted [m, root mean square]."""
+    rotation_rms_rad: float | None = None
+    slow_position_std_m: float = 0.0
+    """Standard deviation of errors that change slowly and differ from episode to episode [m]; 0 where none show."""
+    slow_time_s: float | None = None
+    """Time in which they change [s]; a second or more: a curve in each flight."""
+    own_acceleration_std_m_s2: float = 0.0
+    """Standard deviation of accelerations across gravity that each flight has of its own [m/s2]."""
+    repeats: bool
+    """Whether a part of what is left is common to all episodes: a law of any form predicts held-out ones."""
+    coordinate: str | None = None
+    """Coordinate of the law that predicts held-out episodes best; "constant" for one wrench everywhere."""
+    p_value: float | None = None
+    """Probability of that prediction by chance."""
+    share_explained: float
+    """Share of what repeats from episode to episode that the selected effects explain."""
 
 
 class ContactLimit(FileModel):
@@ -164,6 +195,8 @@ class DiagnoseResult(FileModel):
     aliases: tuple[tuple[str, ...], ...] = ()
     """Groups of effects that these data cannot tell apart, a selected one the first of each."""
     next_experiment: NextExperiment | None = None
+    remaining: Remaining | None = None
+    """What is left in flight; None without flight."""
     residual_law: ResidualLaw | None = None
     saved_law: str | None = None
     """What to pass to `fit --effects` for the residual law, where it was saved."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..physics.effects.effect import ActiveEffect
 from ..physics.parameters import Parameter
@@ -37,6 +38,8 @@ class SelectionStep:
     """Candidates that explain the data equally well, the best first."""
     flagged: bool
     """Whether the best candidate is significant and is selected."""
+    own_std: float | None = None
+    """Standard deviation between episodes, of an effect with a value for each; None for one value in all."""
 
     @property
     def best(self) -> Evidence:
@@ -111,6 +114,8 @@ def select_next(
     names = {e.name: e for e in done}
     ranking = [*done, *(e for e in evidence if e.name not in names)]
     equals = _equals(done, linear, kept, variants, dispersion)
+    if flight.noise_model.slow:
+        equals = _with_unproven(equals, done, linear.episode)
     return SelectionStep(tuple(ranking), tuple(equals), not any(is_slight(e) for e in equals))
 
 
@@ -220,6 +225,32 @@ def _equals(
         if close:
             found.append(other)
     return found
+
+
+def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode: NDArray[np.int64]) -> list[Evidence]:
+    """Return the equals with the rivals that are not worse in most episodes, the simplest of all first.
+
+    Beside slow errors a difference counts where it is the same from episode to episode (a paired t-test): no model of
+    such errors is exact, and a misfit of one episode is one error, not one in each frame.
+
+    Args:
+        equals: The best refitted candidate and those that explain the data equally well.
+        done: All refitted candidates.
+        episode: Episode of each segment (B,).
+    """
+    best, found = equals[0], list(equals)
+    names = {one.name for one in equals}
+    for other in done:
+        if other.name in names or other.refitted is None or best.refitted is None:
+            continue
+        worse = (other.refitted.by_segment[0] - best.refitted.by_segment[0]).numpy()
+        own = np.array([worse[episode == one].sum() for one in np.unique(episode)])
+        error = float(np.std(own, ddof=1)) / math.sqrt(len(own)) if len(own) > 1 else math.inf
+        more = len(best.candidate.effect.parameters) - len(other.candidate.effect.parameters)
+        # what the better one gains by its further parameters in the data that they are fitted to is no evidence
+        if float(own.mean()) - max(more, 0) / len(own) <= LIMITS.paired_t * error:
+            found.append(other)
+    return sorted(found, key=lambda e: (len(e.candidate.effect.parameters), e.delta_bic, e.name))
 
 
 def _contains(

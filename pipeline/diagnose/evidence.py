@@ -37,6 +37,8 @@ class Evidence:
     """Fall of the loss of a contact test less the penalty of BIC; minus infinity in flight."""
     share: float = 0.0
     """Share of what the model leaves unexplained in a contact test that the candidate explains."""
+    spread: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviation between episodes, by parameter, of an effect with a value for each."""
     without_best: float = math.inf
     """Fall of chi2 without the episode in which it falls most; infinite where it was not computed."""
     contact: Mapping[str, float] = field(default_factory=dict)

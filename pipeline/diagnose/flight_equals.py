@@ -64,7 +64,8 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
         steps: Selection steps of the flight search.
     """
     flagged = [step for step in steps if step.flagged]
-    ambiguous = [step for step in flagged if len(step.equals) > 1]
+    # contact is not asked which tilt an episode has of its own
+    ambiguous = [step for step in flagged if len(step.equals) > 1 and step.own_std is None]
     neutral = after_flight
     for step in ambiguous:
         neutral = without_effect(neutral, step.best.name)
@@ -76,7 +77,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
     final, chosen = after_flight, []
     for step in flagged:
         equals = list(step.equals)
-        if len(equals) > 1:
+        if len(equals) > 1 and step.own_std is None:
             kept, _ = separated(equals, contact, base.world, prepared.groups)
             equals = _with_aliases(kept, equals)
             final = _replaced(final, step.best, equals[0])

@@ -99,10 +99,13 @@ def rivals_of(findings: Findings) -> Rivals | None:
     """Return the effects that a diagnosis could not separate, or only just; None if all were separated."""
     if findings.verdict not in ("missing_effect", "not_separable"):
         return None
-    for one in findings.chosen:
+    shared = [one for one in findings.chosen if not one.evidence.spread]
+    if not shared:
+        return None
+    for one in shared:
         if len(one.equals) > 1:
             return Rivals(one.equals, _without(findings.world, one.evidence.name))
-    first = findings.chosen[0]
+    first = shared[0]
     second = _second_in_contact(findings) if first.where == "contact" else _second_in_flight(findings)
     if second is None:
         return None

@@ -49,6 +49,7 @@ from .next_command import next_command
 from .next_experiment import next_experiment
 from .page import diagnosis_html, mark_of
 from .pictures import pictures_of
+from .remaining import held_out_of, remaining_of
 from .sparse_regression import residual_law
 from .verdict import Findings, find
 from .wording import law_warnings, motion_warnings, sentence, unseen_motion
@@ -179,7 +180,7 @@ def report_and_findings(
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
     seen = int((prepared.observations.seen.amax(-1) > 0).sum())
     warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings)]
-    law = _law(prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
+    law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
     document = DiagnoseResult(
@@ -189,13 +190,14 @@ def report_and_findings(
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
         aliases=tuple(tuple(e.candidate.spec for e in group) for group in groups),
-        next_experiment=next_experiment(prepared, findings, throws),
+        next_experiment=next_experiment(findings.flight.prepared, findings, throws),
+        remaining=remaining_of(findings.flight),
         residual_law=law,
         episodes=len(prepared.names),
         phases={"flight": int(clear.sum()), "contact": seen - int(clear.sum())},
         noise={"position_m": prepared.noise.position_m, "rotation_rad": prepared.noise.rotation_rad},
-        flight_before=_flight_test(findings.before),
-        flight_after=_flight_test(findings.after),
+        flight_before=_flight_test(findings.flight.before),
+        flight_after=_flight_test(findings.flight.after),
         contact_chi2=findings.contact_chi2,
         contact_limits=tuple(_limit(one) for one in findings.limits),
         not_tested=dict(sorted(refused.items())),
@@ -318,7 +320,20 @@ def _ranked(evidence: Evidence, findings: Findings) -> RankedEffect:
             for name, (v, s) in estimates.items()
         ),
         constants=evidence.constants,
+        spread=dict(evidence.spread),
+        told_apart_by=_told_apart(evidence, findings),
+        **held_out_of(evidence),
     )
+
+
+def _told_apart(evidence: Evidence, findings: Findings) -> str | None:
+    """Return what rules out the effects that flight does not tell from a selected one; None where nothing does."""
+    chosen = next((c for c in findings.chosen if c.evidence.name == evidence.name and not evidence.spread), None)
+    step = next((s for s in findings.flight.steps if s.flagged and evidence.name in {e.name for e in s.equals}), None)
+    if chosen is None or step is None:
+        return None
+    out = sorted({e.name for e in step.equals} - {e.name for e in chosen.equals})
+    return f"contact rules out {', '.join(out)}" if out else None
 
 
 def _limit(found: DetectionLimit) -> ContactLimit:

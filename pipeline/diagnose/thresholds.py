@@ -67,6 +67,12 @@ class FlightThresholds:
         "development: true ones at least 0.83, false ones at most 0.42",
         "report8: 1 of 44 named with an effect too many",
     )
+    paired_t: float = threshold(
+        3.0,
+        "standard errors",
+        "beside slow errors a rival is ruled out where it is worse by this much in the mean over episodes",
+        "by argument: with 12 episodes 0.6 % of rivals that are as good lie farther off",
+    )
     measured: float = threshold(
         0.04,
         "1",
@@ -95,6 +101,24 @@ class VerdictThresholds:
     )
     enough_share: float = threshold(
         0.9, "1", "share of the excess that the named effects must remove; below it the verdict is `unexplained`"
+    )
+    repeated_p: float = threshold(
+        0.01,
+        "probability",
+        "what is left repeats from episode to episode where a law of any form predicts held-out episodes with a "
+        "p-value below it (Student's t over episodes, Bonferroni over the laws)",
+        BY_ARGUMENT,
+    )
+    common_share: float = threshold(
+        0.6,
+        "1",
+        "share of what repeats from episode to episode that the named effects must explain where something else "
+        "repeats, too; below it the verdict is `unexplained`",
+    )
+    lasting_share: float = threshold(
+        0.6,
+        "1",
+        "share that one tilt in each episode must explain of what tilts of all pieces of its flights do",
     )
     consistent_p: float = threshold(
         1e-4,

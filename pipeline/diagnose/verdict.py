@@ -9,17 +9,15 @@ from typing import Literal
 from ..physics.world import World
 from ..segments.candidates import Candidate
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, omnibus, residual_wrenches
-from ..segments.segments import Segments
-from .alternative_laws import OtherLaw, other_laws
+from ..segments.residual_wrench import Omnibus
+from .alternative_laws import OtherLaw
 from .contact_search import TESTS, Chosen, ContactFindings, with_contact
 from .contact_tests.contact_test import ContactTest
 from .cross_validation import held_out_errors
 from .detection_limits import DetectionLimit
 from .effect_selection import SelectionStep
 from .evidence import Evidence
-from .falsification import consistency
-from .flight_search import flight_search
+from .flight_findings import FlightFindings, flight_findings, is_significant
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -37,10 +35,8 @@ class Findings:
     """Selected effects with their equals, those of flight first."""
     remaining: bool
     """Whether a residual remains in addition to the selected effects, or one of these is doubtful."""
-    before: Omnibus | None
-    """Omnibus statistic of flight without the selected effects, the worst over window lengths; None without flight."""
-    after: Omnibus | None
-    """The same with the selected effects."""
+    flight: FlightFindings
+    """What flights show."""
     ranking: tuple[Evidence, ...]
     """Evidence of the candidates, the best first."""
     contact: tuple[Evidence, ...]
@@ -75,78 +71,51 @@ def find(
         candidates: All candidates.
         tests: The contact tests, in the order in which they run.
     """
-    windows = _flight_windows(prepared, world)
-    scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
-    before = _worst_omnibus(windows, scatter)
-    steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
-    after_search = _worst_omnibus(_flight_windows(prepared, after_flight), scatter)
-    explained = not _is_significant(after_search)
-    contact = with_contact(prepared, world, after_flight, steps, candidates, flight, explained, tests)
-    chosen, final = contact.chosen, contact.world
-    after = _worst_omnibus(_flight_windows(prepared, final), scatter) if chosen else before
-    in_flight = [step.best.name for step in steps if step.flagged]
-    agreement = None if flight is None else consistency(flight, after_flight, in_flight, prepared.groups, scatter)
-    others = [] if flight is None else other_laws(flight, after_flight, in_flight, scatter)
-    doubtful = (agreement is not None and agreement.doubtful) or any(one.better for one in others)
-    verdict = _verdict(chosen, before, after, doubtful)
+    flown = flight_findings(prepared, world, candidates)
+    explained = flown.slow is not None or not is_significant(flown.after)
+    contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
+    verdict = _verdict(contact.chosen, flown)
+    errors = {} if verdict == "unexplained" else _errors(contact, flown)
     return Findings(
         verdict=verdict,
-        chosen=tuple(chosen),
-        remaining=_is_significant(after) or doubtful,
-        before=before,
-        after=after,
-        ranking=tuple(_ranking(chosen, steps, contact.evidence)),
+        chosen=tuple(contact.chosen),
+        remaining=flown.remains or flown.doubtful,
+        flight=flown,
+        ranking=tuple(_ranking(contact.chosen, flown.steps, contact.evidence)),
         contact=tuple(contact.evidence),
-        world=final,
+        world=contact.world,
         contact_chi2=contact.chi2,
         base=world,
-        errors={} if verdict == "unexplained" else _errors(contact, flight),
-        as_good=tuple(one for one in others if one.as_good),
+        errors=errors,
+        as_good=tuple(one for one in flown.others if one.as_good),
         limits=contact.limits,
     )
 
 
-def _verdict(chosen: Sequence[Chosen], before: Omnibus | None, after: Omnibus | None, doubtful: bool) -> VerdictName:
-    """Return the verdict from the selected effects and the omnibus statistics.
+def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
+    """Return the verdict from the selected effects and the findings in flight.
 
-    Args:
-        chosen: The selected effects.
-        before: Omnibus statistic of flight without them.
-        after: Omnibus statistic of flight with them.
-        doubtful: Whether an effect selected in flight changes between units or follows another law.
+    Without slow errors all that is left in flight is physics, and the effects have to explain nearly all of it. Beside
+    slow errors they have to explain what repeats from episode to episode.
     """
-    if doubtful or (_is_significant(after) and _explained(before, after) < LIMITS.enough_share):
+    too_little = is_significant(flown.after) and _explained(flown.before, flown.after) < LIMITS.enough_share
+    if flown.doubtful or (flown.slow is None and too_little):
+        return "unexplained"
+    if not chosen and flown.repeats:
         return "unexplained"
     if any(len(one.equals) > 1 for one in chosen):
         return "not_separable"
     return "missing_effect" if chosen else "none_missing"
 
 
-def _errors(contact: ContactFindings, flight: Segments | None) -> dict[str, tuple[float, float]]:
+def _errors(contact: ContactFindings, flown: FlightFindings) -> dict[str, tuple[float, float]]:
     """Return the held-out errors [m] without and with each selected effect, in the motion that showed it."""
-    errors = {}
+    errors, present = {}, {active.effect.name for active in contact.world.effects}
     for one in contact.chosen:
-        segments = flight if one.where == "flight" else contact.segments
-        if segments is not None:
+        segments = flown.segments if one.where == "flight" else contact.segments
+        if segments is not None and one.evidence.name in present:
             errors[one.evidence.name] = held_out_errors(segments, contact.world, one.evidence.name)
     return errors
-
-
-def _flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
-    """Cut the flights into windows of each length of the omnibus test and estimate their residual wrenches."""
-    cut = [windows for longest_s in LIMITS.omnibus_s if (windows := prepared.pieces(world, longest_s)) is not None]
-    return [(windows, residual_wrenches(windows)) for windows in cut]
-
-
-def _worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
-    """Return the omnibus statistic with the smallest p-value over all window lengths; None without flight."""
-    found = [omnibus(wrenches, scatter) for _, wrenches in windows]
-    return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
-
-
-def _is_significant(found: Omnibus | None) -> bool:
-    """Return whether a residual wrench exceeds the noise by both thresholds; False without flight."""
-    return found is not None and found.statistic > LIMITS.omnibus_limit and found.p_value < LIMITS.omnibus_p
 
 
 def _explained(before: Omnibus | None, after: Omnibus | None) -> float:

@@ -42,8 +42,37 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     listed = " and ".join(word or name for word, name in zip(words, names, strict=True))
-    rest = " In addition, something remains unexplained." if findings.remaining else ""
-    return f"Missing: {listed}.{rest}"
+    return f"Missing: {listed}.{_apart(findings)}{_rest(findings)}"
+
+
+def _apart(findings: Findings) -> str:
+    """Return what rules out effects that flight alone does not tell from the selected ones; empty for none."""
+    words = []
+    for chosen in findings.chosen:
+        name = chosen.evidence.name
+        step = next((s for s in findings.flight.steps if s.flagged and name in {e.name for e in s.equals}), None)
+        if step is not None and step.own_std is None:
+            out = sorted({e.name for e in step.equals} - {e.name for e in chosen.equals})
+            if out:
+                words.append(f" In flight {', '.join(out)} would do the same as {name}; the contacts rule it out.")
+    return "".join(words)
+
+
+def _rest(findings: Findings) -> str:
+    """Return what is left beside the selected effects."""
+    if not findings.remaining:
+        return ""
+    found = findings.flight
+    if found.repeats and found.left is not None:
+        share = f"{100 * found.common_share:.0f} % of what repeats from episode to episode is explained"
+        what = "a constant force" if found.left.coordinate == "constant" else f"a force by {found.left.coordinate}"
+        return f" In addition, something remains unexplained: {share}, and {what} remains."
+    if found.slow is not None:
+        return (
+            " In addition, something remains unexplained; it differs from episode to episode, as errors of the "
+            "tracking do."
+        )
+    return " In addition, something remains unexplained."
 
 
 def unseen_motion(prepared: Prepared) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, fdtrc, ndtr, stdtrit
+from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
 from ...schemas import Correlation
 
@@ -29,6 +29,11 @@ def f_tail(statistic: float, dof_above: float, dof_below: float) -> float:
 def normal_tail(z: float) -> float:
     """Return the probability that a standard normal variable exceeds z."""
     return float(ndtr(-z))
+
+
+def student_tail(t: float, dof: float) -> float:
+    """Return the probability that Student's t with `dof` degrees of freedom exceeds a value."""
+    return float(stdtr(dof, -t))
 
 
 def student_quantile(probability: float, dof: float) -> float:

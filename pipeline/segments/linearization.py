@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..optimization.uncertainty import scaled_pinv
 from ..physics.fused.packing import reason_against
@@ -77,11 +78,26 @@ def linearize(
     Raises:
         ValueError: If there is no parameter.
     """
+    parameters, rows, jacobian = derivatives(segments, world, variants)
+    if not parameters:
+        raise ValueError("no candidate acts in these segments")
+    linear = projected(segments, rows, jacobian, len(parameters))
+    return _linearization(linear, segments, parameters, len(base_parameters(world, segments.kind)), groups, robust)
+
+
+def derivatives(
+    segments: Segments, world: World, variants: Sequence[Variant]
+) -> tuple[list[Parameter], Tensor, Tensor]:
+    """Return parameters (P), residuals (B, F, 6), and their Jacobian (B, F, 6, P + S) by parameters and states.
+
+    Args:
+        segments: With fitted states.
+        world: The model's world, whose parameters come first.
+        variants: The candidates, whose parameters follow.
+    """
     base = base_parameters(world, segments.kind)
     variants = [variant for variant in variants if acts_in(variant, segments.kind)]
     parameters = [*base, *with_variants(world, variants, segments.kind)[1]]
-    if not parameters:
-        raise ValueError("no candidate acts in these segments")
     at = segments.in_world(world)
     rows, jacobian = at.residuals(base, base_values(world, base))
     columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
@@ -91,9 +107,8 @@ def linearize(
         at = segments.in_world(candidates_world)
         slopes = at.slopes(candidate_parameters, base_values(candidates_world, candidate_parameters), rows)
         columns |= {p.name: slopes[..., k] for k, p in enumerate(candidate_parameters)}
-    own = torch.stack([columns[p.name] for p in parameters], -1)
-    linear = projected(segments, rows, torch.cat((own, jacobian[..., len(base) :]), -1), len(parameters))
-    return _linearization(linear, segments, parameters, len(base), groups, robust)
+    own = [columns[p.name][..., None] for p in parameters]
+    return parameters, rows, torch.cat((*own, jacobian[..., len(base) :]), -1)
 
 
 def _parts(variants: Sequence[Variant], segments: Segments, world: World) -> list[list[Variant]]:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
 from ..physics.world import World
-from ..trajectories.correlated_noise import WHITE, NoiseModel, estimate_noise_model, noise_model_warnings
+from ..trajectories.correlated_noise import estimate_noise_model, noise_model_warnings
 from ..trajectories.flight_noise import flight_noise, slow_noise, without_outliers
+from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
 from ..trajectories.track_noise import Noise, estimate_noise
@@ -83,6 +84,23 @@ class Prepared:
         if not self.contact_items:
             return None
         return fit_states(self.segments("contact", world, self.contact_items))
+
+    def with_slow_noise(self, world: World, noise_model: NoiseModel, noise: Noise | None = None) -> Prepared:
+        """Return the episodes with a noise model that has a slow part, and their flights whole.
+
+        The slow errors of neighbouring pieces of a flight are not independent, so the flights are cut nowhere; the
+        noise model covers slow errors, which then count in no other place.
+
+        Args:
+            world: The world to fit the states with.
+            noise_model: The noise model.
+            noise: Standard deviations of the tracks; those of the episodes by default.
+        """
+        found = replace(self, noise_model=noise_model, noise=noise or self.noise, slow=1.0)
+        if self.flight is None:
+            return found
+        items = whole_flights(self.flight.items)
+        return replace(found, flight=fit_states(found.segments("flight", world, items)))
 
     def pieces(self, world: World, longest_s: float) -> Segments | None:
         """Return the flights cut into equal pieces of at most a length [s], states fitted; None without flights."""
@@ -210,6 +228,18 @@ class _State:
         self.fitted = fit_states(
             Segments.of("flight", self.world, self.observations, self.flight, self.noise, self.noise_model)
         )
+
+
+def whole_flights(items: Sequence[Segment]) -> list[Segment]:
+    """Return flight segments with the parts of one flight, which follow each other without a gap, as one."""
+    found: list[Segment] = []
+    for item in items:
+        last = found[-1] if found else None
+        if last is not None and last.episode == item.episode and last.last + 1 == item.first:
+            found[-1] = Segment(item.episode, last.first, item.last)
+        else:
+            found.append(item)
+    return found
 
 
 def _mark_supported_frames(state: _State) -> None:

@@ -20,7 +20,7 @@ from ..physics.effects.residual_wrench import AXES, ResidualWrench
 from ..physics.effects.spin_damping import SpinDamping
 from ..physics.parameters import effect_parameters
 from ..physics.world import Body, World
-from ..trajectories.correlated_noise import WHITE, NoiseModel
+from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment
 from ..trajectories.track_noise import Noise

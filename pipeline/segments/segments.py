@@ -17,7 +17,7 @@ from ..physics.observation_model import measure, true_times
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
-from ..trajectories.correlated_noise import WHITE, NoiseModel, innovations
+from ..trajectories.innovations import WHITE, NoiseModel, axis_innovations
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, retract
 from ..trajectories.segmentation import Segment
@@ -212,7 +212,7 @@ def _innovations(seen: Observations, rows: Tensor, memory: NoiseModel) -> Tensor
     by_body = rows.unflatten(1, (-1, bodies)).movedim(2, 1).flatten(0, 1)  # (B nf, T, 6, ...)
     times = seen.times_s.repeat_interleave(bodies, 0)
     parts = [
-        part if noise.share == 0 else innovations(part, times, mask.movedim(2, 1).flatten(0, 1), noise)
+        part if noise.white else axis_innovations(part, times, mask.movedim(2, 1).flatten(0, 1), noise)
         for part, mask, noise in zip(by_body.split(3, 2), (seen.seen, seen.has_orientation), memory, strict=True)
     ]
     return torch.cat(parts, 2).unflatten(0, (-1, bodies)).movedim(1, 2).flatten(1, 2)

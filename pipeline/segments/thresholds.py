@@ -276,6 +276,28 @@ class DescribedThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SlowErrorThresholds:
+    """Tracking errors have a slow part."""
+
+    evidence: float = threshold(
+        20.0,
+        "2 log L",
+        "twice the gain of the log-likelihood from which a slow process is part of the noise: as for fast ones",
+        BY_ARGUMENT,
+    )
+    sway_evidence: float = threshold(
+        14.0,
+        "2 log L",
+        "the same for an acceleration of each flight's own: one parameter, odds of 1,000",
+        BY_ARGUMENT,
+    )
+    least_episodes: int = threshold(
+        3, "episodes", "fewest that tell what differs between them from what is common", BY_ARGUMENT
+    )
+    least_frames: int = threshold(60, "frames", "fewest of all flights, as for the size of the noise", BY_ARGUMENT)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentThresholds:
     """All thresholds on segments that decide a verdict."""
 
@@ -295,6 +317,8 @@ class SegmentThresholds:
     """Bounces of a ball, with or without its orientation."""
     described: DescribedThresholds = DescribedThresholds()
     """Whether a model describes the motion."""
+    slow_errors: SlowErrorThresholds = SlowErrorThresholds()
+    """Slow errors of flights."""
 
 
 SEGMENT_THRESHOLDS = SegmentThresholds()

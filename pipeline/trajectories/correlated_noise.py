@@ -1,10 +1,10 @@
-"""Correlated measurement noise: its strength and correlation time, and the whitening of residuals.
+"""Correlated measurement noise: its strength and correlation time, from short windows of flight.
 
 A tracker that filters, a marker that moves over a ball or a calibration with local errors makes errors that
 neighbouring frames share. Forces are identified by slow changes, and correlated errors are slow. The noise is an
 Ornstein-Uhlenbeck process plus white noise: with a share s of the variance that decays with time constant tau, the
-covariance of two frames is s exp(-|dt| / tau), plus 1 - s on the diagonal. Residuals are replaced by their innovations,
-so that later steps may assume independence.
+covariance of two frames is s exp(-|dt| / tau), plus 1 - s on the diagonal (see `innovations`). Errors slower than a
+window do not show here; they are looked for in whole flights (`segments/slow_errors`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ..optimization.levenberg_marquardt import Solution
+from .innovations import WHITE, CorrelatedNoise, NoiseModel
 from .observations import Observations
 from .segmentation import Segment
 from .track_noise import FLOOR_M, FLOOR_RAD
@@ -62,65 +62,6 @@ ROBUST_SCALE = 3.0
 """Scale of the robust loss with which windows are fitted, in sigmas."""
 MOST_CORRELATED = 0.98
 """Maximum correlation from frame to frame."""
-
-
-class CorrelatedNoise(NamedTuple):
-    """Noise of one kind: an Ornstein-Uhlenbeck process plus white noise."""
-
-    share: float = 0.0
-    """Share of the variance that is correlated."""
-    time_s: float = 1.0
-    """Correlation time [s], in which the correlation falls to 1/e."""
-    size: float = 1.0
-    """Standard deviation of this model in units of the likeliest model's, which is that of the tracks: windows
-    determine the innovation of each frame much better than the correlated share."""
-
-
-class NoiseModel(NamedTuple):
-    """Noise models of positions and of rotations."""
-
-    position: CorrelatedNoise = CorrelatedNoise()
-    """Noise of the positions."""
-    rotation: CorrelatedNoise = CorrelatedNoise()
-    """Noise of the rotations."""
-
-
-WHITE = NoiseModel()
-"""Uncorrelated noise."""
-
-
-def innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
-    """Return residuals as innovations over their standard deviations: what each frame adds to those before it.
-
-    For noise of the given model they are independent and of variance 1 (Kalman 1960).
-
-    Args:
-        rows: Residuals in sigmas, or their derivatives, (B, T, ...); 0 where a frame does not count.
-        times_s: Frame times (B, T).
-        mask: Frames that count (B, T).
-        noise: The noise model.
-    """
-    share = noise.share
-    kept = torch.exp(-times_s.diff(dim=1) / noise.time_s)
-    rows = rows / noise.size
-    variance, expected = torch.full_like(times_s[:, 0], share), torch.zeros_like(rows[:, 0])
-    found = []
-    for frame in range(rows.shape[1]):
-        counted = mask[:, frame] > 0
-        spread = variance + 1 - share
-        gain = torch.where(counted, variance / spread, torch.zeros_like(spread))
-        away = rows[:, frame] - expected * _expanded(counted.to(rows), rows)
-        found.append(away * _expanded(torch.where(counted, spread.rsqrt(), torch.ones_like(spread)), rows))
-        if frame < rows.shape[1] - 1:
-            factor = kept[:, frame]
-            expected = _expanded(factor, rows) * (expected + _expanded(gain, rows) * away)
-            variance = factor.square() * variance * (1 - gain) + share * (1 - factor.square())
-    return torch.stack(found, 1)
-
-
-def _expanded(values: Tensor, rows: Tensor) -> Tensor:
-    """Return values (B,) in the shape of a frame of rows (B, T, ...)."""
-    return values.view(-1, *[1] * (rows.ndim - 2))
 
 
 def estimate_noise_model(

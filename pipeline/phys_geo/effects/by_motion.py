@@ -28,6 +28,7 @@ from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import linearised, refit
 from ...segments.sliding_descent import information_by_segment
 from ...segments.sliding_fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
+from ...segments.slow_errors import slow_errors
 from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ...trajectories.track_noise import Noise
 from .identified_effects import at_neutral, identified_effects
@@ -44,7 +45,9 @@ def fit_effect_flights(
 ) -> EffectEstimate | None:
     """Fit effects to the flights of episodes, each with its own initial state, as `cgwm diagnose` does.
 
-    Impacts are left out, because the errors of the contact law would bias the effects' parameters.
+    Impacts are left out, because the errors of the contact law would bias the effects' parameters. Where residuals of
+    whole flights have a slow part, the fit is repeated on whole flights by generalised least squares: pieces of a
+    flight with independent errors would give a slow force the wrong size, and too narrow an interval.
 
     Args:
         world: World with effects, none of which acts in contact alone.
@@ -61,6 +64,12 @@ def fit_effect_flights(
     names = [parameter for parameter, _ in wanted]
     start = torch.tensor([parameter.encode(value) for parameter, value in wanted]).to(world.gravity)
     found = refit([prepared.flight], world, names, start, ITERATIONS)
+    slow = slow_errors(prepared, found.world, ())
+    if slow is not None:
+        prepared = prepared.with_slow_noise(found.world, slow.noise_model)
+        if prepared.flight is None:
+            return None
+        found = refit([prepared.flight], world, names, found.values, ITERATIONS)
     linear = linearised(found.segments[0], names, found.values)
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start).numpy()
     information = linear.information.sum(0).numpy()
@@ -76,6 +85,12 @@ def fit_effect_flights(
         fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True)
     )
     record = {"flights": len(prepared.flight.items), "costs": [found.cost], "chi2": excess}
+    if slow is not None:
+        record["slow_errors"] = {
+            "position_std_m": slow.position_m(prepared.noise.position_m),
+            "time_s": slow.noise_model.position.slow_time_s,
+            "own_acceleration_std_m_s2": slow.sway_m_s2(prepared.noise.position_m),
+        }
     correlation = correlation_of([p.name for p in names], covariance)
     return EffectEstimate(
         world=placed(world, names, found.values), parameters=parameters, record=record, correlations=(correlation,)

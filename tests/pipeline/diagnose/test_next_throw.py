@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,8 +60,7 @@ def findings(world: World, *equals: Evidence) -> Findings:
         verdict="not_separable",
         chosen=(Chosen(equals[0], equals, "flight"),),
         remaining=False,
-        before=None,
-        after=None,
+        flight=SimpleNamespace(),  # pyright: ignore[reportArgumentType]
         ranking=equals,
         contact=(),
         world=world,

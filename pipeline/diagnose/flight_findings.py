@@ -1,0 +1,240 @@
+"""What flights show: the effects that they lack, judged beside the errors that the tracks carry, and what is left.
+
+The search runs once under the noise of short windows. What neither its effects nor all candidates together follow is
+then split into slow errors (`segments/slow_errors`), unless the noise explains what is left; where there are any, the
+search runs again under them, on whole flights, so that an effect counts as far as it does the same in all episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..physics.world import World
+from ..segments.candidates import Candidate, admissible, base_parameters, variants_of, without_effect
+from ..segments.prepare import Prepared
+from ..segments.repeated_forces import RepeatedForce, repeated_force
+from ..segments.residual_wrench import (
+    Omnibus,
+    ResidualWrenches,
+    dispersion,
+    omnibus,
+    residual_wrenches,
+    wrench_windows,
+)
+from ..segments.segment_fit import refit
+from ..segments.segments import Segments
+from ..segments.slow_errors import SlowErrors, slow_errors
+from .alternative_laws import OtherLaw, other_laws
+from .coupled_effects import DRAGS
+from .effect_selection import SelectionStep
+from .falsification import Consistency, consistency
+from .flight_search import flight_search
+from .own_tilt import TILTS, has_own_tilts, own_tilt_step
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightFindings:
+    """Result of the search in flight."""
+
+    prepared: Prepared
+    """The episodes, with slow errors as part of their noise where there are any."""
+    slow: SlowErrors | None
+    """The slow errors; None where there are none."""
+    scatter: float
+    """Factor by which variances exceed those of the noise."""
+    steps: tuple[SelectionStep, ...]
+    """The selection steps; without a selected effect the one step that selected none."""
+    world: World
+    """The world with the selected effects."""
+    segments: Segments | None
+    """Flight segments with states fitted by it; None without flight."""
+    before: Omnibus | None
+    """Omnibus statistic without the selected effects, the worst over window lengths; None without flight."""
+    after: Omnibus | None
+    """The same with them."""
+    agreement: Consistency | None
+    """Whether the effects have the same parameters in all episodes; None without effects."""
+    others: tuple[OtherLaw, ...]
+    """Alternative laws of the selected effects."""
+    left: RepeatedForce | None
+    """What repeats from episode to episode beside the selected effects, as a law of any form; None where unknown."""
+    common_share: float
+    """Share of what repeats from episode to episode that the selected effects explain; 1 where nothing is left."""
+
+    @property
+    def in_flight(self) -> list[str]:
+        """Names of the selected effects with one value for all episodes."""
+        return [step.best.name for step in self.steps if step.flagged and step.own_std is None]
+
+    @property
+    def remains(self) -> bool:
+        """Whether a residual exceeds the noise beside the selected effects."""
+        return is_significant(self.after) or self.repeats
+
+    @property
+    def repeats(self) -> bool:
+        """Whether a residual repeats from episode to episode beside the selected effects."""
+        return self.left is not None and self.left.p_value < LIMITS.repeated_p
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the selected effects imitate something else.
+
+        Their parameters change from episode to episode, their law is another one, or a law of any form explains more of
+        what repeats than they do.
+        """
+        inconsistent = self.agreement is not None and self.agreement.doubtful
+        imitated = self.repeats and self.common_share < LIMITS.common_share
+        return inconsistent or imitated or any(one.better for one in self.others)
+
+
+def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> FlightFindings:
+    """Search flights for the effects that a world lacks.
+
+    Args:
+        prepared: The episodes.
+        world: The model's world.
+        candidates: All candidates.
+    """
+    found = _searched(prepared, prepared, world, candidates, None)
+    if not (found.remains or found.doubtful):
+        return found
+    slow = _slow_errors(prepared, found.world, candidates)
+    if slow is not None and slow.sway_evidence and not has_own_tilts(prepared, found.world, candidates, slow):
+        slow = slow.tiltless()
+    if slow is None:
+        return found
+    again = prepared.with_slow_noise(world, slow.noise_model)
+    return _searched(again, prepared, world, candidates, slow)
+
+
+def _slow_errors(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> SlowErrors | None:
+    """Return the slow errors beside the selected effects and all candidates; None where there are none."""
+    kept, _ = admissible(world, candidates, prepared.has_orientation)
+    return slow_errors(prepared, world, variants_of(kept, world.gravity[0, :1]))
+
+
+def _searched(
+    prepared: Prepared, quick: Prepared, world: World, candidates: Sequence[Candidate], slow: SlowErrors | None
+) -> FlightFindings:
+    """Return the findings under the noise of prepared episodes.
+
+    Args:
+        prepared: The episodes, with slow errors as part of their noise where there are any.
+        quick: The same without them: what repeats is looked for in short windows, whose errors differ from episode to
+            episode whatever their law.
+        world: The model's world.
+        candidates: All candidates.
+        slow: The slow errors.
+    """
+    windows = flight_windows(prepared, world)
+    scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
+    before = worst_omnibus(windows, scatter)
+    steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
+    steps, after_flight, flight = _with_own_tilts(prepared, steps, after_flight, flight, candidates, slow)
+    names = [step.best.name for step in steps if step.flagged and step.own_std is None]
+    others = [] if flight is None else other_laws(flight, after_flight, names, scatter)
+    better = {one.effect for one in others if one.better}
+    if flight is not None and better and set(names) - better:
+        # the law of this one is another; the others stand without it
+        steps = [step for step in steps if step.best.name not in better]
+        after_flight, flight = _without(flight, after_flight, better)
+        names = [name for name in names if name not in better]
+        others = [one for one in others if one.effect not in better]
+    agreement = None if flight is None else consistency(flight, after_flight, names, prepared.groups, scatter)
+    left, share = _left(quick, world, after_flight, bool(names))
+    return FlightFindings(
+        prepared=prepared,
+        slow=slow,
+        scatter=scatter,
+        steps=tuple(steps),
+        world=after_flight,
+        segments=flight,
+        before=before,
+        after=worst_omnibus(flight_windows(prepared, after_flight), scatter) if names else before,
+        agreement=agreement,
+        others=tuple(others),
+        left=left,
+        common_share=share,
+    )
+
+
+def _with_own_tilts(
+    prepared: Prepared,
+    steps: list[SelectionStep],
+    world: World,
+    flight: Segments | None,
+    candidates: Sequence[Candidate],
+    slow: SlowErrors | None,
+) -> tuple[list[SelectionStep], World, Segments | None]:
+    """Return the steps with a tilt of each episode's own, where the slow errors have one, in place of a common one."""
+    if flight is None or slow is None or not slow.sway_evidence:
+        return steps, world, flight
+    names = {step.best.name for step in steps if step.flagged}
+    if "wind" in names and names & set(DRAGS):
+        return steps, world, flight  # a drag in wind pushes a box that turns as if each flight were tilted
+    replaced = {step.best.name for step in steps if step.flagged and step.best.name in TILTS}
+    world, flight = _without(flight, world, replaced)
+    own, world, flight = own_tilt_step(prepared, flight, world, candidates, slow)
+    return [*(step for step in steps if step.flagged and step.best.name not in replaced), own], world, flight
+
+
+def _without(flight: Segments, world: World, names: set[str]) -> tuple[World, Segments]:
+    """Return the world without some effects, the others fitted again, and the segments with states fitted by it."""
+    if not names:
+        return world, flight
+    for name in names:
+        world = without_effect(world, name)
+    found = refit([flight], world, base_parameters(world, "flight"))
+    return found.world, found.segments[0]
+
+
+def _left(prepared: Prepared, world: World, after_flight: World, selected: bool) -> tuple[RepeatedForce | None, float]:
+    """Return what repeats beside the selected effects, and the share of all that repeats that these explain."""
+    if prepared.flight is None:
+        return None, 1.0
+    worlds = [world, after_flight] if selected else [world]
+    found = [_wrenches(prepared, one) for one in worlds]
+    laws = [None if one is None else repeated_force(one) for one in found]
+    last = laws[-1]
+    if last is None or found[0] is None or found[-1] is None:
+        return None, 1.0
+    explained = _square(found[0]) - _square(found[-1])
+    gain = max(last.gain, 0.0)
+    return last, explained / (explained + gain) if explained + gain > 0 and selected else float(gain <= 0)
+
+
+def _wrenches(prepared: Prepared, world: World) -> ResidualWrenches | None:
+    """Return the residual wrenches of short windows of flight; None without any."""
+    if prepared.flight is None:
+        return None
+    items, noise = prepared.flight.items, prepared.noise
+    return wrench_windows(world, prepared.observations, items, noise, prepared.noise_model)
+
+
+def _square(found: ResidualWrenches) -> float:
+    """Return chi2 of residual wrenches."""
+    return float(np.einsum("ni,nij,nj->", found.wrench, found.information, found.wrench))
+
+
+def flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
+    """Cut the flights into windows of each length of the omnibus test and estimate their residual wrenches."""
+    cut = [windows for longest_s in LIMITS.omnibus_s if (windows := prepared.pieces(world, longest_s)) is not None]
+    return [(windows, residual_wrenches(windows)) for windows in cut]
+
+
+def worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
+    """Return the omnibus statistic with the smallest p-value over all window lengths; None without flight."""
+    found = [omnibus(wrenches, scatter) for _, wrenches in windows]
+    return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
+
+
+def is_significant(found: Omnibus | None) -> bool:
+    """Return whether a residual wrench exceeds the noise by both thresholds; False without flight."""
+    return found is not None and found.statistic > LIMITS.omnibus_limit and found.p_value < LIMITS.omnibus_p

@@ -1,0 +1,148 @@
+"""A tilt of each episode's own: the frame, or gravity in it, is level in another way in every episode.
+
+Its evidence is that of the variance component of `segments/slow_errors`: accelerations across gravity that are constant
+in a flight and differ from flight to flight. In flight a tilt of the frame and one of gravity are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..optimization.uncertainty import chi2_tail
+from ..physics.effects.effect import ActiveEffect
+from ..physics.effects.registry import load_effect
+from ..physics.world import World
+from ..segments.candidates import Candidate, base_parameters, variants_of
+from ..segments.linearization import linearize
+from ..segments.prepare import Prepared
+from ..segments.segment_fit import refit
+from ..segments.segments import Segments
+from ..segments.slow_errors import SlowErrors
+from .effect_selection import SelectionStep
+from .evidence import Evidence
+from .score_test import ScoreTest, solved
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
+
+TILTS = ("gravity_tilt", "frame_tilt", "constant_force", "wind")
+"""Effects that push across gravity, the same in all episodes: a tilt of each episode's own contains their mean."""
+PIECE_S = 0.15
+"""Length [s] of the pieces of flight between which a tilt of an episode's own may not change."""
+OWN_TILTS = ("gravity_tilt", "frame_tilt")
+"""Effects of which each episode can have its own, which flight does not tell apart."""
+
+
+def has_own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candidate], slow: SlowErrors) -> bool:
+    """Return whether slow errors have a tilt of each episode's own that a world lacks.
+
+    It has to be the same in all pieces of an episode's flights; a gust pushes in some of them.
+
+    Args:
+        prepared: The episodes, without slow errors as part of their noise.
+        world: The world with the effects selected in flight.
+        candidates: All candidates.
+        slow: The slow errors.
+    """
+    if not slow.sway_evidence or float(world.gravity[0].norm()) == 0 or not (names := _missing(world, candidates)):
+        return False
+    return _lasting_share(prepared, world, names[0], slow) > LIMITS.lasting_share
+
+
+def _lasting_share(prepared: Prepared, world: World, name: str, slow: SlowErrors) -> float:
+    """Return the share of what tilts of all pieces of flight explain that one tilt in each episode explains.
+
+    The noise has the slow process, but no acceleration of a flight's own.
+    """
+    position = slow.noise_model.position._replace(sway=0.0)
+    pieces = replace(prepared, noise_model=slow.noise_model._replace(position=position)).pieces(world, PIECE_S)
+    if pieces is None:
+        return 0.0
+    kept = tuple(active for active in world.effects if active.effect.name not in TILTS)
+    bare = replace(world, effects=kept)
+    variants = variants_of([Candidate(name, load_effect(name))], world.gravity[0, :1])
+    linear = linearize(pieces, bare, variants, prepared.groups, robust=False)
+    columns = linear.columns(variants[0].parameters)
+    information, score = linear.information[:, columns][:, :, columns], linear.score[:, columns]
+    width = np.array([linear.parameters[k].prior[1] for k in columns])
+    single = [solved(m, g, width)[2:] for m, g in zip(information, score, strict=True)]
+    units = [linear.episode == episode for episode in np.unique(linear.episode)]
+    joint = [solved(information[own].sum(0), score[own].sum(0), width)[2:] for own in units]
+    common, rank = (sum(part) for part in zip(*joint, strict=True))
+    whole, size = (sum(part) for part in zip(*single, strict=True))
+    if size < 2 * rank:
+        return 0.0  # too few pieces to tell
+    excess = max(whole - common - (size - rank), 0.0)
+    lasting = max(common - rank, 0.0)
+    return lasting / (lasting + excess) if lasting > 0 else 0.0
+
+
+def own_tilt_step(
+    prepared: Prepared, flight: Segments, world: World, candidates: Sequence[Candidate], slow: SlowErrors
+) -> tuple[SelectionStep, World, Segments]:
+    """Select a tilt of each episode's own.
+
+    Args:
+        prepared: The episodes, with the slow errors as part of their noise.
+        flight: Segments with states fitted by the world.
+        world: The world with the effects selected in flight, without a tilt.
+        candidates: All candidates.
+        slow: The slow errors.
+
+    Returns:
+        The step, the world with the mean tilt of all episodes, and the segments with states fitted by it.
+    """
+    names = _missing(world, candidates)
+    std = slow.sway_m_s2(prepared.noise.position_m) / float(world.gravity[0].norm())
+    tilted = replace(world, effects=(*world.effects, ActiveEffect.of(load_effect(names[0]), {}, world.gravity[0, :1])))
+    found = refit([flight], tilted, base_parameters(tilted, "flight"))
+    mean = {name: found.number(f"{names[0]}.{name}") for name in ("tilt_x", "tilt_y")}
+    evidence = tuple(_evidence(name, std, mean, slow.sway_evidence) for name in names)
+    return SelectionStep(evidence, evidence, True, own_std=std), found.world, found.segments[0]
+
+
+def _missing(world: World, candidates: Sequence[Candidate]) -> list[str]:
+    """Return the names of the tilts that are candidates; none where the world has one already."""
+    if any(active.effect.name in OWN_TILTS for active in world.effects if _own(active)):
+        return []
+    known = {candidate.effect.name for candidate in candidates}
+    return [name for name in OWN_TILTS if name in known]
+
+
+def _own(active: ActiveEffect) -> bool:
+    """Return whether an effect has a value for each episode."""
+    return any(parameter.shared == "episode" for parameter in active.effect.parameters)
+
+
+def _evidence(name: str, std: float, mean: Mapping[str, tuple[float, float]], evidence: float) -> Evidence:
+    """Return the evidence of a tilt of each episode's own.
+
+    Args:
+        name: Name of the tilt.
+        std: Standard deviation between episodes [rad].
+        mean: Mean over episodes [rad] and its standard error, by parameter.
+        evidence: Twice the gain of the log-likelihood.
+    """
+    values = np.array([mean[key] for key in mean])
+    # a variance is not below 0: half of the chance is at 0
+    p_value = 0.5 * chi2_tail(evidence, 1)
+    test = ScoreTest(
+        statistic=evidence,
+        dof=1,
+        p_value=p_value,
+        estimate=values[:, 0],
+        covariance=np.diag(values[:, 1] ** 2),
+        admissible=True,
+    )
+    return Evidence(
+        candidate=Candidate(f"{name}@episode", load_effect(f"{name}@episode")),
+        constants={},
+        test=test,
+        p_value=p_value,
+        delta_bic=-evidence,
+        numbers=dict(mean),
+        spread=dict.fromkeys(mean, std),
+    )
