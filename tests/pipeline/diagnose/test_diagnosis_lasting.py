@@ -12,13 +12,8 @@ from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects.registry import BUILT_IN, load_effect
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import LIMITS, Prepared, prepare
-from cgwm.pipeline.trajectories.correlated_noise import (
-    WHITE,
-    CorrelatedNoise,
-    NoiseModel,
-    estimate_noise_model,
-    innovations,
-)
+from cgwm.pipeline.trajectories.correlated_noise import estimate_noise_model
+from cgwm.pipeline.trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel, innovations  # pyright: ignore[reportMissingImports]
 from helpers.diagnosis_data import NOISE, tosses, world_with
 from scipy.signal import savgol_filter
 

@@ -1,0 +1,112 @@
+"""Slow errors of the tracks: they are found in whole flights, are no effect, and hide none that repeats."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.verdict import Findings, find
+from cgwm.pipeline.physics.effects import load_effect
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.prepare import prepare, whole_flights
+from cgwm.pipeline.segments.repeated_forces import repeated_force  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.segments.residual_wrench import ResidualWrenches
+from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, axis_innovations  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.trajectories.segmentation import Segment
+from helpers.diagnosis_data import tosses, world_with
+
+LIBRARY = [
+    Candidate(name, load_effect(name)) for name in ("linear_drag", "gravity_scale", "gravity_tilt", "frame_tilt")
+]
+SLOW_M, SLOW_S, WHITE_M = 7e-4, 0.2, 1e-4
+
+
+def drifting(track: Track, rng: np.random.Generator, tilt_m_s2: float = 0.0) -> Track:
+    """The centroid alone, with slow errors and an acceleration across gravity of its own."""
+    away = np.zeros((len(track.time_s), 3))
+    away[0] = rng.standard_normal(3)
+    for k, step in enumerate(np.diff(track.time_s), 1):
+        kept = np.exp(-step / SLOW_S)
+        away[k] = kept * away[k - 1] + np.sqrt(1 - kept**2) * rng.standard_normal(3)
+    push = tilt_m_s2 * rng.standard_normal(3) * (1, 1, 0)
+    path = 0.5 * (track.time_s - track.time_s[0])[:, None] ** 2 * push
+    noise = WHITE_M * rng.standard_normal(away.shape)
+    return replace(track, position_m=track.position_m + SLOW_M * away + noise + path, quat_wxyz=None)
+
+
+def found(effects: dict, tilt_m_s2: float = 0.0, seed: int = 1) -> Findings:
+    rng = np.random.default_rng(seed)
+    flying = tosses(world_with("ball", effects, False), seed, count=8, duration_s=0.8, noise=(1e-9, 1e-8))
+    episodes = [(name, {b: drifting(t, rng, tilt_m_s2) for b, t in tracks.items()}) for name, tracks in flying]
+    world = world_with("ball", ground=False)
+    return find(prepare(world, episodes), world, LIBRARY)
+
+
+def test_innovations_of_slow_errors_are_what_the_inverse_of_the_covariance_says() -> None:
+    rng = np.random.default_rng(0)
+    times = torch.as_tensor(np.sort(rng.uniform(0, 0.8, (2, 10)), axis=1))
+    mask = torch.ones(2, 10, dtype=torch.float64)
+    mask[0, [3, 4, 8]] = 0
+    rows = torch.as_tensor(rng.standard_normal((2, 10, 3, 4))) * mask[..., None, None]
+    noise = CorrelatedNoise(share=0.6, time_s=0.02, size=1.5, slow=4.0, slow_time_s=0.3, sway=30.0)
+    whitened = axis_innovations(rows, times, mask, noise)
+    for k in range(2):
+        kept = mask[k] > 0
+        t = times[k, kept]
+        gap, path = (t[:, None] - t).abs(), 0.5 * (t - times[k, 0]).square()
+        common = 2.25 * (0.6 * torch.exp(-gap / 0.02) + 0.4 * torch.eye(len(t))) + 16 * torch.exp(-gap / 0.3)
+        for axis in range(3):
+            covariance = common + (900 * path[:, None] * path if axis < 2 else 0)
+            known = torch.linalg.solve_triangular(
+                torch.linalg.cholesky(covariance), rows[k, kept][:, axis], upper=False
+            )
+            torch.testing.assert_close(whitened[k, kept][:, axis], known, rtol=1e-6, atol=1e-8)
+
+
+def test_slow_errors_are_no_effect() -> None:
+    silent = found({})
+    assert silent.verdict == "none_missing" and not silent.chosen
+
+
+def test_a_drag_is_named_beside_slow_errors_with_the_right_number() -> None:
+    named = found({"linear_drag": {"c": 0.3}}, seed=2)
+    assert [one.evidence.name for one in named.chosen] == ["linear_drag"]
+    estimate, error = named.chosen[0].evidence.estimates["c"]
+    assert abs(estimate - 0.3) < 3 * error and error < 0.03
+
+
+def test_a_tilt_that_differs_from_episode_to_episode_is_named_as_such() -> None:
+    named = found({}, tilt_m_s2=0.15, seed=3)
+    assert [one.evidence.candidate.spec for one in named.chosen] == ["gravity_tilt@episode"]
+    (tilt,) = named.chosen
+    assert {one.candidate.spec for one in tilt.equals} == {"gravity_tilt@episode", "frame_tilt@episode"}
+    assert tilt.evidence.spread["tilt_x"] == pytest.approx(0.15 / 9.81, rel=0.5)
+
+
+@pytest.mark.parametrize(("own", "repeats"), [(False, True), (True, False)])
+def test_what_repeats_is_told_from_what_each_episode_has_of_its_own(own: bool, repeats: bool) -> None:
+    """A force by place, and one of the same size that is turned in another way in each episode."""
+    rng = np.random.default_rng(4)
+    count, each = 8, 10
+    place = rng.uniform(-1, 1, count * each)
+    wrench = np.zeros((count * each, 6))
+    wrench[:, 0] = np.sign(place) * (np.repeat(rng.choice([-1.0, 1.0], count), each) if own else 1.0)
+    wrench += 0.3 * rng.standard_normal(wrench.shape)
+    windows = ResidualWrenches(
+        segments=tuple(Segment(k // each, 0, 9) for k in range(count * each)),
+        wrench=wrench,
+        information=np.tile(np.eye(6) / 0.09, (count * each, 1, 1)),
+        coordinates={"x": place, "speed": rng.uniform(1, 2, count * each)},
+        velocity=rng.standard_normal((count * each, 3)),
+        omega=rng.standard_normal((count * each, 3)),
+    )
+    law = repeated_force(windows)
+    assert law is not None and (law.p_value < 1e-3) == repeats
+    if repeats:
+        assert law.coordinate == "x" and law.frame == "world"
+
+
+def test_parts_of_one_flight_are_joined_and_others_are_not() -> None:
+    parts = [Segment(0, 0, 9), Segment(0, 10, 19), Segment(0, 25, 30), Segment(1, 31, 40)]
+    assert whole_flights(parts) == [Segment(0, 0, 19), Segment(0, 25, 30), Segment(1, 31, 40)]
