@@ -33,8 +33,9 @@ COARSE_SIZE, COARSE_BODY_PX = 80, 20.0
 larger."""
 MAX_INSTANTS = 90
 """Maximum number of instants of an episode, evenly spread; each costs a render for each camera."""
-RIVAL_NATS = 10.0
-"""Log-likelihood ratio below which another history of poses is reported as possible [nats]."""
+RIVAL_NATS = 25.0
+"""Log-likelihood ratio below which another history of poses is reported as possible [nats]. A body that looks exactly
+the same turned about reaches 15, as the search knows it by a part of its spheres only."""
 
 
 @dataclass(frozen=True, kw_only=True)
