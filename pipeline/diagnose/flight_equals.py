@@ -64,8 +64,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
         steps: Selection steps of the flight search.
     """
     flagged = [step for step in steps if step.flagged]
-    # contact is not asked which tilt an episode has of its own
-    ambiguous = [step for step in flagged if len(step.equals) > 1 and step.own_std is None]
+    ambiguous = [step for step in flagged if _is_asked(step, flagged)]
     neutral = after_flight
     for step in ambiguous:
         neutral = without_effect(neutral, step.best.name)
@@ -77,7 +76,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
     final, chosen = after_flight, []
     for step in flagged:
         equals = list(step.equals)
-        if len(equals) > 1 and step.own_std is None:
+        if step in ambiguous:
             kept, _ = separated(equals, contact, base.world, prepared.groups)
             equals = _with_aliases(kept, equals)
             final = _replaced(final, step.best, equals[0])
@@ -86,6 +85,19 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
     if ambiguous:
         base, contact = refitted_contact(contact, final)
     return ResolvedFlight(chosen=tuple(chosen), after_flight=final, world=base.world, segments=contact)
+
+
+def _is_asked(step: SelectionStep, steps: Sequence[SelectionStep]) -> bool:
+    """Return whether contact can separate the equals of a selected effect.
+
+    It is not asked which tilt an episode has of its own, nor which drag it is where an effect of another step may act
+    through the drag: without any the other one, as the wind, would do nothing.
+    """
+    if len(step.equals) < 2 or step.own_std is not None:
+        return False
+    drag = any("drag" in one.candidate.effect.provides for one in step.equals)
+    others = (one for other in steps if other is not step for one in other.equals)
+    return not (drag and any("drag" in one.candidate.effect.needs for one in others))
 
 
 def fitted_contact(prepared: Prepared, world: World) -> tuple[Refit, Segments] | None:

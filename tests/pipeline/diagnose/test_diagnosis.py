@@ -13,7 +13,7 @@ from cgwm.pipeline.diagnose import diagnose, flight_search
 from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, select_next
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.falsification import consistency
-from cgwm.pipeline.diagnose.flight_equals import fitted_contact, separated
+from cgwm.pipeline.diagnose.flight_equals import fitted_contact, resolved_flight, separated
 from cgwm.pipeline.diagnose.score_test import ScoreTest, score_test
 from cgwm.pipeline.diagnose.sparse_regression import residual_law
 from cgwm.pipeline.physics.effects import load_effect
@@ -216,6 +216,28 @@ def test_contact_separates_a_scale_from_gravity() -> None:
     assert fitted is not None
     kept, _ = separated(slot.equals, fitted[1], fitted[0].world, prepared.groups)
     assert [e.name for e in kept] == ["length_scale"]
+
+
+def test_contact_is_not_asked_which_drag_it_is_that_the_wind_acts_through() -> None:
+    """Both steps have equals; without any drag the wind could not even be computed."""
+    effects = {"quadratic_drag": {"k": 0.3}, "constant_force": {"f_x": 0.4, "f_y": 0.2}}
+    prepared, world = ready("ball", effects, 3, count=4, duration_s=0.7, height_m=(0.1, 0.25))
+    assert prepared.flight is not None
+    by_name = {one.effect.name: one for one in LIBRARY}
+    steps, current, flight = [], world, prepared.flight
+    for pair in (("quadratic_drag", "linear_drag"), ("constant_force", "wind")):
+        chosen = [by_name[name] for name in pair]
+        slot = select_next(flight, current, chosen, prepared.groups, True)  # pyright: ignore[reportArgumentType]
+        equals = sorted((e for e in slot.evidence if e.refitted is not None), key=lambda e: pair.index(e.name))
+        assert [e.name for e in equals] == list(pair)
+        steps.append(SelectionStep(slot.evidence, tuple(equals), True))
+        refitted = equals[0].refitted
+        assert refitted is not None
+        current, flight = refitted.world, refitted.segments[0]
+    found = resolved_flight(prepared, current, steps)
+    assert [e.name for e in found.chosen[0]] == ["quadratic_drag", "linear_drag"]
+    assert found.segments is not None
+    assert {a.effect.name for a in found.after_flight.effects} == {"quadratic_drag", found.chosen[1][0].name}
 
 
 def test_neither_order_nor_names_of_candidates_matter() -> None:

@@ -270,9 +270,13 @@ def test_a_law_becomes_an_effect_that_pulls_as_it_says(tmp_path: Path) -> None:
     force = 0.5 * (-0.6 * size * u - 0.04 * lift + torch.tensor([[0, 0, 0.3]]))
     assert wrench.force[0].tolist() == pytest.approx(force[0].tolist())
     assert wrench.torque[0].tolist() == pytest.approx([0.0, -0.05 * 5 * 3 * 2, -0.05 * 5 * 4 * 3])
+    # the same law saved again keeps the file; another one does not take its place unasked
+    written = path.stat().st_mtime_ns
+    assert save_law(unexplained(LAW), path) == spec and path.stat().st_mtime_ns == written
+    other = unexplained(LAW.model_copy(update={"terms": LAW.terms[:1]}))
     with pytest.raises(UsageError, match="exists"):
-        save_law(unexplained(LAW), path)
-    assert save_law(unexplained(LAW), path, overwrite=True) == spec
+        save_law(other, path)
+    assert save_law(other, path, overwrite=True) == spec and path.stat().st_mtime_ns != written
     with pytest.raises(UsageError, match="Python file"):
         save_law(unexplained(LAW), tmp_path / "law.txt")
     with pytest.raises(InputDataError, match=r"no residual law.* So it is"):
@@ -315,8 +319,9 @@ def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
     found = json.loads(done.stdout)
     assert found["saved_law"] == f"{law}:ResidualLaw"
     assert "-|omega| omega" in [term["term"] for term in found["residual_law"]["terms"]]
+    law.write_text(law.read_text() + "# my own words\n")
     again = run(app, ["diagnose", str(model), str(root), "--save-law", str(law)])
-    assert again.exit_code == 2 and "exists" in again.stderr
+    assert again.exit_code == 2 and "exists" in again.stderr and "my own words" in law.read_text()
     fit = ["fit", str(root), "--from", str(model), "--out", str(fitted), "--effects", found["saved_law"]]
     done = run(
         app,
