@@ -21,6 +21,7 @@ from ...schemas import (
     NotConvergedError,
     PhysConfig,
     UsageError,
+    read_json,
 )
 from ..diagnose.experiments import Experiment
 from ..diagnose.stage import prepared_world, report
@@ -140,18 +141,32 @@ class Climb:
         groups = proposals_of(found, present, self.files / f"law_{number}.py")
         tried: list[ImproveTrial] = []
         for group in groups:
-            helping: list[tuple[float, str, Proposal]] = []  # by the smaller one of their ratios
+            helping: list[tuple[str, ImproveTrial, Proposal]] = []
             for proposal in group:
                 name = f"m{number}-{len(tried)}"
                 trial = self._trial(base, name, proposal)
                 tried.append(trial)
                 if trial.helps:
-                    ratios = [one.ratio for one in (trial.flight, trial.contact) if one is not None]
-                    helping.append((min(ratios), name, proposal))
+                    helping.append((name, trial, proposal))
             if helping:
-                _, name, proposal = min(helping, key=lambda one: one[0])
+                name, proposal = self._preferred(helping)
                 return tuple(tried), (name, proposal)
         return tuple(tried), None
+
+    def _preferred(self, helping: Sequence[tuple[str, ImproveTrial, Proposal]]) -> tuple[str, Proposal]:
+        """Return what is added of several additions that help, with the name of its models without a fold.
+
+        An effect with a cause comes before the law of the residual, which describes the motion alone, unless the law
+        predicts the same unseen episodes better, beyond chance.
+        """
+        causes = [one for one in helping if one[2].why != "law"] or list(helping)
+        name, _, proposal = min(causes, key=lambda one: _least_ratio(one[1]))
+        for law, _, described in helping:
+            if described.why == "law" and proposal.why != "law":
+                before, after = (read_json(self.files / f"errors-{one}.json", HeldOutErrors) for one in (name, law))
+                if helps(error_ratio(before.flight, after.flight), error_ratio(before.contact, after.contact)):
+                    return law, described
+        return name, proposal
 
     def _trial(self, base: str, name: str, proposal: Proposal) -> ImproveTrial:
         """Add effects to the models without a fold, and compare the errors on the folds."""
@@ -212,6 +227,10 @@ def helps(flight: ErrorRatio | None, contact: ErrorRatio | None) -> bool:
     if any(span is not None and span[0] > 1 for _, span in spans):
         return False
     return any(span is not None and span[1] < 1 and ratio <= 1 - LEAST_FALL for ratio, span in spans)
+
+
+def _least_ratio(trial: ImproveTrial) -> float:
+    return min(one.ratio for one in (trial.flight, trial.contact) if one is not None)
 
 
 def _parameters_of(model: Model, proposal: Proposal) -> tuple[FittedParameter, ...]:

@@ -13,10 +13,11 @@ from ...schemas import (
     ImproveTest,
     ImproveTestStep,
     ImproveTrial,
+    RankedEffect,
 )
-from ..report.page import cautions, command, facts, fixed, link, number, page, paragraph, section, table, text
+from ..report.page import cautions, command, facts, fixed, folded, link, number, page, paragraph, section, table, text
 from ..report.plots import Bar, bars
-from .wording import WHY, ratio_words, trial_words
+from .wording import WHY, remaining_words, share_words, trial_words
 
 PAGE = "improve.html"
 RANKED = 6
@@ -138,24 +139,38 @@ def _ratio(ratio: ErrorRatio) -> str:
 
 def _step(number_: int, step: ImproveStep, test: ImproveTest | None) -> str:
     """Return the section of a step that has added something."""
-    judged, tested = _accepted(step), _tested(test, step.next_model or "", step.model)
-    figures = [
-        f"{where}, prediction error in {kind}: {ratio_words(ratio)}."
-        for where, found in (("Unseen episodes of the split", judged), ("Test episodes", tested))
-        for kind in ("flight", "contact")
-        if found is not None and (ratio := getattr(found, kind)) is not None
-    ]
     return section(
         f"Step {number_}: {', '.join(step.added)}",
         paragraph(f"What {step.model} lacks. {step.sentence}"),
-        *map(paragraph, figures),
+        *map(paragraph, share_words(step)),
+        _unseen(_accepted(step), _tested(test, step.next_model or "", step.model)),
         _parameters(step.next_parameters),
         "<h3>Evidence</h3>",
+        _chart(step),
         _ranking(step),
         _rivals(step),
         _trials(step),
         _law(step),
     )
+
+
+def _unseen(judged: ImproveTrial | None, tested_: ImproveTestStep | None) -> str:
+    """Return the table of prediction errors on unseen episodes before and after a step."""
+    rows = [
+        [
+            text(where),
+            kind,
+            number(ratio.before),
+            number(ratio.after),
+            _ratio(ratio),
+            f"{ratio.better} of {ratio.episodes}",
+        ]
+        for where, found in (("cross-validated", judged), ("test episodes", tested_))
+        for kind in ("flight", "contact")
+        if found is not None and (ratio := getattr(found, kind)) is not None
+    ]
+    header = ["unseen episodes", "in", "error before [noise]", "error after [noise]", "ratio (95 %)", "smaller in"]
+    return table(header, rows, (2, 3)) if rows else ""
 
 
 def _parameters(parameters: Sequence[FittedParameter]) -> str:
@@ -171,33 +186,64 @@ def _parameters(parameters: Sequence[FittedParameter]) -> str:
     return table(["parameter", "estimate", "95 % interval", "unit"], rows, (1, 2)) if rows else ""
 
 
+def _chart(step: ImproveStep) -> str:
+    """Return the chart of how much better the best candidates describe flights; empty where none was refitted."""
+    judged = sorted((e for e in step.ranking if e.delta_bic is not None), key=lambda e: e.delta_bic or 0.0)[:RANKED]
+    if not judged or (judged[0].delta_bic or 0.0) >= 0:
+        return ""
+    words = (
+        "How much better flights are described with each candidate alone, or beside the ones named before it: the "
+        "fall of BIC, twice the rise of the log-likelihood less a charge for each fitted number. A difference of 10 "
+        "is strong evidence for the longer bar."
+    )
+    rows = [
+        Bar(name=e.effect, value=-e.delta_bic, words=number(-e.delta_bic), strong=e.effect in step.selected)
+        for e in judged
+        if e.delta_bic is not None
+    ]
+    return paragraph(words) + bars(rows)
+
+
 def _ranking(step: ImproveStep) -> str:
+    shown = [e for e in step.ranking if e.effect in step.selected]
+    shown += [e for e in step.ranking if e not in shown][: max(RANKED - len(shown), 0)]
     rows = [
         [
             text(entry.effect),
             text(", ".join(entry.acts_in)),
-            "0" if entry.score_p == 0 else number(entry.score_p, 2),
+            f"{entry.score_p:.2g}".replace("-", "−") if entry.score_p > 0 else "&lt; 1e−300",
             number(entry.delta_bic),
             f"{fixed(entry.cv_error_before_m, 2, _MM)} → {fixed(entry.cv_error_after_m, 2, _MM)}"
             if entry.cv_error_after_m is not None
             else "–",
+            _gain(entry),
             "; ".join(f"{text(p.name)} = {number(p.estimate)} ± {number(p.std_error, 2)} {text(p.unit)}"
                       for p in entry.parameters[:3]),
         ]
-        for entry in step.ranking[:RANKED]
+        for entry in shown
     ]  # fmt: skip
     if not rows:
         return paragraph("No candidate was tested.", "soft")
-    strong = [k for k, entry in enumerate(step.ranking[:RANKED]) if entry.effect in step.selected]
-    header = ["candidate", "acts in", "p", "change of BIC", "held-out error [mm]", "estimate"]
-    return table(header, rows, (2, 3), strong)
+    strong = [k for k, entry in enumerate(shown) if entry.effect in step.selected]
+    header = ["candidate", "acts in", "p-value", "change of BIC", "held-out error [mm]", "held-out gain [nats]"]
+    return table([*header, "estimate"], rows, (2, 3), strong)
+
+
+def _gain(entry: RankedEffect) -> str:
+    """Return the rise of the log-likelihood of held-out episodes, with its interval."""
+    if entry.held_out_nats is None:
+        return "–"
+    span = entry.held_out_nats_95
+    return number(entry.held_out_nats) + (f" ({number(span[0])} to {number(span[1])})" if span else "")
 
 
 def _rivals(step: ImproveStep) -> str:
-    if not step.aliases:
+    if not step.selected:
         return ""
-    listed = "; ".join(f"{group[0]}: {', '.join(group[1:])}" for group in step.aliases)
-    return paragraph(f"Rivals that these data cannot separate from what was named. {listed}.")
+    if not step.aliases:
+        return paragraph(f"No rival: no other candidate explains these data as well as {' and '.join(step.selected)}.")
+    said = [f"These data cannot tell {one[0]} from {' or '.join(one[1:])}." for one in step.aliases]
+    return paragraph(" ".join(said))
 
 
 def _trials(step: ImproveStep) -> str:
@@ -231,31 +277,60 @@ def _law(step: ImproveStep) -> str:
 
 def _remains(step: ImproveStep, result: ImproveResult) -> str:
     """Return the section of the diagnosis to which nothing was added."""
-    blind = [limit.effect for limit in step.contact_limits if not limit.sizes]
-    flight = step.flight_before
     pieces = [paragraph(f"Diagnosis of {step.model}. {step.sentence}")]
     if result.refusal:
         pieces.append(paragraph(f"It could not be diagnosed again: {result.refusal}"))
-    if flight is not None:
-        pieces.append(
-            paragraph(f"Mean chi2 of the residual in flight: {number(flight.statistic)}, where 1 is noise alone.")
-        )
-    if blind:
-        pieces.append(paragraph(f"Hardly detectable in these contacts: {', '.join(blind)}."))
-    return section("What remains", *pieces, _rivals(step), _law(step), _trials(step), _ranking(step))
+    pieces += [*map(paragraph, remaining_words(step)), _sizes(step)]
+    return section("What remains", *pieces, _rivals(step), _law(step), _trials(step), _ranking(step), _limits(step))
+
+
+def _sizes(step: ImproveStep) -> str:
+    """Return the chart of what is left in flight: all of it, its slow part, and the noise."""
+    found = step.remaining
+    if found is None:
+        return ""
+    sizes = [("between measurement and model", found.position_rms_m, True)]
+    sizes += [("slow errors", found.slow_position_std_m, False)] if found.slow_position_std_m else []
+    sizes += [("noise from frame to frame", std, False)] if (std := step.noise.get("position_m")) else []
+    rows = [
+        Bar(name=name, value=size, words=f"{fixed(size, 2, _MM)} mm", strong=strong) for name, size, strong in sizes
+    ]
+    return "<h3>Left in flight, positions</h3>" + bars(rows)
+
+
+def _limits(step: ImproveStep) -> str:
+    """Return what contact would have shown, folded."""
+    rows = []
+    for limit in step.contact_limits:
+        sizes = [f"{name} = {number(size, 2)} {limit.units[name]}".removesuffix(" 1")
+                 for name, size in limit.sizes.items()]  # fmt: skip
+        rows.append([text(limit.effect), text(", ".join(sizes)) or "hardly detectable in these motions"])
+    rows += [[text(name), f"not tested: {text(why)}"] for name, why in step.not_tested.items()]
+    words = "What could not have been seen: effects of contact below these sizes, and candidates that were not tested"
+    return folded(words, table(["effect", "seen from"], rows)) if rows else ""
 
 
 def _measure_next(steps: Sequence[ImproveStep]) -> str:
     """Return the last experiment that a diagnosis has proposed."""
-    found = next((one for step in reversed(steps) if (one := step.next_experiment) is not None), None)
-    if found is None:
-        return ""
+    step = next((one for one in reversed(steps) if one.next_experiment is not None), None)
+    if step is None or (found := step.next_experiment) is None:
+        words = "No rivals are left that another motion would tell apart."
+        return section("What to measure next", paragraph(words)) if steps else ""
+    apart = f" It tells {' and '.join(found.separates)} apart." if found.separates and found.initial_state else ""
+    pieces = [
+        paragraph(f"{found.what[:1].upper()}{found.what[1:]}.{apart} Asked for by the diagnosis of {step.model}.")
+    ]
     rows = [[text(entry["rank"]), text(entry["what"]), number(entry.get("order_of_magnitude"), 2)]
             for entry in found.ranked[:3]]  # fmt: skip
-    words = f"To distinguish {' and '.join(found.separates)}: {found.what}."
-    more = table(["rank", "experiment", "expected gain [nats]"], rows, (2,)) if rows else ""
-    left = paragraph(f"None of them separates {', '.join(found.not_separated)}.") if found.not_separated else ""
-    return section("What to measure next", paragraph(words), more, left)
+    if rows:
+        words = (
+            "The best of the motions that were compared, with the rise of the log-likelihood ratio that each is "
+            "expected to give, to the power of ten; 5 are odds of about 150 to 1."
+        )
+        pieces += [paragraph(words), table(["rank", "motion", "expected gain [nats]"], rows, (2,))]
+    if found.not_separated:
+        pieces.append(paragraph(f"None of them separates {', '.join(found.not_separated)}."))
+    return section("What to measure next", *pieces)
 
 
 def _commands(result: ImproveResult, out: Path) -> str:

@@ -108,6 +108,8 @@ def improve(
 
     All decisions rest on cross-validation within one split; the split `test` is opened once, after the last step.
 
+    A complete ladder that was made of the same inputs and settings is kept, and nothing is done.
+
     Args:
         capture: The capture, with tracks.
         out: The directory to write: the models `m0`, `m1`, ..., `improve.json` and the page; it appears when complete.
@@ -119,21 +121,21 @@ def improve(
         candidates: Effects to test in addition to the built-in ones, `file.py:Class` or names of entry points.
         throws: TOML file with the throws to choose the next experiment from; None for throws that can be made by hand.
         overwrite: Replace an existing ladder.
-        resume: Continue an interrupted ladder; keep a complete one that was made of the same.
+        resume: Continue an interrupted ladder.
         accept_units: Do not refuse units and frames of the capture that its motion contradicts.
 
     Returns:
         The content of `improve.json`.
 
     Raises:
-        UsageError: If `out` exists, the split does not, or the fits are not supervised by tracks; with `resume`, if
-            `out` was made of something else.
+        UsageError: If `out` holds something else, or a ladder that was made of something else, the split does not
+            exist, or the fits are not supervised by tracks.
         InputDataError: If the capture lacks what a fit or a diagnosis needs.
         NotConvergedError: If the fit of a model of the ladder diverges.
     """
     out, physics = Path(out), phys_config or PhysConfig()
     clean_stale(out)
-    finished = resume and (out / DOCUMENT).is_file()
+    finished = (out / DOCUMENT).is_file()
     if not finished:
         refuse_output(out, "ladder", overwrite)
     resolve_device(physics.device)
@@ -165,7 +167,7 @@ def improve(
     )
     episodes = request.capture.episodes(split)
     inputs = request.inputs()
-    if finished and (kept := _kept(request, inputs, overwrite)) is not None:
+    if finished and (resume or not overwrite) and (kept := _kept(request, inputs, overwrite)) is not None:
         return kept
     refuse_output(out, "ladder", overwrite)
     made_of = {**inputs, **request.settings, "versions": json.dumps(versions())}
@@ -234,8 +236,7 @@ def _kept(request: _Request, inputs: dict[str, str], overwrite: bool) -> Improve
         return None
     raise UsageError(
         f"{request.out} is complete, and was made with other {', '.join(names)}.",
-        "the same command, on the same capture, with --resume.",
-        "choose another --out, or pass --overwrite to make this ladder anew.",
+        todo="choose another --out, or pass --overwrite to make this ladder anew.",
     )
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-from ...schemas import ErrorRatio, ImproveTest, ImproveTrial
+from ...schemas import DiagnoseResult, ErrorRatio, ImproveTest, ImproveTrial, Remaining
 from ..compare.paired_difference import LEAST_EPISODES
+from ..diagnose.wording import organised
 from .ladder import LEAST_FALL, Ladder
 
 WHY = {
@@ -15,6 +17,11 @@ WHY = {
     "law": "law of the residual, found by regression",
 }
 """In words, where a proposal comes from."""
+_ALL = 0.999
+"""Shares above it are not told from all."""
+_WHOLE_FLIGHT_S = 0.9
+"""Errors that change more slowly bend a whole flight."""
+_GRAVITY_M_S2 = 9.81
 
 
 def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
@@ -27,16 +34,25 @@ def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
         words = [f"Added in {count} step{'' if count == 1 else 's'}: {'; then '.join(added)}."]
     if test is not None and test.steps:
         overall = test.steps[-1]
+        decided = _decided(ladder)
         for ratio, name, scale, unit in (
-            (overall.flight, "prediction error in flight", 1.0, "times the noise"),
+            (overall.flight if "flight" in decided else None, "prediction error in flight", 1.0, "times the noise"),
+            (overall.contact if "contact" in decided else None, "prediction error in contact", 1.0, "times the noise"),
             (overall.translation_error_m, "open-loop error of whole episodes", 1e3, "mm"),
         ):
             if ratio is not None:
                 words.append(
-                    f"Test episodes, {name}: {ratio.before * scale:.3g} before, {ratio.after * scale:.3g} "
-                    f"{unit} after (medians; {ratio_words(ratio)})."
+                    f"On test episodes the {name} goes from {ratio.before * scale:.3g} to "
+                    f"{ratio.after * scale:.3g} {unit} (medians; {ratio_words(ratio)})."
                 )
     return " ".join([*words, why_ended(ladder)])
+
+
+def _decided(ladder: Ladder) -> set[str]:
+    """Return in which of flight and contact the additions of a ladder predict unseen episodes better."""
+    trials = [t for step in ladder.steps for t in step.tried if t.helps and t.effects == step.added]
+    kinds = [(kind, one) for t in trials for kind, one in (("flight", t.flight), ("contact", t.contact))]
+    return {kind for kind, one in kinds if one is not None and one.interval_95 and one.interval_95[1] < 1}
 
 
 def ratio_words(ratio: ErrorRatio) -> str:
@@ -95,3 +111,66 @@ def warnings_of(ladder: Ladder, test: ImproveTest | None, folds: Sequence[Sequen
     found += [f"{', '.join(t.effects)} could not be fitted: {t.failure}" for t in failed]
     found += [text for step in ladder.steps[:1] for text in step.warnings]
     return tuple(dict.fromkeys(found))
+
+
+def share_words(step: DiagnoseResult) -> list[str]:
+    """Return how much of what repeats in flight the named effects explain; empty where they do not act there."""
+    found = step.remaining
+    named = [e.effect for e in step.ranking if e.effect in step.selected and e.judged_in == "flight"]
+    if found is None or not named:
+        return []
+    share = found.share_explained
+    percent = f"{100 * share:.1f}" if share < _ALL else f"more than {100 * _ALL:g}"
+    verb = "explains" if len(named) == 1 else "explain"
+    return [f"Of the force that repeats from episode to episode in flight, {' and '.join(named)} {verb} {percent} %."]
+
+
+def remaining_words(step: DiagnoseResult) -> list[str]:
+    """Return in sentences what is left beside the effects that a diagnosis names.
+
+    How large it is and in which phase, how fast it changes, whether it is common to all episodes, and what it follows.
+    """
+    words, found = [], step.remaining
+    beside = f", with {' and '.join(step.selected)} added," if step.selected else ""
+    if found is None:
+        words.append("Nothing was measured in flight, so that nothing can be said of it.")
+    else:
+        turned = found.rotation_rms_rad
+        rotation = "" if turned is None else f" and rotations by {math.degrees(turned):.2g} degrees"
+        words.append(
+            f"In flight{beside} positions differ from the model by {1e3 * found.position_rms_m:.3g} mm{rotation} "
+            "(root mean square over whole flights, with the start of each fitted)."
+        )
+        words += [_slow(found), *_own(found), _common(found)]
+    if step.contact_chi2 is not None:
+        words.append(
+            f"In contact, what short segments leave has a mean chi2 of {step.contact_chi2:.3g} (1: noise alone); "
+            "what no rigid contact can do counts in it."
+        )
+    return words
+
+
+def _slow(found: Remaining) -> str:
+    if not found.slow_position_std_m or found.slow_time_s is None:
+        return "No slow errors show: what is left changes from frame to frame, as noise does."
+    time = "over a whole flight" if found.slow_time_s > _WHOLE_FLIGHT_S else f"within {1e3 * found.slow_time_s:.0f} ms"
+    return (
+        f"It is slow: errors of {1e3 * found.slow_position_std_m:.2g} mm change {time}, and differ from episode to "
+        "episode, as errors of the tracking do."
+    )
+
+
+def _own(found: Remaining) -> list[str]:
+    own = found.own_acceleration_std_m_s2
+    if not own:
+        return []
+    return [
+        f"Each flight has an acceleration of its own across gravity, {own:.2g} m/s2 in standard deviation, as if "
+        f"gravity leaned by {1e3 * own / _GRAVITY_M_S2:.2g} mrad."
+    ]
+
+
+def _common(found: Remaining) -> str:
+    if found.repeats and found.coordinate is not None:
+        return f"A part of it is common to all episodes. {organised(found.coordinate)}"
+    return "Nothing of it is common to all episodes: no law predicts held-out episodes better than by chance."

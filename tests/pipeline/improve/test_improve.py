@@ -1,8 +1,5 @@
 """The ladder of models: what is proposed, what is accepted, and how its page and files are read again."""
 
-# pyright: reportMissingImports=false
-# until `make install` has linked the room
-
 import json
 import re
 from dataclasses import replace
@@ -15,12 +12,13 @@ from cgwm.cli.app import app
 from cgwm.datasets.io.atomic import sha256
 from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
 from cgwm.pipeline.improve import improve
-from cgwm.pipeline.improve.folds import folds_of
-from cgwm.pipeline.improve.held_out_errors import error_ratio, typical_error
-from cgwm.pipeline.improve.ladder import helps
+from cgwm.pipeline.improve.folds import ReadOnce, folds_of
+from cgwm.pipeline.improve.held_out_errors import HeldOutErrors, error_ratio, typical_error
+from cgwm.pipeline.improve.ladder import Climb, helps
 from cgwm.pipeline.improve.ladder_files import LadderFiles
 from cgwm.pipeline.improve.page import ladder_html
 from cgwm.pipeline.improve.proposals import proposals_of
+from cgwm.pipeline.improve.wording import remaining_words, share_words
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     DiagnoseResult,
@@ -33,6 +31,7 @@ from cgwm.schemas import (
     LawTerm,
     PhysConfig,
     RankedEffect,
+    Remaining,
     ResidualLaw,
     UsageError,
 )
@@ -107,6 +106,58 @@ def test_what_is_named_comes_first_and_what_is_not_is_tried_where_nothing_is(tmp
     assert proposals_of(found("none_missing"), (), law) == []
     weak = found("unexplained", ranking=(RANKED.model_copy(update={"score_p": 0.1}),))
     assert proposals_of(weak, (), law) == []
+
+
+@pytest.mark.parametrize(("law_error", "added"), [(0.43, "linear_drag"), (0.2, "law_0.py:ResidualLaw")])
+def test_a_law_is_taken_before_an_effect_only_where_it_predicts_better_beyond_chance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, law_error: float, added: str
+) -> None:
+    names, scatter = [f"{k}" for k in range(8)], np.random.default_rng(0).normal(0, 0.2, 8)
+    errors = {"m0": np.ones(8), "m0-0": np.full(8, 0.45), "m0-1": law_error * np.exp(scatter - scatter.mean())}
+
+    def measured(_: Climb, name: str, *__: object) -> HeldOutErrors:
+        return HeldOutErrors(flight=dict(zip(names, errors[name].tolist(), strict=True)), contact={})
+
+    monkeypatch.setattr(Climb, "_measured", measured)
+    files = LadderFiles(tmp_path / "out", {}, resume=False, overwrite=False)
+    write_small_model(files / "m0")
+    climb = Climb(
+        capture=ReadOnce.open(write_capture(tmp_path / "capture", 3), splits=("test",)),  # pyright: ignore[reportArgumentType]
+        split="test",
+        files=files,
+        folds=((),),
+        config=ImproveConfig(),
+        physics=PhysConfig(),
+        library=(),
+        throws=(),
+        accept_units=False,
+    )
+    tried, best = climb._tried(0, "m0", found("unexplained", ranking=(RANKED,), residual_law=LAW))
+    assert all(trial.helps for trial in tried) and len(tried) == 2
+    assert best is not None and best[1].names == (added,)
+
+
+def test_what_remains_is_said_in_sentences() -> None:
+    left = Remaining(
+        position_rms_m=0.002,
+        slow_position_std_m=0.0011,
+        slow_time_s=0.03,
+        own_acceleration_std_m_s2=0.0981,
+        repeats=False,
+        coordinate="x",
+        p_value=0.4,
+        share_explained=0.9,
+    )
+    entry = RANKED.model_copy(update={"effect": "drag"})
+    said = found(selected=("drag",), ranking=(entry,), remaining=left, contact_chi2=1.5)
+    text = " ".join(remaining_words(said))
+    for words in ("2 mm", "1.1 mm change within 30 ms", "leaned by 10 mrad", "Nothing of it is common", "chi2 of 1.5"):
+        assert words in text
+    assert "drag explains 90.0 %" in share_words(said)[0]
+    fast = left.model_copy(update={"slow_position_std_m": 0.0, "own_acceleration_std_m_s2": 0.0, "repeats": True})
+    text = " ".join(remaining_words(found(remaining=fast)))
+    assert "No slow errors" in text and "leaned" not in text and "place along x" in text
+    assert "said of it" in remaining_words(found())[0] and share_words(found()) == []
 
 
 def test_an_unfinished_ladder_is_continued_by_the_same_command_only(tmp_path: Path) -> None:
@@ -206,6 +257,7 @@ def test_hidden_drag_is_added_and_test_errors_fall_in_the_same_ladder_after_an_i
     assert last["translation_error_m"]["median"] < 0.5 * first["translation_error_m"]["median"]
     assert validate(tmp_path / "ladder").faults == ()
     kept = (tmp_path / "ladder" / "improve.json").read_bytes()
-    assert CliRunner().invoke(app, words).exit_code == 2
-    assert json.loads(CliRunner().invoke(app, [*words, "--resume"]).stdout) == result
+    for again in (words, [*words, "--resume"]):
+        assert json.loads(CliRunner().invoke(app, again).stdout) == result
+    assert CliRunner().invoke(app, [*words, "--steps", "1"]).exit_code == 2
     assert (tmp_path / "ladder" / "improve.json").read_bytes() == kept
