@@ -37,6 +37,7 @@ from ..schemas import (
 from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
 from .phys_geo.stage import fit_motion
+from .phys_geo.tracks.earlier_estimates import with_fitted_physics
 from .physics.effects.trust import is_trusted, keep_trust
 from .physics.world import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
@@ -292,7 +293,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
         if stage == "phys-geo":
             return model
         fresh = _from_scene(capture, fit_scene(capture, config, checkpoint))
-        return replace(fresh, file=fresh.file.model_copy(update={"effects": model.file.effects}))
+        return replace(fresh, file=with_fitted_physics(fresh.file, model.file))
     if stage == "phys-geo":
         lacking = [body.name for body in capture.manifest.bodies if body.shape is None]
         if lacking:

@@ -31,6 +31,7 @@ from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .tracks.contact_result import PhysicsFit
+from .tracks.earlier_estimates import GROUND, EarlierEstimates
 from .tracks.part_choice import SCALE
 from .work import LESS, fit_parts
 
@@ -112,7 +113,8 @@ def _fitted_motion(
         episodes = track_episodes(capture, split)
         spans = durations(episodes)
         with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
-            found = fit_with_effects(world, episodes, config, noise, warm_started, capture.groups)
+            earlier = EarlierEstimates.of(ready.file.parameters, ready.file.correlations)
+            found = fit_with_effects(world, episodes, config, noise, warm_started, capture.groups, earlier)
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
         return replace(found, warnings=(*found.warnings, *warnings))
@@ -170,8 +172,10 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     added = (SCALE,) if any(p.name.startswith(f"{SCALE}.") for p in found.parameters) else ()
     effects = with_effects(file.effects, added)
     ground = file.ground
-    if ground is not None and found.ground_offset_m is not None:
-        ground = ground.model_copy(update={"offset_m": found.ground_offset_m})
+    earlier_m = next((p.estimate for p in kept if p.name == GROUND and p.state == "fitted"), None)
+    offset_m = earlier_m if found.ground_offset_m is None else found.ground_offset_m
+    if ground is not None and offset_m is not None:
+        ground = ground.model_copy(update={"offset_m": offset_m})
     return file.model_copy(
         update={
             "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),

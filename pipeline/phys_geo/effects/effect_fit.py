@@ -30,6 +30,7 @@ def fit_effects(
     along: Sequence[tuple[Parameter, float]],
     noise: Noise,
     groups: Mapping[str, str] | None = None,
+    held: Sequence[str] = (),
 ) -> EffectEstimate:
     """Fit the world's effects to flights, sliding segments and impacts, and the remaining ones around first contacts.
 
@@ -43,13 +44,15 @@ def fit_effects(
         along: Contact parameters that are fitted with the effects in contact, and their start.
         noise: Noise of the tracks (position [m], rotation [rad]).
         groups: Group of each episode that belongs to one, for effects with group-specific parameters.
+        held: Effects that keep their values; none of those with group-specific parameters.
 
     Raises:
         InputDataError: If an effect has group-specific parameters, and an episode belongs to no group.
         NotConvergedError: If the rollouts diverge at the start.
     """
-    contact = [active.effect.name for active in world.effects if active.effect.phase == "contact"]
-    others = [active.effect.name for active in world.effects if active.effect.name not in contact]
+    free = [active.effect for active in world.effects if active.effect.name not in held]
+    contact = [effect.name for effect in free if effect.phase == "contact"]
+    others = [effect.name for effect in free if effect.phase != "contact"]
     after_s = CONTACT_S if contact else AFTER_S
     if any(parameter.shared != "all" for parameter in effect_parameters(world)):
         return _with_segment_parameters(world, episodes, along, noise, groups or {}, bool(contact))

@@ -14,6 +14,7 @@ from ...physics.world import World
 from ...segments.release_detection import after_release, find_releases
 from ..tracks.contact_fit import fit_physics
 from ..tracks.contact_result import PhysicsFit
+from ..tracks.earlier_estimates import EarlierEstimates
 
 
 def with_effects(present: Sequence[EffectModel], wanted: Iterable[str]) -> tuple[EffectModel, ...]:
@@ -99,6 +100,7 @@ def fit_with_effects(
     noise: tuple[float | None, float | None],
     warm_started: bool = False,
     groups: Mapping[str, str] | None = None,
+    earlier: EarlierEstimates | None = None,
 ) -> PhysicsFit:
     """Fit the world as `fit_physics` does, after checking its effects' needs and cutting throws at their release.
 
@@ -108,7 +110,7 @@ def fit_with_effects(
     """
     _require_needs(world, episodes)
     released_s, warnings = find_releases(world, episodes, noise)
-    found = fit_physics(world, after_release(episodes, released_s), config, noise, warm_started, groups)
+    found = fit_physics(world, after_release(episodes, released_s), config, noise, warm_started, groups, earlier)
     return replace(found, warnings=(*found.warnings, *warnings))
 
 

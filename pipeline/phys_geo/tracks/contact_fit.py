@@ -58,6 +58,7 @@ from .contact_result import (
     with_damping,
 )
 from .contact_shooting import ShootingEpisodes, shoot_contact
+from .earlier_estimates import EarlierEstimates
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
 from .part_choice import SCALE, asked_parts, choose_parts
@@ -70,10 +71,10 @@ MAX_EPISODES = 100
 fit."""
 
 NEVER_TOUCHES = (
-    "nothing touches anything in these episodes: the contact parameters keep their prior values; only effects that act "
+    "nothing touches anything in these episodes: the contact parameters keep their {} values; only effects that act "
     "in flight can be fitted."
 )
-"""Warning for a fit in which no body touches anything."""
+"""Warning for a fit in which no body touches anything; the values are prior or earlier ones."""
 
 
 @one_torch_thread()
@@ -84,6 +85,7 @@ def fit_physics(
     noise: tuple[float | None, float | None] = (None, None),
     warm_started: bool = False,
     groups: Mapping[str, str] | None = None,
+    earlier: EarlierEstimates | None = None,
 ) -> PhysicsFit:
     """Fit contact parameters and ground height to measured tracks, and effects and mass distribution where asked for.
 
@@ -97,6 +99,7 @@ def fit_physics(
         warm_started: Whether the world's contact parameters come from an earlier fit: the search then starts there
             with half as many generations; otherwise it starts at the medians of the priors.
         groups: Group of each episode that belongs to one, for effects with group-specific parameters.
+        earlier: What an earlier fit found: kept where these episodes do not observe it.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
@@ -104,7 +107,8 @@ def fit_physics(
     """
     _require_short_steps(config.step_s)
     data = _FitData.of(world, episodes, noise)
-    ready = _fitted_before(world, data, config, warm_started, groups)
+    earlier = earlier or EarlierEstimates()
+    ready = _fitted_before(world, data, config, warm_started, groups, earlier)
     batch = _with_initial_states(ready.world, data, config.warmup_s)
     record = FitRecord(
         episodes=len(episodes),
@@ -116,12 +120,12 @@ def fit_physics(
         bounces=None if data.bounces is None else data.bounces.to_json(),
     )
     if data.airborne:
-        found = _never_touching(ready, batch, data.noise, record)
+        found = _never_touching(ready, batch, data.noise, record, earlier)
     else:
         estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
         if data.bounces is not None:
             estimate = with_damping(estimate, damping_of(data.bounces))
-        found = physics_fit(ready.world, estimate, data.noise, record)
+        found = physics_fit(ready.world, earlier.kept_in(ready.world, estimate), data.noise, record)
     return _completed(found, ready)
 
 
@@ -207,7 +211,12 @@ class _Ready:
 
 
 def _fitted_before(
-    world: World, data: _FitData, config: PhysConfig, warm_started: bool, groups: Mapping[str, str] | None
+    world: World,
+    data: _FitData,
+    config: PhysConfig,
+    warm_started: bool,
+    groups: Mapping[str, str] | None,
+    earlier: EarlierEstimates,
 ) -> _Ready:
     """Fit mass distribution and effects, which short windows identify better than the open-loop error."""
     # with few episodes the search cannot separate the ground's height from the bouncing; shooting can
@@ -223,12 +232,29 @@ def _fitted_before(
         # a scale alone is known far better than it matters from the episodes of the search
         only_scale = [active.effect.name for active in world.effects] == [SCALE]
         episodes = data.searched if only_scale else data.episodes
-        effects = fit_effects(at, episodes, [] if data.airborne else start, data.noise, groups)
+        effects = _effects_beside(at, episodes, [] if data.airborne else start, data.noise, groups, earlier)
+    if effects is not None:
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
         if effects.ground is not None:  # bodies at rest identify it better than the ends of rollouts
             start = [(p, value) for p, value in start if p in CONTACT_PARAMETERS]
     return _Ready(world=world, start=start, mass=mass, effects=effects, choice=choice)
+
+
+def _effects_beside(
+    world: World,
+    episodes: Sequence[Episode],
+    along: Sequence[tuple[Parameter, float]],
+    noise: Noise,
+    groups: Mapping[str, str] | None,
+    earlier: EarlierEstimates,
+) -> EffectEstimate | None:
+    """Return the effects, fitted beside those that were found before and are not observed now; None if none is left."""
+    found = fit_effects(world, episodes, along, noise, groups)
+    lost = earlier.lost_effects(world, found)
+    if not lost:
+        return found
+    return fit_effects(world, episodes, along, noise, groups, lost) if len(lost) < len(world.effects) else None
 
 
 def _with_chosen_parts(
@@ -279,16 +305,20 @@ def _contact_estimate(
     return estimate, replace(record, shooting=shooting)
 
 
-def _never_touching(ready: _Ready, batch: SearchBatch, noise: Noise, record: FitRecord) -> PhysicsFit:
-    """Return a fit with the contact parameters at their priors; a search would only return the scatter of its draws."""
+def _never_touching(
+    ready: _Ready, batch: SearchBatch, noise: Noise, record: FitRecord, earlier: EarlierEstimates
+) -> PhysicsFit:
+    """Return a fit with earlier contact parameters, or at their priors; a search would return the scatter of draws."""
     names = ready.parameters
     middle = np.array([p.encode(p.prior[0]) for p in names])
     errors = open_loop_errors(ready.world, batch.observations, batch.warm, names)
     record = replace(record, search_open_loop_m=[float(errors(middle[None]).mean())])
     estimate = ContactEstimate(parameters=names, values=middle, covariance=np.diag([p.prior[1] ** 2 for p in names]))
+    estimate = earlier.kept_in(ready.world, estimate)
     found = physics_fit(ready.world, estimate, noise, record)
     unseen = [warning for warning in found.warnings if "not observable" in warning]
-    return replace(found, warnings=(NEVER_TOUCHES, *unseen))
+    values = "prior" if not estimate.kept else "earlier or prior" if unseen else "earlier"
+    return replace(found, warnings=(NEVER_TOUCHES.format(values), *unseen))
 
 
 def _completed(found: PhysicsFit, ready: _Ready) -> PhysicsFit:

@@ -23,6 +23,9 @@ from ...trajectories.track_noise import Noise
 from .bounce_damping import BounceDamping
 from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
 
+KEPT_NOTE = "of the model that the fit started from, as these episodes do not observe it; "
+"""Beginning of the note of an estimate that was kept."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ContactEstimate:
@@ -38,6 +41,8 @@ class ContactEstimate:
     """Time [s] and state of the first frame of each episode, by its name, where shooting found it."""
     bounces: BounceDamping | None = None
     """Damping ratio, where the bounces of a ball gave it."""
+    kept: dict[str, FittedParameter] = field(default_factory=dict)
+    """Estimates of an earlier fit that stand in place of parameters which these episodes do not observe, by name."""
 
 
 def with_damping(estimate: ContactEstimate, damping: BounceDamping) -> ContactEstimate:
@@ -210,6 +215,7 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
     warnings = bound_warnings(names, fitted)
     if GROUND_SHIFT in names and world.ground_offset is not None:
         fitted[-1] = absolute_ground(fitted[-1], float(world.ground_offset[0]))
+    fitted = [_kept(estimate.kept[p.name]) if p.name in estimate.kept else p for p in fitted]
     value = {p.name: p.estimate for p in fitted}
     contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
     warnings += [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
@@ -275,6 +281,12 @@ def _from_bounces(found: FittedParameter, count: int) -> FittedParameter:
     note = f"from the heights on both sides of {count} bounces"
     state = "fitted" if found.state == "not_observable" else found.state
     return found.model_copy(update={"prior": None, "note": note, "state": state})
+
+
+def _kept(found: FittedParameter) -> FittedParameter:
+    """Return an earlier estimate with a note that it is one."""
+    note = f"{KEPT_NOTE}{found.note.removeprefix(KEPT_NOTE)}"
+    return found.model_copy(update={"note": note})
 
 
 def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:

@@ -169,12 +169,21 @@ def _sentence(episodes: int, open_parts: Parts, chosen: Parts, gain: HeldOutGain
     begin = f"By cross-validation over {episodes} training tosses"
     left = [part for part in open_parts if part not in chosen]
     if gain is None:
-        verb = "stays as it is" if len(left) == 1 else "stay as they are"
-        return f"{begin} the {_listed(left)} {verb}: held-out tosses are not predicted better with them fitted."
-    verb = "is fitted, too" if len(chosen) == 1 else "are fitted, too"
-    rest = f"; the {_listed(left)} {'stays as it is' if len(left) == 1 else 'stay as they are'}" if left else ""
+        return f"{begin} the {_listed(left)} {_left(left)}: held-out tosses are not predicted better with them fitted."
+    verb = "are fitted, too" if _plural(chosen) else "is fitted, too"
+    rest = f"; the {_listed(left)} {_left(left)}" if left else ""
     share = f"{100 * gain.share:.0f} +- {100 * gain.std_error:.0f} %"
     return f"{begin} the {_listed(chosen)} {verb}: the misfit of held-out tosses falls by {share}{rest}."
+
+
+def _left(parts: Sequence[str]) -> str:
+    """Return what happens to parts that are not fitted."""
+    return "stay as they are" if _plural(parts) else "stays as it is"
+
+
+def _plural(parts: Sequence[str]) -> bool:
+    """Return whether parts in words take a plural verb."""
+    return len(parts) > 1 or "second_moments" in parts
 
 
 def _listed(parts: Sequence[str]) -> str:
