@@ -27,7 +27,7 @@ from zlib import crc32
 
 import numpy as np
 from cgwm.datasets.capture.capture import Capture
-from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic.hidden_effects.mechanics import Mechanics, Start, build
 from cgwm.datasets.synthetic.hidden_effects.record import ENGINES, measured
@@ -45,7 +45,7 @@ from cgwm.pipeline.segments.candidates import Candidate, base_parameters
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from cgwm.pipeline.segments.segment_fit import Refit, refit
 from cgwm.pipeline.segments.segments import Segments
-from cgwm.schemas import PhysConfig
+from diagnose import base_settings
 from hidden_effects import Case, make_capture
 from store import Store, timed
 
@@ -89,10 +89,10 @@ def measure(case: Case, rival: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         capture, base = Path(folder) / "capture", Path(folder) / "m0"
         make_capture(capture, case)
-        fit(capture, base, stage="phys-geo", phys_config=PhysConfig(supervise="tracks"))
+        fit(capture, base, stage="phys-geo", phys_config=base_settings("tracks"))
         opened = Capture.open(capture, splits=("train",))
         world, prepared = prepared_world(read_model(base), opened, "train")
-        tracks = [(name, opened.tracks(name)) for name in prepared.names]
+        tracks = [Episode(name, opened.tracks(name)) for name in prepared.names]
     fits = [_with(prepared, world, name) for name in pair]
     discount = max(1.0, min(_contact_chi2(one) for one in fits))
     rivals = Rivals((_evidence(pair[0], fits[0]), _evidence(pair[1], fits[1])), world)
@@ -100,7 +100,7 @@ def measure(case: Case, rival: str) -> dict[str, Any]:
     before = _nats(fits[0], fits[1], discount)
     rows = {}
     for place, one in (("first", ranked[0]), ("last", ranked[-1])):
-        more = prepare(world, [*tracks, (place, {case.thing: made(case, one)})], prepared.noise)
+        more = prepare(world, [*tracks, Episode(place, {case.thing: made(case, one)})], prepared.noise)
         after = _nats(_with(more, world, pair[0]), _with(more, world, pair[1]), discount)
         (key,) = one.by_pair
         rows[place] = {

@@ -37,7 +37,8 @@ from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.verdict import Findings, find
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.segments.candidates import Candidate
-from cgwm.schemas import CgwmError, PhysConfig
+from cgwm.schemas import CgwmError
+from diagnose import base_settings
 from hidden_effects import Case, cases, make_capture
 from store import Store, timed
 from thresholds_page import groups
@@ -123,13 +124,13 @@ def measure(case: Case) -> dict[str, Any]:
         make_capture(capture, case)
         row: dict[str, Any] = {"effects": list(case.effects), "magnitude": case.magnitude if case.effects else "null"}
         try:
-            fit(capture, model, stage="phys-geo", phys_config=PhysConfig(supervise="tracks"))
+            fit(capture, model, stage="phys-geo", phys_config=base_settings("tracks"))
             opened = Capture.open(capture, splits=("train",))
             world, prepared = prepared_world(read_model(model), opened, "train")
         except CgwmError as error:
             return row | {"refused": error.found}
         recorders = [Recorder(test) for test in TESTS]
-        found = find(prepared, world, library_of(()), recorders)
+        found = find(prepared, world, library_of(()), recorders)  # pyright: ignore[reportArgumentType]
         contact = {name: value for one in recorders for name, value in one.statistics().items()}
         return row | {"statistics": flight_statistics(found) | contact}
 
@@ -137,9 +138,9 @@ def measure(case: Case) -> dict[str, Any]:
 def flight_statistics(found: Findings) -> dict[str, float]:
     """Return the statistics of flight: the smallest p-value times the number of candidates, and the omnibus test."""
     p_values = [one.p_value for one in found.ranking if one.candidate.effect.phase != "contact"]
-    statistics = {"flight.alpha": min(p_values) * len(p_values)} if p_values and found.before is not None else {}
-    if found.before is not None and found.before.p_value < THRESHOLDS.verdict.omnibus_p:
-        statistics["verdict.omnibus_limit"] = found.before.statistic
+    statistics = {"flight.alpha": min(p_values) * len(p_values)} if p_values and found.flight.before is not None else {}
+    if found.flight.before is not None and found.flight.before.p_value < THRESHOLDS.verdict.omnibus_p:
+        statistics["verdict.omnibus_limit"] = found.flight.before.statistic
     return statistics
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.fit import fit
-from cgwm.schemas import CgwmError, PhysConfig
+from cgwm.schemas import CgwmError
 
 from .effects_base import Named
 
@@ -30,9 +30,9 @@ class Cgwm:
 
     def names(self, capture: Path) -> Named:
         """Fit and diagnose the training split."""
-        from diagnose import added, brief
+        from diagnose import added, base_settings, brief
 
-        physics = PhysConfig(supervise="tracks")
+        physics = base_settings("tracks")
         with tempfile.TemporaryDirectory() as folder:
             base, began = Path(folder) / "m0", time.process_time()
             try:
