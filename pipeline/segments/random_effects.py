@@ -181,14 +181,18 @@ def _batch(
     after_s: float,
 ) -> tuple[Observations, NDArray[np.bool_], tuple[Tensor, Tensor]]:
     """Return the windows, which of them are ends of episodes, and the standard deviations of their rows (B, F, 1)."""
-    picked, windows, contact = windows_of(world, episodes, None, after_s)
-    ends = [False] * len(picked)
+    every, windows, contact = windows_of(world, episodes, None, after_s)
+    picked = every
     if after_s == 0:
         windows = [(a, b if np.isinf(at) else at - 1e-6) for (a, b), at in zip(windows, contact, strict=True)]
+        # an episode that begins in contact has no flight
+        some = [k for k, (a, b) in enumerate(windows) if b > a]
+        picked, windows, contact = ([found[k] for k in some] for found in (picked, windows, contact))
+    ends = [False] * len(picked)
     if not flying:
-        last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in picked]
+        last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in every]
         windows, ends = [*windows, *((t - REST_S, t + 1e-9) for t in last)], [*ends, *(True for _ in last)]
-        picked, contact = [*picked, *picked], [*contact, *(np.inf for _ in last)]
+        picked, contact = [*picked, *every], [*contact, *(np.inf for _ in last)]
     batch = Observations.of(world, picked, windows)
     # model error is added after the first contact; flight and the rest at the end have the tracks' noise alone
     free = batch.times_s < torch.tensor(contact)[:, None].to(batch.times_s)
