@@ -9,10 +9,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
@@ -22,8 +23,7 @@ from .initial_state import FLIGHT_MARGIN_M, clearance
 from .observations import Observations
 from .track_noise import Noise
 
-if TYPE_CHECKING:
-    pass
+Array = NDArray[np.float64]
 
 FLIGHT_S = 0.60
 """Maximum length [s] of a flight segment; longer flights are cut into equal parts."""
@@ -48,10 +48,14 @@ within half a move (study of diagnosis, pitfall P1)."""
 NOISE_SIGMAS = 3.0
 """Standard errors of the measured heights by which the margin of flight grows."""
 MOST_LIFT = 0.5
-"""Maximum difference of an acceleration from gravity, as a share of gravity, for free fall: no effect in the air is
-stronger."""
+"""Maximum difference of an acceleration from gravity, as a share of gravity, for free fall: a known effect in the air
+is weaker."""
 SURE_SIGMAS = 5.0
 """Minimum of that difference in standard errors."""
+LEAST_FALL = 0.2
+"""Minimum downward acceleration, as a share of gravity, of a parabola through all heights that counts as flight."""
+KINK_FRAMES = 3
+"""Number of frames before and after a bounce within a segment that are not free fall."""
 
 
 @dataclass(frozen=True)
@@ -277,6 +281,7 @@ def supported_frames(world: World, whole: Observations, flight: Sequence[Segment
 
     A ground at another height than stated, a marker away from the body's middle or a hand make a body slide or rest
     above the ground. The acceleration is that of a parabola through the measured heights, with its standard error.
+    A bounce that smoothing lifted off the ground has free falls on its sides, of which nothing is supported.
 
     Args:
         world: For gravity.
@@ -293,14 +298,86 @@ def supported_frames(world: World, whole: Observations, flight: Sequence[Segment
         frames = slice(item.first, item.last + 1)
         for column in range(len(whole.free)):
             seen = whole.seen[item.episode, frames, column] > 0
-            if int(seen.sum()) < 4:
-                continue
             t = whole.times_s[item.episode, frames][seen].numpy()
             along = (whole.position_m[item.episode, frames, column][seen] @ gravity / strength).numpy()
-            powers = np.vander(t - t.mean(), 3)
-            solution = np.linalg.lstsq(powers, along, rcond=None)[0]
-            error = 2 * noise.position_m * float(np.sqrt(np.linalg.inv(powers.T @ powers)[0, 0]))
-            off = abs(2 * float(solution[0]) - strength)
-            if off > MOST_LIFT * strength and off > SURE_SIGMAS * error:
+            held = torch.as_tensor(_not_falling(t, along, strength, noise.position_m))
+            places = item.first + torch.nonzero(seen)[:, 0]
+            if bool(held.all()) and len(held):
                 found[item.episode, frames] = True
+            elif bool(held.any()):
+                found[item.episode, places[held]] = True
     return found
+
+
+def _not_falling(t: Array, along: Array, strength: float, sigma: float) -> NDArray[np.bool_]:
+    """Return which frames (n,) are not part of a free fall: none, all, or those between two falls.
+
+    Args:
+        t: Their times (n,) [s].
+        along: Position along gravity (n,) [m].
+        strength: Gravity [m/s2].
+        sigma: Standard deviation of the position [m].
+    """
+    held = np.zeros(len(t), bool)
+    low, (off, _) = _low_point(t, along, strength, sigma), _off_gravity(t, along, strength, sigma)
+    if low is None and not off:
+        return held
+    held[:] = True
+    at = _kink(t, along, strength) if low is None else low
+    sides = [slice(0, max(at - KINK_FRAMES, 0)), slice(at + KINK_FRAMES + 1, len(t))]
+    falls = [_off_gravity(t[side], along[side], strength, sigma) for side in sides]
+    if not off or any(sure and not differs for differs, sure in falls):
+        for side, (_, sure) in zip(sides, falls, strict=True):
+            if sure or not off:
+                held[side] = _not_falling(t[side], along[side], strength, sigma)
+    return held
+
+
+def _low_point(t: Array, along: Array, strength: float, sigma: float) -> int | None:
+    """Return the frame of a bounce among frames (n,); None without one.
+
+    A free fall is lowest at one of its ends. A bounce is lower than frames before and after it by the height of the
+    shortest flight, whichever they are.
+    """
+    if len(t) < 2 * MIN_FRAMES:
+        return None
+    # two wrong frames in a row make no bounce
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(along, 5), axis=1)
+    before, after = np.minimum.accumulate(smooth), np.minimum.accumulate(smooth[::-1])[::-1]
+    depth = smooth - np.maximum(before, after)
+    at = int(depth.argmax())
+    least = max(strength * MIN_FLIGHT_S**2 / 8, SURE_SIGMAS * sigma)
+    return at + 2 if float(depth[at]) > least else None
+
+
+def _off_gravity(t: Array, along: Array, strength: float, sigma: float) -> tuple[bool, bool]:
+    """Return whether the acceleration of frames (n,) surely differs from gravity, and whether it could be seen to."""
+    if len(t) < 4:
+        return False, False
+    powers = np.vander(t - t.mean(), 3)
+    solution = np.linalg.lstsq(powers, along, rcond=None)[0]
+    error = 2 * sigma * float(np.sqrt(np.linalg.inv(powers.T @ powers)[0, 0]))
+    fall = 2 * float(solution[0])
+    away, least = abs(fall - strength), MOST_LIFT * strength
+    off = away > least and away > SURE_SIGMAS * error
+    if off and fall > LEAST_FALL * strength:
+        # an even fall is a flight under a force that nobody has named, not a support
+        off = float((along - powers @ solution).std()) > NOISE_SIGMAS * sigma
+    return off, len(t) >= MIN_FRAMES and SURE_SIGMAS * error < least
+
+
+def _kink(t: Array, along: Array, strength: float) -> int:
+    """Return the frame at which two free falls that follow each other fit frames (n,) best."""
+    time = t - t.mean()
+    fall = along - along.mean() - 0.5 * strength * time**2
+
+    def misfits(x: Array, y: Array) -> Array:
+        """Return the sum of squares about a straight line through the first 1, ..., n of n points."""
+        n = np.arange(1, len(x) + 1)
+        mean_x, mean_y = np.cumsum(x) / n, np.cumsum(y) / n
+        xx, xy, yy = (
+            np.cumsum(a) - n * b for a, b in ((x * x, mean_x**2), (x * y, mean_x * mean_y), (y * y, mean_y**2))
+        )
+        return yy - np.divide(xy**2, xx, out=np.zeros_like(xx), where=xx > 1e-15)
+
+    return int((misfits(time, fall)[:-1] + misfits(time[::-1], fall[::-1])[-2::-1]).argmin()) + 1

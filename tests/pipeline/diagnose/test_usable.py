@@ -20,6 +20,7 @@ from cgwm.pipeline.trajectories.initial_state import clearance
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.schemas import InputDataError
 from helpers.diagnosis_data import NOISE, tosses, world_with, write_capture
+from scipy.signal import savgol_filter
 
 Episodes = list[tuple[str, dict[str, Track]]]
 
@@ -145,3 +146,33 @@ def test_what_was_not_measured_is_no_degree_of_freedom() -> None:
         name="m", short_name="m", model=None, evaluation=None, noise=prepared.noise, short={"000": short}
     )  # pyright: ignore[reportArgumentType]
     assert one.episode_chi2("000") == pytest.approx(1.0, abs=0.6)
+
+
+def test_a_ball_whose_bounces_smoothing_lifts_off_the_ground_is_no_other_shape() -> None:
+    """Parabolas through 17 frames never come as low as the ball: the bounce itself looks airborne."""
+    world = world_with("ball")
+
+    def smoothed(track: Track) -> Track:
+        place = savgol_filter(track.position_m, 17, 2, axis=0)
+        held = track.time_s < 0.03
+        place[held] = place[held][-1]  # a hand
+        return replace(track, position_m=place)
+
+    episodes = changed(tosses(world, 5, count=6, duration_s=1.0, rate_hz=148.0, height_m=(0.4, 0.6)), smoothed)
+    prepared = prepare(world, episodes)
+    check_observability(world, prepared, "here")
+    seen = prepared.observations.seen.amax(-1) > 0
+    assert 0 < float(prepared.supported.sum()) < 0.2 * float(seen.sum())
+    assert prepared.flight is not None
+    for item in prepared.flight.items:
+        frames = slice(item.first, item.last + 1)
+        t = prepared.observations.times_s[item.episode, frames].numpy()
+        height = prepared.observations.position_m[item.episode, frames, 0, 2].numpy()
+        assert -2 * np.polyfit(t, height, 2)[0] == pytest.approx(9.81, rel=0.5), "an impact passes as flight"
+
+
+def test_a_flight_under_a_strange_force_is_no_support() -> None:
+    """Gravity of a third of the usual one, as of a step of it, is found in parabolas through all heights."""
+    light = replace(world_with("ball"), gravity=world_with("ball").gravity / 3)
+    world, episodes = world_with("ball"), tosses(light, 3, count=4, duration_s=0.4, height_m=(0.8, 1.0))
+    assert not bool(prepare(world, episodes).supported.any())
