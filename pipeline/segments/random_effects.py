@@ -187,7 +187,7 @@ def _batch(
         windows = [(a, b if np.isinf(at) else at - 1e-6) for (a, b), at in zip(windows, contact, strict=True)]
         # an episode that begins in contact has no flight
         some = [k for k, (a, b) in enumerate(windows) if b > a]
-        picked, windows, contact = ([found[k] for k in some] for found in (picked, windows, contact))
+        picked, windows, contact = [every[k] for k in some], [windows[k] for k in some], [contact[k] for k in some]
     ends = [False] * len(picked)
     if not flying:
         last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in every]
