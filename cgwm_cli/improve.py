@@ -73,6 +73,7 @@ def improve(
 
 
 def _summary(result: ImproveResult, out: Path) -> str:
+    from ..pipeline.improve.wording import not_added_words, remaining_words
     from .output import table, warnings
 
     rows = [[result.models[0], "", "", ""]]
@@ -81,8 +82,10 @@ def _summary(result: ImproveResult, out: Path) -> str:
     lines = [
         result.sentence,
         table(rows, ["model", "added", "error after / before, unseen", "the same, test"]),
-        *([f"{last.model}: {last.sentence}"] if last is not None and not last.added else []),
     ]
+    if last is not None and not last.added:
+        lines.append(" ".join([f"{last.model}: {last.sentence}", *not_added_words(last)]))
+        lines.append(f"left: {' '.join(remaining_words(last))}")
     next_ = next((one for step in reversed(result.steps) if (one := step.next_experiment) is not None), None)
     if next_ is not None:
         lines.append(f"Measure next, to distinguish {' and '.join(next_.separates)}: {next_.what}.")

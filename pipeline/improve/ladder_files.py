@@ -80,10 +80,27 @@ class LadderFiles:
 
     def _refuse_others(self, made_of: Mapping[str, str]) -> None:
         found = json.loads((self.path / _KEY).read_text(encoding="utf-8"))
-        names = sorted(name for name in {*found, *made_of} if found.get(name) != made_of.get(name))
+        names = differing(found, made_of)
         if names:
             raise UsageError(
-                f"{self.path} was made with other {', '.join(names)}.",
+                f"{self.path} was made with other values of {', '.join(names)}.",
                 "the same command, on the same capture, with --resume.",
                 "pass what was passed before, or --overwrite to begin again.",
             )
+
+
+def differing(found: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
+    """Return the names of inputs and settings that differ; of a table of settings, those in it.
+
+    >>> differing({"split": "train", "improve": '{"steps":6,"folds":4}'}, {"improve": '{"steps":2,"folds":4}'})
+    ['improve.steps', 'split']
+    """
+    names = []
+    for name in sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key)):
+        tables = [found.get(name, ""), wanted.get(name, "")]
+        if all(text.startswith("{") for text in tables):
+            first, second = map(json.loads, tables)
+            names += sorted(f"{name}.{key}" for key in {*first, *second} if first.get(key) != second.get(key))
+        else:
+            names.append(name)
+    return names

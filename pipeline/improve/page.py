@@ -17,7 +17,7 @@ from ...schemas import (
 )
 from ..report.page import cautions, command, facts, fixed, folded, link, number, page, paragraph, section, table, text
 from ..report.plots import Bar, bars
-from .wording import WHY, remaining_words, share_words, trial_words
+from .wording import AXES, WHY, not_added_words, remaining_words, share_words, trial_words
 
 PAGE = "improve.html"
 RANKED = 6
@@ -58,16 +58,24 @@ def _cards(test: ImproveTest | None) -> str:
         return ""
     first, last = test.models[0], test.models[-1]
     known = [
-        ("prediction in flight [noise]", first.flight, last.flight, 1.0, ""),
-        ("prediction in contact [noise]", first.contact, last.contact, 1.0, ""),
-        ("open loop", first.translation_error_m.median, last.translation_error_m.median, _MM, "mm"),
+        ("prediction error in flight, times the noise", first.flight, last.flight, 1.0, ""),
+        ("prediction error in contact, times the noise", first.contact, last.contact, 1.0, ""),
+        (
+            "error of whole episodes, open loop",
+            first.translation_error_m.median,
+            last.translation_error_m.median,
+            _MM,
+            "mm",
+        ),
     ]
     if first.state_fitted_residual_m is not None and last.state_fitted_residual_m is not None:
         residuals = (first.state_fitted_residual_m.median, last.state_fitted_residual_m.median)
-        known.append(("state-fitted residual", *residuals, _MM, "mm"))
+        known.append(("the same with the start fitted", *residuals, _MM, "mm"))
+    same = first.model == last.model
     cards = [
-        f'<div class="card"><div>{name}</div><div class="value">{number(after * scale)} {unit}</div>'
-        f"<dl><dt>{text(first.model)}</dt><dd>{number(before * scale)} {unit}</dd>"
+        f'<div class="card"><div>{name}</div><div class="value">{number(after * scale)} {unit}</div><dl>'
+        + ("" if same else f"<dt>{text(first.model)}</dt><dd>{number(before * scale)} {unit}</dd>")
+        + f"<dt>model</dt><dd>{text(last.model)}</dd>"
         f"<dt>test episodes</dt><dd>{test.episodes}</dd></dl></div>"
         for name, before, after, scale, unit in known
         if before is not None and after is not None
@@ -280,7 +288,7 @@ def _remains(step: ImproveStep, result: ImproveResult) -> str:
     pieces = [paragraph(f"Diagnosis of {step.model}. {step.sentence}")]
     if result.refusal:
         pieces.append(paragraph(f"It could not be diagnosed again: {result.refusal}"))
-    pieces += [*map(paragraph, remaining_words(step)), _sizes(step)]
+    pieces += [*map(paragraph, [*not_added_words(step), *remaining_words(step)]), _sizes(step)]
     return section("What remains", *pieces, _rivals(step), _law(step), _trials(step), _ranking(step), _limits(step))
 
 
@@ -289,13 +297,13 @@ def _sizes(step: ImproveStep) -> str:
     found = step.remaining
     if found is None:
         return ""
-    sizes = [("between measurement and model", found.position_rms_m, True)]
+    sizes = [("measurement less model", found.position_rms_m / AXES, True)]
     sizes += [("slow errors", found.slow_position_std_m, False)] if found.slow_position_std_m else []
     sizes += [("noise from frame to frame", std, False)] if (std := step.noise.get("position_m")) else []
     rows = [
         Bar(name=name, value=size, words=f"{fixed(size, 2, _MM)} mm", strong=strong) for name, size, strong in sizes
     ]
-    return "<h3>Left in flight, positions</h3>" + bars(rows)
+    return "<h3>Positions in flight, error along each axis</h3>" + bars(rows)
 
 
 def _limits(step: ImproveStep) -> str:

@@ -31,7 +31,7 @@ from ..fit import fit
 from ..runtime.device import resolve_device
 from .folds import ReadOnce, folds_of
 from .ladder import Climb, Ladder
-from .ladder_files import LadderFiles
+from .ladder_files import LadderFiles, differing
 from .page import PAGE, ladder_html
 from .test_split import TEST, has_test_split, tested
 from .wording import sentence, warnings_of
@@ -168,6 +168,7 @@ def improve(
     episodes = request.capture.episodes(split)
     inputs = request.inputs()
     if finished and (resume or not overwrite) and (kept := _kept(request, inputs, overwrite)) is not None:
+        note(f"improve: {out} is already the result of this command")
         return kept
     refuse_output(out, "ladder", overwrite)
     made_of = {**inputs, **request.settings, "versions": json.dumps(versions())}
@@ -224,9 +225,7 @@ def _kept(request: _Request, inputs: dict[str, str], overwrite: bool) -> Improve
     """
     made = read_json(request.out / DOCUMENT, ImproveResult)
     found = {name: digest for name, digest in made.input_sha256.items() if not name.startswith(f"{TEST}: ")}
-    wanted = {**inputs, **request.settings}
-    had = {**found, **made.settings}
-    names = sorted(name for name in {*wanted, *had} if wanted.get(name) != had.get(name))
+    names = differing({**found, **made.settings}, {**inputs, **request.settings})
     if not names:
         files = LadderFiles.path_of(request.out)
         if (files / "made_of.json").is_file():  # left by a process that was killed at its end
@@ -235,7 +234,7 @@ def _kept(request: _Request, inputs: dict[str, str], overwrite: bool) -> Improve
     if overwrite:
         return None
     raise UsageError(
-        f"{request.out} is complete, and was made with other {', '.join(names)}.",
+        f"{request.out} is complete, and was made with other values of {', '.join(names)}.",
         todo="choose another --out, or pass --overwrite to make this ladder anew.",
     )
 

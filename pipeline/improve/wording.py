@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ...schemas import DiagnoseResult, ErrorRatio, ImproveTest, ImproveTrial, Remaining
+from ...schemas import DiagnoseResult, ErrorRatio, ImproveStep, ImproveTest, ImproveTrial, Remaining
 from ..compare.paired_difference import LEAST_EPISODES
 from ..diagnose.wording import organised
 from .ladder import LEAST_FALL, Ladder
@@ -22,6 +22,8 @@ _ALL = 0.999
 _WHOLE_FLIGHT_S = 0.9
 """Errors that change more slowly bend a whole flight."""
 _GRAVITY_M_S2 = 9.81
+AXES = 3**0.5
+"""A distance over it is the error along each axis, as which noise is given."""
 
 
 def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
@@ -70,9 +72,10 @@ def why_ended(ladder: Ladder) -> str:
         return "The ladder ends at its largest number of steps; --steps allows more."
     if ladder.stopped == "not_diagnosed":
         return f"The last model could not be diagnosed: {ladder.refusal}"
+    other = "else " if any(step.added for step in ladder.steps) else ""
     if ladder.stopped == "nothing_helps":
-        return "Nothing else that the diagnosis proposes predicts unseen episodes better."
-    return "The diagnosis proposes nothing else."
+        return f"Nothing {other}that the diagnosis proposes predicts unseen episodes better."
+    return f"The diagnosis proposes nothing {other}".rstrip() + "."
 
 
 def trial_words(trial: ImproveTrial) -> str:
@@ -113,6 +116,14 @@ def warnings_of(ladder: Ladder, test: ImproveTest | None, folds: Sequence[Sequen
     return tuple(dict.fromkeys(found))
 
 
+def not_added_words(step: ImproveStep) -> list[str]:
+    """Return that what a diagnosis names was not added, where it was tried; empty otherwise."""
+    if not step.selected or step.added or not step.tried:
+        return []
+    named = " and ".join(step.selected)
+    return [f"{named}: tried and not added, since it does not predict unseen episodes better, beyond chance."]
+
+
 def share_words(step: DiagnoseResult) -> list[str]:
     """Return how much of what repeats in flight the named effects explain; empty where they do not act there."""
     found = step.remaining
@@ -137,9 +148,11 @@ def remaining_words(step: DiagnoseResult) -> list[str]:
     else:
         turned = found.rotation_rms_rad
         rotation = "" if turned is None else f" and rotations by {math.degrees(turned):.2g} degrees"
+        noise = step.noise.get("position_m")
+        scatter = "" if noise is None else f", where the noise from frame to frame is {1e3 * noise:.2g} mm"
         words.append(
-            f"In flight{beside} positions differ from the model by {1e3 * found.position_rms_m:.3g} mm{rotation} "
-            "(root mean square over whole flights, with the start of each fitted)."
+            f"In flight{beside} positions differ from the model by {1e3 * found.position_rms_m / AXES:.2g} mm along "
+            f"each axis{rotation}, root mean square over whole flights with the start of each fitted{scatter}."
         )
         words += [_slow(found), *_own(found), _common(found)]
     if step.contact_chi2 is not None:
@@ -155,8 +168,8 @@ def _slow(found: Remaining) -> str:
         return "No slow errors show: what is left changes from frame to frame, as noise does."
     time = "over a whole flight" if found.slow_time_s > _WHOLE_FLIGHT_S else f"within {1e3 * found.slow_time_s:.0f} ms"
     return (
-        f"It is slow: errors of {1e3 * found.slow_position_std_m:.2g} mm change {time}, and differ from episode to "
-        "episode, as errors of the tracking do."
+        f"A part of it is slow: errors of {1e3 * found.slow_position_std_m:.2g} mm change {time}, and differ from "
+        "episode to episode, as errors of the tracking do."
     )
 
 
@@ -172,5 +185,5 @@ def _own(found: Remaining) -> list[str]:
 
 def _common(found: Remaining) -> str:
     if found.repeats and found.coordinate is not None:
-        return f"A part of it is common to all episodes. {organised(found.coordinate)}"
+        return f"A part is common to all episodes. {organised(found.coordinate)}"
     return "Nothing of it is common to all episodes: no law predicts held-out episodes better than by chance."

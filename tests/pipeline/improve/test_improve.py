@@ -151,7 +151,13 @@ def test_what_remains_is_said_in_sentences() -> None:
     entry = RANKED.model_copy(update={"effect": "drag"})
     said = found(selected=("drag",), ranking=(entry,), remaining=left, contact_chi2=1.5)
     text = " ".join(remaining_words(said))
-    for words in ("2 mm", "1.1 mm change within 30 ms", "leaned by 10 mrad", "Nothing of it is common", "chi2 of 1.5"):
+    for words in (
+        "1.2 mm along each axis",
+        "1.1 mm change within 30 ms",
+        "leaned by 10 mrad",
+        "Nothing of it is common",
+        "chi2 of 1.5",
+    ):
         assert words in text
     assert "drag explains 90.0 %" in share_words(said)[0]
     fast = left.model_copy(update={"slow_position_std_m": 0.0, "own_acceleration_std_m_s2": 0.0, "repeats": True})
@@ -166,7 +172,7 @@ def test_an_unfinished_ladder_is_continued_by_the_same_command_only(tmp_path: Pa
     files.document("one.json", ImproveConfig, lambda: ImproveConfig(steps=3))
     with pytest.raises(UsageError, match="was interrupted"):
         LadderFiles(out, {"split": "train"}, resume=False, overwrite=False)
-    with pytest.raises(UsageError, match="other split"):
+    with pytest.raises(UsageError, match="other values of split"):
         LadderFiles(out, {"split": "look"}, resume=True, overwrite=False)
     again = LadderFiles(out, {"split": "train"}, resume=True, overwrite=False)
     assert again.document("one.json", ImproveConfig, ImproveConfig).steps == 3
