@@ -45,8 +45,10 @@ def millimetres(value_m: float | None) -> str:
 
 
 def warnings(messages: Sequence[str]) -> list[str]:
-    """Write warnings as lines of a summary."""
-    return [f"warning: {message}" for message in messages]
+    """Write warnings as lines of a summary; those that say the same of several episodes are one."""
+    from ..datasets.io.repeated_warnings import fold_repeated
+
+    return [f"warning: {message}" for message in fold_repeated(messages)]
 
 
 def next_line(*words: object) -> str:

@@ -14,6 +14,7 @@ import torch
 from ...datasets.capture.capture import Capture
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads, refuse_output
+from ...datasets.io.progress import note
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     ContactLimit,
@@ -102,7 +103,9 @@ def diagnose(
     loaded = read_model(model)
     accepted = accept_units or loaded.accepts_units
     opened = Capture.open(capture, splits=(split,), accept_units=accepted)
+    note(f"diagnose: flights, contacts and noise of {len(opened.episodes(split))} episodes")
     world, prepared = prepared_world(loaded, opened, split, device, accepted)
+    note(f"diagnose: {len(library)} effects")
     result, findings = report_and_findings(prepared, world, library, compared)
     episodes = diagnosed_episodes(loaded, opened, split).episodes
     result = _first_of_all(result, not_described(world, episodes, prepared.noise))
@@ -111,6 +114,7 @@ def diagnose(
     if page is None:
         return result
     result = result.model_copy(update={"report": str(page)})
+    note("diagnose: page")
     pictures = pictures_of(prepared, findings, result)
     with new_file(page, "page", replaces) as path:
         then = shlex.join(next_command(result, Path(model), Path(capture), split))

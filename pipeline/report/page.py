@@ -11,6 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
+from ...datasets.io.repeated_warnings import fold_repeated
+
 NEGLIGIBLE = 1e-12
 """Largest magnitude that is written as zero, as rounding error, in any unit that occurs."""
 LEAST_SECTIONS = 3
@@ -100,8 +102,9 @@ def folded(summary: str, *pieces: str) -> str:
 
 
 def cautions(messages: Sequence[str]) -> str:
-    """Return the box of warnings; empty without any."""
-    return f'<div class="warnings">{"".join(paragraph(words) for words in messages)}</div>' if messages else ""
+    """Return the box of warnings, those that say the same of several episodes as one; empty without any."""
+    words = "".join(paragraph(words) for words in fold_repeated(messages))
+    return f'<div class="warnings">{words}</div>' if messages else ""
 
 
 def paragraph(words: str, style: str = "") -> str:

@@ -109,9 +109,10 @@ def release_warnings(released_s: Mapping[str, float], starts_s: Mapping[str, flo
         starts_s: Time [s] of the first frame, by name.
     """
     return [
-        f"episode '{name}' begins in a hand: for the first {1e3 * (at - starts_s[name]):.0f} ms of its flight it turns "
-        "differently from the rest, as if something still touched it or the tracker had not found it yet. These frames "
-        f"are left out; start the recording there ([episodes] start_s in capture.toml: {at:.3f} on the track's clock)."
+        f"episode '{name}' begins in a hand: for the first {1e3 * (at - starts_s[name]):.0f} ms of flight the body "
+        "turns differently from the rest, as if something still touched it or the tracker had not found it yet. These "
+        "frames are left out; start the recording there ([episodes] start_s in capture.toml: "
+        f"{at:.3f} on the track's clock)."
         for name, at in released_s.items()
     ]
 
