@@ -13,7 +13,7 @@ from .results import ErrorSummary
 
 IMPROVE_FORMAT = "cgwm-improve/1"
 
-Reason = Literal["selected", "one_of_the_selected", "first_of_the_ranking", "law"]
+Reason = Literal["selected", "one_left_out", "one_of_the_selected", "first_of_the_ranking", "law"]
 
 
 class ImproveConfig(FileModel):

@@ -149,8 +149,8 @@ class Climb:
                 if trial.helps:
                     helping.append((name, trial, proposal))
             if helping:
-                name, proposal = self._preferred(helping)
-                return tuple(tried), (name, proposal)
+                best = self._needed(number, base, self._preferred(helping), tried)
+                return tuple(tried), best
         return tuple(tried), None
 
     def _preferred(self, helping: Sequence[tuple[str, ImproveTrial, Proposal]]) -> tuple[str, Proposal]:
@@ -162,11 +162,37 @@ class Climb:
         causes = [one for one in helping if one[2].why != "law"] or list(helping)
         name, _, proposal = min(causes, key=lambda one: _least_ratio(one[1]))
         for law, _, described in helping:
-            if described.why == "law" and proposal.why != "law":
-                before, after = (read_json(self.files / f"errors-{one}.json", HeldOutErrors) for one in (name, law))
-                if helps(error_ratio(before.flight, after.flight), error_ratio(before.contact, after.contact)):
-                    return law, described
+            if described.why == "law" and proposal.why != "law" and helps(*self._ratios(name, law)):
+                return law, described
         return name, proposal
+
+    def _needed(
+        self, number: int, base: str, best: tuple[str, Proposal], tried: list[ImproveTrial]
+    ) -> tuple[str, Proposal]:
+        """Return an addition without the effects that it does without: left out, no error rises by `LEAST_FALL`.
+
+        Args:
+            number: Number of the step.
+            base: See :meth:`_tried`.
+            best: The addition, with the name of its models without a fold.
+            tried: Trials of the step; what is tried here is appended.
+        """
+        name, proposal = best
+        for effect in reversed(proposal.effects):
+            if len(proposal.effects) == 1:
+                break
+            fewer = Proposal(tuple(e for e in proposal.effects if e != effect), "one_left_out")
+            other = f"m{number}-{len(tried)}"
+            tried.append(self._trial(base, other, fewer))
+            ratios = self._ratios(name, other)
+            if tried[-1].helps and all(one.ratio < 1 + LEAST_FALL for one in ratios if one is not None):
+                name, proposal = other, fewer
+        return name, proposal
+
+    def _ratios(self, before: str, after: str) -> tuple[ErrorRatio | None, ErrorRatio | None]:
+        """Return the ratios of the errors in flight and in contact of two additions that were tried."""
+        first, second = (read_json(self.files / f"errors-{one}.json", HeldOutErrors) for one in (before, after))
+        return error_ratio(first.flight, second.flight), error_ratio(first.contact, second.contact)
 
     def _trial(self, base: str, name: str, proposal: Proposal) -> ImproveTrial:
         """Add effects to the models without a fold, and compare the errors on the folds."""

@@ -150,7 +150,7 @@ def _step(number_: int, step: ImproveStep, test: ImproveTest | None) -> str:
     return section(
         f"Step {number_}: {', '.join(step.added)}",
         paragraph(f"What {step.model} lacks. {step.sentence}"),
-        *map(paragraph, share_words(step)),
+        *map(paragraph, [*share_words(step), *not_added_words(step)]),
         _unseen(_accepted(step), _tested(test, step.next_model or "", step.model)),
         _parameters(step.next_parameters),
         "<h3>Evidence</h3>",

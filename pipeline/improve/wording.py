@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from ...schemas import DiagnoseResult, ErrorRatio, ImproveStep, ImproveTest, ImproveTrial, Remaining
 from ..compare.paired_difference import LEAST_EPISODES
 from ..diagnose.wording import organised
+from ..physics.effects.registry import split_units
 from .ladder import LEAST_FALL, Ladder
 
 WHY = {
     "selected": "named by the diagnosis",
+    "one_left_out": "the same without one of them",
     "one_of_the_selected": "one of those that the diagnosis names",
     "first_of_the_ranking": "not named, but first of the ranking",
     "law": "law of the residual, found by regression",
@@ -117,11 +119,14 @@ def warnings_of(ladder: Ladder, test: ImproveTest | None, folds: Sequence[Sequen
 
 
 def not_added_words(step: ImproveStep) -> list[str]:
-    """Return that what a diagnosis names was not added, where it was tried; empty otherwise."""
-    if not step.selected or step.added or not step.tried:
+    """Return what a diagnosis names and was tried, and was not added; empty for nothing."""
+    left = [name for name in step.selected if name not in step.added]
+    if not left or not step.tried:
         return []
-    named = " and ".join(step.selected)
-    return [f"{named}: tried and not added, since it does not predict unseen episodes better, beyond chance."]
+    named, was = " and ".join(left), "was" if len(left) == 1 else "were"
+    if step.added:
+        return [f"{named} {was} named and not added: the others predict unseen episodes as well."]
+    return [f"{named} {was} tried and not added: unseen episodes are not predicted better, beyond chance."]
 
 
 def share_words(step: DiagnoseResult) -> list[str]:
@@ -142,7 +147,9 @@ def remaining_words(step: DiagnoseResult) -> list[str]:
     How large it is and in which phase, how fast it changes, whether it is common to all episodes, and what it follows.
     """
     words, found = [], step.remaining
-    beside = f", with {' and '.join(step.selected)} added," if step.selected else ""
+    # values of each episode are no part of what the rest is measured against
+    common = [name for name in step.selected if split_units(name)[1] is None]
+    beside = f", with {' and '.join(common)} added," if common else ""
     if found is None:
         words.append("Nothing was measured in flight, so that nothing can be said of it.")
     else:
