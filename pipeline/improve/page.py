@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ...schemas import (
@@ -11,6 +11,7 @@ from ...schemas import (
     ImproveResult,
     ImproveStep,
     ImproveTest,
+    ImproveTestFigures,
     ImproveTestStep,
     ImproveTrial,
     RankedEffect,
@@ -110,16 +111,19 @@ def _overview(result: ImproveResult, ladder: Sequence[ImproveStep]) -> str:
         "95 % interval. Cross-validated: episodes of the split that decides, each predicted by a model that was not "
         "fitted to it. The last columns are medians over the test episodes."
     )
-    charts = []
-    for kind in ("flight", "contact"):
-        known = [(name, value) for name, one in tested.items() if (value := getattr(one, kind)) is not None]
-        rows_ = [
-            Bar(name=name, value=v, words=f"{number(v)} times the noise", strong=name == result.models[-1])
-            for name, v in known
-        ]
-        charts += [paragraph(f"Prediction error of the test episodes in {kind}:"), bars(rows_)] if rows_ else []
     header += ["flight [noise]", "contact [noise]"]
+    charts = [_errors_chart(kind, tested, result.models[-1]) for kind in ("flight", "contact")]
     return section("The ladder", paragraph(words), table(header, rows, (4, 5, 6, 7)), *charts)
+
+
+def _errors_chart(kind: str, tested_: Mapping[str, ImproveTestFigures], last: str) -> str:
+    """Return the chart of the prediction errors of all models on the test episodes; empty where there are none."""
+    rows = [
+        Bar(name=name, value=value, words=f"{number(value)} times the noise", strong=name == last)
+        for name, one in tested_.items()
+        if (value := getattr(one, kind)) is not None
+    ]
+    return paragraph(f"Prediction error of the test episodes in {kind}:") + bars(rows) if rows else ""
 
 
 def _accepted(step: ImproveStep) -> ImproveTrial | None:

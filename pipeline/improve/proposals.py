@@ -44,14 +44,18 @@ def proposals_of(found: DiagnoseResult, present: Sequence[str], law: Path) -> li
     groups = [[Proposal(named, "selected")]] if named else []
     if len(named) > 1:
         groups.append([Proposal((one,), "one_of_the_selected") for one in named])
-    open_ones = []
-    if found.verdict == "unexplained" and not named:
-        first = next((e for e in found.ranking if split_units(e.effect)[0] not in there), None)
-        if first is not None and first.score_p < THRESHOLDS.flight.alpha:
-            open_ones.append(Proposal((first.effect,), "first_of_the_ranking"))
+    first = [] if named else _first_of_the_ranking(found, there)
     if not any(name.startswith("law_") for name in there) and (saved := _saved(found, law)):
-        open_ones.append(Proposal((saved,), "law"))
-    return [*groups, *([open_ones] if open_ones else [])]
+        first.append(Proposal((saved,), "law"))
+    return [*groups, *([first] if first else [])]
+
+
+def _first_of_the_ranking(found: DiagnoseResult, there: set[str]) -> list[Proposal]:
+    """Return the first of the ranking that a model lacks, where nothing explains the data and chance does neither."""
+    first = next((e for e in found.ranking if split_units(e.effect)[0] not in there), None)
+    if found.verdict != "unexplained" or first is None or first.score_p >= THRESHOLDS.flight.alpha:
+        return []
+    return [Proposal((first.effect,), "first_of_the_ranking")]
 
 
 def _saved(found: DiagnoseResult, law: Path) -> str:

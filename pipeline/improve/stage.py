@@ -138,18 +138,7 @@ def improve(
     finished = (out / DOCUMENT).is_file()
     if not finished:
         refuse_output(out, "ladder", overwrite)
-    resolve_device(physics.device)
-    if physics.supervise != "tracks":
-        raise UsageError(
-            f"phys-geo.supervise is {physics.supervise}: a ladder is judged on measured tracks.", "tracks.",
-            "leave it out; for videos run fit and diagnose step by step.",
-        )  # fmt: skip
-    if parent is not None and physics.effects:
-        raise UsageError(
-            f"phys-geo.effects with a model to start from: {', '.join(physics.effects)}.",
-            "the effects of that model, to which the ladder adds.",
-            f"run 'cgwm fit {capture} --from {parent} --effects NAME --out MODEL' first, and start from MODEL.",
-        )
+    _refuse_early(capture, parent, physics)
     experiments = experiments_of(DEFAULT) if throws is None else read_experiments(throws)
     library = library_of(candidates)
     accepted = accept_units or (parent is not None and read_model(parent).accepts_units)
@@ -193,6 +182,22 @@ def improve(
     _write(request, files, result, overwrite)
     files.remove()
     return result
+
+
+def _refuse_early(capture: Path, parent: Path | None, physics: PhysConfig) -> None:
+    """Refuse settings that no ladder can have, before any work."""
+    resolve_device(physics.device)
+    if physics.supervise != "tracks":
+        raise UsageError(
+            f"phys-geo.supervise is {physics.supervise}: a ladder is judged on measured tracks.", "tracks.",
+            "leave it out; for videos run fit and diagnose step by step.",
+        )  # fmt: skip
+    if parent is not None and physics.effects:
+        raise UsageError(
+            f"phys-geo.effects with a model to start from: {', '.join(physics.effects)}.",
+            "the effects of that model, to which the ladder adds.",
+            f"run 'cgwm fit {capture} --from {parent} --effects NAME --out MODEL' first, and start from MODEL.",
+        )
 
 
 def _first_model(request: _Request, files: LadderFiles) -> None:
