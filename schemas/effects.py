@@ -42,7 +42,7 @@ class EffectCard(FileModel):
     phase: Literal["flight", "contact", "measurement"]
     """Where it acts."""
     needs: tuple[str, ...] = ()
-    """What it cannot do without: ground, drag, contact, spin, driven."""
+    """What it cannot do without: ground, drag, contact, spin (measured, or by orientations), orientation, driven."""
     reveals: str
     """The motion that shows it best."""
     aliases: tuple[str, ...] = ()

@@ -29,7 +29,7 @@ class QuadraticSpinDamping(Effect):
     formula = "alpha = -q |omega| omega"
     parameters = (EffectParameter(name="q", unit="1/rad", scale=0.02, limit=5.0, nonnegative=True),)
     phase = "flight"
-    needs = ("spin",)
+    needs = ("orientation",)
     reveals = "long free flight, with fast spin and with slow"
     source = "turbulent torque, by dimensions: it grows with the density of the air and the square of the spin"
 

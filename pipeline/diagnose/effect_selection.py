@@ -100,7 +100,7 @@ def select_next(
         turned: Whether orientations were measured.
         dispersion: Factor by which variances exceed those of the noise.
     """
-    kept, _ = admissible(world, candidates, turned)
+    kept, _ = admissible(world, candidates, turned, flight.observations.spin_rad_s is not None)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if acts_in(v, "flight")]
     linear = linearize(flight, world, variants, groups, robust=False)
     evidence = tested(linear, kept, variants, dispersion)

@@ -180,7 +180,7 @@ def report_and_findings(
             todo="record at 60 Hz or more, or name another split.",
         )
     findings = find(prepared, world, library)
-    _, refused = admissible(world, library, prepared.has_orientation)
+    _, refused = admissible(world, library, prepared.has_orientation, prepared.observations.spin_rad_s is not None)
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
     seen = int((prepared.observations.seen.amax(-1) > 0).sum())
     warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings)]

@@ -44,27 +44,32 @@ class Variant:
         return [f"{effect.name}.{number.name}" for number in effect.parameters]
 
 
-def admissible(world: World, candidates: Sequence[Candidate], turned: bool) -> tuple[list[Candidate], dict[str, str]]:
+def admissible(
+    world: World, candidates: Sequence[Candidate], turned: bool, spun: bool = False
+) -> tuple[list[Candidate], dict[str, str]]:
     """Return the candidates that can be tested with a world, and the reasons against the others, by name.
 
     Args:
         world: The model's world; effects that it already has are no candidates.
         candidates: In any order.
         turned: Whether orientations were measured.
+        spun: Whether spins were measured, where the orientations were not.
     """
     present = {active.effect.name for active in world.effects}
     driven = any(body.motion == "driven" for body in world.bodies)
     has = {
         "ground": world.ground_normal is not None,
         "contact": world.ground_normal is not None or len(world.bodies) > 1,
-        "spin": turned,
+        "spin": turned or spun,
+        "orientation": turned,
         "driven": driven,
         "drag": any("drag" in active.effect.provides for active in world.effects),
     }
     words = {
         "ground": "the world has no ground",
         "contact": "nothing can be touched",
-        "spin": "no orientation was measured",
+        "spin": "no orientation and no spin was measured",
+        "orientation": "no orientation was measured",
         "driven": "no body is driven",
         "drag": "the model has no drag, without which it does nothing",
     }

@@ -18,7 +18,7 @@ from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
 from ..trajectories.innovations import WHITE, NoiseModel, axis_innovations
-from ..trajectories.observations import Observations
+from ..trajectories.observations import Observations, with_spins
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, retract
 from ..trajectories.segmentation import Segment
 from ..trajectories.track_noise import Noise
@@ -257,6 +257,9 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
     state = whole.state.at(rows)
     names = tuple(whole.names[item.episode] for item in items)
     picked["measured_axes"] = whole.measured_axes[rows]
+    if whole.spin_rad_s is not None:
+        spin = whole.spin_rad_s[rows[:, None], place]
+        picked["spin_rad_s"] = torch.where(inside[..., None, None] > 0, spin, torch.nan)
     own = {name: value[rows] for name, value in whole.own_values.items()}
     return replace(whole, names=names, times_s=times, drives=drives, state=state, own_values=own, **picked)
 
@@ -279,7 +282,7 @@ def line_state(segments: Segments, frames: int) -> State:
         known = (turned.sum(1) >= 2)[:, None]
         fields[1][:, body] = torch.where(known, quat_multiply(base, quat_exp(angle)), base)
         fields[3][:, body] = torch.where(known, omega, torch.zeros_like(omega))
-    return State(*fields)
+    return with_spins(State(*fields), seen)
 
 
 def _line(t: Tensor, values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,8 +22,6 @@ FLIGHT_MARGIN_M = 0.003
 
 LINE_MISFIT = 2.0
 """Maximum mean square residual, in units of the noise variance, of frames that lie on a straight line."""
-SPIN_STD_RAD_S = 0.5
-"""Prior standard deviation [rad/s] of a spin about a measured one, where the orientation was not measured."""
 LINE_SPREAD = 2.0
 """Prior standard deviation of a velocity in contact about that of such a line, in standard errors of the line."""
 
@@ -125,11 +123,6 @@ def _information(world: World, warm: Observations, noise: Noise) -> Tensor:
     """
     bodies = len(warm.free)
     information = state_prior(bodies).to(world.gravity).repeat(len(warm.names), 1)
-    for item, name in enumerate(warm.names):
-        for column in range(bodies):
-            if (name, column) in warm.spun:
-                first = STATE_SIZE * column + 9
-                information[item, first : first + 3] = 1 / SPIN_STD_RAD_S**2
     touching = clearance(world, warm)[:, 0] <= FLIGHT_MARGIN_M
     for item in touching.nonzero()[:, 0].tolist():
         for column in range(bodies):

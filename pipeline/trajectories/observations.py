@@ -54,8 +54,9 @@ class Observations:
     """1 for measured coordinates, which are those that change anywhere in the track, shape (B, nf, 3)."""
     own_values: dict[str, Tensor] = field(default_factory=dict)
     """Group-specific values (B,) of effects' parameters, by `effect.parameter`."""
-    spun: frozenset[tuple[str, int]] = frozenset()
-    """Episode and column of the free bodies whose spin was measured, and their orientation not."""
+    spin_rad_s: Tensor | None = None
+    """Measured spins of free bodies whose orientation was not measured, along the world's axes, shape (B, T, nf, 3)
+    [rad/s]; NaN where there is none, and None without any."""
 
     def with_own(self, world: World) -> Observations:
         """Return the items with the group-specific parameters that a world has for their episodes."""
@@ -64,6 +65,17 @@ class Observations:
     def world(self, world: World, repeats: int = 1) -> World:
         """Return a world with the items' group-specific parameters, for the batch repeated `repeats` times."""
         return with_own(world, self.own_values, repeats)
+
+    @property
+    def first_spin(self) -> tuple[Tensor, Tensor] | None:
+        """Mean measured spin (B, nf, 3) of the first frames [rad/s], and where it is known (B, nf); None without any.
+
+        It is in the body's frame, which without orientations is that of the world at the first frame.
+        """
+        if self.spin_rad_s is None:
+            return None
+        mean = self.spin_rad_s[:, :START_FRAMES].nanmean(1)
+        return torch.nan_to_num(mean), mean.isfinite().all(-1)
 
     @property
     def frames(self) -> Tensor:
@@ -105,9 +117,9 @@ class Observations:
             free=free,
             measured_axes=torch.as_tensor(np.stack([row.axes for row in rows])).to(like),
             own_values=_own(world, [row.name for row in rows]),
-            spun=frozenset((row.name, column) for row in rows for column in row.spins),
+            spin_rad_s=_measured_spins(padded, like),
         )
-        return replace(partial, state=_spinning(first_state(world, partial), rows, free))
+        return replace(partial, state=first_state(world, partial))
 
     def select(self, items: Sequence[int]) -> Observations:
         """Return some items of the batch."""
@@ -118,6 +130,8 @@ class Observations:
         drives = {name: drive.select(index) for name, drive in self.drives.items()}
         names = tuple(self.names[i] for i in items)
         picked["measured_axes"] = self.measured_axes[index]
+        if self.spin_rad_s is not None:
+            picked["spin_rad_s"] = self.spin_rad_s[index]
         own = {name: value[index] for name, value in self.own_values.items()}
         return replace(self, names=names, drives=drives, state=self.state.at(index), own_values=own, **picked)
 
@@ -153,8 +167,8 @@ class _Row:
     """1 where the orientation was measured, shape (T, nf)."""
     axes: np.ndarray
     """1 for measured coordinates, shape (nf, 3)."""
-    spins: dict[int, np.ndarray]
-    """By column, the mean measured spin (3,) of the first frames [rad/s], where the orientation was not measured."""
+    spin: np.ndarray
+    """Measured spins where the orientation was not measured, shape (T, nf, 3) [rad/s]; else NaN."""
 
     @staticmethod
     def of(world: World, name: str, tracks: dict[str, Track], window: tuple[float, float]) -> _Row:
@@ -163,7 +177,7 @@ class _Row:
         cut = {body: tracks[body].window(*window) for body in bodies if body in tracks}
         times = np.unique(np.concatenate([track.time_s for track in cut.values()]))
         shape = (len(times), len(bodies))
-        spins: dict[int, np.ndarray] = {}
+        rate = np.full((*shape, 3), np.nan)
         position, quat = np.zeros((*shape, 3)), np.tile([1.0, 0, 0, 0], (*shape, 1))
         seen, turned, axes = np.zeros(shape), np.zeros(shape), np.ones((len(bodies), 3))
         for column, body in enumerate(bodies):
@@ -175,9 +189,9 @@ class _Row:
                 if measured is not None:
                     quat[at, column], turned[at, column] = measured, 1.0
                 elif (spin := cut[body].omega_body_rad_s) is not None:
-                    spins[column] = spin[:START_FRAMES].mean(0)
+                    rate[at, column] = spin
         return _Row(
-            name=name, times=times, position=position, quat=quat, seen=seen, turned=turned, axes=axes, spins=spins
+            name=name, times=times, position=position, quat=quat, seen=seen, turned=turned, axes=axes, spin=rate
         )
 
     def padded(self, length: int) -> _Row:
@@ -198,20 +212,14 @@ class _Row:
             seen=np.concatenate((self.seen, zero)),
             turned=np.concatenate((self.turned, zero)),
             axes=self.axes,
-            spins=self.spins,
+            spin=np.concatenate((self.spin, np.full((extra, *self.spin.shape[1:]), np.nan))),
         )
 
 
-def _spinning(state: State, rows: Sequence[_Row], free: Sequence[int]) -> State:
-    """Return states (B) with the measured spins of bodies whose orientation was not measured, and starts unturned.
-
-    Their body frame is that of the world at the first frame, so that spins along its axes are body-frame ones.
-    """
-    omega = state.omega_body_rad_s.clone()
-    for item, row in enumerate(rows):
-        for column, spin in row.spins.items():
-            omega[item, free[column]] = torch.as_tensor(spin).to(omega)
-    return replace(state, omega_body_rad_s=omega)
+def _measured_spins(rows: Sequence[_Row], like: Tensor) -> Tensor | None:
+    """Return the measured spins (B, T, nf, 3) of padded windows; None without any."""
+    spins = np.stack([row.spin for row in rows])
+    return None if np.isnan(spins).all() else torch.as_tensor(spins).to(like)
 
 
 def first_state(world: World, observations: Observations) -> State:
@@ -230,7 +238,17 @@ def first_state(world: World, observations: Observations) -> State:
                 measured = observations.quat_wxyz[item, at, column]
                 turn = continuous_turns(t, measured)
                 quat[item, body], omega[item, body] = measured[0], straight_line(t, turn)[1]
-    return State(position, quat, velocity, omega)
+    return with_spins(State(position, quat, velocity, omega), observations)
+
+
+def with_spins(state: State, observations: Observations) -> State:
+    """Return states at the first frames (B) with the measured spins of bodies whose orientation was not measured."""
+    if observations.first_spin is None:
+        return state
+    (spin, known), free = observations.first_spin, list(observations.free)
+    omega = state.omega_body_rad_s.clone()
+    omega[:, free] = torch.where(known[..., None], spin, omega[:, free])
+    return replace(state, omega_body_rad_s=omega)
 
 
 def straight_line(t: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:

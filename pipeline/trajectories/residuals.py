@@ -22,6 +22,8 @@ STATE_SIZE = 12
 STATE_STEPS = (2e-4, 2e-3, 5e-3, 5e-2)
 """Difference steps in position [m], rotation [rad], velocity [m/s] and omega [rad/s], where differences replace
 derivatives."""
+SPIN_STD_RAD_S = 0.5
+"""Standard deviation [rad/s] of a measured spin, where the orientation was not measured."""
 STATE_PRIOR_STD = (0.1, 1.0, 5.0, 30.0)
 """Standard deviations of the weak prior on these coordinates about the first guess; it fixes what was not measured."""
 
@@ -133,5 +135,19 @@ class TrajectoryResiduals:
             (mask.flatten(1)[..., None] / std).repeat(repeats, 1, 1)
             for mask, std in ((seen.seen, self.position_std_m), (seen.has_orientation, self.rotation_std_rad))
         ]
-        rows = torch.cat((position.flatten(1, 2) * weights[0], rotation.flatten(1, 2) * weights[1]), -1)
-        return rows.flatten(1)
+        turned = rotation.flatten(1, 2) * weights[1]
+        if seen.first_spin is not None:
+            first = turned[:, : len(free)] + self._spin_residuals(inputs, *seen.first_spin, repeats)
+            turned = torch.cat((first, turned[:, len(free) :]), 1)
+        return torch.cat((position.flatten(1, 2) * weights[0], turned), -1).flatten(1)
+
+    def _spin_residuals(self, inputs: Tensor, spin: Tensor, known: Tensor, repeats: int) -> Tensor:
+        """Return the residuals (repeats * B, nf, 3) of measured initial spins, in sigmas; 0 where there is none.
+
+        They take the place of the rotation of the first frame, which was not measured.
+        """
+        free = self.observations.free
+        change = inputs[:, len(self.parameters) :].unflatten(1, (len(free), STATE_SIZE))[..., 9:]
+        away = self.observations.state.omega_body_rad_s[:, list(free)] - spin
+        weight = known[..., None].to(spin) / SPIN_STD_RAD_S
+        return (away.repeat(repeats, 1, 1) + change) * weight.repeat(repeats, 1, 1)

@@ -117,19 +117,21 @@ def fit_with_effects(
 def _require_needs(world: World, episodes: Sequence[Episode]) -> None:
     """Refuse effects that need what the world or the episodes do not have."""
     free = {body.name for body in world.bodies if body.free}
-    turned = any(
-        name in free and track.quat_wxyz is not None for _, tracks in episodes for name, track in tracks.items()
-    )
+    measured = [track for _, tracks in episodes for name, track in tracks.items() if name in free]
+    turned = any(track.quat_wxyz is not None for track in measured)
+    spun = any(track.omega_body_rad_s is not None for track in measured)
     has = {
         "ground": world.ground_normal is not None,
         "contact": world.ground_normal is not None or len(world.bodies) > 1,
-        "spin": turned,
+        "spin": turned or spun,
+        "orientation": turned,
         "driven": any(body.motion == "driven" for body in world.bodies),
     }
     words = {
         "ground": "a ground in the manifest",
         "contact": "something to touch",
-        "spin": "measured orientations",
+        "spin": "measured orientations or spins",
+        "orientation": "measured orientations",
         "driven": "a driven body",
     }
     for active in world.effects:

@@ -16,7 +16,7 @@ class ComOffset(Effect):
     formula = "com becomes com + (d_x, d_y, d_z), body frame; the inertia about it stays"
     parameters = tuple(EffectParameter(name=f"d_{axis}", unit="m", scale=0.003, limit=0.05) for axis in "xyz")
     phase = "flight"
-    needs = ("spin",)
+    needs = ("orientation",)
     reveals = "free flight with fast spin about different axes, then impacts (against marker_offset)"
     source = "definition"
 

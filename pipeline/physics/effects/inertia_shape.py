@@ -26,7 +26,7 @@ class InertiaShape(Effect):
     formula = "C becomes exp(S/2) C exp(S/2), C = tr(I)/2 - I the second moment of the mass, S symmetric, body axes"
     parameters = tuple(EffectParameter(name=f"s_{axes}", unit="1", scale=0.1, limit=1.0) for axes in _AXES)
     phase = "flight"
-    needs = ("spin",)
+    needs = ("orientation",)
     reveals = "free flight with fast spin about axes that are not principal axes, and off-centre impacts"
     source = "second moments as in Wensing, Kim and Slotine 2018; the exponential map of symmetric matrices"
 

@@ -16,7 +16,7 @@ class MarkerOffset(Effect):
     formula = "p_measured = p + R (d_x, d_y, d_z), d in the body frame; the collision shape stays"
     parameters = tuple(EffectParameter(name=f"d_{axis}", unit="m", scale=0.003, limit=0.05) for axis in "xyz")
     phase = "measurement"
-    needs = ("spin",)
+    needs = ("orientation",)
     reveals = "free flight with fast spin about different axes, then rest on different sides (against com_offset)"
     source = "definition"
 

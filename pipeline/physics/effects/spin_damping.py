@@ -13,7 +13,7 @@ class SpinDamping(Effect):
     formula = "alpha = -d omega"
     parameters = (EffectParameter(name="d", unit="1/s", scale=0.2, limit=20.0, nonnegative=True),)
     phase = "flight"
-    needs = ("spin",)
+    needs = ("orientation",)
     reveals = "long free flight with fast spin"
     source = "viscous torque; d = 8 pi eta r^3 / I for a sphere of radius r"
 

@@ -24,7 +24,7 @@ class MyEffect(Effect):
     # A value without meaning where all parameters are 0 is a constant, which a fit tries on a grid.
     constants = (EffectConstant("r", "m", (0.1, 0.2, 0.5)),)
     phase = "flight"  # or "contact", or "measurement": where it acts
-    needs = ()  # of "ground", "drag", "contact", "spin", "driven"
+    needs = ()  # of "ground", "drag", "contact", "spin", "orientation", "driven"
     reveals = "slow flight past the middle, on different sides"
     source = "made up, as an example"
 

@@ -16,7 +16,7 @@ class TorsionalFriction(Effect):
     formula = "torque = -c_t N sign(omega_n) n"
     parameters = (EffectParameter(name="c_t", unit="m", scale=5e-4, limit=0.02, nonnegative=True),)
     phase = "contact"
-    needs = ("contact", "spin")
+    needs = ("contact", "orientation")
     reveals = "a ball or a rounded body that spins on the spot: it stops at c_t m g / I"
     source = "soft-finger contact; c_t = (2/3) mu R of an evenly loaded disc of radius R"
 

@@ -60,7 +60,7 @@ def test_the_measured_spin_of_a_centroid_is_its_start() -> None:
         found, _ = estimate_states(world, seen, warmup_frames(world, seen, 0.1), Noise(1e-4, 1e-3))
         assert torch.allclose(found.state.omega_body_rad_s[0, 0], expected, rtol=1e-2)
     silent = Observations.of(world, [Episode("a", {name: replace(track, quat_wxyz=None)})], [(0.0, 1.0)])
-    assert not silent.state.omega_body_rad_s.any() and not silent.spun
+    assert not silent.state.omega_body_rad_s.any() and silent.spin_rad_s is None
 
 
 def test_turns_go_on_beyond_half_a_turn_and_equal_the_logarithm_below() -> None:

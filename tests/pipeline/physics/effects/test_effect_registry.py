@@ -124,7 +124,7 @@ def test_wrong_files_are_refused(own: Path, tmp_path: Path) -> None:
         (
             "    phase",
             '    needs = ("luck",)\n    phase',
-            "it needs 'luck'; legal are ground, drag, contact, spin, driven",
+            "it needs 'luck'; legal are ground, drag, contact, spin, orientation, driven",
         ),
     ],
 )
