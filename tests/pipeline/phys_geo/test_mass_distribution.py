@@ -180,7 +180,9 @@ def test_a_model_holds_the_mass_distribution_that_was_fitted(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)  # the mass is fitted before
-    config = PhysConfig(population=8, generations=2, iterations=1, step_s=STEP_S, mass_distribution=True)
+    config = PhysConfig(
+        population=8, generations=2, iterations=1, step_s=STEP_S, mass_distribution=True, length_scale=False
+    )
     file = fit(capture, tmp_path / "model", phys_config=config)
     numbers = {parameter.name: parameter for parameter in file.parameters}
     assert file.bodies[0].com_m == tuple(numbers[f"box.com_{axis}_m"].estimate for axis in "xyz")

@@ -23,18 +23,18 @@ def lowered(world: World, by_m: float) -> World:
 
 @pytest.mark.parametrize(("body", "effects"), [("cube", {}), ("ball", {}), ("ball", DRAG), ("ball", ROLLING)])
 def test_a_model_that_lacks_an_effect_describes_the_motion(body: str, effects: dict) -> None:
-    episodes = tosses(world_with(body, effects), 4, count=6, duration_s=1.2)
+    episodes = tosses(world_with(body, effects), 4, count=4, duration_s=0.7)
     assert not_described(world_with(body), episodes, NOISE) is None
 
 
 def test_flight_alone_is_described_without_contact() -> None:
-    episodes = tosses(world_with("ball", DRAG, ground=False), 5, count=6, duration_s=1.2)
+    episodes = tosses(world_with("ball", DRAG, ground=False), 5, count=4, duration_s=0.7)
     assert not_described(world_with("ball"), episodes, NOISE) is None
 
 
 def test_a_ground_that_is_too_low_or_missing_is_the_likely_cause() -> None:
     world = world_with("ball")
-    episodes = tosses(world, 3, count=6, duration_s=1.2)
+    episodes = tosses(world, 3, count=4, duration_s=0.7)
     low = not_described(lowered(world, 12.0), episodes, NOISE)
     assert low is not None and low.never_touches and "ground lies too low" in low.cause
     assert low.sentence.startswith("The model does not describe this motion: nothing touches anything in it")
@@ -46,8 +46,8 @@ def test_a_body_that_falls_between_spheres_of_a_rail_is_told() -> None:
     """A ball rests on a row of spheres, of which the model has every fourth."""
     ball = ball_body(0.02)
     rail = row_of_spheres(0.01)
-    world = replace(world_with("ball", ground=False), bodies=(ball, rail), step_s=0.004)
-    times = np.arange(0, 0.45, 1 / 40)
+    world = replace(world_with("ball", ground=False), bodies=(ball, rail), step_s=0.008)
+    times = np.arange(0, 0.3, 1 / 40)
     rng = np.random.default_rng(0)
     episodes = []
     for k in range(2):
@@ -64,7 +64,7 @@ def test_a_body_that_falls_between_spheres_of_a_rail_is_told() -> None:
 
 def row_of_spheres(apart_m: float) -> Body:
     """A fixed body of spheres of 1 cm along x."""
-    along = torch.arange(-0.08, 0.3, apart_m, dtype=torch.float64)
+    along = torch.arange(-0.08, 0.2, apart_m, dtype=torch.float64)
     centers = torch.stack([along, 0 * along, 0 * along], -1)[None]
     like = ball_body(0.01)
     place = batch((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
