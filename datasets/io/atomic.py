@@ -7,6 +7,7 @@ that behind, and the next process that writes the same output removes it.
 from __future__ import annotations
 
 import errno
+import filecmp
 import hashlib
 import os
 import re
@@ -19,7 +20,7 @@ from pathlib import Path
 from ...schemas import UsageError
 from .free_space import enough_room
 from .neighbours import PARTIAL, REPLACED, alive, clean_stale, host, remove, sibling
-from .outputs import DirectoryKind, FileKind, about_to_place, inside_output, refuse_output, write_record
+from .outputs import DirectoryKind, FileKind, about_to_place, inside_output, may_repeat, refuse_output, write_record
 from .places import require_place
 
 _LOST = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
@@ -69,14 +70,17 @@ def new_file(path: Path | str, kind: FileKind, overwrite: bool = False) -> Itera
         overwrite: Replace an existing file.
 
     Raises:
-        UsageError: Before anything is written, if `path` is a directory, and see :func:`refuse_output`.
+        UsageError: Before anything is written, if `path` is a directory, and see :func:`refuse_output`. A file that
+            the same command writes with the same bytes again is refused only if these differ.
         NotEnoughSpaceError: If the disk is full.
     """
     path = Path(path)
-    refuse_output(path, kind, overwrite)
+    repeated = not overwrite and may_repeat(path, kind)
+    refuse_output(path, kind, overwrite or repeated)
     with enough_room(path, f"the {kind}"), replaced_file(path) as temporary:
         yield temporary
-        refuse_output(path, kind, overwrite)
+        same = repeated and path.is_file() and filecmp.cmp(temporary, path, shallow=False)
+        refuse_output(path, kind, overwrite or same)
         about_to_place(temporary, path)
 
 

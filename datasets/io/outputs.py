@@ -41,6 +41,8 @@ FileKind = Literal[
 
 _DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
 
+_REPEATABLE = frozenset({"MJCF file", "glTF file", "splat file", "effect template"})
+
 _SYSTEM_FILES = re.compile(
     r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|pending|replaced)-.*)"
 )
@@ -157,6 +159,11 @@ def refuse_output(path: Path, kind: DirectoryKind | FileKind, overwrite: bool) -
 def is_own_file(path: Path, kind: FileKind) -> bool:
     """Return whether a file is one of this kind that cgwm wrote and nobody has changed."""
     return path.is_file() and path.stat().st_size > 0 and not _file_fault(path, kind)
+
+
+def may_repeat(path: Path, kind: DirectoryKind | FileKind) -> bool:
+    """Return whether a file is cgwm's own, of a kind that the same command writes with the same bytes again."""
+    return kind in _REPEATABLE and not path.is_symlink() and is_own_file(path, kind)  # pyright: ignore[reportArgumentType]
 
 
 @contextmanager
@@ -312,6 +319,12 @@ def _head(*signs: bytes) -> Callable[[Path], bool]:
     return recognise
 
 
+def _is_mjcf(path: Path) -> bool:
+    """Return whether a file is MJCF of cgwm; its source stands behind the bodies."""
+    text = path.read_bytes()
+    return text.startswith(b"<mujoco") and b'data="cgwm, of ' in text[-_HEAD_BYTES:]
+
+
 def _is_index(path: Path) -> bool:
     import h5py
 
@@ -335,7 +348,7 @@ def _is_unchanged(path: Path) -> bool:
 
 _RECOGNISED: Mapping[str, Callable[[Path], bool]] = {
     "page": _head(b"<!doctype html>", b'<meta name="generator" content="cgwm">'),
-    "MJCF file": _head(b"<mujoco", b'data="cgwm, of '),
+    "MJCF file": _is_mjcf,
     "glTF file": _head(b"glTF", b'"generator":"cgwm"'),
     "splat file": _head(b"ply\n", b"comment unit metre\ncomment frame "),
     "index": _is_index,

@@ -21,7 +21,7 @@ from ...datasets.exports.selection import Selection
 from ...datasets.exports.splat_files import in_world, write_splat_files
 from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
-from ...datasets.io.outputs import DirectoryKind, FileKind, reads, refuse_output
+from ...datasets.io.outputs import DirectoryKind, FileKind, may_repeat, reads, refuse_output
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
@@ -121,9 +121,8 @@ def export(
     suffix = SUFFIXES.get(format_)
     if suffix and out.suffix.lower() != suffix:
         raise UsageError(f"--out {out}: --to {format_} writes one file.", f"a name that ends in {suffix}.")
-    refuse_output(
-        out, "splat folder" if format_ == "ply" and out.suffix.lower() != ".ply" else _KINDS[format_], overwrite
-    )
+    kind = "splat folder" if format_ == "ply" and out.suffix.lower() != ".ply" else _KINDS[format_]
+    refuse_output(out, kind, overwrite or may_repeat(out, kind))
     facts, notes = _WORK[format_](thing, out, chosen, overwrite)
     return ExportResult(source=str(thing), format=format_, out=str(out), facts=facts, notes=tuple(notes))
 

@@ -601,6 +601,21 @@ def test_what_exists_stays(dataset: Path, model: Path, tmp_path: Path, format_: 
     assert sha256(out) == first  # the same bytes again
 
 
+@pytest.mark.parametrize(("format_", "name"), [("ply", "m.ply"), ("glb", "m.glb")])
+def test_a_file_is_written_again_only_with_the_same_bytes(
+    model: Path, tmp_path: Path, format_: ExportFormat, name: str
+) -> None:
+    export(model, format_, tmp_path / name)
+    first = sha256(tmp_path / name)
+    export(model, format_, tmp_path / name)
+    assert sha256(tmp_path / name) == first
+    with (tmp_path / name).open("ab") as stream:
+        stream.write(b" ")
+    with pytest.raises(UsageError, match="exists"):
+        export(model, format_, tmp_path / name)
+    assert sorted(one.name for one in tmp_path.iterdir()) == [name]
+
+
 def test_what_is_not_there_is_refused(dataset: Path, model: Path, tmp_path: Path) -> None:
     for options, message in (
         (ExportOptions(cameras=("view7",)), r"no camera 'view7'. Did you mean(.|\n)*view0, view1"),
