@@ -8,7 +8,7 @@ search runs again under them, on whole flights, so that an effect counts as far 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from .coupled_effects import DRAGS
 from .effect_selection import SelectionStep
 from .falsification import Consistency, consistency
 from .flight_search import flight_search
-from .own_tilt import TILTS, has_own_tilts, own_tilt_step
+from .own_tilt import TILTS, own_tilt_step, own_tilts
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -66,6 +66,8 @@ class FlightFindings:
     """What repeats from episode to episode beside the selected effects, as a law of any form; None where unknown."""
     common_share: float
     """Share of what repeats from episode to episode that the selected effects explain; 1 where nothing is left."""
+    own_law: str | None = None
+    """What accelerations that differ from episode to episode follow, so that they are none of each episode's own."""
 
     @property
     def in_flight(self) -> list[str]:
@@ -75,7 +77,7 @@ class FlightFindings:
     @property
     def remains(self) -> bool:
         """Whether a residual exceeds the noise beside the selected effects."""
-        return is_significant(self.after) or self.repeats
+        return is_significant(self.after) or self.repeats or self.own_law is not None
 
     @property
     def repeats(self) -> bool:
@@ -86,12 +88,13 @@ class FlightFindings:
     def doubtful(self) -> bool:
         """Whether the selected effects imitate something else.
 
-        Their parameters change from episode to episode, their law is another one, or a law of any form explains more of
-        what repeats than they do.
+        Their parameters change from episode to episode, their law is another one, a law of any form explains more of
+        what repeats than they do, or what differs from episode to episode follows a law of the motion.
         """
         inconsistent = self.agreement is not None and self.agreement.doubtful
         imitated = self.repeats and self.common_share < LIMITS.common_share
-        return inconsistent or imitated or any(one.better for one in self.others)
+        follows = self.own_law is not None
+        return inconsistent or imitated or follows or any(one.better for one in self.others)
 
 
 def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> FlightFindings:
@@ -106,12 +109,18 @@ def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candi
     if not (found.remains or found.doubtful):
         return found
     slow = _slow_errors(prepared, found.world, candidates)
-    if slow is not None and slow.sway_evidence and not has_own_tilts(prepared, found.world, candidates, slow):
-        slow = slow.tiltless()
+    law = None
+    if slow is not None and slow.sway_evidence:
+        own = own_tilts(prepared, found.world, candidates, slow)
+        law = own.law
+        if own.kind == "levelling":
+            slow = replace(slow, sway_evidence=0.0)
+        elif own.kind != "tilts":
+            slow = slow.tiltless()
     if slow is None:
-        return found
+        return replace(found, own_law=law)
     again = prepared.with_slow_noise(world, slow.noise_model)
-    return _searched(again, prepared, world, candidates, slow)
+    return replace(_searched(again, prepared, world, candidates, slow), own_law=law)
 
 
 def _slow_errors(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> SlowErrors | None:

@@ -7,7 +7,8 @@ in a flight and differ from flight to flight. In flight a tilt of the frame and 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -18,11 +19,13 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, base_parameters, variants_of
 from ..segments.linearization import linearize
 from ..segments.prepare import Prepared
+from ..segments.residual_wrench import residual_wrenches
 from ..segments.segment_fit import refit
 from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors
 from .effect_selection import SelectionStep
 from .evidence import Evidence
+from .own_accelerations import OwnAccelerations
 from .score_test import ScoreTest, solved
 from .thresholds import THRESHOLDS
 
@@ -36,10 +39,22 @@ OWN_TILTS = ("gravity_tilt", "frame_tilt")
 """Effects of which each episode can have its own, which flight does not tell apart."""
 
 
-def has_own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candidate], slow: SlowErrors) -> bool:
-    """Return whether slow errors have a tilt of each episode's own that a world lacks.
+@dataclass(frozen=True)
+class OwnTilts:
+    """What accelerations across gravity are that differ from episode to episode."""
 
-    It has to be the same in all pieces of an episode's flights; a gust pushes in some of them.
+    kind: Literal["tilts", "levelling", "force", "none"]
+    """Tilts of each episode's own; such that few episodes do not prove, as small as errors of levelling; a force, or
+    what may be one; or nothing that lasts for an episode."""
+    law: str | None = None
+    """What a force follows; "episode" where there are too few episodes to tell."""
+
+
+def own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candidate], slow: SlowErrors) -> OwnTilts:
+    """Return what the accelerations of the flights' own are that slow errors have.
+
+    A tilt has to be the same in all pieces of an episode's flights (a gust pushes in some of them), to predict each
+    piece from the others, and to follow nothing in the motion.
 
     Args:
         prepared: The episodes, without slow errors as part of their noise.
@@ -48,23 +63,42 @@ def has_own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candida
         slow: The slow errors.
     """
     if not slow.sway_evidence or float(world.gravity[0].norm()) == 0 or not (names := _missing(world, candidates)):
-        return False
-    return _lasting_share(prepared, world, names[0], slow) > LIMITS.lasting_share
-
-
-def _lasting_share(prepared: Prepared, world: World, name: str, slow: SlowErrors) -> float:
-    """Return the share of what tilts of all pieces of flight explain that one tilt in each episode explains.
-
-    The noise has the slow process, but no acceleration of a flight's own.
-    """
+        return OwnTilts("none")
+    if any(active.effect.name == "wind" for active in world.effects):
+        return OwnTilts("none")  # a drag in wind pushes a box that turns as if each flight were tilted
+    # the noise has the slow process, but no acceleration of a flight's own
     position = slow.noise_model.position._replace(sway=0.0)
     pieces = replace(prepared, noise_model=slow.noise_model._replace(position=position)).pieces(world, PIECE_S)
-    if pieces is None:
-        return 0.0
-    kept = tuple(active for active in world.effects if active.effect.name not in TILTS)
-    bare = replace(world, effects=kept)
+    if pieces is None or _lasting_share(pieces, world, names[0], prepared.groups) <= LIMITS.lasting_share:
+        return OwnTilts("none")
+    accelerations = OwnAccelerations.of(
+        residual_wrenches(pieces.in_world(_bare(world))), slow.noise_model.position.level
+    )
+    std_m_s2 = slow.sway_m_s2(prepared.noise.position_m)
+    if float(accelerations.held_out_gains(std_m_s2).sum()) <= 0:
+        return OwnTilts("none")
+    return _kind(accelerations, std_m_s2 / float(world.gravity[0].norm()))
+
+
+def _kind(accelerations: OwnAccelerations, std_rad: float) -> OwnTilts:
+    """Return what accelerations are that last for an episode each, from the size [rad] that they have as tilts."""
+    if (law := accelerations.law()) is not None:
+        return OwnTilts("force", law)
+    if len(np.unique(accelerations.episode)) >= LIMITS.own_episodes:
+        return OwnTilts("tilts")
+    return OwnTilts("levelling") if std_rad < LIMITS.levelling_rad else OwnTilts("force", "episode")
+
+
+def _bare(world: World) -> World:
+    """Return the world without effects that push across gravity."""
+    return replace(world, effects=tuple(active for active in world.effects if active.effect.name not in TILTS))
+
+
+def _lasting_share(pieces: Segments, world: World, name: str, groups: Sequence[int]) -> float:
+    """Return the share of what tilts of all pieces of flight explain that one tilt in each episode explains."""
+    bare = _bare(world)
     variants = variants_of([Candidate(name, load_effect(name))], world.gravity[0, :1])
-    linear = linearize(pieces, bare, variants, prepared.groups, robust=False)
+    linear = linearize(pieces, bare, variants, groups, robust=False)
     columns = linear.columns(variants[0].parameters)
     information, score = linear.information[:, columns][:, :, columns], linear.score[:, columns]
     width = np.array([linear.parameters[k].prior[1] for k in columns])

@@ -120,6 +120,19 @@ class VerdictThresholds:
         "1",
         "share that one tilt in each episode must explain of what tilts of all pieces of its flights do",
     )
+    own_episodes: int = threshold(
+        8,
+        "episodes",
+        "fewest in which a tilt of each episode's own is named: fewer values fit a force that follows the heading by "
+        "its first and second harmonic",
+        BY_ARGUMENT,
+    )
+    levelling_rad: float = threshold(
+        math.radians(1.0),
+        "rad",
+        "in fewer episodes, tilts below it count as errors of levelling, larger ones as a force that nothing explains",
+        "by argument: a degree is seen by eye",
+    )
     consistent_p: float = threshold(
         1e-4,
         "probability",

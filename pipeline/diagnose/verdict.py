@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from ..physics.world import World
-from ..segments.candidates import Candidate
+from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
 from ..segments.residual_wrench import Omnibus
 from .alternative_laws import OtherLaw
@@ -72,10 +72,11 @@ def find(
         tests: The contact tests, in the order in which they run.
     """
     flown = flight_findings(prepared, world, candidates)
-    explained = flown.slow is not None or not is_significant(flown.after)
+    explained = not is_significant(flown.after)
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
+    errors = _errors(contact, flown)
+    contact = _without_useless(contact, errors)
     verdict = _verdict(contact.chosen, flown)
-    errors = {} if verdict == "unexplained" else _errors(contact, flown)
     return Findings(
         verdict=verdict,
         chosen=tuple(contact.chosen),
@@ -86,7 +87,7 @@ def find(
         world=contact.world,
         contact_chi2=contact.chi2,
         base=world,
-        errors=errors,
+        errors={} if verdict == "unexplained" else errors,
         as_good=tuple(one for one in flown.others if one.as_good),
         limits=contact.limits,
     )
@@ -101,17 +102,39 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
     too_little = is_significant(flown.after) and _explained(flown.before, flown.after) < LIMITS.enough_share
     if flown.doubtful or (flown.slow is None and too_little):
         return "unexplained"
-    if not chosen and flown.repeats:
+    if not chosen and flown.remains:
         return "unexplained"
     if any(len(one.equals) > 1 for one in chosen):
         return "not_separable"
     return "missing_effect" if chosen else "none_missing"
 
 
+def _without_useless(contact: ContactFindings, errors: Mapping[str, tuple[float, float]]) -> ContactFindings:
+    """Return the findings without the effects of contact that predict held-out episodes worse than no effect does."""
+    useless = {
+        one.evidence.name
+        for one in contact.chosen
+        if one.where == "contact" and one.evidence.name in errors and not _predicts(errors[one.evidence.name])
+    }
+    world = contact.world
+    for name in sorted(useless):
+        world = without_effect(world, name)
+    return replace(contact, chosen=[one for one in contact.chosen if one.evidence.name not in useless], world=world)
+
+
+def _predicts(errors: tuple[float, float]) -> bool:
+    """Return whether the held-out error falls, from without an effect to with it."""
+    return errors[1] < errors[0]
+
+
 def _errors(contact: ContactFindings, flown: FlightFindings) -> dict[str, tuple[float, float]]:
     """Return the held-out errors [m] without and with each selected effect, in the motion that showed it."""
     errors, present = {}, {active.effect.name for active in contact.world.effects}
+    # the world has the mean of the values that episodes have of their own, whose error says nothing of these
+    own = {step.best.name for step in flown.steps if step.own_std is not None}
     for one in contact.chosen:
+        if one.evidence.name in own:
+            continue
         segments = flown.segments if one.where == "flight" else contact.segments
         if segments is not None and one.evidence.name in present:
             errors[one.evidence.name] = held_out_errors(segments, contact.world, one.evidence.name)

@@ -36,13 +36,23 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         return "Nothing is missing that these data could show."
     if findings.verdict == "unexplained":
         where = f" {organised(law.where)}" if law is not None else ""
-        return f"Something is missing in flight, and none of the candidates explains it.{where}"
+        return f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
     words = []
     for one in findings.chosen:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     listed = " and ".join(word or name for word, name in zip(words, names, strict=True))
     return f"Missing: {listed}.{_apart(findings)}{_rest(findings)}"
+
+
+def _own(findings: Findings) -> str:
+    """Return what the accelerations follow that differ from episode to episode; empty for nothing."""
+    law = findings.flight.own_law
+    if law is None:
+        return ""
+    if law == "episode":
+        return " Each episode is pushed in another direction; more episodes tell a tilt of each from a force."
+    return f" Each episode is pushed in another direction, which follows its {law}."
 
 
 def _apart(findings: Findings) -> str:

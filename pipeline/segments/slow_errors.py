@@ -51,6 +51,8 @@ SHORTEST = 12
 """Minimum number of frames of a flight."""
 KEPT = 1e-3
 """Directions of the common effects that move no frame by more than this many standard deviations are left out."""
+COMMON_S = 0.1
+"""Length [s] of the intervals in each of which one force may act in all episodes alike."""
 STEPS = 260
 """Maximum number of likelihoods of a climb."""
 
@@ -108,7 +110,9 @@ def _of_flights(
     plain = Segments.of("flight", world, prepared.observations, items, prepared.noise, WHITE)
     plain = plain.with_state(fitted.observations.state)
     parameters, rows, jacobian = derivatives(plain, world, variants)
-    kinds = [_Contrasts.of(plain, rows, jacobian, len(parameters), kind) for kind in (0, 1)]
+    timed = _timed_forces(plain)
+    jacobian = torch.cat((timed, jacobian), -1)
+    kinds = [_Contrasts.of(plain, rows, jacobian, len(parameters) + timed.shape[-1], kind) for kind in (0, 1)]
     found, plain_found, evidence, sway_evidence = [], [], 0.0, 0.0
     for kind, contrasts in enumerate(kinds):
         if contrasts is None:
@@ -124,6 +128,29 @@ def _of_flights(
         evidence, sway_evidence = max(evidence, slow * real), max(sway_evidence, sway * real)
     model = NoiseModel(*found)
     return SlowErrors(model, NoiseModel(*plain_found), evidence, sway_evidence) if model.slow else None
+
+
+def _timed_forces(segments: Segments) -> Tensor:
+    """Return the derivatives (B, F, 6, P) of residuals by forces that act in one interval of time in all episodes.
+
+    A force that follows the clock, as a gust or a shaking, does the same in all episodes and is no error of tracks.
+    """
+    seen = segments.observations
+    times, bodies = seen.times_s, len(seen.free)
+    found = times.new_zeros(*times.shape, 6, 0)
+    if len({item.episode for item in segments.items}) >= LIMITS.least_episodes:
+        ends = [float(times[k, n - 1]) for k, n in enumerate(segments.lengths)]
+        edges = torch.arange(float(times[:, 0].min()), max(ends), COMMON_S).to(times)
+        late = (times[..., None] - edges).clamp_min(0.0)
+        path = 0.5 * (late.square() - (late - COMMON_S).clamp_min(0.0).square())
+        # a residual is the model less the measurement, or the reverse: only the space that they span matters
+        path = path / segments.noise.position_m
+        found = torch.stack(
+            [torch.nn.functional.one_hot(torch.tensor(a), 6).to(path)[:, None] * path[..., None, :] for a in range(3)],
+            -1,
+        )
+        found = found.flatten(-2)
+    return found.repeat_interleave(bodies, 1)
 
 
 def _level_axes(world: World) -> list[int]:

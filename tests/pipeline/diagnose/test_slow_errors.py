@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.verdict import Findings, find
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
@@ -105,6 +106,33 @@ def test_what_repeats_is_told_from_what_each_episode_has_of_its_own(own: bool, r
     assert law is not None and (law.p_value < 1e-3) == repeats
     if repeats:
         assert law.coordinate == "x" and law.frame == "world"
+
+
+@pytest.mark.parametrize(("kind", "law"), [("tilts", None), ("heading", "heading"), ("place", "place")])
+def test_what_is_of_each_episode_s_own_is_told_from_a_law_of_its_motion(kind: str, law: str | None) -> None:
+    rng = np.random.default_rng(7)
+    count, each = 8, 4
+    heading, place = rng.uniform(0, 2 * np.pi, count), rng.uniform(-1, 1, (count, 2))
+    along = np.stack((np.cos(heading), np.sin(heading)), 1)
+    across = np.stack((-np.sin(heading), np.cos(heading)), 1)
+    own = {
+        "tilts": 0.3 * rng.standard_normal((count, 2)),
+        "heading": np.sin(2 * heading)[:, None] * across,
+        "place": 0.5 - 2 * place,
+    }[kind]
+    measured = np.repeat(own, each, 0) + 0.02 * rng.standard_normal((count * each, 2))
+    information = np.tile(np.eye(2) / 0.02**2, (count * each, 1, 1))
+    found = OwnAccelerations(
+        score=measured / 0.02**2,
+        information=information,
+        episode=np.repeat(np.arange(count), each),
+        motion={"velocity": np.repeat(along, each, 0), "place": np.repeat(place, each, 0)},
+    )
+    assert found.law() == law
+    # each piece is predicted by the others of its episode, but not where the push changes within it
+    assert found.held_out_gains(0.3).sum() > 100
+    flipped = replace(found, score=found.score * np.tile([1, -1], count * each // 2)[:, None])
+    assert flipped.held_out_gains(0.3).sum() < 0
 
 
 def test_parts_of_one_flight_are_joined_and_others_are_not() -> None:
