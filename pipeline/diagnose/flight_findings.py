@@ -29,6 +29,7 @@ from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors, slow_errors
 from .alternative_laws import OtherLaw, other_laws
 from .coupled_effects import DRAGS
+from .cross_validation import held_out_loss
 from .effect_selection import SelectionStep
 from .falsification import Consistency, consistency
 from .flight_search import flight_search
@@ -147,6 +148,8 @@ def _searched(
     before = worst_omnibus(windows, scatter)
     steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
     steps, after_flight, flight = _with_own_tilts(prepared, steps, after_flight, flight, candidates, slow)
+    if flight is not None and slow is not None:
+        steps, after_flight, flight = _with_the_needed(steps, after_flight, flight)
     names = [step.best.name for step in steps if step.flagged and step.own_std is None]
     others = [] if flight is None else other_laws(flight, after_flight, names, scatter)
     better = {one.effect for one in others if one.better}
@@ -192,6 +195,25 @@ def _with_own_tilts(
     world, flight = _without(flight, world, replaced)
     own, world, flight = own_tilt_step(prepared, flight, world, candidates, slow)
     return [*(step for step in steps if step.flagged and step.best.name not in replaced), own], world, flight
+
+
+def _with_the_needed(
+    steps: list[SelectionStep], world: World, flight: Segments
+) -> tuple[list[SelectionStep], World, Segments]:
+    """Leave out each of several effects without which the others predict held-out flights as well.
+
+    Beside slow errors, whose model is not exact, the fall of BIC alone also takes an effect that adds nothing.
+    """
+    for step in reversed(steps):
+        name = step.best.name
+        names = {one.best.name for one in steps if one.flagged and one.own_std is None}
+        others = names - {name}
+        if name not in names or not others or ("wind" in others and not others & set(DRAGS)):
+            continue  # wind acts through a drag
+        other, fitted = _without(flight, world, {name})
+        if held_out_loss(fitted, other) < (1 + LIMITS.needed_share) * held_out_loss(flight, world):
+            steps, world, flight = [one for one in steps if one is not step], other, fitted
+    return steps, world, flight
 
 
 def _without(flight: Segments, world: World, names: set[str]) -> tuple[World, Segments]:

@@ -109,6 +109,12 @@ class VerdictThresholds:
         "p-value below it (Student's t over episodes, Bonferroni over the laws)",
         BY_ARGUMENT,
     )
+    needed_share: float = threshold(
+        0.02,
+        "1",
+        "beside slow errors, of several effects one is left out if the loss of held-out flights then rises by less",
+        "by argument, as in `improve`; looked at on one recording of throws, it takes away the second of two drags",
+    )
     common_share: float = threshold(
         0.6,
         "1",

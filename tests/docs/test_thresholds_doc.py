@@ -60,6 +60,8 @@ NUMERICS = {
     "pictures.SHOWN_S": "length of a drawn motion",
     "pictures.SLIDE": "the motion that is drawn for an effect in contact",
     "rebound_by_slip.WEAK": "width of a prior of a nuisance",
+    "own_accelerations.FEWEST": "fewest pieces of a regression; fewer determine no variance",
+    "own_accelerations.QUARTER_TURN": "a matrix",
     "own_tilt.PIECE_S": "length of the motion that is looked at",
     "robust_fit.FALL": "end of a descent",
     "robust_fit.ITERATIONS": "end of a descent",
@@ -141,6 +143,7 @@ SEGMENT_NUMERICS = {
         "repeated_forces.USUAL_BINS",
         "slow_errors.FASTEST_S, FAST_S, SLOW_S",
         "slow_errors.SHORTEST",
+        "slow_errors.COMMON_S",
     ),
     "defines a held-out score": ("held_out_gain.FOLDS",),
     "width of a prior of a nuisance, or size of a sample of flights": (
