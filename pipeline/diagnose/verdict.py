@@ -75,7 +75,8 @@ def find(
     explained = not is_significant(flown.after)
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     errors = _errors(contact, flown)
-    contact = _without_useless(contact, errors)
+    if flown.remains:  # what flights show may be what contact imitates
+        contact = _without_useless(contact, errors)
     verdict = _verdict(contact.chosen, flown)
     return Findings(
         verdict=verdict,

@@ -149,5 +149,8 @@ def test_absent_and_existing_files(tmp_path: Path) -> None:
     with pytest.raises(InputDataError, match="no such file"):
         read_splats(tmp_path / "a.ply")
     write_splats(tmp_path / "a.ply", splats())
+    write_splats(tmp_path / "a.ply", splats())  # the same again
+    other = splats()
+    other.means[0] += 1.0
     with pytest.raises(UsageError, match="exists"):
-        write_splats(tmp_path / "a.ply", splats())
+        write_splats(tmp_path / "a.ply", other)
