@@ -2,7 +2,6 @@
 
 import os
 import sys
-import tempfile
 from collections.abc import Iterator
 
 import pytest
@@ -10,8 +9,12 @@ import pytest
 # Tests start commands in processes of their own, from the repository's root. Without this Python puts that directory
 # first on the path, and finds the folder cgwm/ there instead of the installed package.
 os.environ["PYTHONSAFEPATH"] = "1"
-# What a user consents to is kept in the home directory: not that of the user who runs the tests.
-os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cgwm-tests-")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _state_home(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What a user consents to is kept in the home directory: not that of the user who runs the tests."""
+    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
 
 
 @pytest.fixture(scope="module")
