@@ -9,10 +9,18 @@ independence: this is generalised least squares with these errors as random effe
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+RESOLUTION_S = 1e-9
+"""Frame times [s] closer than this are the same: the times of recorded episodes share a grid up to rounding."""
+MOST_NUMBERS = 2_000_000
+"""Maximum size of the whitening matrices of a batch; above it the filter runs over its frames."""
 
 
 class CorrelatedNoise(NamedTuple):
@@ -70,6 +78,51 @@ def innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNo
         mask: Frames that count (B, T).
         noise: The noise model.
     """
+    grids, place = _grids(times_s, mask)
+    length = max(map(len, grids)) // 8
+    # a row that is not finite would spoil earlier ones in a product
+    if len(grids) * length**2 > MOST_NUMBERS or not bool(rows.isfinite().all()):
+        return _filtered(rows, times_s, mask, noise)
+    matrices = _whitening(grids, noise).to(rows)
+    flat = rows.flatten(2) if rows.ndim > 2 else rows[..., None]
+    found = (matrices[0] if len(grids) == 1 else matrices[place]) @ flat[:, :length]
+    found = torch.where(mask[:, :length, None] > 0, found, flat[:, :length])
+    return torch.cat((found, flat[:, length:]), 1).reshape(rows.shape)
+
+
+def _grids(times_s: Tensor, mask: Tensor) -> tuple[tuple[bytes, ...], list[int]]:
+    """Return the different grids of the items' frames, longest first, and which of them begins as each item does.
+
+    A grid is the bytes of one integer for each frame: twice the time since the first frame in units of `RESOLUTION_S`,
+    plus 1 where the frame counts. Frames after the last one that counts do not matter.
+    """
+    counted = mask.detach().cpu().numpy() > 0
+    times = times_s.detach().cpu().numpy()
+    codes: NDArray[np.int64] = 2 * np.rint((times - times[:, :1]) / RESOLUTION_S).astype(np.int64) + counted
+    lengths = np.maximum((counted * np.arange(1, counted.shape[1] + 1)).max(1), 1)
+    grids: list[bytes] = []
+    place = [0] * len(codes)
+    for item in np.argsort(-lengths, kind="stable").tolist():
+        own = codes[item, : lengths[item]].tobytes()
+        found = next((k for k, grid in enumerate(grids) if grid.startswith(own)), len(grids))
+        if found == len(grids):
+            grids.append(own)
+        place[item] = found
+    return tuple(grids), place
+
+
+@lru_cache(maxsize=16)
+def _whitening(grids: tuple[bytes, ...], noise: CorrelatedNoise) -> Tensor:
+    """Return the matrices (K, T, T) whose products with residuals are their innovations, for grids as of `_grids`."""
+    codes = [np.frombuffer(grid, np.int64) for grid in grids]
+    length = len(codes[0])
+    padded = np.stack([np.concatenate((code, code[-1] + 2 * np.arange(1, length - len(code) + 1))) for code in codes])
+    times, mask = torch.from_numpy(padded // 2 * RESOLUTION_S), torch.from_numpy((padded % 2).astype(np.float64))
+    return _filtered(torch.eye(length, dtype=torch.float64).expand(len(grids), -1, -1), times, mask, noise)
+
+
+def _filtered(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
+    """Return the innovations by a filter that runs over the frames; arguments as of `innovations`."""
     if noise.slow or noise.sway:
         return _slow_innovations(rows, times_s, mask, noise)
     share = noise.share

@@ -65,6 +65,24 @@ def test_innovations_of_slow_errors_are_what_the_inverse_of_the_covariance_says(
             torch.testing.assert_close(whitened[k, kept][:, axis], known, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.parametrize("noise", [CorrelatedNoise(0.6, 0.02, 1.5), CorrelatedNoise(0.6, 0.02, 1.5, 4.0, 0.3, 30.0)])
+def test_innovations_do_not_depend_on_the_other_items_of_a_batch(noise: CorrelatedNoise) -> None:
+    rng = np.random.default_rng(1)
+    grid = torch.arange(12, dtype=torch.float64) / 240
+    times = torch.stack((grid, grid + 5.125, grid, grid.square()))  # the first three have one grid
+    mask = torch.ones(4, 12, dtype=torch.float64)
+    mask[1, 9:], mask[2, 4] = 0, 0
+    rows = torch.as_tensor(rng.standard_normal((4, 12, 3))) * mask[..., None]
+    together = axis_innovations(rows, times, mask, noise)
+    for k in range(4):
+        last = 9 if k == 1 else 12
+        alone = axis_innovations(*(part[k : k + 1, :last] for part in (rows, times, mask)), noise)
+        torch.testing.assert_close(together[k : k + 1, :last], alone, rtol=1e-6, atol=1e-8)
+    lost = rows.clone()
+    lost[0, 6:] = torch.nan
+    torch.testing.assert_close(axis_innovations(lost, times, mask, noise)[0, :6], together[0, :6], rtol=1e-6, atol=1e-8)
+
+
 def test_slow_errors_are_no_effect() -> None:
     silent = found({})
     assert silent.verdict == "none_missing" and not silent.chosen
