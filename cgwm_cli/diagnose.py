@@ -91,6 +91,7 @@ def diagnose(
 
 def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> str:
     from ..pipeline.diagnose.next_command import next_command
+    from ..pipeline.report.page import listed
     from .output import next_line, table, warnings
 
     words = next_command(result, model, capture, split)
@@ -98,7 +99,7 @@ def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> 
     lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "evidence", "estimate"])]
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
-        added = f", with {' and '.join(result.selected)} {after:.2f}" if result.selected else ""
+        added = f", with {listed(result.selected)} {after:.2f}" if result.selected else ""
         lines.append(f"flight, mean chi2 of the residual: {before:.2f}{added} (1: noise)")
     lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking)]
     lines += _remaining(result.remaining)
@@ -162,9 +163,11 @@ def _sizes(limit: ContactLimit) -> str:
 
 
 def _experiment(found: NextExperiment) -> list[str]:
+    from ..pipeline.report.page import listed
+
     if not found.ranked:
-        return [f"To distinguish them: {found.what}."]
-    lines = [f"To distinguish {' and '.join(found.separates)}: {found.what}."]
+        return [f"Measure next: {found.what}."]
+    lines = [f"To distinguish {listed(found.separates)}: {found.what}."]
     lines.append(f"  1. {found.ranked[0]['what']} (about {found.ranked[0]['order_of_magnitude']:g} nats expected)")
     lines += [
         f"  {entry['rank']}. {entry['what']} (about {entry['order_of_magnitude']:g} nats)"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .execution import Emit
+from .execution import Emit, loading
 from .options import AcceptUnits, ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects, trust
 from .verb import verb
 
@@ -57,7 +57,8 @@ def improve(
 ) -> None:  # fmt: skip
     """Fit a model, diagnose it, add what helps to predict unseen episodes, and repeat until nothing does."""
     trust(trust_effects)
-    from ..pipeline.improve import improve as work
+    with loading():
+        from ..pipeline.improve import improve as work
     from ..schemas import ImproveConfig, PhysConfig, SplatConfig
     from .settings import StageSettings
 
@@ -69,12 +70,13 @@ def improve(
     result = work(
         capture, out, parent, split, numbers, splats, physics, wanted, throws, overwrite, resume, accept_units
     )
-    emit(result, lambda found: _summary(found, out))
+    emit(result, lambda found: _summary(found, out, capture))
 
 
-def _summary(result: ImproveResult, out: Path) -> str:
+def _summary(result: ImproveResult, out: Path, capture: Path) -> str:
     from ..pipeline.improve.wording import not_added_words, remaining_words
-    from .output import table, warnings
+    from ..pipeline.report.page import listed
+    from .output import next_line, table, warnings
 
     rows = [[result.models[0], "", "", ""]]
     rows += [_row(step, result) for step in result.steps if step.added]
@@ -88,10 +90,11 @@ def _summary(result: ImproveResult, out: Path) -> str:
         lines.append(f"left: {' '.join(remaining_words(last))}")
     next_ = next((one for step in reversed(result.steps) if (one := step.next_experiment) is not None), None)
     if next_ is not None:
-        lines.append(f"Measure next, to distinguish {' and '.join(next_.separates)}: {next_.what}.")
+        why = f", to distinguish {listed(next_.separates)}" if next_.initial_state else ""
+        lines.append(f"Measure next{why}: {next_.what}.")
     lines += [*warnings(result.warnings), f"Page: {out / result.page}"]
     if len(result.models) > 1:
-        lines.append(f"Next: cgwm compare {out / result.models[0]} {out / result.models[-1]} {result.capture}")
+        lines.append(next_line("cgwm", "compare", out / result.models[0], out / result.models[-1], capture))
     return "\n".join(lines)
 
 

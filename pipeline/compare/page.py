@@ -39,6 +39,7 @@ def comparison_html(
     result: CompareResult,
     models: Sequence[ComparedModel],
     footage: Mapping[str, list[dict[str, Any]]],
+    files: Sequence[tuple[str, str]] = (),
     mark: str = "",
 ) -> str:
     """Return the HTML page of a comparison.
@@ -47,6 +48,7 @@ def comparison_html(
         result: The figures.
         models: The models that they come from, in the same order.
         footage: Sheets of frames by episode, see `frames.footage_of`.
+        files: What lies beside the page, with links, see `page_file.links_beside`.
         mark: By what the page is recognised, see `mark_of`.
     """
     names = [one.short_name for one in models]
@@ -64,6 +66,7 @@ def comparison_html(
         _phases(result, names),
         _episodes(result, models),
         wrench_section(models),
+        section("Files", facts(files)) if files else "",
         _provenance(result, models),
         f'<script type="application/json" id="replay-data">{_embedded(data)}</script>',
     ]

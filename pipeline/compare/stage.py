@@ -20,7 +20,7 @@ from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
 from ..evaluate.work import LESS, evaluation_parts
 from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
-from ..report.page_file import short_names, shows_the_same
+from ..report.page_file import links_beside, short_names, shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..runtime.work_budget import motion_doubt, within_budget
@@ -93,7 +93,8 @@ def compare(
     result = comparison.result.model_copy(update={"report": str(out)})
     footage = footage_of(comparison.models, source, device)
     with new_file(out, "page", overwrite) as path:
-        path.write_text(comparison_html(result, comparison.models, footage, mark), encoding="utf-8")
+        files = links_beside(out, models, capture)
+        path.write_text(comparison_html(result, comparison.models, footage, files, mark), encoding="utf-8")
     return result
 
 

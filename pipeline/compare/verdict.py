@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from ...schemas import CompareResult, ModelComparison, PairedDifference, PhaseFigures, ShortDifference
+from ..report.page import number
 from .paired_difference import LEAST_EPISODES
 
 EXPLAINED = 1.2
@@ -30,6 +32,8 @@ def comparison_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
         pair = _pair(result, subject.model, other.model)
         sentences = [_versus(pair, subject, other, result, names)] if pair else [_alone(subject, result, names)]
         short = _in_short(pair, subject, other, names) if pair else ""
+        if pair and short and _disagree(pair):
+            sentences = [f"Over whole episodes it is the other way round: {sentences[0]}", *sentences[1:]]
         sentences = [short, *sentences] if short else sentences
     if result.episodes < LEAST_EPISODES:
         sentences.append(
@@ -73,6 +77,13 @@ def _reversed(short: ShortDifference) -> ShortDifference:
     )
 
 
+def _disagree(pair: PairedDifference) -> bool:
+    """Return whether one model is better in short predictions and the other over whole episodes, both beyond chance."""
+    spans = (pair.short.interval_95 if pair.short is not None else None), pair.interval_95_m
+    signs = [0 if span is None or span[0] <= 0 <= span[1] else math.copysign(1, span[0]) for span in spans]
+    return signs[0] * signs[1] < 0
+
+
 def _in_short(pair: PairedDifference, model: ModelComparison, other: ModelComparison, names: Mapping[str, str]) -> str:
     """Return how two models differ in short predictions, and in which phase most; empty where nothing is known."""
     short = pair.short
@@ -83,15 +94,15 @@ def _in_short(pair: PairedDifference, model: ModelComparison, other: ModelCompar
     a, b = names[good.model], names[bad.model]
     least, most = sorted((short.reduced_chi2, short.than_reduced_chi2))
     figures = (
-        f"over {short.frames} frames, the mean square error of {a} is {least:.3g} times that of the noise, that of {b} "
-        f"{most:.3g}"
+        f"over {short.frames} frames, the mean square error of {a} is {number(least)} times that of the noise, that of "
+        f"{b} {number(most)}"
     )
     if short.interval_95 is None:
         return f"In short predictions, {figures}."
     low, high = sorted(abs(value) for value in short.interval_95)
     if short.interval_95[0] <= 0 <= short.interval_95[1]:
         return f"In short predictions the two cannot be told apart: {figures}."
-    figures += f" (95 % interval of the difference: {low:.2g} to {high:.2g})"
+    figures += f" (95 % interval of the difference: {number(low, 2)} to {number(high, 2)})"
     gains = {
         phase: (mine.reduced_chi2 - theirs.reduced_chi2) * mine.frames
         for phase, mine in good.by_phase.items()

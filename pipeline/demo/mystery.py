@@ -27,6 +27,7 @@ from ..compare.stage import REPORT_HTML as COMPARE_HTML
 from ..compare.stage import compare_models
 from ..diagnose.stage import diagnose
 from ..fit import fit
+from ..report.page import listed, way_link
 from ..runtime.device import resolve_device
 from ..runtime.timing import StagedRun
 from .mystery_page import REPORT_HTML, REPORT_JSON, mystery_html
@@ -109,7 +110,9 @@ def _compare(run: _Mystery, names: Sequence[str]) -> CompareResult:
     source = Capture.open(run.folder / "capture", splits=(SPLIT,))
     found = compare_models([(name, read_model(run.folder / name)) for name in names], source, SPLIT, device=run.device)
     result = found.result.model_copy(update={"capture": "capture", "report": COMPARE_HTML})
-    html = comparison_html(result, found.models, footage_of(found.models, source, run.device))
+    files = [(kind, way_link(name, name)) for kind, name in (
+        ("report", REPORT_HTML), *(("model", name) for name in names), ("capture", "capture"))]  # fmt: skip
+    html = comparison_html(result, found.models, footage_of(found.models, source, run.device), files)
     (run.folder / COMPARE_HTML).write_text(html, encoding="utf-8")
     return result
 
@@ -180,26 +183,22 @@ def judged(diagnosis: DiagnoseResult, hidden: Sequence[HiddenEffect]) -> tuple[O
 
 
 def _were_hidden(names: set[str]) -> str:
-    return f"{_and(sorted(names))} {'was' if len(names) == 1 else 'were'} hidden"
+    return f"{listed(sorted(names))} {'was' if len(names) == 1 else 'were'} hidden"
 
 
 def _named(diagnosis: DiagnoseResult, names: set[str]) -> tuple[Outcome, str]:
     selected = list(diagnosis.selected)
     if not names:
-        return "wrong", f"Nothing was hidden, but {_and(selected)} was named: a false alarm."
+        return "wrong", f"Nothing was hidden, but {listed(selected)} was named: a false alarm."
     hidden = _were_hidden(names)
     classes = [next((group for group in diagnosis.aliases if name in group), (name,)) for name in selected]
     if not names <= {name for group in classes for name in group}:
-        return "wrong", f"{hidden}, but {_and(selected)} was named: wrong."
+        return "wrong", f"{hidden}, but {listed(selected)} was named: wrong."
     extra = [name for name, group in zip(selected, classes, strict=True) if not names & set(group)]
     if extra:
-        return "partly", f"{hidden} and found, but {_and(extra)}, which was not hidden, was named, too."
+        return "partly", f"{hidden} and found, but {listed(extra)}, which was not hidden, was named, too."
     wide = next((group for group in classes if len(group) > 1), None)
     if wide is None:
-        return "right", f"{hidden}, and {_and(selected)} was named: right."
-    listed = f"one of {_and(wide)}, which these data cannot distinguish"
-    return "right_class", f"{hidden}. The diagnosis named {listed}: right, as a class."
-
-
-def _and(names: Sequence[str]) -> str:
-    return " and ".join((", ".join(names[:-1]), names[-1]) if len(names) > 1 else names)
+        return "right", f"{hidden}, and {listed(selected)} was named: right."
+    words = f"one of {listed(wide)}, which these data cannot distinguish"
+    return "right_class", f"{hidden}. The diagnosis named {words}: right, as a class."

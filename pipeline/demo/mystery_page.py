@@ -9,7 +9,7 @@ from ...schemas import ComparedParameter, HiddenEffect, ModelComparison, Mystery
 from ..compare.error_ladder import LADDER_WORDS, error_ladder
 from ..compare.player import REPLAY_STYLE
 from ..report.charts import interval_svg
-from ..report.page import fixed, number, page, paragraph, read_asset, section, table, text
+from ..report.page import fixed, number, page, paragraph, read_asset, section, table, text, way_link
 
 REPORT_HTML = "report.html"
 REPORT_JSON = "report.json"
@@ -248,7 +248,7 @@ def _with_truth(compared: ComparedParameter) -> list[str]:
 
 
 def _files(result: MysteryResult) -> str:
-    rows = [[text(kind), f"<code>{text(path)}</code>"] for kind, path in result.paths.items()]
+    rows = [[text(kind), way_link(path, path)] for kind, path in result.paths.items()]
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
     return section(
         "Files, warnings and times",

@@ -12,7 +12,7 @@ import numpy as np
 from ...schemas import ComparedParameter, DemoResult, DemoTarget, EvalResult
 from ..rendering.contact_sheets import FrameStrip, RolloutTile, depth_colors, jpeg_uri, label_colors, png_uri
 from ..report.charts import interval_svg
-from ..report.page import facts, fixed, number, page, paragraph, section, table, text
+from ..report.page import facts, fixed, number, page, paragraph, section, table, text, way_link
 from .episode_section import curves_section, film_section
 from .verdict import shown
 
@@ -287,7 +287,7 @@ def _timings(result: DemoResult) -> str:
 
 
 def _files(result: DemoResult) -> str:
-    rows = [(name, f"<code>{text(path)}</code>") for name, path in result.paths.items()]
+    rows = [(name, way_link(path, path)) for name, path in result.paths.items()]
     words = "In the same directory as this page. The README has the command that makes each of them."
     return section("Files", paragraph(words), facts(rows))
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ...schemas import NextExperiment
 from ..physics.world import World
+from ..report.page import listed
 from ..segments.candidates import Variant, variants_of
 from ..segments.prepare import Prepared
 from .evidence import Evidence
@@ -129,7 +130,7 @@ def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Exp
     open_pairs, closed_pairs = _pairs_by_separation(ranked, rivals)
     left = _names_in(closed_pairs, rivals)
     advice = _advice(rivals, left)
-    unseparated = f"no throw tells {' and '.join(left)} apart"
+    unseparated = f"no throw tells {listed(left)} apart"
     if not open_pairs:
         what = f"{unseparated}; {advice}" if ranked else advice
         return NextExperiment(what=what, initial_state={}, separates=left, expected_gain_nats=0.0, not_separated=left)

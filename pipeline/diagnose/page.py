@@ -9,8 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from ...schemas import DiagnoseResult, EffectParameterEstimate, RankedEffect
-from ..report.page import cautions, command, facts, folded, link, number, page, paragraph, section, table, text
-from ..report.page_file import made_of, page_beside, short_names
+from ..report.page import (
+    cautions,
+    command,
+    facts,
+    folded,
+    link,
+    listed,
+    number,
+    page,
+    paragraph,
+    section,
+    table,
+    text,
+)
+from ..report.page_file import links_beside, made_of, page_beside, short_names
 from ..report.plots import Bar, Plot, Series, bars, legend, plot_svg
 from .pictures import EffectPicture, MissingForce, Pictures, binned_means
 from .wording import organised
@@ -83,8 +96,8 @@ def _cards(result: DiagnoseResult) -> str:
 
 
 def _card(name: str, value: str, rows: Sequence[tuple[str, str]]) -> str:
-    listed = "".join(f"<dt>{text(label)}</dt><dd>{text(words)}</dd>" for label, words in rows)
-    return f'<div class="card"><div>{text(name)}</div><div class="value">{text(value)}</div><dl>{listed}</dl></div>'
+    small = "".join(f"<dt>{text(label)}</dt><dd>{text(words)}</dd>" for label, words in rows)
+    return f'<div class="card"><div>{text(name)}</div><div class="value">{text(value)}</div><dl>{small}</dl></div>'
 
 
 def _ranking(result: DiagnoseResult) -> str:
@@ -105,7 +118,7 @@ def _ranking(result: DiagnoseResult) -> str:
         pieces += _in_contact(contact, result)
     pieces.append(_all_candidates(result))
     pieces += [
-        paragraph(f"{' and '.join(group)} cannot be told apart in these data: any of them explains them as well.")
+        paragraph(f"{listed(group)} cannot be told apart in these data: any of them explains them as well.")
         for group in result.aliases
     ]
     return section("Which effect explains the data", *pieces)
@@ -180,7 +193,7 @@ def _missing(result: DiagnoseResult, pictures: Pictures) -> str:
     )
     pieces = [paragraph(words), _curves(missing, axis, "The model lacks")]
     if pictures.left is not None:
-        named = " and ".join(result.selected)
+        named = listed(result.selected)
         pieces += [f"<h3>What is left with {text(named)}</h3>", _curves(pictures.left, axis, "left")]
     law = result.residual_law
     if law is not None and law.terms:
@@ -274,7 +287,7 @@ def _next(result: DiagnoseResult, pictures: Pictures) -> str:
     found = result.next_experiment
     if found is None:
         return ""
-    apart = f"It tells {' and '.join(found.separates)} apart." if found.separates and found.initial_state else ""
+    apart = f"It tells {listed(found.separates)} apart." if found.separates and found.initial_state else ""
     pieces = [paragraph(f"{found.what[:1].upper()}{found.what[1:]}. {apart}")]
     if pictures.throw:
         series = [
@@ -290,10 +303,8 @@ def _next(result: DiagnoseResult, pictures: Pictures) -> str:
 
 
 def _files(result: DiagnoseResult, place: Path, model: Path, capture: Path) -> str:
-    rows = [("model", link(str(model), model, place)), ("capture", link(str(capture), capture, place))]
+    rows = links_beside(place, [model], capture)
     if result.saved_law is not None:
         law = Path(result.saved_law.rpartition(":")[0])
         rows.append(("law", link(str(law), law, place)))
-    pages = [p for p in sorted(place.parent.glob(f"compare-{model.name}*.html")) if p != place]
-    rows += [("comparison", link(p.name, p, place)) for p in pages]
     return section("Files", facts(rows))

@@ -14,8 +14,9 @@ from torch import Tensor
 from ...schemas import DiagnoseResult, NotConvergedError
 from ..physics.rollout import simulate
 from ..physics.world import State, World
-from ..segments.prepare import Prepared
+from ..segments.prepare import Prepared, whole_flights
 from ..segments.residual_wrench import ResidualWrenches, covariates_of, motion_axes, wrench_windows
+from ..segments.segments import Segments
 from .experiments import Experiment
 from .fisher_information import experiment_states
 from .verdict import Findings
@@ -23,7 +24,7 @@ from .verdict import Findings
 Array = NDArray[np.float64]
 
 SHOWN_S = 1.0
-"""Length of a drawn motion [s]."""
+"""Length of a drawn motion that was not measured [s]."""
 FRAMES = 81
 """Number of points of a drawn motion."""
 SLIDE = Experiment(
@@ -171,13 +172,15 @@ def _picture(prepared: Prepared, world: World, name: str) -> EffectPicture | Non
     active = next((one for one in world.effects if one.effect.name == name), None)
     if active is None or active.effect.phase == "measurement":
         return None
-    times = torch.linspace(0.0, SHOWN_S, FRAMES).to(world.gravity)
     if active.effect.phase == "contact" and world.ground_normal is not None:
-        start, words = experiment_states(prepared, world, [SLIDE]), "a body set on the ground at 1 m/s without spin"
+        start, length_s = experiment_states(prepared, world, [SLIDE]), SHOWN_S
+        words = "a body set on the ground at 1 m/s without spin"
     elif prepared.flight is not None:
-        start, words = _fastest(prepared), "the fastest measured flight"
+        start, length_s = _fastest(prepared, prepared.flight)
+        words = "the fastest measured flight, and last as long"
     else:
         return None
+    times = torch.linspace(0.0, length_s, FRAMES).to(world.gravity)
     without = replace(world, effects=tuple(one for one in world.effects if one is not active))
     try:
         places = [simulate(one, start, times).position_m[0, :, world.free[0]].double() for one in (world, without)]
@@ -189,12 +192,17 @@ def _picture(prepared: Prepared, world: World, name: str) -> EffectPicture | Non
     return EffectPicture(name, words, times.double().numpy(), motions, apart.numpy())
 
 
-def _fastest(prepared: Prepared) -> State:
-    """Return the fitted start (1, nb) of the flight with the largest speed."""
-    assert prepared.flight is not None
-    state = prepared.flight.observations.state
-    item = int(state.velocity_m_s[:, prepared.flight.world.free[0]].norm(dim=1).argmax())
-    return State(**{key: getattr(state, key)[item : item + 1] for key in State.__dataclass_fields__})
+def _fastest(prepared: Prepared, flight: Segments) -> tuple[State, float]:
+    """Return the fitted start (1, nb) of the whole flight with the largest speed, and how long it was measured [s]."""
+    state = flight.observations.state
+    speed = state.velocity_m_s[:, flight.world.free[0]].norm(dim=1)
+    whole = {(one.episode, one.first): one for one in whole_flights(flight.items)}
+    first = [k for k, one in enumerate(flight.items) if (one.episode, one.first) in whole]
+    item = max(first, key=lambda k: float(speed[k]))
+    begin = flight.items[item]
+    times = prepared.observations.times_s[begin.episode]
+    length_s = float(times[whole[begin.episode, begin.first].last] - times[begin.first])
+    return State(**{key: getattr(state, key)[item : item + 1] for key in State.__dataclass_fields__}), length_s
 
 
 def _from_side(world: World, start: State, place: Tensor) -> Array:

@@ -187,6 +187,7 @@ def report_and_findings(
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
+    tested = {evidence.name for evidence in findings.ranking}  # some beside an effect that they need
     document = DiagnoseResult(
         verdict=findings.verdict,
         sentence=sentence(findings, law) + unseen_motion(prepared),
@@ -204,7 +205,7 @@ def report_and_findings(
         flight_after=_flight_test(findings.flight.after),
         contact_chi2=findings.contact_chi2,
         contact_limits=tuple(_limit(one) for one in findings.limits),
-        not_tested=dict(sorted(refused.items())),
+        not_tested={name: why for name, why in sorted(refused.items()) if name not in tested},
         warnings=tuple(warnings),
     )
     return document, findings

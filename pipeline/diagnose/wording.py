@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...schemas import ResidualLaw
+from ..report.page import listed
 from ..segments.prepare import Prepared
 from .verdict import Findings
 
@@ -41,8 +42,8 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     for one in findings.chosen:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
-    listed = " and ".join(word or name for word, name in zip(words, names, strict=True))
-    return f"Missing: {listed}.{_apart(findings)}{_rest(findings)}"
+    named = listed([word or name for word, name in zip(words, names, strict=True)])
+    return f"Missing: {named}.{_apart(findings)}{_rest(findings)}"
 
 
 def _own(findings: Findings) -> str:
@@ -64,7 +65,8 @@ def _apart(findings: Findings) -> str:
         if step is not None and step.own_std is None:
             out = sorted({e.name for e in step.equals} - {e.name for e in chosen.equals})
             if out:
-                words.append(f" In flight {', '.join(out)} would do the same as {name}; the contacts rule it out.")
+                it = "it" if len(out) == 1 else "them"
+                words.append(f" In flight {listed(out)} would do the same as {name}; the contacts rule {it} out.")
     return "".join(words)
 
 

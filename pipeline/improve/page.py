@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +17,21 @@ from ...schemas import (
     ImproveTrial,
     RankedEffect,
 )
-from ..report.page import cautions, command, facts, fixed, folded, link, number, page, paragraph, section, table, text
+from ..report.page import (
+    cautions,
+    command,
+    facts,
+    fixed,
+    folded,
+    link,
+    listed,
+    number,
+    page,
+    paragraph,
+    section,
+    table,
+    text,
+)
 from ..report.plots import Bar, bars
 from .wording import AXES, WHY, not_added_words, remaining_words, share_words, trial_words
 
@@ -253,7 +268,7 @@ def _rivals(step: ImproveStep) -> str:
     if not step.selected:
         return ""
     if not step.aliases:
-        return paragraph(f"No rival: no other candidate explains these data as well as {' and '.join(step.selected)}.")
+        return paragraph(f"No rival: no other candidate explains these data as well as {listed(step.selected)}.")
     said = [f"These data cannot tell {one[0]} from {' or '.join(one[1:])}." for one in step.aliases]
     return paragraph(" ".join(said))
 
@@ -328,7 +343,7 @@ def _measure_next(steps: Sequence[ImproveStep]) -> str:
     if step is None or (found := step.next_experiment) is None:
         words = "No rivals are left that another motion would tell apart."
         return section("What to measure next", paragraph(words)) if steps else ""
-    apart = f" It tells {' and '.join(found.separates)} apart." if found.separates and found.initial_state else ""
+    apart = f" It tells {listed(found.separates)} apart." if found.separates and found.initial_state else ""
     pieces = [
         paragraph(f"{found.what[:1].upper()}{found.what[1:]}.{apart} Asked for by the diagnosis of {step.model}.")
     ]
@@ -347,10 +362,11 @@ def _measure_next(steps: Sequence[ImproveStep]) -> str:
 
 def _commands(result: ImproveResult, out: Path) -> str:
     first, last = out / result.models[0], out / result.models[-1]
-    listed = [command(f"cgwm compare {first} {last} {result.capture}")] if first != last else []
-    listed.append(command(f"cgwm synthesize {last} --out DATASET"))
+    pair = shlex.join(["cgwm", "compare", str(first), str(last), result.capture])
+    typed = [command(pair)] if first != last else []
+    typed.append(command(f"cgwm synthesize {shlex.quote(str(last))} --out DATASET"))
     links = ", ".join(link(name, out / name, out / PAGE) for name in result.models)
-    return section("Models and commands", f"<p>Models: {links}. Every other command accepts them.</p>", *listed)
+    return section("Models and commands", f"<p>Models: {links}. Every other command accepts them.</p>", *typed)
 
 
 def _judged(result: ImproveResult) -> str:

@@ -9,6 +9,7 @@ from ...schemas import DiagnoseResult, ErrorRatio, ImproveStep, ImproveTest, Imp
 from ..compare.paired_difference import LEAST_EPISODES
 from ..diagnose.wording import organised
 from ..physics.effects.registry import split_units
+from ..report.page import listed
 from .ladder import LEAST_FALL, Ladder
 
 WHY = {
@@ -123,7 +124,7 @@ def not_added_words(step: ImproveStep) -> list[str]:
     left = [name for name in step.selected if name not in step.added]
     if not left or not step.tried:
         return []
-    named, was = " and ".join(left), "was" if len(left) == 1 else "were"
+    named, was = listed(left), "was" if len(left) == 1 else "were"
     if step.added:
         return [f"{named} {was} named and not added: the others predict unseen episodes as well."]
     return [f"{named} {was} tried and not added: unseen episodes are not predicted better, beyond chance."]
@@ -138,7 +139,7 @@ def share_words(step: DiagnoseResult) -> list[str]:
     share = found.share_explained
     percent = f"{100 * share:.1f}" if share < _ALL else f"more than {100 * _ALL:g}"
     verb = "explains" if len(named) == 1 else "explain"
-    return [f"Of the force that repeats from episode to episode in flight, {' and '.join(named)} {verb} {percent} %."]
+    return [f"Of the force that repeats from episode to episode in flight, {listed(named)} {verb} {percent} %."]
 
 
 def remaining_words(step: DiagnoseResult) -> list[str]:
@@ -149,7 +150,7 @@ def remaining_words(step: DiagnoseResult) -> list[str]:
     words, found = [], step.remaining
     # values of each episode are no part of what the rest is measured against
     common = [name for name in step.selected if split_units(name)[1] is None]
-    beside = f", with {' and '.join(common)} added," if common else ""
+    beside = f", with {listed(common)} added," if common else ""
     if found is None:
         words.append("Nothing was measured in flight, so that nothing can be said of it.")
     else:

@@ -87,8 +87,21 @@ def _with_contents(body: Sequence[str]) -> list[str]:
 
 def link(words: str, target: Path | str, page: Path) -> str:
     """Return a link from a page on disk to a file or folder beside it, which stays right if both are moved together."""
-    way = os.path.relpath(os.path.realpath(target), os.path.realpath(page.parent))
+    return way_link(words, os.path.relpath(os.path.realpath(target), os.path.realpath(page.parent)))
+
+
+def way_link(words: str, way: str) -> str:
+    """Return a link to a file or folder whose way from the page's folder is known."""
     return f'<a href="{text(quote(way))}">{text(words)}</a>'
+
+
+def listed(names: Sequence[str], last: str = "and") -> str:
+    """Return names as they are listed in a sentence.
+
+    >>> listed(["a"]), listed(["a", "b"]), listed(["a", "b", "c"], "or")
+    ('a', 'a and b', 'a, b or c')
+    """
+    return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def command(words: str) -> str:
@@ -103,7 +116,7 @@ def folded(summary: str, *pieces: str) -> str:
 
 def cautions(messages: Sequence[str]) -> str:
     """Return the box of warnings, those that say the same of several episodes as one; empty without any."""
-    words = "".join(paragraph(words) for words in fold_repeated(messages))
+    words = "".join(paragraph(words[:1].upper() + words[1:]) for words in fold_repeated(messages))
     return f'<div class="warnings">{words}</div>' if messages else ""
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from ...datasets.io.outputs import RECORD
 from ...schemas.regular_files import real_path
+from .page import link
 
 _HEAD_BYTES = 1 << 12
 
@@ -18,6 +20,35 @@ def page_beside(model: Path, name: str) -> Path:
     outputs = [above for above in real_path(model).parents if (above / RECORD).is_file()]
     folder = outputs[-1].parent if outputs else model.parent
     return folder / name
+
+
+def pages_beside(place: Path, models: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Return the pages about models that lie beside a page: comparisons, diagnoses, and the ladder that holds a model.
+
+    Args:
+        place: The page itself, which is not listed.
+        models: The models that it shows.
+
+    Returns:
+        Kind of each page, in words, and its path.
+    """
+    found: dict[Path, str] = {}
+    for name in (os.path.basename(os.path.normpath(model)) for model in models):
+        about = re.compile(rf"(compare|diagnose)-(?:.+-)?{re.escape(name)}(?:-.+)?\.html")
+        for page in sorted(place.parent.glob("*.html")):
+            if (kind := about.fullmatch(page.name)) and page.name != place.name:
+                found.setdefault(page, {"compare": "comparison", "diagnose": "diagnosis"}[kind[1]])
+    for ladder in dict.fromkeys(Path(model).parent / "improve.html" for model in models):
+        if ladder.is_file():
+            found[ladder] = "ladder of models"
+    return [(kind, page) for page, kind in found.items()]
+
+
+def links_beside(place: Path, models: Sequence[Path], capture: Path) -> list[tuple[str, str]]:
+    """Return the rows of a table of files, with links to models, capture and the pages that lie beside a page."""
+    rows = [("model", link(str(model), model, place)) for model in models]
+    rows.append(("capture", link(str(capture), capture, place)))
+    return [*rows, *((kind, link(page.name, page, place)) for kind, page in pages_beside(place, models))]
 
 
 def short_names(models: Sequence[str]) -> list[str]:

@@ -145,7 +145,11 @@ def legend(series: Sequence[Series]) -> str:
     """Return the legend of a plot."""
     return (
         '<div class="legend">'
-        + "".join(f'<span><i style="border-color:var(--{s.color})"></i>{text(s.name)}</span>' for s in series)
+        + "".join(
+            f'<span><i style="border-color:var(--{s.color}){";border-top-style:dashed" if s.kind == "dashed" else ""}">'
+            f"</i>{text(s.name)}</span>"
+            for s in series
+        )
         + "</div>"
     )
 

@@ -132,7 +132,9 @@ def prepare(
     _remove_held_starts(state)
     _model_correlated_noise(state)
     turned = state.oriented
-    if not turned and not all(is_round(world.bodies[k]) for k in world.free):
+    if _touches_nothing(world):
+        state.contact = []  # what does not fly is in a hand or was caught: it says nothing of a law of contact
+    elif not turned and not all(is_round(world.bodies[k]) for k in world.free):
         state.contact = []
         state.warnings.append("no orientation was measured and the body is not a ball: contacts cannot be examined.")
     released = {episodes[k][0]: float(state.observations.times_s[k, first]) for k, first in state.held.items()}
@@ -244,11 +246,9 @@ def whole_flights(items: Sequence[Segment]) -> list[Segment]:
 
 def _mark_supported_frames(state: _State) -> None:
     """Count frames as contact in which a body above the ground is not in free fall; then measure the noise."""
-    world = state.world
     # without anything that could support the body, drag alone may keep it from falling
-    alone = world.ground_normal is None and len(world.bodies) == 1
-    if not alone:
-        state.supported = supported_frames(world, state.observations, state.flight, state.noise)
+    if not _touches_nothing(state.world):
+        state.supported = supported_frames(state.world, state.observations, state.flight, state.noise)
     if bool(state.supported.any()):
         state.segment(state.supported)
         state.warnings.append(
@@ -256,6 +256,11 @@ def _mark_supported_frames(state: _State) -> None:
             "free fall: they count as contact. Check the ground's height, the shape and the position of the marker."
         )
     state.measure_noise(state.flight, state.warnings)
+
+
+def _touches_nothing(world: World) -> bool:
+    """Return whether the world has nothing that its body could touch."""
+    return world.ground_normal is None and len(world.bodies) == 1
 
 
 def _remove_outliers(state: _State) -> None:

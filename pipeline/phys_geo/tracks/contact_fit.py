@@ -72,7 +72,7 @@ fit."""
 
 NEVER_TOUCHES = (
     "nothing touches anything in these episodes: the contact parameters keep their {} values; only effects that act "
-    "in flight can be fitted."
+    "in flight can be fitted. Impacts and slides would reveal the others."
 )
 """Warning for a fit in which no body touches anything; the values are prior or earlier ones."""
 
@@ -316,9 +316,9 @@ def _never_touching(
     estimate = ContactEstimate(parameters=names, values=middle, covariance=np.diag([p.prior[1] ** 2 for p in names]))
     estimate = earlier.kept_in(ready.world, estimate)
     found = physics_fit(ready.world, estimate, noise, record)
-    unseen = [warning for warning in found.warnings if "not observable" in warning]
+    unseen = any(parameter.state == "not_observable" for parameter in found.parameters)
     values = "prior" if not estimate.kept else "earlier or prior" if unseen else "earlier"
-    return replace(found, warnings=(NEVER_TOUCHES.format(values), *unseen))
+    return replace(found, warnings=(NEVER_TOUCHES.format(values),))
 
 
 def _completed(found: PhysicsFit, ready: _Ready) -> PhysicsFit:

@@ -88,6 +88,12 @@ def test_without_ground_all_is_flight() -> None:
     assert prepared.airborne.all() and not prepared.contact_items
 
 
+def test_where_nothing_can_be_touched_what_is_no_flight_is_no_contact_either() -> None:
+    bouncing = tosses(world_with("ball"), 2, count=3, duration_s=1.2)
+    prepared = prepare(world_with("ball", ground=False), bouncing)
+    assert not prepared.airborne.all() and prepared.contact_items == ()
+
+
 def test_segments_recover_states_and_the_noise() -> None:
     world = world_with()
     episodes = tosses(world, 4, count=6, duration_s=0.9)

@@ -14,7 +14,7 @@ from cgwm.pipeline.diagnose.pictures import (
     Pictures,
     binned_means,
 )
-from cgwm.pipeline.report.page_file import shows_the_same
+from cgwm.pipeline.report.page_file import pages_beside, shows_the_same
 from cgwm.pipeline.segments.residual_wrench import motion_axes
 from cgwm.schemas import ContactLimit, DiagnoseResult, EffectParameterEstimate, LawTerm, RankedEffect, ResidualLaw
 from helpers.pages import Tags
@@ -63,6 +63,17 @@ def test_the_page_shows_what_decides_what_it_does_and_what_could_have_been_seen(
     place.write_text(made)
     assert shows_the_same(place, mark_of(place, model, capture, "train"))
     assert not shows_the_same(place, mark_of(place, model, capture, "test"))
+
+
+def test_the_page_leads_to_the_pages_beside_it(tmp_path: Path) -> None:
+    for name in ("compare-m0-m1.html", "compare-m00.html", "diagnose-m0.html", "diagnose-m0-test.html"):
+        (tmp_path / name).touch()
+    (tmp_path / "improve.html").touch()
+    found = pages_beside(tmp_path / "diagnose-m0.html", [tmp_path / "m0"])
+    assert [(kind, page.name) for kind, page in found] == [
+        ("comparison", "compare-m0-m1.html"), ("diagnosis", "diagnose-m0-test.html"),
+        ("ladder of models", "improve.html"),
+    ]  # fmt: skip
 
 
 def test_the_page_is_beside_the_model_and_named_after_it() -> None:
