@@ -22,6 +22,8 @@ _EXPORT = "export the mesh again, or take the original."
 
 MOST_BYTES = 8 << 30
 """Largest size of the file of a mesh [bytes]."""
+LEAST_THICKNESS = 1e-4
+"""Smallest mean thickness of a solid, in units of its length: half of that of a sheet of paper."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,7 @@ def mass_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
         path: Its file, for messages.
 
     Raises:
-        InputDataError: If it is not closed, not consistently oriented, or encloses no volume.
+        InputDataError: If it is not closed, not consistently oriented, encloses no volume, or is a sheet.
     """
     check_closed(mesh, path)
     return solid_properties(mesh, path)
@@ -104,7 +106,7 @@ def solid_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
         path: Its file, for messages.
 
     Raises:
-        InputDataError: If it encloses no volume.
+        InputDataError: If it encloses no volume, or is a sheet.
     """
     # About the vertices' mean, so that a solid far from its origin loses no digits.
     origin = mesh.vertices.mean(axis=0)
@@ -114,6 +116,16 @@ def solid_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if abs(six_volume) < 1e-9 * extent**3:
         raise InputDataError(f"{path}: the mesh encloses no volume.", "a closed surface around a solid.")
+    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    twice_area = float(np.linalg.norm(np.cross(*sides), axis=1).sum())
+    # that of a plate; of other solids their volume over half of their surface
+    thickness = abs(six_volume) / 6 / (twice_area / 4)
+    if thickness < LEAST_THICKNESS * extent:
+        raise InputDataError(
+            f"{path}: the mesh is a sheet: {thickness:.2g} m thick on average, and {extent:.2g} m long.",
+            f"a solid that is thicker than {LEAST_THICKNESS:g} of its length.",
+            "give the surface its thickness (in Blender: Solidify), or give another shape, such as a box.",
+        )
     sums = corners.sum(axis=1)
     com = np.einsum("f,fi->i", six_volumes, sums) / (4 * six_volume)
     outer = np.einsum("f,fki,fkj->ij", six_volumes, corners, corners)

@@ -35,6 +35,9 @@ _SUPPORT_SHARE = 0.7
 _FILL_SHARE = 0.08
 _SAMPLES = 4000
 _CORNER_RADIUS_M = 2.5e-4
+_BARE_SHARE = 0.4
+"""Largest gap between a mesh and its spheres, in units of its size: a plate in eight spheres has 0.33, and a solid that
+is thinner than the grid half of its length."""
 
 
 class Solid(Protocol):
@@ -106,7 +109,7 @@ def shape_to_spheres(
         The spheres in the body frame, and the largest distance between their surface and that of the shape [m].
 
     Raises:
-        InputDataError: If the shape's file is missing or not readable.
+        InputDataError: If the shape's file is missing or not readable, or a mesh is too thin for its length.
     """
     if shape.sphere is not None:
         one = CollisionSpheres(np.zeros((1, 3)), np.array([shape.sphere.radius_m]), 0.0, 0.0)
@@ -114,7 +117,7 @@ def shape_to_spheres(
     if shape.splats is not None:
         spheres = _from_splats(read_splats(capture_root / shape.splats.path), max_spheres, radius_factor)
     elif shape.mesh is not None:
-        spheres = distil(mesh_volume(read_mesh(capture_root / shape.mesh.path)), max_spheres)
+        spheres = _from_mesh(capture_root / shape.mesh.path, max_spheres)
     elif shape.box is not None:
         spheres = _box_spheres(np.array(shape.box.half_extents_m), max_spheres)
     else:
@@ -320,6 +323,24 @@ def _box_spheres(half: Array, max_spheres: int) -> CollisionSpheres:
     signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), -1).reshape(-1, 3)
     corners = signs * (half - radius)
     return distil(_Box.make(half), max_spheres, first=(corners, np.full(8, radius)))
+
+
+def _from_mesh(path: Path, max_spheres: int) -> CollisionSpheres:
+    """Return spheres in a mesh.
+
+    Raises:
+        InputDataError: If the file is not readable, or the solid is so thin that spheres fit in single places alone.
+    """
+    solid = mesh_volume(read_mesh(path))
+    spheres = distil(solid, max_spheres)
+    if spheres.distance_m > _BARE_SHARE * solid.size():
+        raise InputDataError(
+            f"{path}: spheres fit inside the mesh in single places alone, {spheres.distance_m:.2g} m from the farthest "
+            f"point of its surface; it is thinner than {1e3 * solid.pitch:.2g} mm, to which its volume is resolved.",
+            "solid shapes that are not thin for their length.",
+            "divide a long thin body into shorter ones, or give it spheres: shape = { splats = { path = ... } }.",
+        )
+    return spheres
 
 
 def _from_splats(splats: Splats, max_spheres: int, radius_factor: float) -> CollisionSpheres:

@@ -25,10 +25,19 @@ def rows() -> Iterator[Row]:
         yield Row(name, "captures", "tosses", edit, VALIDATE)
     for name, edit in PHOTOS:
         yield Row(name, "cameras", "cameras.json", edit, VALIDATE)
+    yield Row("a mesh that is a sheet", "captures", "shapes", _sheet, ("validate", "obj"))
     for name, subject, words, edit in IMPORTS:
         yield Row(f"import {name}", "importers", subject, edit, ("import", *words.split(), "--out", "OUT"))
     for words in OVERWRITES:
         yield Row(words, "outputs", "things", nothing, tuple(words.split()))
+
+
+def _sheet(root: Path) -> None:
+    """Make the box of a capture 0.1 um thick."""
+    path = root / "obj" / "box.obj"
+    lines = [line.split() for line in path.read_text().splitlines()]
+    flat = [[*words[:3], repr(float(words[3]) * 1e-6)] if words[:1] == ["v"] else words for words in lines]
+    path.write_text("\n".join(map(" ".join, flat)) + "\n")
 
 
 def _both(kind: str, subject: str, table: tuple[tuple[str, Edit], ...]) -> Iterator[Row]:
@@ -289,6 +298,9 @@ OVERWRITES = (
     "export dataset --to bop --out dataset --overwrite",
     "export dataset --to nerfstudio --out docs --overwrite",
     "export dataset --to lerobot --out capture --overwrite",
+    "diagnose model capture --split look --page notes.html --overwrite",
+    "diagnose model capture --split look --page model/model.json --overwrite",
+    "diagnose model capture --split look --page capture/capture.toml --overwrite",
     "diagnose model capture --split look --save-law model/model.json --overwrite",
     "effects new notes.html --overwrite",
 )

@@ -82,7 +82,7 @@ VALIDATE = command("validate capture", weight=3)
 FIT = command("fit capture --out OUT --stage phys-geo", *FAST_FIT, weight=0.5)
 EVAL = command("eval model capture")
 COMPARE = command("compare model capture --out OUT.html", weight=0.7)
-DIAGNOSE = command("diagnose model capture --split look", weight=0.3)
+DIAGNOSE = command("diagnose model capture --split look --page OUT.html", weight=0.3)
 IMPROVE = command("improve capture --from model --split look --steps 1 --out OUT", *FAST_FIT, weight=0.1)
 SPLATS = command("fit capture --out OUT", *FAST_SPLATS, weight=0.3)
 FIT_IMAGES = command(

@@ -140,6 +140,15 @@ def _improve(folder: Path) -> Command:
     return Command(words=words, out=("out",), again=("--resume",), check=(["validate", str(folder / "out")],))
 
 
+def _page(verb: str, option: str) -> Callable[[Path], Command]:
+    def case(folder: Path) -> Command:
+        capture, model = write_capture(folder / "capture", 3), write_small_model(folder / "model")
+        words = [verb, str(model), str(capture), "--split", "test", option, str(folder / "out.html")]
+        return Command(words=words, out=("out.html",))
+
+    return case
+
+
 def _import(folder: Path) -> Command:
     capture = write_capture(folder / "source", 6)
     words = ["import", "csv", str(capture / "tracks"), "--out", str(folder / "out")]
@@ -162,6 +171,8 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
     "import csv": _import,
     "improve": _improve,
+    "compare": _page("compare", "--out"),
+    "diagnose": _page("diagnose", "--page"),
 }
 
 

@@ -126,6 +126,21 @@ def test_open_mesh_is_refused() -> None:
         mass_properties(Mesh(box().vertices, flipped))
 
 
+@pytest.mark.parametrize(("thickness", "sheet"), [(1e-7, True), (1e-6, True), (8e-6, False), (0.03, False)])
+def test_a_sheet_is_refused_as_a_solid(thickness: float, sheet: bool) -> None:
+    plate = Mesh(box().vertices * np.array([1.0, 1.0, thickness / 0.06]), BOX_FACES)
+    if not sheet:
+        assert mass_properties(plate).volume_m3 == pytest.approx(0.02 * 0.04 * thickness)
+        return
+    with pytest.raises(InputDataError) as caught:
+        mass_properties(plate, "plate.obj")
+    assert str(caught.value) == (
+        f"plate.obj: the mesh is a sheet: {thickness:.2g} m thick on average, and 0.04 m long.\n"
+        "Allowed: a solid that is thicker than 0.0001 of its length.\n"
+        "Next: give the surface its thickness (in Blender: Solidify), or give another shape, such as a box."
+    )
+
+
 def test_two_boxes_that_share_an_edge_are_closed() -> None:
     """Four triangles meet at the shared edge; the solid is that of both boxes."""
     corners = np.concatenate([box().vertices, box().vertices + np.array([0.02, 0.04, 0.0])])

@@ -203,7 +203,7 @@ def test_the_command_says_what_to_throw_next(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["diagnose", str(model), str(root), "--throws", str(throws)])
     assert done.exit_code == 0, done.output
     # the measured frame is tilted, or gravity: where the ground is touched, its height tells
-    assert "To distinguish gravity_tilt and frame_tilt and constant_force: let it slide over the ground" in done.stdout
+    assert "To distinguish gravity_tilt, frame_tilt and constant_force: let it slide over the ground" in done.stdout
     assert "no throw tells gravity_tilt and constant_force apart: gravity_tilt: put a spirit level" in done.stdout
     assert "  2. let it slide over the ground" in done.stdout
 

@@ -115,6 +115,16 @@ def test_meshes_from_files(tmp_path, ellipsoid):
     assert len(splats) <= 60
 
 
+def test_a_mesh_in_which_spheres_fit_at_the_corners_alone_is_refused(tmp_path):
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * [0.05, 0.05, 0.0005]
+    faces = ["1 2 4", "1 4 3", "5 7 8", "5 8 6", "1 5 6", "1 6 2", "3 4 8", "3 8 7", "1 3 7", "1 7 5", "2 6 8", "2 8 4"]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {face}" for face in faces]
+    (tmp_path / "plate.obj").write_text("\n".join(lines))
+    words = r"plate.obj: spheres fit inside the mesh in single places alone, 0.07 m .* it is thinner than 1.5 mm"
+    with pytest.raises(InputDataError, match=words):
+        shape_to_spheres(Shape.model_validate({"mesh": {"path": "plate.obj"}}), tmp_path, 60)
+
+
 def test_bad_meshes(tmp_path, ellipsoid):
     with pytest.raises(InputDataError, match=r"none.obj: no such file."):
         read_mesh(tmp_path / "none.obj")

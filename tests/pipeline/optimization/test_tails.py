@@ -1,7 +1,8 @@
-"""Tail probabilities against `scipy.stats`."""
+"""Tail probabilities against `scipy.stats`, and correlations at their limits."""
 
+import numpy as np
 import pytest
-from cgwm.pipeline.optimization.uncertainty import chi2_tail, f_tail, normal_tail, student_quantile
+from cgwm.pipeline.optimization.uncertainty import chi2_tail, correlation_of, f_tail, normal_tail, student_quantile
 from scipy import stats
 
 
@@ -16,3 +17,8 @@ def test_probabilities(x: float) -> None:
 def test_quantiles(dof: float) -> None:
     for probability in (0.05, 0.5, 0.975):
         assert student_quantile(probability, dof) == pytest.approx(stats.t.ppf(probability, dof), rel=1e-12, abs=1e-12)
+
+
+def test_parameters_that_do_the_same_are_correlated_by_no_more_than_1() -> None:
+    (_, (below, itself)) = correlation_of(["a", "b"], np.array([[4.0, 2.0000002], [2.0000002, 1.0]])).matrix
+    assert (below, itself) == (1.0, 1.0)
