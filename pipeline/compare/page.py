@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ...schemas import PHASES, CompareResult, ErrorSummary, ModelComparison, PairedDifference
 from ..report.page import cautions, facts, fixed, number, page, paragraph, section, table, text
-from ..report.page_file import made_of, page_beside, short_names
+from ..report.page_file import made_of, page_beside
 from ..trajectories.segmentation import CONTACT_S, FLIGHT_S
 from .error_ladder import LADDER_WORDS, error_ladder
 from .model_comparison import ComparedModel
@@ -26,8 +25,7 @@ HOTTEST = 5.0
 
 def default_page(models: Sequence[Path], split: str = "test") -> Path:
     """Return the page's path by default: beside the first model, named after the models."""
-    names = [name.replace("/", "-") for name in short_names([os.fspath(model) for model in models])]
-    return page_beside(models[0], f"compare-{'-'.join([*names, *([split] if split != 'test' else [])])}.html")
+    return page_beside(models, "compare", *([split] if split != "test" else []))
 
 
 def mark_of(page: Path, models: Sequence[Path], capture: Path, split: str) -> str:

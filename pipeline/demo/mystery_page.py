@@ -9,7 +9,20 @@ from ...schemas import ComparedParameter, HiddenEffect, ModelComparison, Mystery
 from ..compare.error_ladder import LADDER_WORDS, error_ladder
 from ..compare.player import REPLAY_STYLE
 from ..report.charts import interval_svg
-from ..report.page import fixed, number, page, paragraph, read_asset, section, table, text, way_link
+from ..report.page import (
+    cautions,
+    fixed,
+    number,
+    page,
+    paragraph,
+    read_asset,
+    section,
+    table,
+    text,
+    unit_text,
+    unit_words,
+    way_link,
+)
 
 REPORT_HTML = "report.html"
 REPORT_JSON = "report.json"
@@ -46,10 +59,6 @@ def _opening(result: MysteryResult) -> str:
         "another simulator, perhaps with something in its physics or in its measurement that a textbook omits. "
         "What, if anything? The answer was in a sealed file until all of this had been computed."
     )
-
-
-def _warnings(messages: Sequence[str]) -> str:
-    return f'<div class="warnings">{"".join(paragraph(m) for m in messages)}</div>' if messages else ""
 
 
 def _commands(*lines: str) -> str:
@@ -127,7 +136,7 @@ def _diagnosis(result: MysteryResult) -> str:
 
 def _candidate(entry: RankedEffect) -> list[str]:
     numbers = "<br>".join(
-        f"<code>{text(p.name)}</code> = {number(p.estimate)} ± {number(p.std_error, 2)}{_unit(p.unit)}"
+        f"<code>{text(p.name)}</code> = {number(p.estimate)} ± {number(p.std_error, 2)}{unit_words(p.unit)}"
         for p in entry.parameters[:3]
     )
     # number() writes magnitudes below 1e-12 as zero; a p-value may be that small
@@ -144,10 +153,6 @@ def _candidate(entry: RankedEffect) -> list[str]:
     ]
 
 
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else f" {text(unit)}"
-
-
 def _added(result: MysteryResult) -> str:
     selected = result.diagnosis.selected
     if not selected:
@@ -156,7 +161,7 @@ def _added(result: MysteryResult) -> str:
             paragraph("The diagnosis named no effect, so nothing is added and no second model is compared."),
         )
     rows = [
-        [f"<code>{text(p.name)}</code>", number(p.estimate), _span(p.interval_95), text(p.unit)]
+        [f"<code>{text(p.name)}</code>", number(p.estimate), _span(p.interval_95), unit_text(p.unit)]
         for p in (compared.parameter for compared in result.parameters)
     ]
     return section(
@@ -242,7 +247,7 @@ def _with_truth(compared: ComparedParameter) -> list[str]:
         _span(p.interval_95),
         drawn,
         number(compared.true_value),
-        text(p.unit),
+        unit_text(p.unit),
         word[compared.covered],
     ]
 
@@ -253,7 +258,7 @@ def _files(result: MysteryResult) -> str:
     return section(
         "Files, warnings and times",
         table(["what", "where"], rows),
-        _warnings([*result.warnings, *result.comparison.warnings]),
+        cautions([*result.warnings, *result.comparison.warnings]),
         paragraph(f"On {result.device}: {times}.", "soft"),
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from ...schemas import ComparedParameter, DemoResult, DemoTarget, EvalResult
 from ..rendering.contact_sheets import FrameStrip, RolloutTile, depth_colors, jpeg_uri, label_colors, png_uri
 from ..report.charts import interval_svg
-from ..report.page import facts, fixed, number, page, paragraph, section, table, text, way_link
+from ..report.page import cautions, facts, fixed, number, page, paragraph, section, table, text, unit_text, way_link
 from .episode_section import curves_section, film_section
 from .verdict import shown
 
@@ -51,7 +51,7 @@ def report_html(result: DemoResult, pictures: ReportPictures) -> str:
         f"<h1>cgwm demo · scene {text(result.scene)} · seed {result.seed}</h1>",
         f'<p class="verdict">{text(result.verdict)}</p>',
         f'<div class="cards">{"".join(_card(target) for target in result.targets)}</div>',
-        _warnings(result.warnings),
+        cautions(result.warnings),
         film,
         curves_section(result.curves),
         _errors(result.evaluation, result.selection),
@@ -81,10 +81,6 @@ def _card(target: DemoTarget) -> str:
         f'<div class="card"><div>{text(target.name)}</div>'
         f'<div class="value{"" if target.met else " bad"}">{shown(target, target.value)}</div><dl>{listed}</dl></div>'
     )
-
-
-def _warnings(messages: Sequence[str]) -> str:
-    return f'<div class="warnings">{"".join(paragraph(m) for m in messages)}</div>' if messages else ""
 
 
 def _errors(evaluation: EvalResult, selection: str) -> str:
@@ -117,7 +113,7 @@ def _errors(evaluation: EvalResult, selection: str) -> str:
         table(header, rows, numeric=range(1, len(header)), strong=[episodes]),
         paragraph(words, "soft"),
         paragraph(selection, "soft") if selection else "",
-        _warnings(evaluation.warnings),
+        cautions(evaluation.warnings),
     )
 
 
@@ -167,7 +163,7 @@ def _parameter_table(parameters: Sequence[ComparedParameter]) -> str:
                 span,
                 drawn,
                 number(compared.true_value),
-                text(p.unit),
+                unit_text(p.unit),
                 f'<span class="bad">{state}</span>' if p.state in ("on_bound", "not_observable") else state,
                 f"{p.bounds[0]:g} to {p.bounds[1]:g}".replace("-", "−") if p.bounds else "–",
                 "" if p.state == "fitted" else text(p.note),

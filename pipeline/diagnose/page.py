@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -22,10 +21,11 @@ from ..report.page import (
     section,
     table,
     text,
+    unit_words,
 )
-from ..report.page_file import links_beside, made_of, page_beside, short_names
+from ..report.page_file import links_beside, made_of, page_beside
 from ..report.plots import Bar, Plot, Series, bars, legend, plot_svg
-from .pictures import EffectPicture, MissingForce, Pictures, binned_means
+from .pictures import DrawnMotion, EffectPicture, MissingForce, Pictures, binned_means
 from .wording import organised
 
 _MM = 1e3
@@ -37,8 +37,7 @@ _COLORS = ("m0", "m1", "m2")
 
 def default_page(model: Path, split: str = "train") -> Path:
     """Return the page's path by default: beside the model, named after it."""
-    name = short_names([os.fspath(model)])[0].replace("/", "-")
-    return page_beside(model, f"diagnose-{name}{'' if split == 'train' else f'-{split}'}.html")
+    return page_beside([model], "diagnose", *([split] if split != "train" else []))
 
 
 def mark_of(place: Path, model: Path, capture: Path, split: str) -> str:
@@ -176,8 +175,7 @@ def _held_out(one: RankedEffect) -> str:
 
 
 def _estimate(one: EffectParameterEstimate) -> str:
-    unit = "" if one.unit == "1" else f" {one.unit}"
-    return text(f"{one.name} = {number(one.estimate)} ± {number(one.std_error, 2)}{unit}")
+    return f"{text(one.name)} = {number(one.estimate)} ± {number(one.std_error, 2)}{unit_words(one.unit)}"
 
 
 def _missing(result: DiagnoseResult, pictures: Pictures) -> str:
@@ -260,14 +258,12 @@ def _tested(result: DiagnoseResult) -> str:
     for one in result.ranking:
         if one.judged_in == "flight" and one.parameters:
             seen = "<br>".join(
-                text(f"{p.name}: {number(3 * p.std_error, 2)}{'' if p.unit == '1' else ' ' + p.unit}")
-                for p in one.parameters[:3]
+                f"{text(p.name)}: {number(3 * p.std_error, 2)}{unit_words(p.unit)}" for p in one.parameters[:3]
             )
             rows.append([text(one.effect), "flight", seen])
     for limit in result.contact_limits:
         sizes = "<br>".join(
-            text(f"{name}: {number(size, 2)}{'' if limit.units[name] == '1' else ' ' + limit.units[name]}")
-            for name, size in limit.sizes.items()
+            f"{text(name)}: {number(size, 2)}{unit_words(limit.units[name])}" for name, size in limit.sizes.items()
         )
         rows.append([text(limit.effect), "contact", sizes or "hardly detectable in these motions"])
     rows += [[text(name), "not tested", text(why)] for name, why in result.not_tested.items()]
@@ -289,17 +285,23 @@ def _next(result: DiagnoseResult, pictures: Pictures) -> str:
         return ""
     apart = f"It tells {listed(found.separates)} apart." if found.separates and found.initial_state else ""
     pieces = [paragraph(f"{found.what[:1].upper()}{found.what[1:]}. {apart}")]
-    if pictures.throw:
-        series = [
-            Series(name=one.name, points=_pairs(*one.path.T), color=color)
-            for one, color in zip(pictures.throw, _COLORS, strict=False)
-        ]
-        side = Plot(title="from the side: height [m]", x="along the throw [m]", series=series, equal=True)
-        pieces.append(f'<div class="plots"><figure>{plot_svg(side)}</figure></div>')
+    pieces.append(drawn_throw(pictures.throw))
     rows = [[str(one["rank"]), text(one["what"]), number(float(one["expected_gain_nats"]))] for one in found.ranked[:5]]
     if rows:
         pieces.append(table(["", "throw", "expected rise of the log-likelihood ratio"], rows, (2,)))
     return section("What to measure next", *pieces)
+
+
+def drawn_throw(throw: Sequence[DrawnMotion]) -> str:
+    """Return the drawing of the next experiment; empty where none is proposed."""
+    if not throw:
+        return ""
+    series = [
+        Series(name=one.name, points=_pairs(*one.path.T), color=color)
+        for one, color in zip(throw, _COLORS, strict=False)
+    ]
+    side = Plot(title="from the side: height [m]", x="along the throw [m]", series=series, equal=True)
+    return f'<div class="plots"><figure>{plot_svg(side)}</figure></div>'
 
 
 def _files(result: DiagnoseResult, place: Path, model: Path, capture: Path) -> str:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...schemas import DiagnoseResult, NotConvergedError
+from ...schemas import DiagnoseResult, NextExperiment, NotConvergedError
 from ..physics.rollout import simulate
 from ..physics.world import State, World
 from ..segments.prepare import Prepared, whole_flights
@@ -122,7 +122,9 @@ def pictures_of(prepared: Prepared, findings: Findings, result: DiagnoseResult) 
         left = _missing(after, prepared.has_orientation, missing.coordinate)
     named = [one.evidence.name for one in findings.chosen] if result.selected else []
     drawn = [_picture(prepared, findings.world, name) for name in named]
-    return Pictures(missing, left, tuple(one for one in drawn if one is not None), _throw(findings.world, result))
+    return Pictures(
+        missing, left, tuple(one for one in drawn if one is not None), throw_of(findings.world, result.next_experiment)
+    )
 
 
 def _windows(prepared: Prepared, world: World) -> ResidualWrenches | None:
@@ -215,9 +217,8 @@ def _from_side(world: World, start: State, place: Tensor) -> Array:
     return torch.stack(((place - place[0]) @ along, place @ up), 1).numpy()
 
 
-def _throw(world: World, result: DiagnoseResult) -> tuple[DrawnMotion, ...]:
-    """Return the next experiment as it would fly with what was found; empty where none is proposed."""
-    found = result.next_experiment
+def throw_of(world: World, found: NextExperiment | None) -> tuple[DrawnMotion, ...]:
+    """Return an experiment as it would fly in a world; empty where none is proposed."""
     if found is None or not found.initial_state or len(world.free) != 1:
         return ()
     body, like = world.free[0], world.gravity

@@ -9,6 +9,7 @@ from typing import Literal
 
 from ...datasets.capture.tracks import Episode
 from ...datasets.io.progress import note
+from ...datasets.models.effect_files import effect_file
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     DiagnoseResult,
@@ -27,6 +28,7 @@ from ..diagnose.experiments import Experiment
 from ..diagnose.stage import prepared_world, report
 from ..fit import fit
 from ..physics.effects.registry import effect_of
+from ..physics.effects.trust import trust_effects
 from ..runtime.resources import one_torch_thread
 from ..segments.candidates import Candidate
 from ..segments.prepare import Prepared
@@ -197,6 +199,8 @@ class Climb:
     def _trial(self, base: str, name: str, proposal: Proposal) -> ImproveTrial:
         """Add effects to the models without a fold, and compare the errors on the folds."""
         note(f"improve: try {', '.join(proposal.names)} on unseen episodes")
+        # models that an interrupted run has fitted with them are read, not fitted again
+        trust_effects(found[0] for effect in proposal.effects if (found := effect_file(effect)) is not None)
         before = self._fold_errors(base, "m0", ())
         after = self._fold_errors(name, base, proposal.effects)
         failure = before.failure or after.failure

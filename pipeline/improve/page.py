@@ -17,6 +17,8 @@ from ...schemas import (
     ImproveTrial,
     RankedEffect,
 )
+from ..diagnose.page import drawn_throw
+from ..diagnose.pictures import DrawnMotion
 from ..report.page import (
     cautions,
     command,
@@ -31,6 +33,8 @@ from ..report.page import (
     section,
     table,
     text,
+    unit_text,
+    unit_words,
 )
 from ..report.plots import Bar, bars
 from .wording import AXES, WHY, not_added_words, remaining_words, share_words, trial_words
@@ -41,12 +45,13 @@ RANKED = 6
 _MM = 1e3
 
 
-def ladder_html(result: ImproveResult, out: Path) -> str:
+def ladder_html(result: ImproveResult, out: Path, throw: Sequence[DrawnMotion] = ()) -> str:
     """Return the HTML page of a ladder.
 
     Args:
         result: The ladder.
         out: Its directory.
+        throw: The experiment of `asking_step`, drawn.
     """
     ladder = [step for step in result.steps if step.added]
     ends = [step for step in result.steps if not step.added]
@@ -59,7 +64,7 @@ def ladder_html(result: ImproveResult, out: Path) -> str:
         _overview(result, ladder),
         *(_step(number, step, result.test) for number, step in enumerate(ladder, 1)),
         *(_remains(step, result) for step in ends),
-        _measure_next(result.steps),
+        _measure_next(result.steps, throw),
         _commands(result, out),
         _judged(result),
         _provenance(result, out),
@@ -206,7 +211,7 @@ def _parameters(parameters: Sequence[FittedParameter]) -> str:
             f"<code>{text(p.name)}</code>",
             number(p.estimate),
             f"{number(p.interval_95[0])} to {number(p.interval_95[1])}" if p.interval_95 else "–",
-            text(p.unit),
+            unit_text(p.unit),
         ]
         for p in parameters
     ]
@@ -244,7 +249,7 @@ def _ranking(step: ImproveStep) -> str:
             if entry.cv_error_after_m is not None
             else "–",
             _gain(entry),
-            "; ".join(f"{text(p.name)} = {number(p.estimate)} ± {number(p.std_error, 2)} {text(p.unit)}"
+            "; ".join(f"{text(p.name)} = {number(p.estimate)} ± {number(p.std_error, 2)}{unit_words(p.unit)}"
                       for p in entry.parameters[:3]),
         ]
         for entry in shown
@@ -261,7 +266,11 @@ def _gain(entry: RankedEffect) -> str:
     if entry.held_out_nats is None:
         return "–"
     span = entry.held_out_nats_95
-    return number(entry.held_out_nats) + (f" ({number(span[0])} to {number(span[1])})" if span else "")
+    return _nats(entry.held_out_nats) + (f" ({_nats(span[0])} to {_nats(span[1])})" if span else "")
+
+
+def _nats(value: float) -> str:
+    return number(value) if abs(value) >= 1 else fixed(value + 0.0, 2)
 
 
 def _rivals(step: ImproveStep) -> str:
@@ -337,15 +346,21 @@ def _limits(step: ImproveStep) -> str:
     return folded(words, table(["effect", "seen from"], rows)) if rows else ""
 
 
-def _measure_next(steps: Sequence[ImproveStep]) -> str:
+def asking_step(steps: Sequence[ImproveStep]) -> ImproveStep | None:
+    """Return the last step whose diagnosis has proposed an experiment; None where none has."""
+    return next((one for one in reversed(steps) if one.next_experiment is not None), None)
+
+
+def _measure_next(steps: Sequence[ImproveStep], throw: Sequence[DrawnMotion]) -> str:
     """Return the last experiment that a diagnosis has proposed."""
-    step = next((one for one in reversed(steps) if one.next_experiment is not None), None)
+    step = asking_step(steps)
     if step is None or (found := step.next_experiment) is None:
         words = "No rivals are left that another motion would tell apart."
         return section("What to measure next", paragraph(words)) if steps else ""
     apart = f" It tells {listed(found.separates)} apart." if found.separates and found.initial_state else ""
     pieces = [
-        paragraph(f"{found.what[:1].upper()}{found.what[1:]}.{apart} Asked for by the diagnosis of {step.model}.")
+        paragraph(f"{found.what[:1].upper()}{found.what[1:]}.{apart} Asked for by the diagnosis of {step.model}."),
+        drawn_throw(throw),
     ]
     rows = [[text(entry["rank"]), text(entry["what"]), number(entry.get("order_of_magnitude"), 2)]
             for entry in found.ranked[:3]]  # fmt: skip
@@ -355,8 +370,8 @@ def _measure_next(steps: Sequence[ImproveStep]) -> str:
             "expected to give, to the power of ten; 5 are odds of about 150 to 1."
         )
         pieces += [paragraph(words), table(["rank", "motion", "expected gain [nats]"], rows, (2,))]
-    if found.not_separated:
-        pieces.append(paragraph(f"None of them separates {', '.join(found.not_separated)}."))
+    if rows and found.not_separated:
+        pieces.append(paragraph(f"None of them separates {listed(found.not_separated)}."))
     return section("What to measure next", *pieces)
 
 
@@ -389,7 +404,7 @@ def _judged(result: ImproveResult) -> str:
 
 def _provenance(result: ImproveResult, out: Path) -> str:
     rows = [
-        ("capture", text(result.capture)),
+        ("capture", link(result.capture, result.capture, out / PAGE)),
         ("versions", text(", ".join(f"{name} {version}" for name, version in result.versions.items()))),
         ("figures", link("improve.json", out / "improve.json", out / PAGE)),
     ]

@@ -26,13 +26,15 @@ from ...schemas import (
     read_json,
 )
 from ..diagnose.experiments import DEFAULT, experiments_of, read_experiments
+from ..diagnose.pictures import DrawnMotion, throw_of
 from ..diagnose.stage import library_of
 from ..fit import fit
+from ..physics.world import World
 from ..runtime.device import resolve_device
 from .folds import ReadOnce, folds_of
 from .ladder import Climb, Ladder
 from .ladder_files import LadderFiles, differing
-from .page import PAGE, ladder_html
+from .page import PAGE, asking_step, ladder_html
 from .test_split import TEST, has_test_split, tested
 from .wording import sentence, warnings_of
 
@@ -284,4 +286,12 @@ def _write(request: _Request, files: LadderFiles, result: ImproveResult, overwri
         for name in result.models:
             copy_files(files / name, folder / name)
         (folder / DOCUMENT).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        (folder / PAGE).write_text(ladder_html(result, request.out), encoding="utf-8")
+        (folder / PAGE).write_text(ladder_html(result, request.out, _asked(result, files)), encoding="utf-8")
+
+
+def _asked(result: ImproveResult, files: LadderFiles) -> tuple[DrawnMotion, ...]:
+    """Return the experiment that the ladder asks for, as it would fly with what was added since; empty for none."""
+    step = asking_step(result.steps)
+    if step is None or step.next_experiment is None:
+        return ()
+    return throw_of(World.from_model(read_model(files / (step.next_model or step.model))), step.next_experiment)

@@ -19,6 +19,9 @@ LEAST_SECTIONS = 3
 """Minimum number of sections for a list of contents."""
 MOST_COLUMNS = 3
 """Largest number of columns that a narrow screen shows side by side; of wider tables it shows each row as a list."""
+_BEGINNING = re.compile(r"^[a-z](?=[a-z]* )")
+"""First letter of a text that begins with a word, not with a name of a file or an option."""
+_POWER = re.compile(r"(?<=[A-Za-z])[23]")
 _HEADING = re.compile(r'<h2 id="([^"]+)">(.*?)</h2>')
 
 
@@ -116,8 +119,8 @@ def folded(summary: str, *pieces: str) -> str:
 
 def cautions(messages: Sequence[str]) -> str:
     """Return the box of warnings, those that say the same of several episodes as one; empty without any."""
-    words = "".join(paragraph(words[:1].upper() + words[1:]) for words in fold_repeated(messages))
-    return f'<div class="warnings">{words}</div>' if messages else ""
+    said = [_BEGINNING.sub(lambda first: first[0].upper(), words) for words in fold_repeated(messages)]
+    return f'<div class="warnings">{"".join(map(paragraph, said))}</div>' if said else ""
 
 
 def paragraph(words: str, style: str = "") -> str:
@@ -184,6 +187,24 @@ def number(value: float | None, digits: int = 3) -> str:
         decimals = digits - 1 - math.floor(math.log10(abs(float(written))))
         written = f"{round(value, decimals):.{max(0, decimals)}f}"
     return written.replace("-", "−")
+
+
+def unit_words(unit: str) -> str:
+    """Return a unit as it follows a number, as HTML; empty for the unit 1.
+
+    >>> unit_words("m/s2"), unit_words("1")
+    (' m/s²', '')
+    """
+    return "" if unit == "1" else f" {unit_text(unit)}"
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as HTML, with its powers raised.
+
+    >>> unit_text("kg m2"), unit_text("1/s2")
+    ('kg m²', '1/s²')
+    """
+    return _POWER.sub(lambda found: "²³"[int(found[0]) - 2], text(unit))
 
 
 def fixed(value: float | None, places: int = 1, scale: float = 1.0) -> str:

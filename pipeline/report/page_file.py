@@ -3,23 +3,48 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 from ...datasets.io.outputs import RECORD
 from ...schemas.regular_files import real_path
 from .page import link
 
-_HEAD_BYTES = 1 << 12
+_HEAD_BYTES = 1 << 15
+_MARK = re.compile(r'<meta name="cgwm-made-of" content="([^"]*)">')
+_KINDS = {"compare": "comparison", "diagnose": "diagnosis"}
+"""In words, what the commands write."""
 
 
-def page_beside(model: Path, name: str) -> Path:
-    """Return the path of a page of this name beside a model, and in no output of cgwm."""
+def page_beside(models: Sequence[Path], verb: str, *words: str) -> Path:
+    """Return the path of a page that is named after its models, beside the first one and in no output of cgwm.
+
+    The name of a model within an output, such as a ladder, has that one's name before it.
+
+    Args:
+        models: The models.
+        verb: The command that writes the page, the first word of its name.
+        words: Its last words.
+    """
+    names = [name.replace("/", "-") for name in short_names([os.fspath(model) for model in models])]
+    outputs = [_outermost(model) for model in models]
+    first = outputs[0]
+    if first is not None and all(one == first for one in outputs):
+        names = [first.name, *names]
+    else:
+        names = [name if one is None else f"{one.name}-{name}" for name, one in zip(names, outputs, strict=True)]
+    folder = models[0].parent if first is None else first.parent
+    return folder / f"{'-'.join([verb, *names, *words])}.html"
+
+
+def _outermost(model: Path) -> Path | None:
+    """Return the outermost output of cgwm that holds a model; None for one that lies in none."""
     outputs = [above for above in real_path(model).parents if (above / RECORD).is_file()]
-    folder = outputs[-1].parent if outputs else model.parent
-    return folder / name
+    return outputs[-1] if outputs else None
 
 
 def pages_beside(place: Path, models: Sequence[Path]) -> list[tuple[str, Path]]:
@@ -32,16 +57,14 @@ def pages_beside(place: Path, models: Sequence[Path]) -> list[tuple[str, Path]]:
     Returns:
         Kind of each page, in words, and its path.
     """
-    found: dict[Path, str] = {}
-    for name in (os.path.basename(os.path.normpath(model)) for model in models):
-        about = re.compile(rf"(compare|diagnose)-(?:.+-)?{re.escape(name)}(?:-.+)?\.html")
-        for page in sorted(place.parent.glob("*.html")):
-            if (kind := about.fullmatch(page.name)) and page.name != place.name:
-                found.setdefault(page, {"compare": "comparison", "diagnose": "diagnosis"}[kind[1]])
-    for ladder in dict.fromkeys(Path(model).parent / "improve.html" for model in models):
-        if ladder.is_file():
-            found[ladder] = "ladder of models"
-    return [(kind, page) for page, kind in found.items()]
+    own = {_from(place, model) for model in models}
+    found: list[tuple[str, Path]] = []
+    for page in sorted(place.parent.glob("[!.]*.html")):
+        verb, _, *inputs = _mark_in(page).split() or [""] * 2
+        if verb in _KINDS and own & {*inputs} and page.name != place.name:
+            found.append((_KINDS[verb], page))
+    ladders = dict.fromkeys(Path(model).parent / "improve.html" for model in models)
+    return [*found, *(("ladder of models", page) for page in ladders if page.is_file())]
 
 
 def links_beside(place: Path, models: Sequence[Path], capture: Path) -> list[tuple[str, str]]:
@@ -74,16 +97,26 @@ def made_of(page: Path, verb: str, inputs: Sequence[Path], *words: str) -> str:
         inputs: The directories that it shows, in order.
         words: What else makes another page of the same inputs, such as the split.
     """
-    folder = real_path(page).parent
-    places = [os.path.relpath(real_path(path), folder) for path in inputs]
-    return f"{verb} {hashlib.sha256(chr(0).join([*places, *words]).encode()).hexdigest()}"
+    places = [_from(page, path) for path in inputs]
+    return " ".join([verb, hashlib.sha256(chr(0).join([*places, *words]).encode()).hexdigest(), *places])
 
 
 def shows_the_same(page: Path, mark: str) -> bool:
     """Return whether a page is one that cgwm wrote with this mark of :func:`made_of`."""
+    return _mark_in(page) == mark
+
+
+def _mark_in(page: Path) -> str:
+    """Return the mark of a page that cgwm wrote; empty for other files."""
     try:
         with page.open("rb") as stream:
             head = stream.read(_HEAD_BYTES)
     except OSError:
-        return False
-    return f'<meta name="cgwm-made-of" content="{mark}">'.encode() in head
+        return ""
+    found = _MARK.search(head.decode(errors="replace"))
+    return html.unescape(found[1]) if found else ""
+
+
+def _from(page: Path, path: Path) -> str:
+    """Return the way from a page's folder to a path, without spaces."""
+    return quote(os.path.relpath(real_path(path), real_path(page).parent))

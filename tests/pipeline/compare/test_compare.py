@@ -350,7 +350,9 @@ def test_the_page_is_beside_the_models_and_in_no_output(folder: Path, tmp_path: 
     assert default_page([Path("m0")]) == Path("compare-m0.html")
     with new_directory(tmp_path / "dataset", "dataset") as made:
         (made / "model").mkdir()
-    assert default_page([tmp_path / "dataset" / "model"]) == tmp_path / "compare-model.html"
+    assert default_page([tmp_path / "dataset" / "model"]) == tmp_path / "compare-dataset-model.html"
+    both = [tmp_path / "dataset" / "model", tmp_path / "m1"]
+    assert default_page(both) == tmp_path / "compare-dataset-model-m1.html"
     assert default_page([Path("a/m"), Path("b/m")]) == Path("a/compare-a-m-b-m.html")
     assert default_page([Path("m0")], "train") == Path("compare-m0-train.html")
 

@@ -13,10 +13,21 @@ from cgwm.pipeline.diagnose.pictures import (
     MissingForce,
     Pictures,
     binned_means,
+    throw_of,
 )
-from cgwm.pipeline.report.page_file import pages_beside, shows_the_same
+from cgwm.pipeline.report.page import page
+from cgwm.pipeline.report.page_file import made_of, pages_beside, shows_the_same
 from cgwm.pipeline.segments.residual_wrench import motion_axes
-from cgwm.schemas import ContactLimit, DiagnoseResult, EffectParameterEstimate, LawTerm, RankedEffect, ResidualLaw
+from cgwm.schemas import (
+    ContactLimit,
+    DiagnoseResult,
+    EffectParameterEstimate,
+    LawTerm,
+    NextExperiment,
+    RankedEffect,
+    ResidualLaw,
+)
+from helpers.diagnosis_data import world_with
 from helpers.pages import Tags
 
 NUMBERS = np.linspace(0.0, 1.0, 12)
@@ -66,13 +77,15 @@ def test_the_page_shows_what_decides_what_it_does_and_what_could_have_been_seen(
 
 
 def test_the_page_leads_to_the_pages_beside_it(tmp_path: Path) -> None:
-    for name in ("compare-m0-m1.html", "compare-m00.html", "diagnose-m0.html", "diagnose-m0-test.html"):
-        (tmp_path / name).touch()
+    shown = {"both": "compare m0 m1", "other": "compare m00", "own": "diagnose m0", "test": "diagnose m0"}
+    for name, (verb, *models) in ((name, words.split()) for name, words in shown.items()):
+        place = tmp_path / f"{name}.html"
+        place.write_text(page("<t>", [], made_of=made_of(place, verb, [tmp_path / model for model in models])))
+    (tmp_path / "mine.html").write_text("m0")
     (tmp_path / "improve.html").touch()
-    found = pages_beside(tmp_path / "diagnose-m0.html", [tmp_path / "m0"])
-    assert [(kind, page.name) for kind, page in found] == [
-        ("comparison", "compare-m0-m1.html"), ("diagnosis", "diagnose-m0-test.html"),
-        ("ladder of models", "improve.html"),
+    found = pages_beside(tmp_path / "own.html", [tmp_path / "m0"])
+    assert [(kind, path.name) for kind, path in found] == [
+        ("comparison", "both.html"), ("diagnosis", "test.html"), ("ladder of models", "improve.html"),
     ]  # fmt: skip
 
 
@@ -106,6 +119,17 @@ def test_the_next_model_has_a_number_that_is_free(tmp_path: Path) -> None:
     (tmp_path / "m1").mkdir()
     assert successor(tmp_path / "m0") == tmp_path / "m2"
     assert successor(tmp_path / "base") == tmp_path / "base-1"
+
+
+def test_an_experiment_is_drawn_as_it_would_fly() -> None:
+    state = {"position_m": [0.0, 0.0, 5.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0], "velocity_m_s": [0.0, -2.0, 3.0]}
+    state["omega_body_rad_s"] = [0.0, 0.0, 0.0]
+    throw = NextExperiment(what="throw it; hard", initial_state=state, separates=("a", "b"), expected_gain_nats=1.0)
+    (drawn,) = throw_of(world_with("ball"), throw)
+    t = np.linspace(0.0, 1.0, len(drawn.path))
+    assert drawn.name == "throw it"
+    np.testing.assert_allclose(drawn.path, np.stack([2 * t, 5 + 3 * t - 9.81 / 2 * t**2], 1), atol=1e-6)
+    assert throw_of(world_with("ball"), None) == ()
 
 
 def test_axes_of_a_motion_are_orthonormal_and_right_handed() -> None:

@@ -10,15 +10,19 @@ import pytest
 import torch
 from cgwm.cli.app import app
 from cgwm.datasets.io.atomic import sha256
+from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
+from cgwm.pipeline.diagnose.pictures import DrawnMotion
 from cgwm.pipeline.improve import improve
 from cgwm.pipeline.improve.folds import ReadOnce, folds_of
 from cgwm.pipeline.improve.held_out_errors import HeldOutErrors, error_ratio, typical_error
 from cgwm.pipeline.improve.ladder import Climb, helps
 from cgwm.pipeline.improve.ladder_files import LadderFiles
 from cgwm.pipeline.improve.page import ladder_html
-from cgwm.pipeline.improve.proposals import proposals_of
+from cgwm.pipeline.improve.proposals import Proposal, proposals_of
 from cgwm.pipeline.improve.wording import remaining_words, share_words
+from cgwm.pipeline.phys_geo.effects.requested_effects import with_effects
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     DiagnoseResult,
@@ -29,14 +33,16 @@ from cgwm.schemas import (
     ImproveTrial,
     InputDataError,
     LawTerm,
+    NextExperiment,
     PhysConfig,
     RankedEffect,
     Remaining,
     ResidualLaw,
     UsageError,
+    read_json,
 )
 from helpers.pages import Tags
-from helpers.small_model import write_small_model
+from helpers.small_model import small_model, write_small_model
 from helpers.thrown_cube import write_capture
 from typer.testing import CliRunner
 
@@ -152,6 +158,21 @@ def test_a_law_is_taken_before_an_effect_only_where_it_predicts_better_beyond_ch
     assert best is not None and best[1].names == (added,)
 
 
+def test_the_law_of_an_interrupted_ladder_is_run_again(climb: Climb, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CGWM_TRUSTED_EFFECTS", "")
+    law = climb.files / "law_0.py"
+    proposals_of(found("unexplained", residual_law=LAW), (), law)
+    fitted = with_effects((), [f"{law}:ResidualLaw"])
+    model = small_model()
+    write_model(
+        climb.files / "folds" / "m0-0-0", replace(model, file=model.file.model_copy(update={"effects": fitted}))
+    )
+    monkeypatch.setenv("CGWM_TRUSTED_EFFECTS", "")  # the next process
+    set_errors(monkeypatch, {(): 1.0, ("law_0.py:ResidualLaw",): 0.5})
+    climb._trial("m0", "m0-0", Proposal((f"{law}:ResidualLaw",), "law"))
+    World.from_model(read_model(climb.files / "folds" / "m0-0-0"))
+
+
 def test_what_the_others_do_without_is_left_out(climb: Climb, monkeypatch: pytest.MonkeyPatch) -> None:
     drag, force = ("linear_drag",), ("constant_force",)
     named = ("quadratic_drag", *force, *drag)
@@ -255,7 +276,17 @@ def test_the_page_is_whole_and_takes_no_text_for_html(ladder: Path) -> None:
     tags = Tags()
     tags.feed(text)
     assert (tags.faults, tags.open) == ([], [])
-    assert set(tags.addresses) == {"m0", "improve.json"}
+    assert {address.rpartition("/")[2] for address in tags.addresses} == {"m0", "improve.json", "%3Cscript%3E"}
+
+
+def test_the_page_draws_the_last_experiment_that_was_asked_for(ladder: Path) -> None:
+    result = read_json(ladder / "improve.json", ImproveResult)
+    throw = NextExperiment(what="throw it", initial_state={"a": 1}, separates=("a", "b", "c"), expected_gain_nats=1.0)
+    steps = [result.steps[0].model_copy(update={"model": name, "next_experiment": throw}) for name in ("m0", "m1")]
+    asked = result.model_copy(update={"steps": (*steps, result.steps[0])})
+    drawn = ladder_html(asked, ladder, (DrawnMotion("throw it", np.array([[0.0, 1.0], [1.0, 0.0]])),))
+    assert "It tells a, b and c apart. Asked for by the diagnosis of m1." in drawn
+    assert "along the throw [m]" in drawn and "along the throw [m]" not in ladder_html(asked, ladder)
 
 
 def test_a_ladder_is_validated_with_its_models(ladder: Path) -> None:
