@@ -14,7 +14,7 @@ from .verb import verb
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, RankedEffect, Remaining
+    from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, NextMotions, RankedEffect, Remaining
 
 SHOWN = 8
 """Number of candidates that are listed; --json has all."""
@@ -108,6 +108,7 @@ def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> 
         lines.append(f"law of the residual: {terms}")
     if result.next_experiment is not None:
         lines += _experiment(result.next_experiment)
+    lines += _motions(result.next_motions)
     lines += [f"Wrote {result.saved_law.rpartition(':')[0]}."] if result.saved_law is not None else []
     lines += [f"Page: {result.report}"] if result.report is not None else []
     return "\n".join([*lines, *warnings(result.warnings), next_line(*words)])
@@ -160,6 +161,25 @@ def _limits(limits: tuple[ContactLimit, ...]) -> list[str]:
 def _sizes(limit: ContactLimit) -> str:
     words = [f"{name} = {size:.2g} {limit.units[name]}".removesuffix(" 1") for name, size in limit.sizes.items()]
     return ", ".join(words)
+
+
+def _motions(found: NextMotions | None) -> list[str]:
+    """Return the motions to record next for contact, one a line, and what they show."""
+    from ..pipeline.report.page import listed
+
+    if found is None:
+        return []
+    if found.separates:
+        lines = [f"To distinguish {listed(found.separates)}, record next and add to the split:"]
+    else:
+        lines = ["To see effects of contact that these data could not show, record next and add to the split:"]
+    lines += [f"  {place}. {motion.what}" for place, motion in enumerate(found.motions, 1)]
+    shown = [
+        f"{one.effect} from {one.then_from:g} {one.unit}".removesuffix(" 1")
+        + (f" (now {one.seen_from:g})" if one.seen_from is not None else " (now hardly)")
+        for one in found.reveals
+    ]
+    return [*lines, *([f"  expected to show then: {'; '.join(shown)}"] if shown else [])]
 
 
 def _experiment(found: NextExperiment) -> list[str]:

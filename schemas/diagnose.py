@@ -107,6 +107,40 @@ class NextExperiment(FileModel):
     order_of_magnitude (a power of 10; 0 below 1)."""
 
 
+class ProposedMotion(FileModel):
+    """A motion that a hand can make."""
+
+    what: str
+    """In words."""
+    initial_state: dict[str, Any]
+    """position_m, quat_wxyz, velocity_m_s, omega_body_rad_s."""
+    duration_s: float
+    """Of the recording."""
+
+
+class RevealedEffect(FileModel):
+    """About from which size on an effect of contact would be named, before and after the proposed motions."""
+
+    effect: str
+    unit: str
+    """Of its first number."""
+    seen_from: float | None
+    """In the data so far; None where no size would show."""
+    then_from: float
+    """With the motions."""
+
+
+class NextMotions(FileModel):
+    """The motions to record next for contact, and what they show."""
+
+    motions: tuple[ProposedMotion, ...]
+    """Up to three; equal ones stand next to each other."""
+    reveals: tuple[RevealedEffect, ...] = ()
+    """What they show that the data do not, or that they tell apart."""
+    separates: tuple[str, ...] = ()
+    """Rivals that they tell apart; empty where nothing was found so far."""
+
+
 Several = Annotated[tuple[Annotated[float, Field(ge=0, le=1e5)], ...], Field(min_length=1, max_length=1000)]
 Angles = Annotated[tuple[Annotated[float, Field(ge=-3600, le=3600)], ...], Field(min_length=1, max_length=1000)]
 
@@ -195,6 +229,8 @@ class DiagnoseResult(FileModel):
     aliases: tuple[tuple[str, ...], ...] = ()
     """Groups of effects that these data cannot tell apart, a selected one the first of each."""
     next_experiment: NextExperiment | None = None
+    next_motions: NextMotions | None = None
+    """What to record next for contact; None where no effect of contact is left open, or no motion would help."""
     remaining: Remaining | None = None
     """What is left in flight; None without flight."""
     residual_law: ResidualLaw | None = None

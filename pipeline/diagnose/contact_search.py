@@ -59,6 +59,8 @@ class ContactFindings:
     """Contact segments with fitted states; None without contact."""
     limits: tuple[DetectionLimit, ...] = ()
     """Detection limits of the contact effects, where contact selected none."""
+    sliding: StartedSliding | None = None
+    """The sliding segments and their fit without effects of contact; None without any."""
 
 
 def with_contact(
@@ -97,7 +99,12 @@ def with_contact(
     )
     kept, _ = admissible(data.world, candidates, prepared.has_orientation)
     common = ContactFindings(
-        chosen=chosen, evidence=[], world=resolved.world, chi2=resolved.chi2, segments=resolved.segments
+        chosen=chosen,
+        evidence=[],
+        world=resolved.world,
+        chi2=resolved.chi2,
+        segments=resolved.segments,
+        sliding=data.sliding,
     )
     for test in tests:
         evidence = test.evidence(data, kept)

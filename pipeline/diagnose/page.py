@@ -279,29 +279,63 @@ def _tested(result: DiagnoseResult) -> str:
 
 
 def _next(result: DiagnoseResult, pictures: Pictures) -> str:
-    """Return the section on the next experiment, drawn as a throw."""
+    """Return the section on the next experiment, drawn as a throw, and on the motions to record next for contact."""
+    pieces = [*_next_throw(result, pictures), *_next_motions(result, pictures)]
+    return section("What to measure next", *pieces) if pieces else ""
+
+
+def _next_throw(result: DiagnoseResult, pictures: Pictures) -> list[str]:
     found = result.next_experiment
     if found is None:
-        return ""
+        return []
     apart = f"It tells {listed(found.separates)} apart." if found.separates and found.initial_state else ""
     pieces = [paragraph(f"{found.what[:1].upper()}{found.what[1:]}. {apart}")]
     pieces.append(drawn_throw(pictures.throw))
     rows = [[str(one["rank"]), text(one["what"]), number(float(one["expected_gain_nats"]))] for one in found.ranked[:5]]
     if rows:
         pieces.append(table(["", "throw", "expected rise of the log-likelihood ratio"], rows, (2,)))
-    return section("What to measure next", *pieces)
+    return pieces
+
+
+def _next_motions(result: DiagnoseResult, pictures: Pictures) -> list[str]:
+    found = result.next_motions
+    if found is None:
+        return []
+    why = (
+        f"These motions tell {listed(found.separates)} apart."
+        if found.separates
+        else "These motions show effects of contact that the data so far could not."
+    )
+    pieces = [
+        paragraph(f"{why} Record them as new episodes of the same capture, and add them to the split."),
+        f"<ol>{''.join(f'<li>{text(motion.what)}</li>' for motion in found.motions)}</ol>",
+    ]
+    if pictures.paths:
+        pieces.append(_drawn(pictures.paths, "from above: y [m]", "x [m]", True))
+    rows = [
+        [
+            text(one.effect),
+            "hardly" if one.seen_from is None else text(f"{number(one.seen_from, 2)} {one.unit}".removesuffix(" 1")),
+            text(f"{number(one.then_from, 2)} {one.unit}".removesuffix(" 1")),
+        ]
+        for one in found.reveals
+    ]
+    return [*pieces, table(["effect", "seen from, now", "with these motions"], rows)] if rows else pieces
+
+
+def _drawn(motions: Sequence[DrawnMotion], title: str, axis: str, named: bool) -> str:
+    """Return the plot of motions, with a legend where they are named."""
+    series = [
+        Series(name=one.name, points=_pairs(*one.path.T), color=color)
+        for one, color in zip(motions, _COLORS, strict=False)
+    ]
+    drawn = plot_svg(Plot(title=title, x=axis, series=series, equal=True))
+    return f'<div class="plots"><figure>{drawn}{legend(series) if named else ""}</figure></div>'
 
 
 def drawn_throw(throw: Sequence[DrawnMotion]) -> str:
     """Return the drawing of the next experiment; empty where none is proposed."""
-    if not throw:
-        return ""
-    series = [
-        Series(name=one.name, points=_pairs(*one.path.T), color=color)
-        for one, color in zip(throw, _COLORS, strict=False)
-    ]
-    side = Plot(title="from the side: height [m]", x="along the throw [m]", series=series, equal=True)
-    return f'<div class="plots"><figure>{plot_svg(side)}</figure></div>'
+    return _drawn(throw, "from the side: height [m]", "along the throw [m]", False) if throw else ""
 
 
 def _files(result: DiagnoseResult, place: Path, model: Path, capture: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...schemas import DiagnoseResult, NextExperiment, NotConvergedError
+from ..physics.impulse_solver import tangent_axes
 from ..physics.rollout import simulate
 from ..physics.world import State, World
 from ..segments.prepare import Prepared, whole_flights
@@ -110,6 +111,8 @@ class Pictures:
     """What each named effect does to a motion; effects of the measurement move nothing and are not in it."""
     throw: tuple[DrawnMotion, ...]
     """The next experiment; empty where none is proposed."""
+    paths: tuple[DrawnMotion, ...] = ()
+    """The motions to record next for contact from above: paths along the ground's x and y [m] instead of heights."""
 
 
 def pictures_of(prepared: Prepared, findings: Findings, result: DiagnoseResult) -> Pictures:
@@ -122,9 +125,9 @@ def pictures_of(prepared: Prepared, findings: Findings, result: DiagnoseResult) 
         left = _missing(after, prepared.has_orientation, missing.coordinate)
     named = [one.evidence.name for one in findings.chosen] if result.selected else []
     drawn = [_picture(prepared, findings.world, name) for name in named]
-    return Pictures(
-        missing, left, tuple(one for one in drawn if one is not None), throw_of(findings.world, result.next_experiment)
-    )
+    pictures = tuple(one for one in drawn if one is not None)
+    throw = throw_of(findings.world, result.next_experiment)
+    return Pictures(missing, left, pictures, throw, _paths(findings.world, result))
 
 
 def _windows(prepared: Prepared, world: World) -> ResidualWrenches | None:
@@ -221,19 +224,41 @@ def throw_of(world: World, found: NextExperiment | None) -> tuple[DrawnMotion, .
     """Return an experiment as it would fly in a world; empty where none is proposed."""
     if found is None or not found.initial_state or len(world.free) != 1:
         return ()
+    start = _start(world, found.initial_state)
+    place = _path(world, start, SHOWN_S)
+    return () if place is None else (DrawnMotion(found.what.partition(";")[0], _from_side(world, start, place)),)
+
+
+def _paths(world: World, result: DiagnoseResult) -> tuple[DrawnMotion, ...]:
+    """Return the motions to record next that move along the ground, each once, from above."""
+    if result.next_motions is None or world.ground_normal is None:
+        return ()
+    level, found = tangent_axes(world.ground_normal)[1:].double(), {}
+    for motion in result.next_motions.motions:
+        place = _path(world, _start(world, motion.initial_state), motion.duration_s)
+        if place is not None and motion.what not in found and np.linalg.norm(motion.initial_state["velocity_m_s"]) > 0:
+            found[motion.what] = DrawnMotion(motion.what, (place @ level.T).numpy())
+    return tuple(found.values())
+
+
+def _start(world: World, state: Mapping[str, Sequence[float]]) -> State:
+    """Return the state (1, nb) of the free body as a report has it; other bodies stay at the origin."""
     body, like = world.free[0], world.gravity
     rows = {key: torch.zeros(1, len(world.bodies), 4 if key == "quat_wxyz" else 3).to(like) for key in
             State.__dataclass_fields__}  # fmt: skip
     rows["quat_wxyz"][..., 0] = 1.0
     for key, row in rows.items():
-        row[0, body] = torch.tensor(found.initial_state[key]).to(row)
-    start = State(**rows)
-    times = torch.linspace(0.0, SHOWN_S, FRAMES).to(like)
+        row[0, body] = torch.tensor(state[key]).to(row)
+    return State(**rows)
+
+
+def _path(world: World, start: State, length_s: float) -> Tensor | None:
+    """Return the places (T, 3) [m] of the free body; None where it cannot be simulated."""
+    times = torch.linspace(0.0, length_s, FRAMES).to(world.gravity)
     try:
-        place = simulate(world, start, times).position_m[0, :, body].double()
+        return simulate(world, start, times).position_m[0, :, world.free[0]].double()
     except NotConvergedError:
-        return ()
-    return (DrawnMotion(found.what.partition(";")[0], _from_side(world, start, place)),)
+        return None
 
 
 def binned_means(x: Array, values: Array, std: Array, bins: int = 4) -> list[tuple[float, float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,6 +48,7 @@ from .experiments import DEFAULT, Experiment, experiments_of, read_experiments
 from .law_export import require_law_file, save_law
 from .next_command import next_command
 from .next_experiment import next_experiment
+from .next_motions import next_motions
 from .page import diagnosis_html, mark_of
 from .pictures import pictures_of
 from .remaining import held_out_of, remaining_of
@@ -187,6 +188,10 @@ def report_and_findings(
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
+    tested = {evidence.name for evidence in findings.ranking}  # some beside an effect that they need
+    motions = next_motions(findings.flight.prepared, findings, library)
+    # motions that tell effects of contact apart are chosen by the tests that will judge them
+    throw = None if motions and motions.separates else next_experiment(findings.flight.prepared, findings, throws)
     document = DiagnoseResult(
         verdict=findings.verdict,
         sentence=sentence(findings, law) + unseen_motion(prepared),
@@ -194,7 +199,8 @@ def report_and_findings(
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
         aliases=tuple(tuple(e.candidate.spec for e in group) for group in groups),
-        next_experiment=next_experiment(findings.flight.prepared, findings, throws),
+        next_experiment=throw,
+        next_motions=motions,
         remaining=remaining_of(findings.flight),
         residual_law=law,
         episodes=len(prepared.names),
@@ -204,16 +210,10 @@ def report_and_findings(
         flight_after=_flight_test(findings.flight.after),
         contact_chi2=findings.contact_chi2,
         contact_limits=tuple(_limit(one) for one in findings.limits),
-        not_tested=_not_tested(refused, findings),
+        not_tested={name: why for name, why in sorted(refused.items()) if name not in tested},
         warnings=tuple(warnings),
     )
     return document, findings
-
-
-def _not_tested(refused: Mapping[str, str], findings: Findings) -> dict[str, str]:
-    """Return why candidates were not tested; some were beside an effect that they need."""
-    tested = {evidence.name for evidence in findings.ranking}
-    return {name: why for name, why in sorted(refused.items()) if name not in tested}
 
 
 def _first_of_all(result: DiagnoseResult, useless: NotDescribed | None) -> DiagnoseResult:

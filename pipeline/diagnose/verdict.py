@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from ...datasets.io.progress import note
 from ..physics.world import World
 from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
 from ..segments.residual_wrench import Omnibus
+from ..segments.sliding_fit import StartedSliding
 from .alternative_laws import OtherLaw
 from .contact_search import TESTS, Chosen, ContactFindings, with_contact
 from .contact_tests.contact_test import ContactTest
@@ -54,6 +54,8 @@ class Findings:
     """Alternative laws that explain the flights as well as those of the selected effects."""
     limits: tuple[DetectionLimit, ...] = ()
     """Detection limits of the contact effects, where contact selected none."""
+    sliding: StartedSliding | None = None
+    """The sliding segments and their fit without effects of contact; None without any."""
 
     @property
     def judged_in_contact(self) -> set[str]:
@@ -72,12 +74,9 @@ def find(
         candidates: All candidates.
         tests: The contact tests, in the order in which they run.
     """
-    note("diagnose: flights")
     flown = flight_findings(prepared, world, candidates)
-    note("diagnose: contacts")
     explained = not is_significant(flown.after)
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
-    note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
     if flown.remains:  # what flights show may be what contact imitates
         contact = _without_useless(contact, errors)
@@ -95,6 +94,7 @@ def find(
         errors={} if verdict == "unexplained" else errors,
         as_good=tuple(one for one in flown.others if one.as_good),
         limits=contact.limits,
+        sliding=contact.sliding,
     )
 
 

@@ -30,6 +30,10 @@ LIMITS = SEGMENT_THRESHOLDS.sliding_data
 
 START_FRAMES = (4, 7)
 """Numbers of frames of the straight lines from which states are fitted first."""
+FACTORS = (0.5, 0.8, 1.25, 2.0, 4.0, 12.0)
+"""Multiples of a fitted effect at which friction and states are fitted again."""
+HELD_ITERATIONS = 5
+"""Maximum number of steps of these fits."""
 START_FRICTION = (0.15, 0.35)
 """Friction coefficients from which each segment is fitted first."""
 
@@ -144,6 +148,52 @@ def fit_sliding(
             SlidingFit(segments.with_state(states), found.chi2[chosen], found.values[k : k + 1, row], information)
         )
     return fits
+
+
+def better_starts(
+    world: World, variants: Sequence[Variant], fits: Sequence[SlidingFit], flight_parameters: Sequence[Parameter]
+) -> list[tuple[Segments, Tensor]]:
+    """Return for each fit of a variant where to go on: there, or at a multiple of its effect if that fits better.
+
+    A friction that grows with the speed and a lower constant one cancel each other: along that valley the cost falls
+    slowly and is curved, and joint steps stall in it. With the effect held, friction and states follow in a few steps.
+
+    Args:
+        world: With the soft contact.
+        variants: As fitted, all in one batch.
+        fits: Of the variants.
+        flight_parameters: See :func:`fit_sliding`.
+    """
+    candidates_world, own = with_variants(world, variants, "contact")
+    known = nuisance_parameters(world, flight_parameters)
+    parameters = [*known, *own]
+    place = {p.name: k for k, p in enumerate(parameters)}
+    count, each = len(fits[0].segments.items), len(FACTORS)
+    values = base_values(candidates_world, parameters).repeat(len(variants) * each, 1)
+    low, high = torch.tensor([p.limits for p in own]).to(values).T
+    for k, (variant, fit) in enumerate(zip(variants, fits, strict=True)):
+        columns = [place[name] for name in variant.parameters]
+        rows = slice(k * each, (k + 1) * each)
+        values[rows, : len(known)] = fit.values[0, : len(known)]
+        values[rows, columns] = torch.tensor(FACTORS).to(values)[:, None] * fit.values[0, len(known) :]
+    values[:, len(known) :] = torch.minimum(torch.maximum(values[:, len(known) :], low), high)
+    every = fits[0].segments.in_world(candidates_world).select(list(range(count)) * len(values))
+    every = every.with_state(State.joined(*(fit.segments.observations.state for fit in fits for _ in FACTORS)))
+    free = torch.arange(len(known)).expand(len(values), -1)
+    group = torch.arange(len(values)).repeat_interleave(count)
+    found = fit_groups(every, parameters, values, free, group, HELD_ITERATIONS)
+    costs = found.chi2.unflatten(0, (len(variants), each, count)).sum(-1)
+    starts = []
+    for k, (variant, fit) in enumerate(zip(variants, fits, strict=True)):
+        best = int(costs[k].argmin())
+        if float(costs[k, best]) >= fit.cost:
+            starts.append((fit.segments, fit.values[0]))
+            continue
+        row = k * each + best
+        states = found.segments.observations.state.at(torch.arange(row * count, (row + 1) * count))
+        columns = [*range(len(known)), *(place[name] for name in variant.parameters)]
+        starts.append((fit.segments.with_state(states), found.values[row, columns]))
+    return starts
 
 
 def noiseless_misfits(

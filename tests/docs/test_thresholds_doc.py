@@ -45,6 +45,8 @@ STATED = [
 TABLE = {f"{group}.{one.name}": one for group, some in thresholds_page.groups().items() for one in some}
 """Thresholds of a diagnosis, by group.field."""
 NUMERICS = {
+    "contact_information.LEAST_STEP_S": "resolution of simulated motions",
+    "contact_information.WEAK_SHARE": "keeps a matrix solvable",
     "coupled_effects.ITERATIONS": "bounds the duration of a refit",
     "cross_validation.ITERATIONS": "bounds the duration of a fit",
     "cross_validation.KNOWN_SHARE": "defines the held-out error: the share of an episode that fits its start",
@@ -66,7 +68,13 @@ NUMERICS = {
     "robust_fit.FALL": "end of a descent",
     "robust_fit.ITERATIONS": "end of a descent",
     "robust_fit.STEPS": "lengths of a step that are tried",
+    "hand_motions.INSIDE": "tolerance of a geometric test",
+    "hand_motions.MOST_AHEAD_M": "where a proposed motion begins",
+    "hand_motions.SAME_FACE": "tolerance of a geometric test",
+    "next_motions.MOST_MOTIONS": "how many motions are asked for at a time",
+    "next_motions.WORTH_TELLING": "which effects a proposal names",
     "sliding.FIRST_ITERATIONS": "end of a descent",
+    "sliding.MOST_PASSES": "end of a descent",
     "sliding.MANY": "size of a batch",
     "sparse_regression.EXPONENTS": "grid of a search",
 }
@@ -82,6 +90,7 @@ SEGMENT_NUMERICS = {
         "segment_fit.FALL",
         "segment_fit.FALL_SHARE",
         "segment_states.FALL, MAX_DAMPING",
+        "sliding_fit.HELD_ITERATIONS",
         "segment_states.THOROUGH_STARTS, THOROUGH_ITERATIONS",
         "segment_states.SEARCHES, SEARCH_ITERATIONS",
         "sliding_descent.ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE",
@@ -96,6 +105,7 @@ SEGMENT_NUMERICS = {
         "segment_states.DRAW_SPREAD",
         "segments.START_FRAMES",
         "sliding_descent.DAMPINGS",
+        "sliding_fit.FACTORS",
         "sliding_fit.START_FRAMES",
         "sliding_fit.START_FRICTION",
     ),

@@ -16,14 +16,17 @@ import numpy as np
 import torch
 
 from ...segments.candidates import Candidate, Variant
-from ...segments.sliding_descent import SlidingFit
-from ...segments.sliding_fit import StartedSliding, fit_sliding
+from ...segments.sliding_descent import ITERATIONS, SlidingFit
+from ...segments.sliding_fit import StartedSliding, better_starts, fit_sliding
 from ..evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 
 FIRST_ITERATIONS = 3
 """Number of iterations after which fits that are far behind are not continued."""
+MOST_PASSES = 5
+"""Maximum number of continuations of the fits that are close. A slide that ends within a segment allows small steps
+only, and a fit that has not converged would lose against one that needs fewer."""
 MANY = 4
 """Maximum number of parameters of a candidate that is fitted in a batch with smaller ones. The longest fit determines
 the time of a batch."""
@@ -64,9 +67,15 @@ class SlidingTest(ContactTest):
         return ranked(_judged(found, candidates, base, least, degrees))
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
-        """Return the leads in score, the second over effects that explain nearly as much."""
+        """Return the leads in score, the second over effects that explain nearly as much.
+
+        A rival is ruled out where it leaves twice what the best effect leaves, since no law is wrong by more than
+        itself; or else where it is behind by a share of the score.
+        """
+        left = best.score * (1 - best.share) / max(best.share, 1e-9)
+        share = min(self.limits.lead_share, max(left, 0.0) / max(best.score, 1e-9))
         return (
-            Lead(score=self.limits.lead, share=self.limits.lead_share),
+            Lead(score=self.limits.lead, share=share),
             Lead(score=self.limits.misled, rival=Bar(share=self.limits.rival_share * best.share)),
         )
 
@@ -92,7 +101,7 @@ class SlidingTest(ContactTest):
 def _fits(
     variants: Sequence[Variant], started: StartedSliding, thresholds: SlidingThresholds
 ) -> list[tuple[Variant, SlidingFit]]:
-    """Return the fit of each variant; those that are far behind after the first iterations are not continued.
+    """Return the fit of each variant; those that are far behind after the first iterations do not converge.
 
     Args:
         variants: The variants.
@@ -105,14 +114,32 @@ def _fits(
     for part in batches(variants):
         tried = fit_sliding(soft_world, part, [start] * len(part), known, FIRST_ITERATIONS)
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
+    found = _continued(found, started, FIRST_ITERATIONS)
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
     least = thresholds.close_share * max(gains.values())
-    close = [k for k, gain in gains.items() if gain > thresholds.score_sure and gain > least]
-    for part in batches([found[k][0] for k in close]):
-        mine = [(k, found[k]) for k in close if found[k][0] in part]
-        again = fit_sliding(soft_world, part, [(fit.segments, fit.values[0]) for _, (_, fit) in mine], known)
-        found |= {k: (variant, fit) for (k, (variant, _)), fit in zip(mine, again, strict=True)}
+    close = {k: found[k] for k, gain in gains.items() if gain > thresholds.score_sure and gain > least}
+    for _ in range(MOST_PASSES):
+        again = _continued(close, started, ITERATIONS)
+        found |= again
+        fell = [k for k in close if close[k][1].cost - again[k][1].cost > thresholds.converged]
+        close = {k: again[k] for k in fell if len(again[k][0].parameters) <= MANY}
     return list(found.values())
+
+
+def _continued(
+    some: dict[int, tuple[Variant, SlidingFit]], started: StartedSliding, iterations: int
+) -> dict[int, tuple[Variant, SlidingFit]]:
+    """Return fits of variants continued from better starts, by the same keys."""
+    world, known = started.segments.world, started.flight_parameters
+    done: dict[int, tuple[Variant, SlidingFit]] = {}
+    for part in batches([variant for variant, _ in some.values()]):
+        mine = {k: fit for k, (variant, fit) in some.items() if any(variant is one for one in part)}
+        many = len(part[0].parameters) > MANY
+        plain = [(fit.segments, fit.values[0]) for fit in mine.values()]
+        starts = plain if many else better_starts(world, part, list(mine.values()), known)
+        again = fit_sliding(world, part, starts, known, iterations)
+        done |= {k: (variant, fit) for k, variant, fit in zip(mine, part, again, strict=True)}
+    return done
 
 
 def batches(variants: Sequence[Variant]) -> list[list[Variant]]:
