@@ -65,6 +65,8 @@ class Channel:
     """Information of each motion, shape (M, P, P)."""
     count: int
     """Degrees of freedom (sliding) or number of impacts of the data."""
+    episodes: Array | None = None
+    """Information of each episode of the data, where a test asks that held-out episodes are predicted, (E, P, P)."""
 
     def noncentrality(self, information: Array, sizes: Array, variant: int, beside: int | None = None) -> Array:
         """Return the expected fall of chi2 (M,) by a missing effect of given sizes, averaged over its parameters.
@@ -108,7 +110,7 @@ def contact_information(
     made, true, share = _simulated(prepared, fitted, motions, state)
     found = [
         _sliding(prepared, fitted, started, variants, made, true, share, len(motions)),
-        _impacts(prepared, fitted, variants, made, share, len(motions)),
+        _impacts(prepared, fitted, variants, made, len(motions)),
     ]
     return [channel for channel in found if channel is not None], state
 
@@ -240,29 +242,37 @@ def _states_at(true: Rollout, segments: Segments) -> State:
 
 
 def _impacts(
-    prepared: Prepared, world: World, variants: Sequence[Variant], made: Prepared, share: float, count: int
+    prepared: Prepared, world: World, variants: Sequence[Variant], made: Prepared, count: int
 ) -> Channel | None:
-    """Return the information of the impacts of a ball; None where they cannot be judged."""
+    """Return the information of the impacts of a ball; None where they cannot be judged.
+
+    It is divided by the scatter of the measured impacts about their law, as the test divides their misfit.
+    """
     if not isinstance(world.contact, ContactLaw):
         return None
-    parts: list[tuple[NDArray[np.int64], Array, Array, tuple[tuple[int, ...], ...]] | None] = []
-    for source in (prepared, made):
-        impacts = measured_impacts(source, world)
-        known = None if impacts is None else _of_impacts(world, ImpactBase.of(world, impacts), variants)
-        parts.append(None if impacts is None or known is None else (impacts.episode, *known))
-    if parts[1] is None:
+    impacts = measured_impacts(made, world)
+    if impacts is None:
         return None
-    episode, found, base, columns = parts[1]
+    found, base, columns = _of_impacts(world, ImpactBase.of(world, impacts), variants)
+    data, number, spread = np.zeros((1, *found.shape[1:])), 0, 1.0
+    known = measured_impacts(prepared, world)
+    if known is not None:
+        fitted, number = ImpactBase.of(world, known), len(known)
+        data = np.zeros((1 + int(known.episode.max()), *found.shape[1:]))
+        np.add.at(data, known.episode, _of_impacts(world, fitted, variants)[0])
+        degrees = np.maximum([number - 1, 5 * number - 1], 1)
+        spread = max(1.0, float((fitted.fit.chi2 / degrees).max()))
     total = np.zeros((count, *found.shape[1:]))
-    np.add.at(total, episode, found)
+    np.add.at(total, impacts.episode, found)
     return Channel(
         name="impact",
-        base=base.shape[0],
+        base=len(base),
         columns=columns,
         prior=base,
-        data=np.zeros(found.shape[1:]) if parts[0] is None else parts[0][1].sum(0),
-        motions=total,
-        count=0 if parts[0] is None else len(parts[0][0]),
+        data=data.sum(0) / spread,
+        motions=total / spread,
+        count=number,
+        episodes=data / spread,
     )
 
 

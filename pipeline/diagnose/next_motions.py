@@ -1,10 +1,11 @@
 """Which motions to record next for contact: those that show best what the data could not, or tell rivals apart.
 
 An effect counts as seen if one of its usual size, times `experiment.seen_sizes`, would reach the score of its test
-with the margin of a detection limit, whatever its constants, and as told apart if every other effect of contact, fitted
-in its stead, would leave a lead that suffices. Both follow from noncentralities (`contact_information`). Each effect is
-worth the square roots of the shares of what it needs that data and motions have, at most 1; motions are chosen one
-after the other (greedily) by what they add for the effects that lack something.
+with the margin of a detection limit, and as told apart if every other effect of contact, fitted in its stead, would
+leave a lead that suffices. Both follow from noncentralities (`contact_information`), which grow with the square of the
+size. How large an effect is, is not known: its size is taken as log-uniform from that size to `SIZES` times it. The
+worth of motions is the expected number of effects that are seen then, and told apart, each counted half; motions are
+chosen one after the other (greedily).
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from .verdict import Findings
 Array = NDArray[np.float64]
 
 LIMITS = THRESHOLDS.experiment
+SIZES = 10.0
+"""Largest size of an effect for which motions are chosen, in smallest ones."""
 WORTH_TELLING = 0.8
 """Share to which the smallest visible size of an effect must fall for the report to name it."""
 MOST_MOTIONS = 3
@@ -53,20 +56,25 @@ class Question:
     rivals: frozenset[str] = frozenset()
     """Effects that have to be told apart; empty for all effects of contact."""
 
-    def shares(self, chosen: Sequence[int], more: Sequence[int]) -> tuple[Array, Array]:
+    def shares(self, chosen: list[int], more: Sequence[int], times: int = 1) -> tuple[Array, Array]:
         """Return shares (V, M) of what each effect needs to be seen, and to be told apart; 1 is enough.
 
         Args:
             chosen: Motions that count with the data.
             more: Motions (M), each of which is added alone; -1 adds none.
+            times: How often each of these is made.
         """
         seen, apart = (np.zeros((len(self.variants), len(more))) for _ in range(2))
         for channel in self.channels:
-            both = channel.data + channel.motions[list(chosen)].sum(0)
+            both = channel.data + channel.motions[chosen].sum(0)
             extra = np.stack([channel.motions[k] if k >= 0 else np.zeros_like(both) for k in more])
-            information = both + extra
+            information = both + times * extra
             for place, name in enumerate(self.names):
                 own = channel.noncentrality(information, self.sizes[place], place)
+                if channel.episodes is not None:  # without any one episode, too
+                    parts = [np.broadcast_to(one, extra.shape) for one in (*channel.episodes, *channel.motions[chosen])]
+                    for part in (*parts, extra):
+                        own = np.minimum(own, channel.noncentrality(information - part, self.sizes[place], place))
                 enough = own / _needed(channel, self.variants[place])
                 left = np.full(len(more), math.inf)
                 for other, rival in enumerate(self.names):
@@ -113,7 +121,7 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
     chosen = best_motions(question, len(motions))
     if not chosen:
         return None
-    before, after = (question.shares(some, [-1])[0][:, 0] for some in ((), chosen))
+    before, after = (question.shares(some, [-1])[0][:, 0] for some in ([], chosen))
     face = face_down(world, world.free[0])[1]
     counted = {k: chosen.count(k) for k in chosen}
     return NextMotions(
@@ -132,16 +140,21 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
 
 
 def best_motions(question: Question, count: int) -> list[int]:
-    """Return up to three of `count` motions, the most valuable first; one may come several times."""
+    """Return up to three of `count` motions, the most valuable first; one may come several times.
+
+    A motion is worth what it adds, or half of what it adds when it is made twice, where one alone proves nothing.
+    """
     chosen: list[int] = []
     worth = float(_worth(question, *question.shares(chosen, [-1]))[0])
     for _ in range(MOST_MOTIONS):
-        every = _worth(question, *question.shares(chosen, range(count)))
-        best = int(every.argmax())
-        if every[best] - worth < LIMITS.least_worth:
+        once = _worth(question, *question.shares(chosen, range(count)))
+        twice = _worth(question, *question.shares(chosen, range(count), times=2))
+        gains = np.maximum(once - worth, 0.5 * (twice - worth))
+        best = int(gains.argmax())
+        if gains[best] < LIMITS.least_worth:
             break
         chosen.append(best)
-        worth = float(every[best])
+        worth = float(once[best])
     return chosen
 
 
@@ -152,8 +165,13 @@ def _worth(question: Question, seen: Array, apart: Array) -> Array:
         if question.rivals and name not in question.rivals:
             continue
         rows = [k for k, other in enumerate(question.names) if other == name]
-        total += (np.sqrt(seen[rows].clip(0, 1)) + np.sqrt(apart[rows].clip(0, 1))).mean(0)
+        total += 0.5 * (_chance(seen[rows]) + _chance(np.minimum(seen[rows], apart[rows]))).mean(0)
     return total
+
+
+def _chance(share: Array) -> Array:
+    """Return the share of sizes, log-uniform, at which an effect has what it needs; share: that of the smallest one."""
+    return (1 + 0.5 * np.log(np.maximum(share, 1e-300)) / math.log(SIZES)).clip(0.0, 1.0)
 
 
 def _needed(channel: Channel, variant: Variant) -> float:

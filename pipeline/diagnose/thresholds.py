@@ -139,19 +139,6 @@ class VerdictThresholds:
         "in fewer episodes, tilts below it count as errors of levelling, larger ones as a force that nothing explains",
         "by argument: a degree is seen by eye",
     )
-    rest_frames: int = threshold(8, "frames", "fewest at the end of an episode that show how a body lies", BY_ARGUMENT)
-    still_rad: float = threshold(
-        0.005, "rad", "change of orientation over these frames that is rest, beside the noise", BY_ARGUMENT
-    )
-    face_rad: float = threshold(
-        0.1, "rad", "angle to the ground up to which a face lies on it", "by argument: as `most_tilt`"
-    )
-    rest_times: tuple[float, float] = threshold(
-        (0.5, 2.0),
-        "1",
-        "tilts at rest times gravity, in units of the accelerations of the flights, that show these to be tilts",
-        "by argument: the ground itself need not be level",
-    )
     consistent_p: float = threshold(
         1e-4,
         "probability",
@@ -398,9 +385,9 @@ class ExperimentThresholds:
         BY_ARGUMENT,
     )
     least_worth: float = threshold(
-        0.1,
+        0.05,
         "1",
-        "least worth of a motion that is asked for; 1 is an effect of contact seen or told apart, from nothing",
+        "least worth of a motion that is asked for, in effects of contact that it shows",
         BY_ARGUMENT,
     )
     law_margin: float = threshold(

@@ -104,13 +104,13 @@ def test_nothing_is_asked_for_where_everything_is_bounded(known: float, asked: i
         columns=((1,), (2,)),
         prior=np.ones(1),
         data=known * np.eye(3),
-        motions=np.stack([np.diag([1e4, 2e4, 1e2]), np.diag([1e4, 1e2, 1e4]), np.diag([1.0, 1.0, 1.0])]),
+        motions=np.stack([np.diag([1e4, 5e3, 1.0]), np.diag([1e4, 1.0, 5e3]), np.diag([1.0, 1.0, 1.0])]),
         count=100,
     )
     question = Question(variants=tuple(variants), names=names, sizes=(np.array([0.2]),) * 2, channels=(channel,))
     chosen = best_motions(question, 3)
     assert len(chosen) == asked
-    assert 2 not in chosen
+    assert set(chosen) == ({0, 1} if asked else set())
 
 
 def test_a_friction_that_grows_with_the_speed_is_fitted_beside_a_constant_one() -> None:
