@@ -13,7 +13,11 @@ from ...schemas import CompareResult, ErrorSummary
 from ..report.charts import decades
 
 _WIDTH, _HEIGHT = 1060, 360
+_RUNG_WIDTH = 130
+"""Width for each model, as far as the page has it: on a narrow screen the ladder of a few models is to be read."""
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60, 150, 28, 44
+_SMALLEST = 0.75
+"""Scale below which the ladder is moved sideways, not made smaller."""
 _LOWEST_MM = 0.01
 _LABEL_HEIGHT = 14
 
@@ -89,12 +93,14 @@ def ladder_svg(rungs: Sequence[Rung], zeros_mm: Mapping[str, float]) -> str:
         place = math.log(min(max(value, low), high) / low) / math.log(high / low)
         return bottom - (bottom - _TOP) * place
 
-    columns = [_LEFT + (_WIDTH - _LEFT - _RIGHT) * (k + 0.5) / len(rungs) for k in range(len(rungs))]
+    width = min(_WIDTH, _LEFT + _RIGHT + _RUNG_WIDTH * len(rungs))
+    columns = [_LEFT + (width - _LEFT - _RIGHT) * (k + 0.5) / len(rungs) for k in range(len(rungs))]
     parts = [
-        f'<svg class="chart ladder" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="errors by model">',
+        f'<svg class="chart ladder" viewBox="0 0 {width} {_HEIGHT}" style="max-width:{width}px;'
+        f'min-width:{round(_SMALLEST * width)}px" role="img" aria-label="errors by model">',
         f'<text class="title" x="{_LEFT}" y="15">translation error [mm], open loop</text>',
     ]
-    right = _WIDTH - _RIGHT
+    right = width - _RIGHT
     for power in range(round(math.log10(low)), round(math.log10(high)) + 1):
         at = y(10.0**power)
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{at:.1f}" y2="{at:.1f}"/>')

@@ -16,6 +16,8 @@ UNITS = {"time": "s", "x": "m", "y": "m", "height": "m", "heading": "deg", "spee
 """Units of the coordinates, in the order in which they are offered."""
 _MISFIT = 6
 """Index of the misfit after the components of force and torque in the world frame; those of the motion follow it."""
+_NEARLY = 0.9
+"""Share of what the best coordinate explains, from which another one explains nearly as much."""
 MOST_POINTS = 1500
 """Maximum number of points per model; more are subsampled."""
 
@@ -79,14 +81,20 @@ def _first(models: Sequence[ComparedModel], names: Sequence[str]) -> list[int]:
     """Return the indices of the quantity and the coordinate to show first.
 
     These are the component with the largest excess and the coordinate that explains most, or else the misfit and the
-    first coordinate.
+    first coordinate. A force along or across the motion is shown against the speed or the spin, if one of them explains
+    nearly as much.
     """
-    ordered = [o.coordinate for o in models[0].covariates if o.coordinate in names]
-    excess = np.array([np.square(p.acceleration / p.std) for p in models[0].wrenches if p.phase == "flight"])
-    if not ordered or not np.isfinite(excess).any():
+    known = [o for o in models[0].covariates if o.coordinate in names]
+    flying = [p for p in models[0].wrenches if p.phase == "flight"]
+    sizes = [np.concatenate((p.acceleration / p.std, [np.nan], p.in_motion / p.in_motion_std)) for p in flying]
+    excess = np.square(np.array(sizes))
+    if not known or not np.isfinite(excess).any():
         return [_MISFIT, 0]
     typical = [np.nanmedian(column) if np.isfinite(column).any() else 0.0 for column in excess.T]
-    return [int(np.argmax(typical)), names.index(ordered[0])]
+    kind = int(np.argmax(typical))
+    nearly = [o.coordinate for o in known if o.share >= _NEARLY * known[0].share]
+    moving = next((name for name in nearly if kind > _MISFIT and name in ("speed", "spin")), known[0].coordinate)
+    return [kind, names.index(moving)]
 
 
 def _thinned(points: Sequence[WrenchPoint]) -> Sequence[WrenchPoint]:

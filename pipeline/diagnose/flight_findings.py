@@ -76,6 +76,11 @@ class FlightFindings:
         return [step.best.name for step in self.steps if step.flagged and step.own_std is None]
 
     @property
+    def own(self) -> list[str]:
+        """Names of the selected effects with a value for each episode."""
+        return [step.best.name for step in self.steps if step.flagged and step.own_std is not None]
+
+    @property
     def remains(self) -> bool:
         """Whether a residual exceeds the noise beside the selected effects."""
         return is_significant(self.after) or self.repeats or self.own_law is not None
@@ -160,6 +165,11 @@ def _searched(
         names = [name for name in names if name not in better]
         others = [one for one in others if one.effect not in better]
     agreement = None if flight is None else consistency(flight, after_flight, names, prepared.groups, scatter)
+    if flight is not None and slow is not None and agreement is not None and agreement.doubtful:
+        steps, after_flight, flight = _without_contradicted(prepared, steps, after_flight, flight, scatter)
+        names = [step.best.name for step in steps if step.flagged and step.own_std is None]
+        agreement = consistency(flight, after_flight, names, prepared.groups, scatter)
+        others = [one for one in others if one.effect in names]
     left, share = _left(quick, world, after_flight, bool(names))
     return FlightFindings(
         prepared=prepared,
@@ -208,12 +218,32 @@ def _with_the_needed(
         name = step.best.name
         names = {one.best.name for one in steps if one.flagged and one.own_std is None}
         others = names - {name}
-        if name not in names or not others or ("wind" in others and not others & set(DRAGS)):
+        own = any(one.own_std is not None for one in steps)
+        if name not in names or not (others or own) or ("wind" in others and not others & set(DRAGS)):
             continue  # wind acts through a drag
         other, fitted = _without(flight, world, {name})
         if held_out_loss(fitted, other) < (1 + LIMITS.needed_share) * held_out_loss(flight, world):
             steps, world, flight = [one for one in steps if one is not step], other, fitted
     return steps, world, flight
+
+
+def _without_contradicted(
+    prepared: Prepared, steps: list[SelectionStep], world: World, flight: Segments, scatter: float
+) -> tuple[list[SelectionStep], World, Segments]:
+    """Leave out the effects whose parameters differ from episode to episode, where flights do not ask for them.
+
+    Such an effect imitates something else; where what is left without it does not exceed the noise, the others stand.
+    """
+    names = [step.best.name for step in steps if step.flagged and step.own_std is None]
+    alone = {name: consistency(flight, world, [name], prepared.groups, scatter) for name in names}
+    wrong = {name for name, found in alone.items() if found is not None and found.doubtful}
+    kept = [step for step in steps if step.flagged and step.best.name not in wrong]
+    if not wrong or not kept:
+        return steps, world, flight
+    other, fitted = _without(flight, world, wrong)
+    if is_significant(worst_omnibus(flight_windows(prepared, other), scatter)):
+        return steps, world, flight
+    return kept, other, fitted
 
 
 def _without(flight: Segments, world: World, names: set[str]) -> tuple[World, Segments]:

@@ -69,7 +69,7 @@ class OwnAccelerations:
         """
         episodes, gains = np.unique(self.episode), []
         prior = np.eye(2) / std_m_s2**2
-        own = self._by_episode()
+        own = self.by_episode()
         for number, episode in enumerate(episodes):
             mean = np.delete(own, number, 0).mean(0) if len(own) > 1 else np.zeros(2)
             mine = np.flatnonzero(self.episode == episode)
@@ -83,7 +83,7 @@ class OwnAccelerations:
 
     def law(self) -> str | None:
         """Return what the episodes' accelerations follow beyond chance; None where nothing is found."""
-        values = self._by_episode()
+        values = self.by_episode()
         if len(values) < FEWEST:
             return None
         means = {name: self._mean(vector) for name, vector in self.motion.items()}
@@ -92,7 +92,7 @@ class OwnAccelerations:
         name = min(found, key=lambda one: found[one])
         return name if len(found) * found[name] < LIMITS.repeated_p else None
 
-    def _by_episode(self) -> Array:
+    def by_episode(self) -> Array:
         """Return the acceleration (E, 2) of each episode [m/s2]."""
         found = []
         for episode in np.unique(self.episode):
@@ -107,18 +107,28 @@ class OwnAccelerations:
 
 
 def _followed_p(values: Array, vectors: Array) -> float:
-    """Return the p-value that vectors turned and scaled alike explain values (E, 2) beside a common one.
+    """Return the p-value that vectors turned and scaled alike explain values (E, 2) beside a common one."""
+    return follows(values, vectors)[0]
+
+
+def follows(values: Array, vectors: Array) -> tuple[float, float, float]:
+    """Return how values (E, 2) follow vectors (E, 2) that are turned and scaled alike.
 
     The F-test of a = m + p v + q (v turned by 90 degrees): 2 degrees of freedom against 2 E - 4.
+
+    Returns:
+        The p-value, p, and q.
     """
     common = np.tile(np.eye(2), (len(values), 1))
     followed = np.stack((vectors, vectors @ QUARTER_TURN.T), -1).reshape(-1, 2)
     flat, joint = values.reshape(-1), np.hstack((common, followed))
-    left = [float(np.linalg.lstsq(design, flat, rcond=None)[1].sum()) for design in (common, joint)]
+    alone = float(np.linalg.lstsq(common, flat, rcond=None)[1].sum())
+    slopes, left = np.linalg.lstsq(joint, flat, rcond=None)[:2]
     below = len(flat) - 4
-    if np.linalg.matrix_rank(joint) < 4 or below < 2 or left[1] <= 0:
-        return 1.0
-    return f_tail((left[0] - left[1]) / 2 / (left[1] / below), 2, below)
+    if np.linalg.matrix_rank(joint) < 4 or below < 2 or float(left.sum()) <= 0:
+        return 1.0, 0.0, 0.0
+    ratio = (alone - float(left.sum())) / 2 / (float(left.sum()) / below)
+    return f_tail(ratio, 2, below), float(slopes[2]), float(slopes[3])
 
 
 def _polarised_p(values: Array, velocity: Array) -> float:

@@ -26,6 +26,7 @@ from ..segments.slow_errors import SlowErrors
 from .effect_selection import SelectionStep
 from .evidence import Evidence
 from .own_accelerations import OwnAccelerations
+from .rest_tilts import rests_confirm
 from .score_test import ScoreTest, solved
 from .thresholds import THRESHOLDS
 
@@ -33,8 +34,9 @@ LIMITS = THRESHOLDS.verdict
 
 TILTS = ("gravity_tilt", "frame_tilt", "constant_force", "wind")
 """Effects that push across gravity, the same in all episodes: a tilt of each episode's own contains their mean."""
-PIECE_S = 0.15
-"""Length [s] of the pieces of flight between which a tilt of an episode's own may not change."""
+PIECE_S, LONGEST_S = 0.15, 60.0
+"""Length [s] of the pieces of flight between which a tilt of an episode's own may not change, half a flight where that
+is less; and one above that of any flight."""
 OWN_TILTS = ("gravity_tilt", "frame_tilt")
 """Effects of which each episode can have its own, which flight does not tell apart."""
 
@@ -54,7 +56,7 @@ def own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candidate],
     """Return what the accelerations of the flights' own are that slow errors have.
 
     A tilt has to be the same in all pieces of an episode's flights (a gust pushes in some of them), to predict each
-    piece from the others, and to follow nothing in the motion.
+    piece from the others, and to follow nothing in the motion; or the bodies have to lie on the ground as tilted.
 
     Args:
         prepared: The episodes, without slow errors as part of their noise.
@@ -68,16 +70,32 @@ def own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candidate],
         return OwnTilts("none")  # a drag in wind pushes a box that turns as if each flight were tilted
     # the noise has the slow process, but no acceleration of a flight's own
     position = slow.noise_model.position._replace(sway=0.0)
-    pieces = replace(prepared, noise_model=slow.noise_model._replace(position=position)).pieces(world, PIECE_S)
-    if pieces is None or _lasting_share(pieces, world, names[0], prepared.groups) <= LIMITS.lasting_share:
-        return OwnTilts("none")
-    accelerations = OwnAccelerations.of(
-        residual_wrenches(pieces.in_world(_bare(world))), slow.noise_model.position.level
-    )
+    swayless = replace(prepared, noise_model=slow.noise_model._replace(position=position))
+    whole = swayless.pieces(world, LONGEST_S)
+    return OwnTilts("none") if whole is None else _told(swayless, world, names[0], whole, slow)
+
+
+def _told(prepared: Prepared, world: World, name: str, whole: Segments, slow: SlowErrors) -> OwnTilts:
+    """Return what the accelerations of whole flights are, by bodies at rest, by pieces of flight, and by the motion."""
+    level, gravity = prepared.noise_model.position.level, float(world.gravity[0].norm())
+    accelerations = OwnAccelerations.of(residual_wrenches(whole.in_world(_bare(world))), level)
+    if rests_confirm(prepared, world.bodies[world.free[0]], gravity, accelerations):
+        return OwnTilts("tilts")
     std_m_s2 = slow.sway_m_s2(prepared.noise.position_m)
-    if float(accelerations.held_out_gains(std_m_s2).sum()) <= 0:
+    pieces = prepared.pieces(world, min(PIECE_S, 0.5 * _median_length_s(whole)))
+    lasting = pieces is not None and _lasting_share(pieces, world, name, prepared.groups) > LIMITS.lasting_share
+    if pieces is None or not lasting:
         return OwnTilts("none")
-    return _kind(accelerations, std_m_s2 / float(world.gravity[0].norm()))
+    by_piece = OwnAccelerations.of(residual_wrenches(pieces.in_world(_bare(world))), level)
+    if float(by_piece.held_out_gains(std_m_s2).sum()) <= 0:
+        return OwnTilts("none")
+    return _kind(accelerations, std_m_s2 / gravity)
+
+
+def _median_length_s(whole: Segments) -> float:
+    """Return the median length of flights [s]."""
+    times = whole.observations.times_s
+    return float(np.median([float(times[k, n - 1] - times[k, 0]) for k, n in enumerate(whole.lengths)]))
 
 
 def _kind(accelerations: OwnAccelerations, std_rad: float) -> OwnTilts:

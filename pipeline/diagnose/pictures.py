@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from ...schemas import DiagnoseResult, NextExperiment, NotConvergedError
 from ..physics.impulse_solver import tangent_axes
 from ..physics.rollout import simulate
 from ..physics.world import State, World
+from ..segments.candidates import without_effect
 from ..segments.prepare import Prepared, whole_flights
 from ..segments.residual_wrench import ResidualWrenches, covariates_of, motion_axes, wrench_windows
 from ..segments.segments import Segments
@@ -124,7 +125,7 @@ def pictures_of(prepared: Prepared, findings: Findings, result: DiagnoseResult) 
     if after is not None and missing is not None:
         left = _missing(after, prepared.has_orientation, missing.coordinate)
     named = [one.evidence.name for one in findings.chosen] if result.selected else []
-    drawn = [_picture(prepared, findings.world, name) for name in named]
+    drawn = [effect_picture(prepared, findings.world, name) for name in named]
     pictures = tuple(one for one in drawn if one is not None)
     throw = throw_of(findings.world, result.next_experiment)
     return Pictures(missing, left, pictures, throw, _paths(findings.world, result))
@@ -172,7 +173,7 @@ def _curves(found: ResidualWrenches, first: int, axes: Array, names: Sequence[st
     return tuple(ForceCurve(name, values[:, k], np.sqrt(spread[:, k])) for k, name in enumerate(names))
 
 
-def _picture(prepared: Prepared, world: World, name: str) -> EffectPicture | None:
+def effect_picture(prepared: Prepared, world: World, name: str) -> EffectPicture | None:
     """Return a motion with and without an effect; None for one of the measurement, and where it cannot be simulated."""
     active = next((one for one in world.effects if one.effect.name == name), None)
     if active is None or active.effect.phase == "measurement":
@@ -186,7 +187,7 @@ def _picture(prepared: Prepared, world: World, name: str) -> EffectPicture | Non
     else:
         return None
     times = torch.linspace(0.0, length_s, FRAMES).to(world.gravity)
-    without = replace(world, effects=tuple(one for one in world.effects if one is not active))
+    without = without_effect(world, name)
     try:
         places = [simulate(one, start, times).position_m[0, :, world.free[0]].double() for one in (world, without)]
     except NotConvergedError:

@@ -139,6 +139,19 @@ class VerdictThresholds:
         "in fewer episodes, tilts below it count as errors of levelling, larger ones as a force that nothing explains",
         "by argument: a degree is seen by eye",
     )
+    rest_frames: int = threshold(8, "frames", "fewest at the end of an episode that show how a body lies", BY_ARGUMENT)
+    still_rad: float = threshold(
+        0.005, "rad", "change of orientation over these frames that is rest, beside the noise", BY_ARGUMENT
+    )
+    face_rad: float = threshold(
+        0.1, "rad", "angle to the ground up to which a face lies on it", "by argument: as `most_tilt`"
+    )
+    rest_times: tuple[float, float] = threshold(
+        (0.5, 2.0),
+        "1",
+        "tilts at rest times gravity, in units of the accelerations of the flights, that show these to be tilts",
+        "by argument: the ground itself need not be level",
+    )
     consistent_p: float = threshold(
         1e-4,
         "probability",

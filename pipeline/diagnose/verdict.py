@@ -78,7 +78,7 @@ def find(
     explained = not is_significant(flown.after)
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     errors = _errors(contact, flown)
-    if flown.remains:  # what flights show may be what contact imitates
+    if flown.remains or flown.own:  # what flights show may be what contact imitates
         contact = _without_useless(contact, errors)
     verdict = _verdict(contact.chosen, flown)
     return Findings(
@@ -115,7 +115,7 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
 
 
 def _without_useless(contact: ContactFindings, errors: Mapping[str, tuple[float, float]]) -> ContactFindings:
-    """Return the findings without the effects of contact that predict held-out episodes worse than no effect does."""
+    """Return the findings without the effects of contact that hardly lower the error of held-out episodes."""
     useless = {
         one.evidence.name
         for one in contact.chosen
@@ -128,8 +128,8 @@ def _without_useless(contact: ContactFindings, errors: Mapping[str, tuple[float,
 
 
 def _predicts(errors: tuple[float, float]) -> bool:
-    """Return whether the held-out error falls, from without an effect to with it."""
-    return errors[1] < errors[0]
+    """Return whether the held-out error falls by more than an effect that is not needed lets it fall."""
+    return errors[1] < (1 - LIMITS.needed_share) * errors[0]
 
 
 def _errors(contact: ContactFindings, flown: FlightFindings) -> dict[str, tuple[float, float]]:

@@ -252,9 +252,12 @@ class Climb:
 
 
 def helps(flight: ErrorRatio | None, contact: ErrorRatio | None) -> bool:
-    """Return whether an error falls beyond chance and by `LEAST_FALL`, in flight or in contact, and neither rises."""
+    """Return whether an error falls beyond chance and by `LEAST_FALL`, in flight or in contact, and neither rises.
+
+    A rise by less than `LEAST_FALL` is none: its interval reaches below it.
+    """
     spans = [(one.ratio, one.interval_95) for one in (flight, contact) if one is not None]
-    if any(span is not None and span[0] > 1 for _, span in spans):
+    if any(span is not None and span[0] > 1 + LEAST_FALL for _, span in spans):
         return False
     return any(span is not None and span[1] < 1 and ratio <= 1 - LEAST_FALL for ratio, span in spans)
 

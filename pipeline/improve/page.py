@@ -389,9 +389,9 @@ def _judged(result: ImproveResult) -> str:
         f"The {result.episodes} episodes of split '{result.split}' were divided into {len(result.folds)} parts. For "
         "each part and each addition all parameters were fitted to the other parts, and the part was predicted. An "
         "addition stays if the error of these predictions falls by at least 2 % in flight or in contact, with a 95 % "
-        "interval of the ratio below 1, and rises beyond chance in neither. The diagnosis that proposes additions "
-        "sees the whole split, so that these intervals are a little too short; those of the test episodes are not, as "
-        "they have decided nothing."
+        "interval of the ratio below 1, and in neither rises by 2 % or more beyond chance. The diagnosis that proposes "
+        "additions sees the whole split, so that these intervals are a little too short; those of the test episodes "
+        "are not, as they have decided nothing."
     )
     short = (
         "Prediction error: the motion is cut into segments of flight and contact; the state of each is fitted to its "

@@ -90,7 +90,7 @@ def trial_words(trial: ImproveTrial) -> str:
     spans = [one.interval_95 for one in (trial.flight, trial.contact) if one is not None and one.interval_95]
     if not spans:
         return "too few episodes to tell"
-    if any(low > 1 for low, _ in spans):
+    if any(low > 1 + LEAST_FALL for low, _ in spans):
         return "makes predictions worse"
     return "may be chance" if all(high >= 1 for _, high in spans) else f"less than {LEAST_FALL:.0%}"
 

@@ -194,7 +194,9 @@ class _Contrasts:
         at = rows[:, ::bodies][item, place][..., columns] * weight
         slopes = torch.nan_to_num(jacobian[:, ::bodies][item, place][:, :, columns]) * weight[..., None]
         common, own = slopes[..., :count], slopes[..., count:]
-        own = own[..., _moving(own)]
+        other = jacobian[:, ::bodies][item, place][:, :, slice(3 - 3 * kind, 6 - 3 * kind), count:]
+        seen_there = (seen.has_orientation, seen.seen)[kind][:, :, 0][item, place] * inside
+        own = own[..., moving(own, torch.nan_to_num(other) * seen_there[:, :, None, None])]
         return _Contrasts(seen.times_s[item, place], inside, at, own, _spanned(common, own), axes)
 
     def likelihood(self, noise: CorrelatedNoise) -> float:
@@ -244,10 +246,15 @@ def _projected_log(own: Tensor) -> float:
     return 2 * float(triangle.diagonal(dim1=1, dim2=2).abs().clamp_min(1e-12).log().sum())
 
 
-def _moving(own: Tensor) -> list[int]:
-    """Return the states that move these residuals (B, n, 3, S) in every flight: those that a flight determines."""
-    size = own.square().sum((1, 2)).amin(0)
-    return torch.nonzero(size > 1e-12)[:, 0].tolist()
+def moving(own: Tensor, other: Tensor) -> list[int]:
+    """Return the states that these residuals (B, n, 3, S) determine: those that move them in every flight.
+
+    A state that moves the residuals of the other kind more is determined by these: a turn moves the tracked point of a
+    body about its centre of mass by less than its errors, and would take the place of six coefficients of a path.
+    """
+    size = own.square().sum((1, 2))
+    moves, better = size.amin(0) > 1e-12, size.sum(0) > other.square().sum((1, 2)).sum(0)
+    return torch.nonzero(moves & better)[:, 0].tolist()
 
 
 def _spanned(common: Tensor, own: Tensor) -> Tensor:

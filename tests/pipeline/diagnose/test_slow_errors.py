@@ -1,18 +1,23 @@
 """Slow errors of the tracks: they are found in whole flights, are no effect, and hide none that repeats."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.diagnose.pictures import effect_picture
+from cgwm.pipeline.diagnose.rest_tilts import rests_confirm  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.verdict import Findings, find
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import prepare, whole_flights
 from cgwm.pipeline.segments.repeated_forces import repeated_force  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.residual_wrench import ResidualWrenches
+from cgwm.pipeline.segments.slow_errors import moving  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, axis_innovations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.segmentation import Segment
 from helpers.diagnosis_data import tosses, world_with
@@ -151,6 +156,46 @@ def test_what_is_of_each_episode_s_own_is_told_from_a_law_of_its_motion(kind: st
     assert found.held_out_gains(0.3).sum() > 100
     flipped = replace(found, score=found.score * np.tile([1, -1], count * each // 2)[:, None])
     assert flipped.held_out_gains(0.3).sum() < 0
+
+
+@pytest.mark.parametrize(("level", "confirmed"), [("tilt", True), ("ground turned", True), ("chance", False)])
+def test_bodies_at_rest_tell_a_tilt_of_each_episode_from_a_force(level: str, confirmed: bool) -> None:
+    rng = np.random.default_rng(3)
+    count, frames = 10, 12
+    tilt = 0.01 * rng.standard_normal((count, 2))
+    shown = {"tilt": tilt, "ground turned": tilt @ np.array([[0.8, 0.6], [-0.6, 0.8]])}.get(level)
+    shown = 0.01 * rng.standard_normal((count, 2)) if shown is None else shown
+    # the measured frame is turned, so that a face on the ground points along (shown, 1), on either side of the box
+    turn = quat_exp(torch.as_tensor(np.stack((-shown[:, 1], shown[:, 0], np.zeros(count)), 1)))
+    turn = quat_multiply(turn, quat_exp(torch.as_tensor(rng.choice([0, np.pi], (count, 1)) * [1.0, 0, 0])))
+    quat = turn[:, None, None].expand(count, frames, 1, 4)
+    seen = SimpleNamespace(has_orientation=torch.ones(count, frames, 1), quat_wxyz=quat)
+    prepared = SimpleNamespace(
+        has_orientation=True,
+        observations=seen,
+        names=tuple("abcdefghij"),
+        airborne=torch.zeros(count, frames, dtype=torch.bool),
+        noise=SimpleNamespace(rotation_rad=1e-4),
+    )
+    values = -9.81 * tilt + 0.005 * rng.standard_normal((count, 2))
+    found = OwnAccelerations(
+        score=values, information=np.tile(np.eye(2), (count, 1, 1)), episode=np.arange(count), motion={}
+    )
+    body = world_with("cube").bodies[0]
+    assert rests_confirm(prepared, body, 9.81, found) == confirmed  # pyright: ignore[reportArgumentType]
+
+
+def test_a_state_is_determined_by_the_residuals_that_it_moves_more() -> None:
+    own, other = torch.zeros(2, 5, 3, 3), torch.zeros(2, 5, 3, 3)
+    own[..., 0], own[..., 1], other[..., 1] = 1.0, 0.1, 3.0  # the third moves nothing
+    assert moving(own, other) == [0]
+    assert moving(other, own) == [1]
+
+
+def test_a_drag_through_which_a_wind_acts_is_drawn_without_both() -> None:
+    world = world_with("ball", {"quadratic_drag": {"k": 0.1}, "wind": {"w_x": 1.0}}, ground=False)
+    prepared = prepare(world, tosses(world, 1, count=1, duration_s=0.3))
+    assert effect_picture(prepared, world, "quadratic_drag") is not None
 
 
 def test_parts_of_one_flight_are_joined_and_others_are_not() -> None:

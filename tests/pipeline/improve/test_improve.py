@@ -87,6 +87,7 @@ def test_an_addition_helps_if_one_error_falls_beyond_chance_and_none_rises() -> 
 
     falls, chance, rises = ratio(0.5, 0.4, 0.7), ratio(0.9, 0.7, 1.1), ratio(1.3, 1.1, 1.6)
     assert helps(falls, chance) and helps(None, falls)
+    assert helps(falls, ratio(1.024, 1.001, 1.053)) and not helps(falls, ratio(1.024, 1.021, 1.027))
     assert not helps(falls, rises) and not helps(chance, None) and not helps(None, None)
     assert not helps(ratio(0.99, 0.985, 0.995), None)
     assert not helps(falls.model_copy(update={"interval_95": None}), None)

@@ -14,6 +14,7 @@ from cgwm.datasets.models.model import write_model
 from cgwm.datasets.rollouts.dataset import shard_name
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.pipeline.validate import validate
+from cgwm.pipeline.validate.newton import _bent
 from cgwm.schemas import EffectModel, InputDataError, SynthesizeConfig, UsageError
 from helpers.small_model import small_model, write_small_model
 from scipy.spatial.transform import Rotation
@@ -381,6 +382,13 @@ def test_a_sample_reads_the_hashes_of_its_shards_only(good: Path, tmp_path: Path
     looked_at = [bool(validate(tmp_path / "out", sample=1, seed=seed).faults) for seed in range(8)]
     assert True in looked_at and False in looked_at
     assert validate(tmp_path / "out").faults
+
+
+def test_loads_in_a_bounce_may_be_larger_than_at_the_frames_around_it() -> None:
+    pull = np.zeros((8, 3))
+    pull[1] = [0.0, 3.0, 4.0]
+    bound = _bent(pull, np.array([False, False, False, True, True, False, False]))
+    np.testing.assert_allclose(bound, [5.0, 5.0, 0.0, 10.0, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("effect", ["linear_drag", "spin_damping", "com_offset", "gravity_scale", "constant_force"])
