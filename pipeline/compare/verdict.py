@@ -30,11 +30,7 @@ def comparison_verdict(result: CompareResult, names: Mapping[str, str]) -> str:
         # the best model against the first; if the first is the best, against the last
         other = result.models[0] if subject is not result.models[0] else last
         pair = _pair(result, subject.model, other.model)
-        sentences = [_versus(pair, subject, other, result, names)] if pair else [_alone(subject, result, names)]
-        short = _in_short(pair, subject, other, names) if pair else ""
-        if pair and short and _disagree(pair):
-            sentences = [f"Over whole episodes it is the other way round: {sentences[0]}", *sentences[1:]]
-        sentences = [short, *sentences] if short else sentences
+        sentences = _compared(pair, subject, other, result, names) if pair else [_alone(subject, result, names)]
     if result.episodes < LEAST_EPISODES:
         sentences.append(
             f"{_episodes(result.episodes)} {'is' if result.episodes == 1 else 'are'} too few to decide whether a "
@@ -75,6 +71,20 @@ def _reversed(short: ShortDifference) -> ShortDifference:
             "interval_95": None if span is None else (-span[1], -span[0]),
         }
     )
+
+
+def _compared(
+    pair: PairedDifference,
+    model: ModelComparison,
+    other: ModelComparison,
+    result: CompareResult,
+    names: Mapping[str, str],
+) -> list[str]:
+    """Return how two models differ in short predictions and over whole episodes."""
+    short, whole = _in_short(pair, model, other, names), _versus(pair, model, other, result, names)
+    if short and _disagree(pair):
+        whole = f"Over whole episodes it is the other way round: {whole}"
+    return [short, whole]
 
 
 def _disagree(pair: PairedDifference) -> bool:

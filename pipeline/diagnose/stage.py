@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,7 +188,6 @@ def report_and_findings(
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
-    tested = {evidence.name for evidence in findings.ranking}  # some beside an effect that they need
     motions = next_motions(findings.flight.prepared, findings, library)
     # motions that tell effects of contact apart are chosen by the tests that will judge them
     throw = None if motions and motions.separates else next_experiment(findings.flight.prepared, findings, throws)
@@ -210,10 +209,16 @@ def report_and_findings(
         flight_after=_flight_test(findings.flight.after),
         contact_chi2=findings.contact_chi2,
         contact_limits=tuple(_limit(one) for one in findings.limits),
-        not_tested={name: why for name, why in sorted(refused.items()) if name not in tested},
+        not_tested=_not_tested(refused, findings),
         warnings=tuple(warnings),
     )
     return document, findings
+
+
+def _not_tested(refused: Mapping[str, str], findings: Findings) -> dict[str, str]:
+    """Return why candidates were not tested; some were beside an effect that they need."""
+    tested = {evidence.name for evidence in findings.ranking}
+    return {name: why for name, why in sorted(refused.items()) if name not in tested}
 
 
 def _first_of_all(result: DiagnoseResult, useless: NotDescribed | None) -> DiagnoseResult:

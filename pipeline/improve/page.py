@@ -6,17 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ...schemas import (
-    ErrorRatio,
-    FittedParameter,
-    ImproveResult,
-    ImproveStep,
-    ImproveTest,
-    ImproveTestFigures,
-    ImproveTestStep,
-    ImproveTrial,
-    RankedEffect,
-)
+from ...schemas import ImproveResult, ImproveStep, ImproveTest, ImproveTestFigures
 from ..diagnose.page import drawn_throw
 from ..diagnose.pictures import DrawnMotion
 from ..report.page import (
@@ -33,15 +23,12 @@ from ..report.page import (
     section,
     table,
     text,
-    unit_text,
-    unit_words,
 )
 from ..report.plots import Bar, bars
-from .wording import AXES, WHY, not_added_words, remaining_words, share_words, trial_words
+from .step_section import accepted, law_words, ranking_table, ratios, rivals, step_section, tested_step, trials
+from .wording import AXES, not_added_words, remaining_words
 
 PAGE = "improve.html"
-RANKED = 6
-"""Number of candidates that are shown of a ranking."""
 _MM = 1e3
 
 
@@ -62,7 +49,7 @@ def ladder_html(result: ImproveResult, out: Path, throw: Sequence[DrawnMotion] =
         _cards(result.test),
         cautions(result.warnings),
         _overview(result, ladder),
-        *(_step(number, step, result.test) for number, step in enumerate(ladder, 1)),
+        *(step_section(number, step, result.test) for number, step in enumerate(ladder, 1)),
         *(_remains(step, result) for step in ends),
         _measure_next(result.steps, throw),
         _commands(result, out),
@@ -111,14 +98,14 @@ def _overview(result: ImproveResult, ladder: Sequence[ImproveStep]) -> str:
     for k, name in enumerate(result.models):
         one = tested.get(name)
         added = "as fitted" if k == 0 else ", ".join(ladder[k - 1].added)
-        judged = None if k == 0 else _accepted(ladder[k - 1])
-        tests = _tested(test, name, result.models[k - 1]) if k else None
+        judged = None if k == 0 else accepted(ladder[k - 1])
+        tests = tested_step(test, name, result.models[k - 1]) if k else None
         rows.append(
             [
                 text(name),
                 text(added),
-                _ratios(judged),
-                _ratios(tests),
+                ratios(judged),
+                ratios(tests),
                 fixed(one.translation_error_m.median if one else None, 1, _MM),
                 fixed(one.state_fitted_residual_m.median if one and one.state_fitted_residual_m else None, 1, _MM),
                 number(one.flight if one else None),
@@ -146,178 +133,15 @@ def _errors_chart(kind: str, tested_: Mapping[str, ImproveTestFigures], last: st
     return paragraph(f"Prediction error of the test episodes in {kind}:") + bars(rows) if rows else ""
 
 
-def _accepted(step: ImproveStep) -> ImproveTrial | None:
-    """Return the trial of the addition that a step has made."""
-    return next((one for one in step.tried if one.helps and one.effects == step.added), None)
-
-
-def _tested(test: ImproveTest | None, model: str, than: str) -> ImproveTestStep | None:
-    steps = () if test is None else test.steps
-    return next((one for one in steps if (one.model, one.than) == (model, than)), None)
-
-
-def _ratios(found: ImproveTrial | ImproveTestStep | None) -> str:
-    """Return the ratios in flight and in contact with their intervals."""
-    if found is None:
-        return "–"
-    known = [(kind, one) for kind, one in (("flight", found.flight), ("contact", found.contact)) if one is not None]
-    return "<br>".join(f"{kind} {_ratio(one)}" for kind, one in known) or "–"
-
-
-def _ratio(ratio: ErrorRatio) -> str:
-    span = ratio.interval_95
-    return number(ratio.ratio) + (f" ({number(span[0])} to {number(span[1])})" if span else " (no interval)")
-
-
-def _step(number_: int, step: ImproveStep, test: ImproveTest | None) -> str:
-    """Return the section of a step that has added something."""
-    return section(
-        f"Step {number_}: {', '.join(step.added)}",
-        paragraph(f"What {step.model} lacks. {step.sentence}"),
-        *map(paragraph, [*share_words(step), *not_added_words(step)]),
-        _unseen(_accepted(step), _tested(test, step.next_model or "", step.model)),
-        _parameters(step.next_parameters),
-        "<h3>Evidence</h3>",
-        _chart(step),
-        _ranking(step),
-        _rivals(step),
-        _trials(step),
-        _law(step),
-    )
-
-
-def _unseen(judged: ImproveTrial | None, tested_: ImproveTestStep | None) -> str:
-    """Return the table of prediction errors on unseen episodes before and after a step."""
-    rows = [
-        [
-            text(where),
-            kind,
-            number(ratio.before),
-            number(ratio.after),
-            _ratio(ratio),
-            f"{ratio.better} of {ratio.episodes}",
-        ]
-        for where, found in (("cross-validated", judged), ("test episodes", tested_))
-        for kind in ("flight", "contact")
-        if found is not None and (ratio := getattr(found, kind)) is not None
-    ]
-    header = ["unseen episodes", "in", "error before [noise]", "error after [noise]", "ratio (95 %)", "smaller in"]
-    return table(header, rows, (2, 3)) if rows else ""
-
-
-def _parameters(parameters: Sequence[FittedParameter]) -> str:
-    rows = [
-        [
-            f"<code>{text(p.name)}</code>",
-            number(p.estimate),
-            f"{number(p.interval_95[0])} to {number(p.interval_95[1])}" if p.interval_95 else "–",
-            unit_text(p.unit),
-        ]
-        for p in parameters
-    ]
-    return table(["parameter", "estimate", "95 % interval", "unit"], rows, (1, 2)) if rows else ""
-
-
-def _chart(step: ImproveStep) -> str:
-    """Return the chart of how much better the best candidates describe flights; empty where none was refitted."""
-    judged = sorted((e for e in step.ranking if e.delta_bic is not None), key=lambda e: e.delta_bic or 0.0)[:RANKED]
-    if not judged or (judged[0].delta_bic or 0.0) >= 0:
-        return ""
-    words = (
-        "How much better flights are described with each candidate alone, or beside the ones named before it: the "
-        "fall of BIC, twice the rise of the log-likelihood less a charge for each fitted number. A difference of 10 "
-        "is strong evidence for the longer bar."
-    )
-    rows = [
-        Bar(name=e.effect, value=-e.delta_bic, words=number(-e.delta_bic), strong=e.effect in step.selected)
-        for e in judged
-        if e.delta_bic is not None
-    ]
-    return paragraph(words) + bars(rows)
-
-
-def _ranking(step: ImproveStep) -> str:
-    shown = [e for e in step.ranking if e.effect in step.selected]
-    shown += [e for e in step.ranking if e not in shown][: max(RANKED - len(shown), 0)]
-    rows = [
-        [
-            text(entry.effect),
-            text(", ".join(entry.acts_in)),
-            f"{entry.score_p:.2g}".replace("-", "−") if entry.score_p > 0 else "&lt; 1e−300",
-            number(entry.delta_bic),
-            f"{fixed(entry.cv_error_before_m, 2, _MM)} → {fixed(entry.cv_error_after_m, 2, _MM)}"
-            if entry.cv_error_after_m is not None
-            else "–",
-            _gain(entry),
-            "; ".join(f"{text(p.name)} = {number(p.estimate)} ± {number(p.std_error, 2)}{unit_words(p.unit)}"
-                      for p in entry.parameters[:3]),
-        ]
-        for entry in shown
-    ]  # fmt: skip
-    if not rows:
-        return paragraph("No candidate was tested.", "soft")
-    strong = [k for k, entry in enumerate(shown) if entry.effect in step.selected]
-    header = ["candidate", "acts in", "p-value", "change of BIC", "held-out error [mm]", "held-out gain [nats]"]
-    return table([*header, "estimate"], rows, (2, 3), strong)
-
-
-def _gain(entry: RankedEffect) -> str:
-    """Return the rise of the log-likelihood of held-out episodes, with its interval."""
-    if entry.held_out_nats is None:
-        return "–"
-    span = entry.held_out_nats_95
-    return _nats(entry.held_out_nats) + (f" ({_nats(span[0])} to {_nats(span[1])})" if span else "")
-
-
-def _nats(value: float) -> str:
-    return number(value) if abs(value) >= 1 else fixed(value + 0.0, 2)
-
-
-def _rivals(step: ImproveStep) -> str:
-    if not step.selected:
-        return ""
-    if not step.aliases:
-        return paragraph(f"No rival: no other candidate explains these data as well as {listed(step.selected)}.")
-    said = [f"These data cannot tell {one[0]} from {' or '.join(one[1:])}." for one in step.aliases]
-    return paragraph(" ".join(said))
-
-
-def _trials(step: ImproveStep) -> str:
-    if not step.tried:
-        return ""
-    rows = [
-        [
-            text(", ".join(trial.effects)),
-            text(WHY[trial.why]),
-            _ratios(trial),
-            text(trial_words(trial)),
-        ]
-        for trial in step.tried
-    ]
-    header = ["tried", "why", "error after / before, unseen", "outcome"]
-    return "<h3>Tried on unseen episodes</h3>" + table(header, rows, strong=_helped(step))
-
-
-def _helped(step: ImproveStep) -> list[int]:
-    return [k for k, trial in enumerate(step.tried) if trial.helps and trial.effects == step.added]
-
-
-def _law(step: ImproveStep) -> str:
-    law = step.residual_law
-    if law is None or not law.terms:
-        return ""
-    terms = ", ".join(f"{number(t.coefficient)} ± {number(t.std_error, 2)} {t.unit} [{t.term}]" for t in law.terms)
-    return paragraph(f"Law of the residual force, by regression: {terms}. What is left of it has a mean chi2 of "
-                     f"{number(law.left_chi2)} (1: noise).")  # fmt: skip
-
-
 def _remains(step: ImproveStep, result: ImproveResult) -> str:
     """Return the section of the diagnosis to which nothing was added."""
     pieces = [paragraph(f"Diagnosis of {step.model}. {step.sentence}")]
     if result.refusal:
         pieces.append(paragraph(f"It could not be diagnosed again: {result.refusal}"))
     pieces += [*map(paragraph, [*not_added_words(step), *remaining_words(step)]), _sizes(step)]
-    return section("What remains", *pieces, _rivals(step), _law(step), _trials(step), _ranking(step), _limits(step))
+    return section(
+        "What remains", *pieces, rivals(step), law_words(step), trials(step), ranking_table(step), _limits(step)
+    )
 
 
 def _sizes(step: ImproveStep) -> str:

@@ -15,6 +15,8 @@ from ...schemas import (
     BodyModel,
     ContactParameters,
     FitFile,
+    FittedParameter,
+    Ground,
     InputDataError,
     ModelFile,
     PhysConfig,
@@ -171,16 +173,12 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     correlations = [block for block in file.correlations if not fresh & set(block.parameters)]
     added = (SCALE,) if any(p.name.startswith(f"{SCALE}.") for p in found.parameters) else ()
     effects = with_effects(file.effects, added)
-    ground = file.ground
-    earlier_m = next((p.estimate for p in kept if p.name == GROUND and p.state == "fitted"), None)
-    offset_m = earlier_m if found.ground_offset_m is None else found.ground_offset_m
-    if ground is not None and offset_m is not None:
-        ground = ground.model_copy(update={"offset_m": offset_m})
+    own_values, spread = ({}, {}) if found.effects is None else (found.effects.own_values, found.effects.spread)
     return file.model_copy(
         update={
             "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),
             "contact": found.contact,
-            "ground": ground,
+            "ground": _with_offset(file.ground, kept, found),
             "parameters": (*found.parameters, *kept),
             "correlations": (*found.correlations, *correlations),
             "effects": fitted_effects(
@@ -188,14 +186,21 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
                 {e.name: effect_of(e).name for e in effects},
                 found.parameters,
                 found.constants,
-                {} if found.effects is None else found.effects.own_values,
-                {} if found.effects is None else found.effects.spread,
+                own_values,
+                spread,
             ),
             "choice": found.record.choice,
             "measurement_std": {"position_m": found.noise.position_m, "rotation_rad": found.noise.rotation_rad},
             "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
         }
     )
+
+
+def _with_offset(ground: Ground | None, kept: Sequence[FittedParameter], found: PhysicsFit) -> Ground | None:
+    """Return the ground at the fitted height, or at one that an earlier fit has found."""
+    earlier_m = next((p.estimate for p in kept if p.name == GROUND and p.state == "fitted"), None)
+    offset_m = earlier_m if found.ground_offset_m is None else found.ground_offset_m
+    return ground if ground is None or offset_m is None else ground.model_copy(update={"offset_m": offset_m})
 
 
 def _with_mass(bodies: Sequence[BodyModel], world: World) -> tuple[BodyModel, ...]:

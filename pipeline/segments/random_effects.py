@@ -181,25 +181,32 @@ def _batch(
     after_s: float,
 ) -> tuple[Observations, NDArray[np.bool_], tuple[Tensor, Tensor]]:
     """Return the windows, which of them are ends of episodes, and the standard deviations of their rows (B, F, 1)."""
-    every, windows, contact = windows_of(world, episodes, None, after_s)
-    picked = every
+    picked, windows, contact = windows_of(world, episodes, None, after_s)
+    every = picked
     if after_s == 0:
-        windows = [(a, b if np.isinf(at) else at - 1e-6) for (a, b), at in zip(windows, contact, strict=True)]
-        # an episode that begins in contact has no flight
-        some = [k for k, (a, b) in enumerate(windows) if b > a]
-        picked, windows, contact = [every[k] for k in some], [windows[k] for k in some], [contact[k] for k in some]
-    ends = [False] * len(picked)
+        picked, windows, contact = _flights(picked, windows, contact)
+    ends = np.zeros(len(picked), dtype=bool)
     if not flying:
         last = [max(float(track.time_s[-1]) for track in tracks.values()) for _, tracks in every]
-        windows, ends = [*windows, *((t - REST_S, t + 1e-9) for t in last)], [*ends, *(True for _ in last)]
-        picked, contact = [*picked, *every], [*contact, *(np.inf for _ in last)]
+        windows = [*windows, *((t - REST_S, t + 1e-9) for t in last)]
+        picked, contact = [*picked, *every], [*contact, *[np.inf] * len(last)]
+        ends = np.concatenate((ends, np.ones(len(last), dtype=bool)))
     batch = Observations.of(world, picked, windows)
     # model error is added after the first contact; flight and the rest at the end have the tracks' noise alone
     free = batch.times_s < torch.tensor(contact)[:, None].to(batch.times_s)
     free = free.repeat_interleave(len(batch.free), 1)[..., None]
     rough = [float(np.hypot(e, sigma)) for e, sigma in zip(MODEL_ERROR, noise, strict=True)]
     stds = [torch.where(free, fine, coarse).to(world.gravity) for fine, coarse in zip(noise, rough, strict=True)]
-    return batch, np.array(ends), (stds[0], stds[1])
+    return batch, ends, (stds[0], stds[1])
+
+
+def _flights(
+    episodes: Sequence[Episode], windows: Sequence[tuple[float, float]], contact: Sequence[float]
+) -> tuple[list[Episode], list[tuple[float, float]], list[float]]:
+    """Return episodes with their windows [s] up to the first contact [s], without those that begin in contact."""
+    cut = [(a, b if np.isinf(at) else at - 1e-6) for (a, b), at in zip(windows, contact, strict=True)]
+    some = [k for k, (a, b) in enumerate(cut) if b > a]
+    return [episodes[k] for k in some], [cut[k] for k in some], [contact[k] for k in some]
 
 
 @dataclass(frozen=True)

@@ -114,35 +114,43 @@ def fit_with_effects(
     return replace(found, warnings=(*found.warnings, *warnings))
 
 
-def _require_needs(world: World, episodes: Sequence[Episode]) -> None:
-    """Refuse effects that need what the world or the episodes do not have."""
+_NEEDS = {
+    "ground": "a ground in the manifest",
+    "contact": "something to touch",
+    "spin": "measured orientations or spins",
+    "orientation": "measured orientations",
+    "driven": "a driven body",
+}
+"""What effects may need, in words."""
+
+
+def _present(world: World, episodes: Sequence[Episode]) -> frozenset[str]:
+    """Return which of the needs of effects a world and episodes meet."""
     free = {body.name for body in world.bodies if body.free}
     measured = [track for _, tracks in episodes for name, track in tracks.items() if name in free]
     turned = any(track.quat_wxyz is not None for track in measured)
     spun = any(track.omega_body_rad_s is not None for track in measured)
-    has = {
+    met = {
         "ground": world.ground_normal is not None,
         "contact": world.ground_normal is not None or len(world.bodies) > 1,
         "spin": turned or spun,
         "orientation": turned,
         "driven": any(body.motion == "driven" for body in world.bodies),
     }
-    words = {
-        "ground": "a ground in the manifest",
-        "contact": "something to touch",
-        "spin": "measured orientations or spins",
-        "orientation": "measured orientations",
-        "driven": "a driven body",
-    }
-    for active in world.effects:
-        effect = active.effect
-        for need in effect.needs:
-            if not has.get(need, True):
-                raise InputDataError(
-                    f"the effect '{effect.name}' needs {words[need]}, and this capture has none.",
-                    todo="add it to the capture, or leave the effect out of --effects.",
-                )
-        if has["driven"] and effect.phase == "measurement" and "driven" not in effect.needs:
+    return frozenset(need for need, is_met in met.items() if is_met)
+
+
+def _require_needs(world: World, episodes: Sequence[Episode]) -> None:
+    """Refuse effects that need what the world or the episodes do not have."""
+    present = _present(world, episodes)
+    for effect in (active.effect for active in world.effects):
+        lacking = next((need for need in effect.needs if need in _NEEDS and need not in present), None)
+        if lacking is not None:
+            raise InputDataError(
+                f"the effect '{effect.name}' needs {_NEEDS[lacking]}, and this capture has none.",
+                todo="add it to the capture, or leave the effect out of --effects.",
+            )
+        if "driven" in present and effect.phase == "measurement" and "driven" not in effect.needs:
             raise InputDataError(
                 f"the effect '{effect.name}' with a driven body: the body's track is its command, and is distorted by "
                 "the same measurement, which a fit cannot correct yet.",

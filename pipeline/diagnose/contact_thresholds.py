@@ -1,0 +1,203 @@
+"""Thresholds of the contact tests of `cgwm diagnose`; `thresholds` says what is stated of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..segments.thresholds import BY_ARGUMENT, threshold
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlidingThresholds:
+    """An effect of contact is named in sliding."""
+
+    score: float = threshold(
+        220.0,
+        "chi2",
+        "score from which an effect with one parameter is named",
+        "14 large effects and 13 nulls of development (nulls at most 170)",
+        "wrong names reached 165; for 31 of 36 missed development effects the largest score that the data allow is "
+        "below this threshold",
+        (0, 13),
+    )
+    explained: float = threshold(
+        0.5, "1", "share of the excess of chi2 that a named effect explains", "as `score`", "see `score`"
+    )
+    few_parameters: int = threshold(
+        1, "parameters", "an effect with more needs `score_flexible`", "as `score_flexible`"
+    )
+    score_flexible: float = threshold(
+        400.0,
+        "chi2",
+        "score of an effect with more parameters, or next to an effect of flight",
+        "development nulls: friction map at most 270, friction by direction 240",
+        "report3 to report4: false names of cubes 3 of 100, then 0 of 100; report4: friction against spinning named "
+        "friction by direction (827)",
+        (0, 100),
+    )
+    score_sure: float = threshold(
+        80.0,
+        "chi2",
+        "lower score for an effect that explains at least `share_sure`",
+        "development: false ones reached 165 at a share of 0.69, any share up to 50, and (friction by direction with "
+        "a drag in wind) 179 at a share of 0.94",
+        "report5: 2 of 200 nulls with scores of 81 and 101; `braked_otherwise` has excluded the second since",
+        (2, 200),
+    )
+    share_sure: float = threshold(
+        0.78, "1", "see `score_sure`; also needed where flight is not explained", "as `score_sure`", "see `score_sure`"
+    )
+    many_parameters: int = threshold(
+        4, "parameters", "`score_sure` does not apply to an effect with more: a friction map can fit almost anything"
+    )
+    least_size: float = threshold(
+        0.3,
+        "usual sizes",
+        "an effect whose parameters all are below it is not named",
+        "by argument: engines differ by as much",
+        "with `score_flexible`: 3 of 100 cubes on report3, 0 of 100 on report4",
+    )
+    without_best: float = threshold(
+        80.0,
+        "chi2",
+        "next to an effect of flight, chi2 must fall by this much in other episodes than the best one",
+        "report4 and report5: false ones 18 and 33 (of scores of 1,044 and 823), true ones 114 to 34,000",
+        "one true effect (26) became silent; on fresh seeds not measured alone",
+    )
+    lead: float = threshold(12.0, "chi2", "another effect within this score is not separable")
+    lead_share: float = threshold(0.1, "1", "another effect within this share of the best score is not separable")
+    misled: float = threshold(
+        165.0,
+        "chi2",
+        "nor is one whose score is lower by less than this (the largest score of a false effect) and that explains "
+        "`rival_share`",
+        "development, report3",
+        "named as a near relative: 3 of 30 on report3, 0 of 30 on report4, where 2 were `not_separable`",
+    )
+    rival_share: float = threshold(
+        0.5,
+        "1",
+        "explained share of a rival, as a fraction of the best one's; see `misled`",
+        "as `misled`",
+        "see `misled`",
+    )
+    braked_otherwise: tuple[str, ...] = threshold(
+        ("torsional_friction",),
+        "effects",
+        "not named below `score_flexible` where a friction map explains the same: engines differ in the spin of a "
+        "sliding body",
+        "report4 to report6: 3 of 4 such names were false (101 to 260)",
+        "the fourth, true one is silent, too",
+    )
+    flight_tells_m_s2: float = threshold(
+        0.3,
+        "m/s2",
+        "where flights could not have shown a force of this size, effects in flight are candidates in sliding, too",
+        "by argument: a tenth of usual friction",
+        "development: a drag on a rolling ball was `rolling_resistance` in 2 of 2 cases before the rule, in none since",
+    )
+    surplus_sigmas: float = threshold(
+        3.0,
+        "sigma",
+        "no candidate is fitted where even a chi2 this far below its expectation would leave the score too low",
+        BY_ARGUMENT,
+    )
+    close_share: float = threshold(
+        0.3, "1", "after the first steps only candidates with this share of the best gain are followed"
+    )
+    converged: float = threshold(
+        3.0,
+        "chi2",
+        "a fit that falls by less in a pass of steps has converged",
+        "by argument: a quarter of `lead`",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImpactThresholds:
+    """An effect of contact is named in impacts of a ball."""
+
+    score: float = threshold(
+        6.0,
+        "chi2",
+        "score from which an effect is named",
+        "development: 30 balls without an effect at most 4.1 (size 0.26) and 2.7 (0.33)",
+        "0 of 30 nulls of development; named 14 of 16 effects of restitution, rolling and spinning, none of 16 of "
+        "friction and adhesion. Reports 4 to 8: restitution by speed named in 2 of 1,000 nulls",
+        (2, 1000),
+    )
+    size: float = threshold(0.35, "usual sizes", "size from which an effect is named", "as `score`", "see `score`")
+    explained: float = threshold(0.5, "1", "share of the excess of chi2 that it explains", "as `score`", "see `score`")
+    gain_t: float = threshold(1.0, "standard errors", "mean gain of held-out episodes", "as `score`", "see `score`")
+    lead: float = threshold(6.0, "chi2", "another effect within this score is not separable")
+    lead_share: float = threshold(0.1, "1", "another effect within this share of the best score is not separable")
+    shown: float = threshold(
+        1.0, "chi2", "an effect of usual size must change the impacts by this much, or they do not test it"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrictionThresholds:
+    """Friction of sliding against friction of impacts: adhesion is named."""
+
+    spread: float = threshold(
+        0.13,
+        "logarithm",
+        "difference of the two frictions that counts as the contact model's error",
+        "14 cubes without an effect: 0.13 root mean square, at most 0.33",
+        "one engine only",
+    )
+    score: float = threshold(
+        8.0,
+        "chi2",
+        "discrepancy from which effects are fitted, and score from which one is named",
+        "development: without an effect at most 6, with one 13 to 29",
+        "0 of 14 nulls; 4 of 4 large adhesions of cubes; small ones (3 m/s2) are missed",
+        (0, 14),
+    )
+    resolved: float = threshold(
+        0.75, "1", "share of the discrepancy that a named effect must remove", "as `score`", "see `score`"
+    )
+    lead: float = threshold(6.0, "chi2", "another effect within this score is not separable")
+    fewest: int = threshold(6, "segments", "fewest segments with impacts that show their friction")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentsThresholds:
+    """An effect of contact is named under the model's contact law."""
+
+    own_share: float = threshold(
+        0.1,
+        "widths of the prior",
+        "standard deviation of each contact's own friction, contact time and damping: no law of contact is exact, and "
+        "what such deviations explain is no evidence",
+    )
+    score: float = threshold(
+        22.0,
+        "chi2",
+        "score of an effect that sliding cannot show",
+        "41 nulls of development: at most 18.9",
+        "0 of 41 nulls of the first report (at most 7.6); 17 of 19 contact effects were missed by this test alone",
+        (0, 41),
+    )
+    gain_t: float = threshold(
+        1.0, "standard errors", "mean gain of held-out episodes of a named effect", "as `score`", "see `score`"
+    )
+    agreed_score: float = threshold(
+        40.0, "chi2", "score where sliding segments can detect the effect: it must rank first there, with this score"
+    )
+    alone_score: float = threshold(
+        120.0,
+        "chi2",
+        "score where there are no sliding segments that could confirm the effect",
+        "friction by direction has reached 113 where there was none",
+    )
+    in_impacts_alone: tuple[str, ...] = threshold(("velocity_restitution",), "effects", "what sliding cannot show")
+    lead_share: float = threshold(0.5, "1", "another effect within this share of the best score is not separable")
+    confirmed: float = threshold(2.0, "standard errors", "distance from zero that a refit must leave")
+    separate_chi2: float = threshold(
+        12.0, "chi2", "contact rules out an equal of flight that is worse by more than this: odds of 400", BY_ARGUMENT
+    )
+    separate_t: float = threshold(
+        1.5, "standard errors", "and whose mean difference between episodes is above this", BY_ARGUMENT
+    )
