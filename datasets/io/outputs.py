@@ -41,7 +41,7 @@ FileKind = Literal[
 
 _DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
 
-_REPEATABLE = frozenset({"MJCF file", "glTF file", "splat file", "effect template"})
+_REPEATABLE = frozenset({"MJCF file", "glTF file", "splat file", "effect template", "index"})
 
 _SYSTEM_FILES = re.compile(
     r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|pending|replaced)-.*)"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from ...datasets.io.progress import note
 from ..physics.world import World
 from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
@@ -74,9 +75,12 @@ def find(
         candidates: All candidates.
         tests: The contact tests, in the order in which they run.
     """
+    note("diagnose: flights")
     flown = flight_findings(prepared, world, candidates)
+    note("diagnose: contacts")
     explained = not is_significant(flown.after)
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
+    note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
     if flown.remains or flown.own:  # what flights show may be what contact imitates
         contact = _without_useless(contact, errors)

@@ -22,6 +22,7 @@ from ...datasets.exports.splat_files import in_world, write_splat_files
 from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
 from ...datasets.io.outputs import DirectoryKind, FileKind, may_repeat, reads, refuse_output
+from ...datasets.io.progress import note
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
@@ -172,6 +173,7 @@ def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tu
     if not LEAST_DURATION_S <= options.duration_s <= MOST_DURATION_S:
         raise UsageError(f"--duration {options.duration_s:g} s.", f"{LEAST_DURATION_S:g} to {MOST_DURATION_S:g} s.")
     model = _simulated(thing)
+    note("export: the same motion in MuJoCo")
     start = start_of(model, options.seed, options.duration_s)
     text = write_mjcf(model, keyframe=keyframe_of(start), source=f"cgwm, of {model.file.provenance.capture}")
     away = resimulate(model, text, start, options.duration_s)

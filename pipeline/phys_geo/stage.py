@@ -9,6 +9,7 @@ from dataclasses import replace
 from ...datasets.capture.cameras import require_metric
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.video import video_info
+from ...datasets.io.progress import note
 from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
 from ...schemas import (
@@ -149,6 +150,7 @@ def _with_appearance(model: Model, capture: Capture, split: str, config: PhysCon
     from .images.lighting_fit import learn_appearance
     from .images.video_exposure import estimate_exposures
 
+    note("phys-geo: exposure and light")
     exposures = estimate_exposures(model, capture, split, config.device)
     model = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
     # with images alone measured tracks are not used

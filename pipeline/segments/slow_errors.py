@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
+from ...datasets.io.progress import note
 from ..physics.world import World
 from ..trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel
 from ..trajectories.segmentation import Segment
@@ -99,6 +100,7 @@ def slow_errors(prepared: Prepared, world: World, variants: Sequence[Variant]) -
     if len({item.episode for item in items}) < LIMITS.least_episodes:
         return None
     chosen = np.linspace(0, len(items) - 1, min(len(items), FLIGHTS)).round().astype(int)
+    note(f"slow errors of the tracks: {len(chosen)} whole flights")
     return _of_flights(prepared, world, variants, [items[k] for k in chosen])
 
 

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from ...datasets.io.progress import note
 from ...datasets.shapes.ply import Splats
 from ...schemas import Body, InputDataError, Pose, SplatConfig
 from ..geometry.primitives import shape_mass_properties, shape_volume
@@ -57,12 +58,15 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
             "add one of them.",
         )
     T_world_body = _pose_matrix(body.photo_pose or Pose())
+    if masked:
+        note(f"{body.name}: shape from {len(masked)} photos")
     solid = _solid(stage, index, body, masked, T_world_body)
     world = None if solid is None else _fit_spheres(stage, index, body, solid)
     if body.photo_pose is None and body.shape is None and world is not None:
         T_world_body = np.eye(4)
         T_world_body[:3, 3] = world.means.double().mean(0).cpu().numpy()
     T_body_world = np.linalg.inv(T_world_body)
+    note(f"{body.name}: colliding spheres")
     collision, distance, mass_properties = _contact_properties(stage, body, solid, T_body_world)
     visual = None
     if world is not None and solid is not None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ...datasets.capture.cameras import posed
 from ...datasets.capture.capture import Capture
+from ...datasets.io.progress import note
 from ...datasets.shapes.ply import Splats
 from ...schemas import CamerasFile, InputDataError, SplatConfig, UsageError
 from ..geometry.spheres import Spheres
@@ -104,6 +105,7 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
 def _checked(stage: Stage, bodies: list[Spheres], scene: Spheres | None) -> dict[str, bytes]:
     """Record the errors on held-out photos; return their contact sheet and the turntable film by file name."""
     config, pictures = stage.config, {}
+    note("sg-gs: held-out photos")
     held_out = look(stage.test, bodies, scene, stage.spread, poses=config.refine_poses)
     if config.exposure:
         stage.record["exposure_gain_rgb"] = stage.exposures.record()

@@ -189,6 +189,17 @@ def test_a_link_to_an_input_is_an_input(things: Path) -> None:
         synthesize(things / "model", things / "link", TINY, overwrite=True)
 
 
+def test_an_index_typed_twice_is_written_again_and_another_one_refused(things: Path) -> None:
+    words = ["merge", str(things / "shards"), "--out", str(things / "joined.h5")]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    written = (things / "joined.h5").read_bytes()
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert (things / "joined.h5").read_bytes() == written
+    other = [*words[:1], str(things / "dataset"), *words[2:]]
+    assert CliRunner().invoke(app, other).exit_code == 2
+    assert (things / "joined.h5").read_bytes() == written
+
+
 def test_an_import_typed_twice_is_kept_and_another_one_refused(things: Path) -> None:
     words = ["import", "csv", str(things / "csv"), "--out", str(things / "twice")]
 

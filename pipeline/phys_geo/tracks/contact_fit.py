@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ....datasets.capture.tracks import Episode, Track
+from ....datasets.io.progress import note
 from ....schemas import FitChoice, InputDataError, PhysConfig
 from ...optimization.importance_sampling import episode_covariance
 from ...physics.effects import ActiveEffect, load_effect
@@ -106,6 +107,7 @@ def fit_physics(
         InputDataError: If the mass distribution is asked for, and the tracks do not identify it.
     """
     _require_short_steps(config.step_s)
+    note(f"phys-geo: motion of {len(episodes)} episode{'' if len(episodes) == 1 else 's'}")
     data = _FitData.of(world, episodes, noise)
     earlier = earlier or EarlierEstimates()
     ready = _fitted_before(world, data, config, warm_started, groups, earlier)
@@ -232,6 +234,7 @@ def _fitted_before(
         # a scale alone is known far better than it matters from the episodes of the search
         only_scale = [active.effect.name for active in world.effects] == [SCALE]
         episodes = data.searched if only_scale else data.episodes
+        note(f"phys-geo: {', '.join(active.effect.name for active in world.effects)}")
         effects = _effects_beside(at, episodes, [] if data.airborne else start, data.noise, groups, earlier)
     if effects is not None:
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)

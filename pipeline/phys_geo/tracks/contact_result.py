@@ -17,6 +17,7 @@ from ...optimization.uncertainty import correlation_of
 from ...physics.contact_law import restitution
 from ...physics.parameters import CONTACT_PARAMETERS, DAMPING_RATIO, GROUND_SHIFT, Parameter
 from ...physics.world import State, World
+from ...report.page import listed
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings, fitted_parameter
 from ...trajectories.track_noise import Noise
@@ -198,6 +199,16 @@ class PhysicsFit:
     """Correlations of the contact parameters, then of those of effects and of the mass distribution."""
 
 
+def _unseen_warning(unseen: Sequence[FittedParameter]) -> list[str]:
+    """Return what would reveal the parameters that data do not show; empty where they show all."""
+    if not unseen:
+        return []
+    if len(unseen) == 1:
+        return [f"{unseen[0].name} is not observable in these data; {unseen[0].note}."]
+    notes = "; ".join(p.note.removesuffix(" would reveal it") for p in unseen)
+    return [f"{listed([p.name for p in unseen])} are not observable in these data; to reveal them: {notes}."]
+
+
 def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: FitRecord) -> PhysicsFit:
     """Return the stage's result from an estimate of the contact parameters.
 
@@ -218,7 +229,7 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
     fitted = [_kept(estimate.kept[p.name]) if p.name in estimate.kept else p for p in fitted]
     value = {p.name: p.estimate for p in fitted}
     contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
-    warnings += [f"{p.name} is not observable in these data; {p.note}." for p in fitted if p.state == "not_observable"]
+    warnings += _unseen_warning([p for p in fitted if p.state == "not_observable"])
     if record.episodes < ENOUGH_EPISODES:
         warnings.append(
             f"with fewer than {ENOUGH_EPISODES} episodes the intervals assume {_interval_assumption(record.shooting)}"

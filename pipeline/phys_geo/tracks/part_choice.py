@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from ....datasets.capture.tracks import Episode
+from ....datasets.io.progress import note
 from ....schemas import FitChoice, HeldOutFall, PhysConfig
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.effects.registry import FLIGHT_ALIASES
@@ -63,6 +64,7 @@ def choose_parts(world: World, episodes: Sequence[Episode], noise: Noise, config
     open_parts = _open_parts(world, config)
     if not open_parts or len(tosses) < LEAST_EPISODES:
         return None
+    note(f"phys-geo: which of {', '.join(open_parts)} predict held-out episodes")
     return _Comparison.of(world, tosses, noise, asked_parts(config)).choice(open_parts)
 
 
