@@ -23,6 +23,8 @@ from ...schemas import (
     FlightTest,
     InputDataError,
     LawTerm,
+    NextExperiment,
+    NextMotions,
     NotDescribed,
     RankedEffect,
     ResidualLaw,
@@ -189,8 +191,6 @@ def report_and_findings(
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
     motions = next_motions(findings.flight.prepared, findings, library)
-    # motions that tell effects of contact apart are chosen by the tests that will judge them
-    throw = None if motions and motions.separates else next_experiment(findings.flight.prepared, findings, throws)
     document = DiagnoseResult(
         verdict=findings.verdict,
         sentence=sentence(findings, law) + unseen_motion(prepared),
@@ -198,7 +198,7 @@ def report_and_findings(
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
         aliases=tuple(tuple(e.candidate.spec for e in group) for group in groups),
-        next_experiment=throw,
+        next_experiment=_next_throw(findings, motions, throws),
         next_motions=motions,
         remaining=remaining_of(findings.flight),
         residual_law=law,
@@ -213,6 +213,16 @@ def report_and_findings(
         warnings=tuple(warnings),
     )
     return document, findings
+
+
+def _next_throw(findings: Findings, motions: NextMotions | None, throws: Sequence[Experiment]) -> NextExperiment | None:
+    """Return the next experiment among throws; None where motions that are asked for tell the rivals apart.
+
+    Motions that tell effects of contact apart are chosen by the tests that will judge them.
+    """
+    if motions is not None and motions.separates:
+        return None
+    return next_experiment(findings.flight.prepared, findings, throws)
 
 
 def _not_tested(refused: Mapping[str, str], findings: Findings) -> dict[str, str]:

@@ -58,8 +58,7 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
             "add one of them.",
         )
     T_world_body = _pose_matrix(body.photo_pose or Pose())
-    if masked:
-        note(f"{body.name}: shape from {len(masked)} photos")
+    note(f"{body.name}: shape from {len(masked)} photos")
     solid = _solid(stage, index, body, masked, T_world_body)
     world = None if solid is None else _fit_spheres(stage, index, body, solid)
     if body.photo_pose is None and body.shape is None and world is not None:

@@ -234,7 +234,6 @@ def _fitted_before(
         # a scale alone is known far better than it matters from the episodes of the search
         only_scale = [active.effect.name for active in world.effects] == [SCALE]
         episodes = data.searched if only_scale else data.episodes
-        note(f"phys-geo: {', '.join(active.effect.name for active in world.effects)}")
         effects = _effects_beside(at, episodes, [] if data.airborne else start, data.noise, groups, earlier)
     if effects is not None:
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
@@ -253,6 +252,7 @@ def _effects_beside(
     earlier: EarlierEstimates,
 ) -> EffectEstimate | None:
     """Return the effects, fitted beside those that were found before and are not observed now; None if none is left."""
+    note(f"phys-geo: {', '.join(active.effect.name for active in world.effects)}")
     found = fit_effects(world, episodes, along, noise, groups)
     lost = earlier.lost_effects(world, found)
     if not lost:
