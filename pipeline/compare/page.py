@@ -209,10 +209,10 @@ def _player(replay: Replay, filmed: bool) -> str:
     if replay.left_out:
         left_out = f"To keep the page small, the player omits the episodes {', '.join(replay.left_out)}."
     words = (
-        "Without colour: measured. In colour: predicted, open loop from the warm-up (shaded). The lower curve shows the "
-        f"residuals of short predictions: segments of at most {CONTACT_S:g} s in contact and {FLIGHT_S:g} s in flight, "
-        "each from the start that fits it best; "
-        "the dashed line is the noise. Click or drag on a curve to move in time."
+        "Without colour: measured. In colour: predicted, open loop from the warm-up (shaded). The lower curve shows "
+        f"the residuals of short predictions: segments of at most {CONTACT_S:g} s in contact and {FLIGHT_S:g} s in "
+        "flight, each from the start that fits it best; the dashed line is the noise. Click or drag on a curve to "
+        "move in time."
     )
     if filmed:
         words += " Below: video frames after the warm-up; the difference is amplified four times."
