@@ -3,7 +3,7 @@
     python benchmarks/sequence.py run --stage development --each 1 --nulls 1 --groups mujoco --workers 2
     python benchmarks/sequence.py run --stage report1 --groups mujoco --workers 16 --seconds 500   # again, until 0 left
     python benchmarks/sequence.py make --stage report1 --groups drake,dart,rapier      # on a machine with these engines
-    python benchmarks/sequence.py table --stage report1 [--record]
+    python benchmarks/sequence.py table --stage report1 --groups mujoco [--record]
 
 Each case begins as six mixed tosses of a cube or a ball with one large effect of contact, or none, made by an engine
 that is not cgwm's. It is fitted and diagnosed as a user would do it. Where the diagnosis asks for motions (at most
@@ -47,7 +47,8 @@ from diagnose import base_settings, brief, judged
 from hidden_effects import EFFECTS, Case, make_capture
 from hidden_effects import ENGINES as KNOWN_ENGINES
 from real_like.engines import COMES_WITH, ENGINE_OF, GROUPS, can_hide, missing
-from real_like.score import rate
+from real_like.score import rate, wilson
+from render_results import record
 from store import ROOT, Store, commit_of_tree, timed
 
 Stage = Literal["development", "report1", "report2", "report3"]
@@ -64,6 +65,7 @@ EACH, NULLS = 4, 12
 """Captures of each effect, body and group, and nulls of each group, of a report."""
 NAMED = ("exact", "exact, and more")
 COLUMNS = ("exact", "exact, and more", "among", "silent", "family", "wrong", "unexplained", "refused")
+LEAST_NAMED, MOST_WRONG = 0.8, 0.05
 WRONG = ("exact, and more", "family", "wrong", "false alarm")
 KNOWN_ENGINES.update({group: module for group, (module, _) in GROUPS.items()})
 
@@ -345,6 +347,35 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def record_figures(rows: Sequence[dict[str, Any]], stage: str) -> None:
+    """Record the figures of a report in benchmarks/results/diagnose.jsonl."""
+    command = f"python benchmarks/sequence.py run --stage {stage} --groups mujoco --workers 16"
+    hidden = [row for row in rows if row.get("effect")]
+    nulls = [row for row in rows if "judged" in row and not row["effect"]]
+    head, engines = "experiments in sequence", ", ".join(dict.fromkeys(ENGINE_OF[row["group"]] for row in hidden))
+    what = "large effects of contact, named"
+    for figure, marks, least, most in (
+        (f"{head}: {what} after two rounds", [row["judged"][-1] in NAMED for row in hidden], LEAST_NAMED, None),
+        (f"{head}: {what} after one round", [row["judged"][1] in NAMED for row in hidden], None, None),
+        (f"{head}: {what} before", [row["judged"][0] in NAMED for row in hidden], None, None),
+        (f"{head}: a wrong name after two rounds", [row["judged"][-1] in WRONG for row in hidden], None, MOST_WRONG),
+        (f"{head}: nothing hidden, a wrong name", [row["judged"][-1] in WRONG for row in nulls], None, MOST_WRONG),
+    ):
+        low, high = wilson(sum(marks), len(marks))
+        share = sum(marks) / max(len(marks), 1)
+        met = share >= least if least is not None else share <= most if most is not None else None
+        target = f"{100 * least:g} %" if least is not None else f"at most {100 * most:g} %" if most is not None else ""
+        record(
+            "diagnose",
+            figure=figure,
+            value=f"{sum(marks)} of {len(marks)} ({100 * share:.0f} %)",
+            target=target,
+            met=met,
+            note=f"95 % interval {100 * low:.1f} to {100 * high:.1f} %; engines: {engines}",
+            command=command,
+        )
+
+
 def _names(rows: Sequence[dict[str, Any]]) -> list[str]:
     return sorted({f"{row['effect']}, {row['thing']}" for row in rows})
 
@@ -372,7 +403,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--captures", type=Path, default=None, help="where captures are kept; default out/sequence")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
+    parser.add_argument("--record", action="store_true", help="of table: write a report's figures to results/")
     given = parser.parse_args(words)
+    if given.record and (given.only or not given.stage.startswith("report")):
+        parser.error("--record wants a report: --stage report..., without --only.")
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     chosen = [one for one in sequence_cases(given.stage, given.each, given.nulls) if given.only in one.name]
     chosen = _in_groups(chosen, given.groups)
@@ -394,7 +428,13 @@ def main(words: Sequence[str] | None = None) -> int:
         done, elsewhere, left = run([chosen[k] for k in order], store, root, given.workers, deadline)
         print(f"{done} measured, {elsewhere} wait for captures of another machine, {left} left.", file=sys.stderr)
     names = {one.name for one in chosen}
-    print(table([row for row in store.results() if row["key"] in names]))
+    rows = [row for row in store.results() if row["key"] in names]
+    print(table(rows))
+    if given.record and len(rows) < len(names):
+        print(f"{len(names) - len(rows)} cases are not measured yet: nothing is recorded.", file=sys.stderr)
+        return 1
+    if given.record:
+        record_figures(rows, given.stage)
     return 3 if left else 0
 
 

@@ -92,6 +92,9 @@ def _summary(result: ImproveResult, out: Path, capture: Path) -> str:
     if next_ is not None:
         why = f", to distinguish {listed(next_.separates)}" if next_.initial_state else ""
         lines.append(f"Measure next{why}: {next_.what}.")
+    if last is not None and last.next_motions is not None:
+        lines.append("Record next, for contact:")
+        lines += [f"  {place}. {motion.what}" for place, motion in enumerate(last.next_motions.motions, 1)]
     lines += [*warnings(result.warnings), f"Page: {out / result.page}"]
     if len(result.models) > 1:
         lines.append(next_line("cgwm", "compare", out / result.models[0], out / result.models[-1], capture))

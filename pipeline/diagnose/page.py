@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...schemas import DiagnoseResult, EffectParameterEstimate, RankedEffect
+from ...schemas import DiagnoseResult, EffectParameterEstimate, NextMotions, RankedEffect
 from ..report.page import (
     cautions,
     command,
@@ -297,19 +297,22 @@ def _next_throw(result: DiagnoseResult, pictures: Pictures) -> list[str]:
     return pieces
 
 
-def _next_motions(result: DiagnoseResult, pictures: Pictures) -> list[str]:
-    found = result.next_motions
-    if found is None:
-        return []
+def asked_motions(found: NextMotions, then: str) -> list[str]:
+    """Return the motions to record next for contact as a list, after a sentence on what they are for."""
     why = (
         f"These motions tell {listed(found.separates)} apart."
         if found.separates
         else "These motions show effects of contact that the data so far could not."
     )
-    pieces = [
-        paragraph(f"{why} Record them as new episodes of the same capture, and add them to the split."),
-        f"<ol>{''.join(f'<li>{text(motion.what)}</li>' for motion in found.motions)}</ol>",
-    ]
+    items = "".join(f"<li>{text(motion.what)}</li>" for motion in found.motions)
+    return [paragraph(f"{why} {then}"), f"<ol>{items}</ol>"]
+
+
+def _next_motions(result: DiagnoseResult, pictures: Pictures) -> list[str]:
+    found = result.next_motions
+    if found is None:
+        return []
+    pieces = asked_motions(found, "Record them as new episodes of the same capture, and add them to the split.")
     if pictures.paths:
         pieces.append(_drawn(pictures.paths, "from above: y [m]", "x [m]", True))
     rows = [
@@ -330,7 +333,7 @@ def _drawn(motions: Sequence[DrawnMotion], title: str, axis: str, named: bool) -
         for one, color in zip(motions, _COLORS, strict=False)
     ]
     drawn = plot_svg(Plot(title=title, x=axis, series=series, equal=True))
-    return f'<div class="plots"><figure>{drawn}{legend(series) if named else ""}</figure></div>'
+    return f'<div class="plots"><figure style="max-width:40rem">{drawn}{legend(series) if named else ""}</figure></div>'
 
 
 def drawn_throw(throw: Sequence[DrawnMotion]) -> str:

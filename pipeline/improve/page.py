@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ...schemas import ImproveResult, ImproveStep, ImproveTest, ImproveTestFigures
-from ..diagnose.page import drawn_throw
+from ..diagnose.page import asked_motions, drawn_throw
 from ..diagnose.pictures import DrawnMotion
 from ..report.page import (
     cautions,
@@ -176,11 +176,20 @@ def asking_step(steps: Sequence[ImproveStep]) -> ImproveStep | None:
 
 
 def _measure_next(steps: Sequence[ImproveStep], throw: Sequence[DrawnMotion]) -> str:
-    """Return the last experiment that a diagnosis has proposed."""
+    """Return the last experiment that a diagnosis has proposed, and the motions for contact that the last asks for."""
+    pieces = _throw(steps, throw)
+    if steps and (motions := steps[-1].next_motions) is not None:
+        pieces += asked_motions(motions, f"Asked for by the diagnosis of {steps[-1].model}.")
+    if pieces or not steps:
+        return section("What to measure next", *pieces) if pieces else ""
+    words = "No rivals are left that another motion would tell apart, and no effect of contact that one would show."
+    return section("What to measure next", paragraph(words))
+
+
+def _throw(steps: Sequence[ImproveStep], throw: Sequence[DrawnMotion]) -> list[str]:
     step = asking_step(steps)
     if step is None or (found := step.next_experiment) is None:
-        words = "No rivals are left that another motion would tell apart."
-        return section("What to measure next", paragraph(words)) if steps else ""
+        return []
     apart = f" It tells {listed(found.separates)} apart." if found.separates and found.initial_state else ""
     pieces = [
         paragraph(f"{found.what[:1].upper()}{found.what[1:]}.{apart} Asked for by the diagnosis of {step.model}."),
@@ -196,7 +205,7 @@ def _measure_next(steps: Sequence[ImproveStep], throw: Sequence[DrawnMotion]) ->
         pieces += [paragraph(words), table(["rank", "motion", "expected gain [nats]"], rows, (2,))]
     if rows and found.not_separated:
         pieces.append(paragraph(f"None of them separates {listed(found.not_separated)}."))
-    return section("What to measure next", *pieces)
+    return pieces
 
 
 def _commands(result: ImproveResult, out: Path) -> str:
