@@ -202,7 +202,8 @@ def _row(entry: RankedEffect) -> list[str]:
         numbers += ", ..."
     if entry.spread:
         name, std = next(iter(entry.spread.items()))
-        numbers += f"; {name} differs by {std:.2g} from episode to episode"
+        unit = "group" if entry.effect.endswith("@group") else "episode"
+        numbers += f"; {name} differs by {std:.2g} from {unit} to {unit}"
     return [
         entry.effect,
         ", ".join(entry.acts_in),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..physics.parameters import effect_parameters
 from ..physics.world import World
 from ..segments.candidates import Candidate, admissible, base_parameters, variants_of, without_effect
 from ..segments.prepare import Prepared
@@ -33,6 +34,7 @@ from .cross_validation import held_out_loss
 from .effect_selection import SelectionStep
 from .falsification import Consistency, consistency
 from .flight_search import flight_search
+from .group_values import with_group_values
 from .own_tilt import TILTS, own_tilt_step, own_tilts
 from .thresholds import THRESHOLDS
 
@@ -114,19 +116,43 @@ def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candi
     found = _searched(prepared, prepared, world, candidates, None)
     if not (found.remains or found.doubtful):
         return found
-    slow = _slow_errors(prepared, found.world, candidates)
-    law = None
-    if slow is not None and slow.sway_evidence:
-        own = own_tilts(prepared, found.world, candidates, slow)
-        law = own.law
-        if own.kind == "levelling":
-            slow = replace(slow, sway_evidence=0.0)
-        elif own.kind != "tilts":
-            slow = slow.tiltless()
+    slow, law = _told_slow_errors(prepared, found.world, candidates)
     if slow is None:
         return replace(found, own_law=law)
-    again = prepared.with_slow_noise(world, slow.noise_model)
-    return replace(_searched(again, prepared, world, candidates, slow), own_law=law)
+    found = _searched(prepared.with_slow_noise(world, slow.noise_model), prepared, world, candidates, slow)
+    by_group = [p.name.partition(".")[0] for p in effect_parameters(found.world) if p.shared == "group"]
+    if not by_group or not set(by_group) - {active.effect.name for active in world.effects}:
+        return replace(found, own_law=law)
+    # what groups have of their own counted as slow errors of the tracks, and hid which effect it is
+    beside, own_law = _told_slow_errors(
+        prepared.with_own(found.world), found.world, candidates, not set(by_group) & set(TILTS)
+    )
+    if beside is None:
+        return replace(found, own_law=law)
+    found = _searched(prepared.with_slow_noise(world, beside.noise_model), prepared, world, candidates, beside)
+    return replace(found, own_law=own_law)
+
+
+def _told_slow_errors(
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], tilted: bool = True
+) -> tuple[SlowErrors | None, str | None]:
+    """Return the slow errors beside the effects of a world, and what accelerations follow that are no tilts.
+
+    Args:
+        prepared: The episodes.
+        world: The world with the effects found so far.
+        candidates: All candidates.
+        tilted: Whether episodes may have a tilt of their own; not where their groups have one.
+    """
+    slow = _slow_errors(prepared, world, candidates)
+    if slow is None or not slow.sway_evidence:
+        return slow, None
+    if not tilted:
+        return slow.tiltless(), None
+    own = own_tilts(prepared, world, candidates, slow)
+    if own.kind == "levelling":
+        return replace(slow, sway_evidence=0.0), own.law
+    return (slow if own.kind == "tilts" else slow.tiltless()), own.law
 
 
 def _slow_errors(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> SlowErrors | None:
@@ -155,6 +181,9 @@ def _searched(
     steps, after_flight, flight = _with_own_tilts(prepared, steps, after_flight, flight, candidates, slow)
     if flight is not None and slow is not None:
         steps, after_flight, flight = _with_the_needed(steps, after_flight, flight)
+    if flight is not None and slow is not None:
+        steps, after_flight, flight = with_group_values(prepared, steps, after_flight, flight, candidates, scatter)
+    prepared, quick = prepared.with_own(after_flight), quick.with_own(after_flight)
     names = [step.best.name for step in steps if step.flagged and step.own_std is None]
     others = [] if flight is None else other_laws(flight, after_flight, names, scatter)
     better = {one.effect for one in others if one.better}
@@ -170,7 +199,7 @@ def _searched(
         names = [step.best.name for step in steps if step.flagged and step.own_std is None]
         agreement = consistency(flight, after_flight, names, prepared.groups, scatter)
         others = [one for one in others if one.effect in names]
-    left, share = _left(quick, world, after_flight, bool(names))
+    left, share = _left(quick, world, after_flight, after_flight is not world)
     return FlightFindings(
         prepared=prepared,
         slow=slow,
@@ -179,7 +208,7 @@ def _searched(
         world=after_flight,
         segments=flight,
         before=before,
-        after=worst_omnibus(flight_windows(prepared, after_flight), scatter) if names else before,
+        after=worst_omnibus(flight_windows(prepared, after_flight), scatter) if after_flight is not world else before,
         agreement=agreement,
         others=tuple(others),
         left=left,

@@ -102,6 +102,10 @@ class Prepared:
         items = whole_flights(self.flight.items)
         return replace(found, flight=fit_states(found.segments("flight", world, items)))
 
+    def with_own(self, world: World) -> Prepared:
+        """Return the episodes with the values of their own that a world has for them."""
+        return replace(self, observations=self.observations.with_own(world))
+
     def pieces(self, world: World, longest_s: float) -> Segments | None:
         """Return the flights cut into equal pieces of at most a length [s], states fitted; None without flights."""
         if self.flight is None:

@@ -55,6 +55,8 @@ NUMERICS = {
     "experiments.MOST_THROWS": "bounds the duration",
     "fisher_information.LEAST_STEP_S": "resolution of simulated throws",
     "fisher_information.MOST_CONTACTS": "bounds the duration",
+    "group_values.MOST_PARAMETERS": "which effects are looked at: those of sessions, not of bodies",
+    "group_values.REFITTED": "bounds the duration",
     "law_export.LIMIT": "bounds of a parameter in a file that is written",
     "page._MM": "millimetres in a metre",
     "page.BARS": "number of bars in a chart",

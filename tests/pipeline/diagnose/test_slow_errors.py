@@ -192,6 +192,25 @@ def test_a_state_is_determined_by_the_residuals_that_it_moves_more() -> None:
     assert moving(other, own) == [1]
 
 
+@pytest.mark.parametrize("drags", [(0.15, 0.6), (0.3, 0.3)])
+def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tuple[float, float]) -> None:
+    rng = np.random.default_rng(4)
+    world, episodes = world_with("ball", ground=False), []
+    for group, c in enumerate(drags):
+        flying = tosses(
+            world_with("ball", {"linear_drag": {"c": c}}, False), group, count=3, duration_s=0.6, noise=(1e-9, 1e-8)
+        )
+        episodes += [(f"{group}{name}", {b: drifting(t, rng) for b, t in tracks.items()}) for name, tracks in flying]
+    found = find(prepare(world, episodes, groups=[0, 0, 0, 1, 1, 1]), world, LIBRARY)
+    named = [one.evidence.candidate.spec for one in found.chosen]
+    assert named == (["linear_drag@group"] if drags[0] != drags[1] else ["linear_drag"])
+    values = found.world.own_values
+    if values:
+        for episode, c in (("0", drags[0]), ("1", drags[1])):
+            mine = [value["linear_drag.c"] for name, value in values.items() if name.startswith(episode)]
+            assert np.allclose(mine, c, atol=0.02)
+
+
 def test_a_drag_through_which_a_wind_acts_is_drawn_without_both() -> None:
     world = world_with("ball", {"quadratic_drag": {"k": 0.1}, "wind": {"w_x": 1.0}}, ground=False)
     prepared = prepare(world, tosses(world, 1, count=1, duration_s=0.3))
