@@ -12,7 +12,7 @@ import torch
 from cgwm.cli.app import app
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
-from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.diagnose import diagnose, stage
 from cgwm.pipeline.diagnose.contact_search import Chosen
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.experiments import DEFAULT, Experiment, experiments_of, read_experiments, states_of
@@ -40,6 +40,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 THROWS = experiments_of(DEFAULT)
+
+
+@pytest.fixture(autouse=True)
+def throws_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Motions for contact take seconds, and have tests of their own."""
+    monkeypatch.setattr(stage, "next_motions", lambda *_: None)
 
 
 def evidence(name: str, **numbers: float) -> Evidence:
@@ -312,7 +318,7 @@ def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
     truth = replace(truth, effects=(ActiveEffect.of(load_effect(f"{file}:Stranger"), {"c": 0.2}),))
     root, law, fitted = tmp_path / "capture", tmp_path / "my_law.py", tmp_path / "m1"
     # high up, where nothing touches
-    model = write_capture(root, truth, tosses(truth, 3, 9, 0.35, height_m=(1.2, 1.6)), test=1)
+    model = write_capture(root, truth, tosses(truth, 3, 7, 0.35, 60.0, height_m=(1.2, 1.6)), test=1)
     run = CliRunner().invoke
     done = run(app, ["diagnose", str(model), str(root), "--save-law", str(law), "--json"])
     assert done.exit_code == 0, done.output

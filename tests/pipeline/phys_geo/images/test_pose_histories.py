@@ -10,7 +10,7 @@ import torch
 from cgwm.datasets.models.model import Model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.geometry.rotation import geodesic_angle
-from cgwm.pipeline.phys_geo.images import video_episodes
+from cgwm.pipeline.phys_geo.images import pose_tracking, video_episodes
 from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model
 from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
 from cgwm.pipeline.phys_geo.images.pose_search import Poses
@@ -63,7 +63,10 @@ def test_a_body_that_looks_almost_the_same_turned_about_does_not_flip() -> None:
     assert found.rival_nats > 0
 
 
-def test_a_body_that_looks_the_same_turned_about_keeps_one_history_and_the_other_is_told() -> None:
+def test_a_body_that_looks_the_same_turned_about_keeps_one_history_and_the_other_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 3)
     footage, found, _ = tracked(two_sided(0.0))
     assert turned_between_frames(found) < 60
     assert 0 <= found.rival_nats < RIVAL_NATS
