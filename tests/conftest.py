@@ -38,12 +38,14 @@ def pytest_collection_finish() -> None:
 
 
 LONGEST = (
-    "test_fused.py", "test_calibrate.py", "test_separation.py", "test_diagnosis.py", "test_sg_gs.py", "test_compare.py",
-    "test_scenes.py", "test_export.py", "test_fuzz.py", "test_validate.py", "test_fit_effects.py", "test_estimation.py",
-    "test_next_throw.py", "test_diagnosis_impacts.py", "test_effects.py", "test_physics.py", "test_ellipse.py",
-    "test_honest_supervision.py", "test_photos.py", "test_visual_collision.py", "test_shards.py",
+    "test_diagnosis.py", "test_fused.py", "test_calibrate.py", "test_next_throw.py", "test_sg_gs.py",
+    "test_separation.py", "test_diagnosis_impacts.py", "test_scenes.py", "test_diagnosis_glides.py",
+    "test_diagnosis_lasting.py", "test_hidden_loop.py", "test_ellipse.py", "test_export.py", "test_image_fit.py",
+    "test_validate.py", "test_shards.py", "test_phys_images.py", "test_honest_supervision.py", "test_pose_histories.py",
+    "test_visual_collision.py", "test_photos.py", "test_compare.py", "test_releases.py", "test_video_input.py",
+    "test_fit_effects.py", "test_workers.py", "test_mystery.py", "test_slow_errors.py",
 )  # fmt: skip
-"""Files that take 8 s or more of one core, the longest first."""
+"""Files that take 5 s or more of one core, the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
