@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers.pages import CHROMIUM
+from helpers.pages import CHROMIUM, sockets
 
 # SwiftShader is WebGL without a GPU.
 _OPTIONS = """--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist
@@ -87,15 +87,17 @@ def chromium(folder: Path) -> Iterator[Page]:
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine to open the page in")
     command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder / 'profile'}", "about:blank"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stderr is not None
-        address = next(
-            (found[1] for line in process.stderr if (found := re.search(r"DevTools listening on (ws://\S+)", line))), ""
+    with sockets() as environment:
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment
         )
-        assert address, "Chromium ended before it listened"
-        threading.Thread(target=process.stderr.read, daemon=True).start()  # a full pipe would stop it
-        yield Page(address)
-    finally:
-        process.terminate()
-        process.wait(30)
+        try:
+            assert process.stderr is not None
+            lines = (re.search(r"DevTools listening on (ws://\S+)", line) for line in process.stderr)
+            address = next((found[1] for found in lines if found), "")
+            assert address, "Chromium ended before it listened"
+            threading.Thread(target=process.stderr.read, daemon=True).start()  # a full pipe would stop it
+            yield Page(address)
+        finally:
+            process.terminate()
+            process.wait(30)

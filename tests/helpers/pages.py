@@ -1,8 +1,12 @@
 """HTML pages under test: are their elements closed, what would they load, and what happens when they are clicked?"""
 
 import json
+import os
 import shutil
 import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -44,6 +48,13 @@ class Tags(HTMLParser):
             self.faults.append(f"</{tag}> at {self.getpos()}")
 
 
+@contextmanager
+def sockets() -> Iterator[dict[str, str]]:
+    """Yield the environment for Chromium, whose sockets need a short path and are left behind if it is killed."""
+    with tempfile.TemporaryDirectory(prefix="cgwm-", ignore_cleanup_errors=True) as folder:
+        yield os.environ | {"TMPDIR": folder}
+
+
 def clicked(page: Path, folder: Path, script: str) -> dict[str, Any]:
     """Open a page in headless Chromium, run the body of an async function in it, and return what that returns.
 
@@ -65,7 +76,8 @@ def clicked(page: Path, folder: Path, script: str) -> dict[str, Any]:
     copy = folder / "clicked.html"
     copy.write_text(html, encoding="utf-8")
     command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder / 'profile'}", "--dump-dom", copy.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    with sockets() as environment:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, env=environment)
     parser = _Answer()
     parser.feed(done.stdout)
     assert parser.text, done.stderr[-2000:]
