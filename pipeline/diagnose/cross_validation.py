@@ -43,6 +43,23 @@ def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[floa
     return _error(before, [], values.new_zeros(0)), _error(with_it, parameters, values)
 
 
+def held_out_fall(segments: Segments, world: World, effect: str) -> float:
+    """Return the mean fall of an episode's prediction error by an effect, in its standard errors; see above.
+
+    Args:
+        segments: Segments with states fitted by the world.
+        world: The world with the effect at its estimate.
+        effect: Name of the effect.
+    """
+    parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
+    with_it, before = segments.in_world(world), segments.in_world(without_effect(world, effect))
+    values = _by_others(with_it, parameters, base_values(world, parameters))
+    fall = _away(before, [], values.new_zeros(0)) - _away(with_it, parameters, values)
+    episode = torch.tensor([item.episode for item in segments.items])
+    own = torch.stack([fall[episode == one].sum() for one in episode.unique()])
+    return float(own.mean() / (own.std() / len(own) ** 0.5).clamp_min(1e-12)) if len(own) > 1 else 0.0
+
+
 def held_out_loss(segments: Segments, world: World) -> float:
     """Return the mean prediction error of a world, positions plus rotations, in standard deviations of the noise.
 
@@ -84,10 +101,17 @@ def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tens
 
 def _error(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> float:
     """Return the mean position error [m] of the frames that the states are not fitted to."""
+    known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in segments.lengths])
+    seen = segments.observations.seen
+    late = seen * (torch.arange(seen.shape[1]) >= known[:, None])[..., None]
+    return float(_away(segments, parameters, values).sum() / late.sum().clamp_min(1.0))
+
+
+def _away(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
+    """Return the sum of these errors of each segment (B,) [m]."""
     fitted, late = continued(segments, parameters, values)
     away = (fitted.positions(parameters, values) - segments.observations.position_m).norm(dim=-1)
-    late = segments.observations.seen * late
-    return float((away * late).sum() / late.sum().clamp_min(1.0))
+    return (away * segments.observations.seen * late).sum((1, 2))
 
 
 def continued(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> tuple[Segments, Tensor]:

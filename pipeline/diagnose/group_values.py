@@ -92,7 +92,7 @@ def with_group_values(
         scatter: Factor by which variances exceed those of the noise.
     """
     groups = _groups(prepared, flight)
-    if len(np.unique(groups)) < 2 or any(parameter.shared != "all" for parameter in effect_parameters(world)):
+    if len(np.unique(groups)) < 2 or any(parameter.shared == "group" for parameter in effect_parameters(world)):
         return steps, world, flight
     count = math.log(max(float(flight.dof.sum()), 2.0))
     named = [step.best.name for step in steps if step.flagged and step.own_std is None]

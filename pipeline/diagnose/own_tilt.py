@@ -21,6 +21,7 @@ from ..segments.linearization import linearize
 from ..segments.prepare import Prepared
 from ..segments.residual_wrench import residual_wrenches
 from ..segments.segment_fit import refit
+from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors
 from .effect_selection import SelectionStep
@@ -153,7 +154,40 @@ def own_tilt_step(
     found = refit([flight], tilted, base_parameters(tilted, "flight"))
     mean = {name: found.number(f"{names[0]}.{name}") for name in ("tilt_x", "tilt_y")}
     evidence = tuple(_evidence(name, std, mean, slow.sway_evidence) for name in names)
-    return SelectionStep(evidence, evidence, True, own_std=std), found.world, found.segments[0]
+    world, flight = _with_own(prepared, found.segments[0], found.world, names[0], std)
+    return SelectionStep(evidence, evidence, True, own_std=std), world, flight
+
+
+def _with_own(prepared: Prepared, flight: Segments, world: World, name: str, std: float) -> tuple[World, Segments]:
+    """Return the world with the likeliest tilt of each episode, and the flights in it.
+
+    Args:
+        prepared: The episodes, with the slow errors as part of their noise.
+        flight: Segments with states fitted by the world.
+        world: The world with the mean tilt of all episodes.
+        name: The tilt.
+        std: Standard deviation of the tilts between episodes [rad].
+    """
+    noise = flight.noise_model
+    still = replace(flight, noise_model=noise._replace(position=noise.position._replace(sway=0.0)))
+    linear = linearize(still, world, (), prepared.groups, robust=False)
+    numbers = ("tilt_x", "tilt_y")
+    columns = linear.columns([f"{name}.{number}" for number in numbers])
+    mean = next(active for active in world.effects if active.effect.name == name).values
+    own = dict(world.own_values)
+    for episode in np.unique(linear.episode).tolist():
+        mine = linear.episode == episode
+        information = linear.information[mine][:, columns][:, :, columns].sum(0) + np.eye(2) / std**2
+        step = np.linalg.solve(information, linear.score[mine][:, columns].sum(0))
+        values = {f"{name}.{key}": float(mean[key][0] + s) for key, s in zip(numbers, step, strict=True)}
+        own[prepared.names[episode]] = {**own.get(prepared.names[episode], {}), **values}
+    tilt = ActiveEffect.of(
+        load_effect(f"{name}@episode"), {key: float(mean[key][0]) for key in numbers}, world.gravity[0, :1]
+    )
+    others = tuple(active for active in world.effects if active.effect.name != name)
+    world = replace(world, effects=(*others, tilt), own_values=own)
+    flight = replace(flight, observations=flight.observations.with_own(world)).in_world(world)
+    return world, fit_states(flight)
 
 
 def _missing(world: World, candidates: Sequence[Candidate]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,7 +15,7 @@ from ..segments.sliding_fit import StartedSliding
 from .alternative_laws import OtherLaw
 from .contact_search import TESTS, Chosen, ContactFindings, with_contact
 from .contact_tests.contact_test import ContactTest
-from .cross_validation import held_out_errors
+from .cross_validation import held_out_errors, held_out_fall
 from .detection_limits import DetectionLimit
 from .effect_selection import SelectionStep
 from .evidence import Evidence
@@ -78,12 +78,13 @@ def find(
     note("diagnose: flights")
     flown = flight_findings(prepared, world, candidates)
     note("diagnose: contacts")
+    prepared = prepared.with_own(flown.world)  # contact is judged with the values that episodes have of their own
     explained = not is_significant(flown.after)
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
     if flown.remains or flown.own:  # what flights show may be what contact imitates
-        contact = _without_useless(contact, errors)
+        contact = _without_useless(contact)
     verdict = _verdict(contact.chosen, flown)
     return Findings(
         verdict=verdict,
@@ -118,22 +119,18 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
     return "missing_effect" if chosen else "none_missing"
 
 
-def _without_useless(contact: ContactFindings, errors: Mapping[str, tuple[float, float]]) -> ContactFindings:
-    """Return the findings without the effects of contact that hardly lower the error of held-out episodes."""
-    useless = {
-        one.evidence.name
-        for one in contact.chosen
-        if one.where == "contact" and one.evidence.name in errors and not _predicts(errors[one.evidence.name])
-    }
+def _without_useless(contact: ContactFindings) -> ContactFindings:
+    """Return the findings without the effects of contact that lower the error of held-out episodes by chance."""
+    if contact.segments is None:
+        return contact
+    present = {active.effect.name for active in contact.world.effects}
+    named = {one.evidence.name for one in contact.chosen if one.where == "contact"} & present
+    falls = {name: held_out_fall(contact.segments, contact.world, name) for name in named}
+    useless = {name for name, fall in falls.items() if fall < THRESHOLDS.segments.confirmed}
     world = contact.world
     for name in sorted(useless):
         world = without_effect(world, name)
     return replace(contact, chosen=[one for one in contact.chosen if one.evidence.name not in useless], world=world)
-
-
-def _predicts(errors: tuple[float, float]) -> bool:
-    """Return whether the held-out error falls by more than an effect that is not needed lets it fall."""
-    return errors[1] < (1 - LIMITS.needed_share) * errors[0]
 
 
 def _errors(contact: ContactFindings, flown: FlightFindings) -> dict[str, tuple[float, float]]:

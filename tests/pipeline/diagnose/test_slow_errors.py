@@ -9,6 +9,7 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.pictures import effect_picture
+from cgwm.pipeline.diagnose.remaining import remaining_of
 from cgwm.pipeline.diagnose.rest_tilts import rests_confirm  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.verdict import Findings, find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
@@ -106,6 +107,9 @@ def test_a_tilt_that_differs_from_episode_to_episode_is_named_as_such() -> None:
     (tilt,) = named.chosen
     assert {one.candidate.spec for one in tilt.equals} == {"gravity_tilt@episode", "frame_tilt@episode"}
     assert tilt.evidence.spread["tilt_x"] == pytest.approx(0.15 / 9.81, rel=0.5)
+    remaining = remaining_of(named.flight)
+    # 0.15 m/s2 alone are some 5 mm; what each episode has of its own does not count as left
+    assert remaining is not None and remaining.position_rms_m < 3 * SLOW_M
 
 
 @pytest.mark.parametrize(("own", "repeats"), [(False, True), (True, False)])
