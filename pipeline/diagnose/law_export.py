@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from ...datasets.io.atomic import new_file
@@ -72,15 +73,16 @@ def require_law_file(path: Path, overwrite: bool) -> None:
         refuse_output(path, "effect", overwrite)
 
 
-def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str:
+def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False, present: Sequence[str] = ()) -> str:
     """Write the residual law of a diagnosis as a custom effect, and return the argument for `fit --effects`.
 
-    Terms of a selected effect are left out, because the two are fitted together.
+    Terms of a selected effect, and of one that the model has, are left out, because the two are fitted together.
 
     Args:
         result: The diagnosis.
         path: The Python file.
         overwrite: Replace an existing file.
+        present: Effects of the model.
 
     Raises:
         InputDataError: If no law was found, or no term of it is left to export.
@@ -88,7 +90,7 @@ def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False) -> str
     """
     require_law_file(path, overwrite)
     law = result.residual_law
-    known = {term for name in result.selected for term in SELECTED_TERMS.get(name, ())}
+    known = {term for name in (*result.selected, *present) for term in SELECTED_TERMS.get(name, ())}
     terms = () if law is None else tuple(term for term in law.terms if term.term not in known)
     if law is None or not terms:
         what = "has no residual law" if law is None else "leaves a residual that follows none of the known terms"

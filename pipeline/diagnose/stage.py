@@ -113,7 +113,8 @@ def diagnose(
     episodes = diagnosed_episodes(loaded, opened, split).episodes
     result = _first_of_all(result, not_described(world, episodes, prepared.noise))
     if save_law_to is not None:
-        result = result.model_copy(update={"saved_law": save_law(result, save_law_to, overwrite)})
+        present = [split_units(effect.name)[0] for effect in loaded.file.effects]
+        result = result.model_copy(update={"saved_law": save_law(result, save_law_to, overwrite, present)})
     if page is None:
         return result
     result = result.model_copy(update={"report": str(page)})

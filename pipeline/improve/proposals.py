@@ -45,7 +45,7 @@ def proposals_of(found: DiagnoseResult, present: Sequence[str], law: Path) -> li
     if len(named) > 1:
         groups.append([Proposal((one,), "one_of_the_selected") for one in named])
     first = [] if named else _first_of_the_ranking(found, there)
-    if not any(name.startswith("law_") for name in there) and (saved := _saved(found, law)):
+    if not any(name.startswith("law_") for name in there) and (saved := _saved(found, law, sorted(there))):
         first.append(Proposal((saved,), "law"))
     return [*groups, *([first] if first else [])]
 
@@ -58,13 +58,13 @@ def _first_of_the_ranking(found: DiagnoseResult, there: set[str]) -> list[Propos
     return [Proposal((first.effect,), "first_of_the_ranking")]
 
 
-def _saved(found: DiagnoseResult, law: Path) -> str:
+def _saved(found: DiagnoseResult, law: Path, present: Sequence[str]) -> str:
     """Write the law of the residual as a custom effect, and return its name; empty where there is none to write."""
     if found.residual_law is None or not found.residual_law.terms:
         return ""
     if not law.is_file():
         try:
-            save_law(found, law)
-        except InputDataError:  # its terms belong to effects that are proposed
+            save_law(found, law, present=present)
+        except InputDataError:  # its terms belong to effects that are proposed or there
             return ""
     return f"{law}:{CLASS}"

@@ -291,6 +291,9 @@ def test_a_law_becomes_an_effect_that_pulls_as_it_says(tmp_path: Path) -> None:
     # what a selected effect has is not had twice
     beside = unexplained(LAW.model_copy(update={"terms": LAW.terms[:2]}), ("linear_drag",))
     assert [p.unit for p in load_effect(save_law(beside, tmp_path / "beside.py")).parameters] == ["1"]
+    there = unexplained(LAW)
+    both = load_effect(save_law(there, tmp_path / "both.py")).parameters
+    assert len(load_effect(save_law(there, tmp_path / "there.py", present=("linear_drag",))).parameters) < len(both)
     with pytest.raises(InputDataError, match="none of the known terms"):
         save_law(beside.model_copy(update={"selected": ("linear_drag", "magnus_lift")}), tmp_path / "none.py")
     assert 'name = "residual_law"' in law_source(LAW, tmp_path / "wind.py")
