@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -204,24 +205,23 @@ class _Contrasts:
     def likelihood(self, noise: CorrelatedNoise) -> float:
         """Return the restricted log-likelihood of a noise model."""
         logs, whitened = 0.0, []
-        joined = torch.cat((self.rows[..., None], self.own, self.common), -1)
-        for level in (True, False):
-            axes = [a for a in range(3) if (a in noise.level) == level]
+        still = self._covariance(noise)
+        level = noise.level if noise.sway else ()
+        for axes in (tuple(level), tuple(a for a in range(3) if a not in level)):
             if not axes:
                 continue
-            factor = torch.linalg.cholesky(self._covariance(noise if level else noise._replace(sway=0.0)))
-            part = joined[:, :, axes]
-            flat = torch.linalg.solve_triangular(factor, part.flatten(2), upper=False)
-            whitened.append(flat.unflatten(2, part.shape[2:]).flatten(1, 2))
+            factor = torch.linalg.cholesky(still + noise.sway**2 * self._paths if axes == level else still)
+            flat = torch.linalg.solve_triangular(factor, self._joined(axes), upper=False)
+            whitened.append(flat.unflatten(2, (len(axes), -1)).flatten(1, 2))
             diagonal = factor.diagonal(dim1=1, dim2=2).log() * self.mask
             logs += 2 * float((diagonal.sum(1) * self.axes[:, axes].sum(1)).sum())
-        white = torch.cat(whitened, 1)
-        left, own = white, self.own.shape[-1]
-        logs += _projected_log(white[..., 1 : 1 + own])
-        basis = torch.linalg.qr(white[..., 1 : 1 + own])[0]
-        left = torch.cat((white[..., :1], white[..., 1 + own :]), -1)
-        left = left - basis @ (basis.mT @ left)
-        normal = torch.einsum("bfk,bfl->kl", left, left)
+        white = whitened[0] if len(whitened) == 1 else torch.cat(whitened, 1)
+        own = self.own.shape[-1]
+        basis, triangle = torch.linalg.qr(white[..., :own])
+        logs += 2 * float(triangle.diagonal(dim1=1, dim2=2).abs().clamp_min(1e-12).log().sum())
+        left = white[..., own:]
+        left = (left - basis @ (basis.mT @ left)).flatten(0, 1)
+        normal = left.mT @ left
         square, slope, matrix = float(normal[0, 0]), normal[1:, 0], normal[1:, 1:]
         if len(matrix):
             chol = torch.linalg.cholesky(matrix + 1e-9 * torch.diag(matrix.diagonal()) + 1e-12 * torch.eye(len(matrix)))
@@ -231,21 +231,40 @@ class _Contrasts:
         return -0.5 * (logs + square)
 
     def _covariance(self, noise: CorrelatedNoise) -> Tensor:
-        """Return the covariance (B, n, n) of the frames of one axis; the unit matrix where a frame does not count."""
-        gap = (self.times_s[:, :, None] - self.times_s[:, None]).abs()
+        """Return the covariance (B, n, n) of the frames of one axis without accelerations of the flights' own.
+
+        It is the unit matrix where a frame does not count.
+        """
         square = noise.size**2
-        found = square * noise.share * torch.exp(-gap / noise.time_s)
-        found = found + noise.slow**2 * torch.exp(-gap / noise.slow_time_s)
-        path = 0.5 * (self.times_s - self.times_s[:, :1]).square()
-        found = found + noise.sway**2 * path[:, :, None] * path[:, None]
-        found = found * self.mask[:, :, None] * self.mask[:, None]
-        return found + torch.diag_embed(torch.where(self.mask > 0, square * (1 - noise.share) + 1e-6, 1.0))
+        found = torch.exp(self._gaps / -noise.time_s).mul_(square * noise.share)
+        if noise.slow:
+            found.add_(torch.exp(self._gaps / -noise.slow_time_s), alpha=noise.slow**2)
+        found.diagonal(dim1=1, dim2=2).add_(torch.where(self.mask > 0, square * (1 - noise.share) + 1e-6, 1.0))
+        return found
 
+    @cached_property
+    def _gaps(self) -> Tensor:
+        """Times between frames, shape (B, n, n) [s]; infinite where one does not count."""
+        gap = (self.times_s[:, :, None] - self.times_s[:, None]).abs()
+        return torch.where(self.mask[:, :, None] * self.mask[:, None] > 0, gap, torch.inf)
 
-def _projected_log(own: Tensor) -> float:
-    """Return the sum of log det X'X over flights for whitened derivatives X (B, F, S) by the states."""
-    triangle = torch.linalg.qr(own, mode="r")[1]
-    return 2 * float(triangle.diagonal(dim1=1, dim2=2).abs().clamp_min(1e-12).log().sum())
+    @cached_property
+    def _paths(self) -> Tensor:
+        """Covariance (B, n, n) of the path of an acceleration of variance 1."""
+        path = 0.5 * (self.times_s - self.times_s[:, :1]).square() * self.mask
+        return path[:, :, None] * path[:, None]
+
+    @cached_property
+    def _by_axes(self) -> dict[tuple[int, ...], Tensor]:
+        """What `_joined` has returned, by axes."""
+        return {}
+
+    def _joined(self, axes: tuple[int, ...]) -> Tensor:
+        """Return derivatives by states, residuals and common directions of some axes, shape (B, n, axes * all)."""
+        if axes not in self._by_axes:
+            every = torch.cat((self.own, self.rows[..., None], self.common), -1)
+            self._by_axes[axes] = every[:, :, axes].flatten(2).mT.contiguous().mT
+        return self._by_axes[axes]
 
 
 def moving(own: Tensor, other: Tensor) -> list[int]:

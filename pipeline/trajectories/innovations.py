@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-RESOLUTION_S = 1e-9
+RESOLUTION_S = 1e-12
 """Frame times [s] closer than this are the same: the times of recorded episodes share a grid up to rounding."""
 MOST_NUMBERS = 2_000_000
 """Maximum size of the whitening matrices of a batch; above it the filter runs over its frames."""

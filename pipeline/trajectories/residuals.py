@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..optimization.forward_mode import batched_jacobian
-from ..physics.engine import ragged_rollout
+from ..physics.engine import length_groups, ragged_rollout
 from ..physics.observation_model import measure
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
@@ -22,6 +22,8 @@ STATE_SIZE = 12
 STATE_STEPS = (2e-4, 2e-3, 5e-3, 5e-2)
 """Difference steps in position [m], rotation [rad], velocity [m/s] and omega [rad/s], where differences replace
 derivatives."""
+SMOOTH_STEPS = (1e-6, 1e-6, 1e-6, 1e-5)
+"""The same where motion is smooth: one side of such a step is closer to the derivative than both of the larger ones."""
 SPIN_STD_RAD_S = 0.5
 """Standard deviation [rad/s] of a measured spin, where the orientation was not measured."""
 STATE_PRIOR_STD = (0.1, 1.0, 5.0, 30.0)
@@ -65,6 +67,8 @@ class TrajectoryResiduals:
     differences: bool = False
     """Whether the Jacobian is that of differences over `STATE_STEPS`: exact derivatives of a body that rests on many
     spheres grow by a third in every step of 1 ms, and are useless."""
+    smooth: bool = False
+    """With `differences`, whether motion is smooth: states are moved up only, by `SMOOTH_STEPS`, in half the time."""
     parameter_steps: Sequence[tuple[float, float]] = ()
     """With `differences`, how far down and how far up each parameter is moved, in fitted coordinates; 0 leaves that
     side out."""
@@ -86,15 +90,18 @@ class TrajectoryResiduals:
         """Return residuals (B, m) and their differences (B, m, P + S) by the inputs (B, P + S)."""
         batch, size = inputs.shape
         states = (size - len(self.parameters)) // STATE_SIZE
-        own = [(step, step) for step in STATE_STEPS for _ in range(3)] * states
+        pairs = [(0.0, step) for step in SMOOTH_STEPS] if self.smooth else [(step, step) for step in STATE_STEPS]
+        own = [pair for pair in pairs for _ in range(3)] * states
         down, up = torch.tensor([*self.parameter_steps, *own]).to(inputs).T
         below, above = (down > 0).nonzero()[:, 0], (up > 0).nonzero()[:, 0]
         moves = torch.cat([torch.zeros(1, size).to(inputs), torch.diag(up)[above], -torch.diag(down)[below]])
         with torch.no_grad():
             rows = self._residuals((inputs + moves[:, None]).flatten(0, 1), len(moves)).unflatten(0, (-1, batch))
         ends = rows[:1].expand(size, -1, -1)
-        high = ends.index_copy(0, above, rows[1 : 1 + len(above)])
-        low = ends.index_copy(0, below, rows[1 + len(above) :])
+        high = (
+            rows[1:] if len(above) == size and not len(below) else ends.index_copy(0, above, rows[1 : 1 + len(above)])
+        )
+        low = ends.index_copy(0, below, rows[1 + len(above) :]) if len(below) else rows[:1]
         slopes = (high - low) / (down + up)[:, None, None]
         return rows[0], torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 
@@ -126,20 +133,45 @@ class TrajectoryResiduals:
         return measure(world, state, seen.times_s[:, :frames].repeat(repeats, 1), drives)
 
     def _residuals(self, inputs: Tensor, repeats: int) -> Tensor:
-        """Return the flat residuals (repeats * B, F * 6) of inputs (repeats * B, P + S)."""
-        rollout, seen, free = self._roll(inputs, repeats), self.observations, list(self.observations.free)
-        position = rollout.position_m[:, :, free] - seen.position_m.repeat(repeats, 1, 1, 1)
-        measured = quat_conjugate(seen.quat_wxyz.repeat(repeats, 1, 1, 1))
-        rotation = quat_log(quat_multiply(measured, rollout.quat_wxyz[:, :, free]))
-        weights = [
-            (mask.flatten(1)[..., None] / std).repeat(repeats, 1, 1)
-            for mask, std in ((seen.seen, self.position_std_m), (seen.has_orientation, self.rotation_std_rad))
-        ]
-        turned = rotation.flatten(1, 2) * weights[1]
+        """Return the flat residuals (repeats * B, F * 6) of inputs (repeats * B, P + S).
+
+        Items are rolled out up to their last measured frame; the residuals of later frames are 0.
+        """
+        seen, bodies = self.observations, len(self.observations.free)
+        batch, frames = seen.times_s.shape
+        groups = length_groups(seen.ends.tolist(), repeats)
+        if len(groups) == 1:
+            return self._rows(inputs, repeats, frames).flatten(1)
+        every, parts = inputs.unflatten(0, (repeats, batch)), []
+        for items, ends in groups:
+            own = {name: _some(getattr(self, name), items) for name in ("position_std_m", "rotation_std_rad")}
+            rows = replace(self, observations=seen.select(items), **own)._rows(
+                every[:, items].flatten(0, 1), repeats, ends
+            )
+            parts.append(torch.nn.functional.pad(rows, (0, 0, 0, (frames - ends) * bodies)).unflatten(0, (repeats, -1)))
+        back = torch.cat([torch.tensor(items) for items, _ in groups]).argsort()
+        return torch.cat(parts, 1)[:, back].flatten(0, 1).flatten(1)
+
+    def _rows(self, inputs: Tensor, repeats: int, frames: int) -> Tensor:
+        """Return the residuals (repeats * B, frames * nf, 6) of the first frames."""
+        rollout, seen, free = self._roll_together(inputs, repeats, frames), self.observations, self.observations.free
+        bodies = slice(None) if free == tuple(range(len(self.world.bodies))) else list(free)
+        position, quat = (x[:, :, bodies].unflatten(0, (repeats, -1)) for x in (rollout.position_m, rollout.quat_wxyz))
+        moved = self._weighted(position - seen.position_m[:, :frames], seen.seen, self.position_std_m)
+        if bool(seen.has_orientation[:, :frames].any()):
+            turn = quat_log(quat_multiply(quat_conjugate(seen.quat_wxyz[:, :frames]), quat))
+            turned = self._weighted(turn, seen.has_orientation, self.rotation_std_rad)
+        else:
+            turned = torch.zeros_like(moved)
         if seen.first_spin is not None:
             first = turned[:, : len(free)] + self._spin_residuals(inputs, *seen.first_spin, repeats)
             turned = torch.cat((first, turned[:, len(free) :]), 1)
-        return torch.cat((position.flatten(1, 2) * weights[0], turned), -1).flatten(1)
+        return torch.cat((moved, turned), -1)
+
+    def _weighted(self, away: Tensor, mask: Tensor, std: float | Tensor) -> Tensor:
+        """Return differences (repeats, B, F, nf, 3) over their standard deviations, shape (repeats * B, F nf, 3)."""
+        weight = mask.flatten(1)[..., None] / std
+        return (away.flatten(2, 3) * weight[:, : away.shape[2] * away.shape[3]]).flatten(0, 1)
 
     def _spin_residuals(self, inputs: Tensor, spin: Tensor, known: Tensor, repeats: int) -> Tensor:
         """Return the residuals (repeats * B, nf, 3) of measured initial spins, in sigmas; 0 where there is none.
@@ -151,3 +183,8 @@ class TrajectoryResiduals:
         away = self.observations.state.omega_body_rad_s[:, list(free)] - spin
         weight = known[..., None].to(spin) / SPIN_STD_RAD_S
         return (away.repeat(repeats, 1, 1) + change) * weight.repeat(repeats, 1, 1)
+
+
+def _some(std: float | Tensor, items: list[int]) -> float | Tensor:
+    """Return the standard deviations of some items."""
+    return std[items] if isinstance(std, Tensor) and std.ndim > 0 else std
