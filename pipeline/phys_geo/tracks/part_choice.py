@@ -2,7 +2,8 @@
 
 The parts are the centre of mass, the second moments of mass and the scale of lengths. Each set of them is judged by the
 misfit of tosses that its estimate has not seen (`segments/held_out_gain.py`). A part stays out unless it lowers this
-misfit beyond chance; the scale also has to beat the effects that look the same in flight.
+misfit beyond chance, also beside a drag where tosses ask for one; the scale also has to beat the effects that look the
+same in flight.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ SCALE = "length_scale"
 """The part that is an effect of the measurement; the others are those of the mass distribution."""
 RIVALS = ("gravity_scale", "clock_scale", "linear_drag")
 """Effects that look like a scale of lengths before the first contact."""
+DRAGS = ("linear_drag", "quadratic_drag")
+"""Forces that a fit of the mass distribution would follow for lack of anything else."""
 FLIGHT_FRAMES = 3
 """Minimum number of frames before the first contact, which determine the velocities at it."""
 WORDS = {"centre_of_mass": "centre of mass", "second_moments": "second moments of mass", SCALE: "scale of lengths"}
@@ -107,7 +110,7 @@ class _Comparison:
     def of(world: World, tosses: Sequence[Episode], noise: Noise, asked: Parts) -> _Comparison:
         """Linearise the misfit of the tosses."""
         own = {active.effect.name for active in world.effects}
-        added = [name for name in (SCALE, *RIVALS) if name not in own]
+        added = [name for name in dict.fromkeys((SCALE, *RIVALS, *DRAGS)) if name not in own]
         neutral = tuple(ActiveEffect.of(load_effect(name), {}, world.gravity) for name in added)
         wide = replace(world, effects=(*world.effects, *neutral))
         base = [(p, p.prior[0]) for p in (*CONTACT_PARAMETERS, GROUND_SHIFT)]
@@ -135,7 +138,13 @@ class _Comparison:
         """Return the best set of the open parts, each of which is needed."""
         sets = [some for count in range(1, len(open_parts) + 1) for some in combinations(open_parts, count)]
         gains = {some: self.gain(some) for some in sets}
-        admitted = [some for some in sets if gains[some].matters and self._beats_rivals(some)]
+        drag = self._drag()
+        beside = () if drag is None else (drag,)
+        admitted = [
+            some
+            for some in sets
+            if gains[some].matters and self._beats_rivals(some) and self._beside(some, beside).matters
+        ]
         chosen = max(admitted, key=lambda some: gains[some].share, default=())
         while unneeded := [part for part in chosen if not self._needed(part, chosen)]:
             weakest = min(unneeded, key=lambda part: self.gain(chosen, _without(chosen, part)).share)
@@ -146,8 +155,18 @@ class _Comparison:
             tested=tuple(
                 HeldOutFall(parts=some, share=gains[some].share, std_error=gains[some].std_error) for some in sets
             ),
-            sentence=_sentence(len(self.linear.score), open_parts, chosen, gains.get(chosen)),
+            sentence=_sentence(len(self.linear.score), open_parts, chosen, gains.get(chosen))
+            + ("" if drag is None or chosen else _force(drag, self.gain(beside))),
         )
+
+    def _drag(self) -> str | None:
+        """Return the drag that held-out tosses ask for most; None where they ask for none."""
+        gains = {name: self.gain((name,)) for name in DRAGS if name in self.columns}
+        return max((name for name in gains if gains[name].matters), key=lambda name: gains[name].share, default=None)
+
+    def _beside(self, parts: Parts, drag: Parts) -> HeldOutGain:
+        """Return the gain of parts beside a drag: what a force in flight explains is no mass distribution."""
+        return self.gain((*parts, *drag), drag)
 
     def _needed(self, part: str, chosen: Parts) -> bool:
         """Return whether held-out tosses miss a part of the chosen ones."""
@@ -176,6 +195,12 @@ def _sentence(episodes: int, open_parts: Parts, chosen: Parts, gain: HeldOutGain
     rest = f"; the {_listed(left)} {_left(left)}" if left else ""
     share = f"{100 * gain.share:.0f} +- {100 * gain.std_error:.0f} %"
     return f"{begin} the {_listed(chosen)} {verb}: the misfit of held-out tosses falls by {share}{rest}."
+
+
+def _force(drag: str, gain: HeldOutGain) -> str:
+    """Return that a force in flight explains held-out tosses better, as a further sentence."""
+    share = f"{100 * gain.share:.0f} +- {100 * gain.std_error:.0f} %"
+    return f" A force in flight, as {drag}, lets that misfit fall by {share}: cgwm diagnose tells which."
 
 
 def _left(parts: Sequence[str]) -> str:

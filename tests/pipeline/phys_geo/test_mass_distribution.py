@@ -15,6 +15,7 @@ from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_result import FitRecord
 from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
 from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
 from cgwm.pipeline.segments.held_out_gain import FOLDS, ContactLinearization
@@ -48,8 +49,11 @@ def weighted_world():
 
 
 @cache
-def tosses(count: int, weighted: bool = True) -> list[Episode]:
+def tosses(count: int, weighted: bool = True, drag_per_s: float = 0.0) -> list[Episode]:
     world = weighted_world() if weighted else world_of(box_body(), contact=law(), step_s=STEP_S)
+    if drag_per_s:
+        drag = ActiveEffect.of(load_effect("linear_drag"), {"c": drag_per_s}, world.gravity[0, :1])
+        world = replace(world, effects=(drag,))
     rng = np.random.default_rng(0)
     episodes = []
     for number in range(count):
@@ -108,6 +112,12 @@ def test_held_out_tosses_choose_a_hidden_weight_and_nothing_else() -> None:
     found = chosen(plain, tosses(10)) or ()
     assert "centre_of_mass" in found and "length_scale" not in found
     assert chosen(plain, tosses(10, weighted=False)) == ()
+
+
+def test_a_force_in_flight_is_no_mass_distribution_and_is_said() -> None:
+    choice = choose_parts(world_of(box_body(), step_s=STEP_S), tosses(10, False, 4.0), NOISE, PhysConfig())
+    assert choice is not None and not choice.chosen
+    assert "A force in flight, as linear_drag" in choice.sentence and "cgwm diagnose" in choice.sentence
 
 
 def test_nothing_is_chosen_from_few_tosses_or_against_the_settings() -> None:
