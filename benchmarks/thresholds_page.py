@@ -1,7 +1,8 @@
 """Write the thresholds of a diagnosis into docs/thresholds.md: `python benchmarks/thresholds_page.py`.
 
 The tables between the comments `<!-- thresholds: GROUP -->` and `<!-- end -->` are replaced by those of
-`pipeline/diagnose/thresholds.py` and `pipeline/segments/thresholds.py`; the rest of the page is left as it is.
+`thresholds.py` in `pipeline/diagnose/`, `pipeline/segments/` and `pipeline/trajectories/`; the rest of the page is
+left as it is.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from dataclasses import fields
 from pathlib import Path
 
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
-from cgwm.pipeline.segments.thresholds import SEGMENT_THRESHOLDS, Threshold, thresholds_of
+from cgwm.pipeline.segments.thresholds import SEGMENT_THRESHOLDS
+from cgwm.pipeline.trajectories.thresholds import TRACK_THRESHOLDS, Threshold, thresholds_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "thresholds.md"
 HEAD = ("name", "value", "unit", "decides", "calibrated on", "false alarms and misses")
@@ -22,7 +24,7 @@ def groups() -> dict[str, list[Threshold]]:
     """Return the thresholds of each group."""
     return {
         one.name: thresholds_of(getattr(every, one.name))
-        for every in (THRESHOLDS, SEGMENT_THRESHOLDS)
+        for every in (THRESHOLDS, SEGMENT_THRESHOLDS, TRACK_THRESHOLDS)
         for one in fields(every)
     }
 

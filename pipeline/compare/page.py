@@ -10,7 +10,7 @@ from typing import Any
 from ...schemas import PHASES, CompareResult, ErrorSummary, ModelComparison, PairedDifference
 from ..report.page import cautions, facts, fixed, number, page, paragraph, section, table, text
 from ..report.page_file import made_of, page_beside
-from ..trajectories.segmentation import CONTACT_S, FLIGHT_S
+from ..trajectories.thresholds import TRACK_THRESHOLDS
 from .error_ladder import LADDER_WORDS, error_ladder
 from .model_comparison import ComparedModel
 from .paired_difference import LEAST_EPISODES
@@ -18,6 +18,7 @@ from .player import REPLAY_SCRIPT, REPLAY_STYLE, Replay, replay_of
 from .short_horizon_errors import FREEDOMS
 from .wrench_chart import wrench_data, wrench_section
 
+CUTS = TRACK_THRESHOLDS.segmentation
 _MM = 1e3
 HOTTEST = 5.0
 """Residual, in units of the noise, that is drawn in full colour."""
@@ -210,9 +211,9 @@ def _player(replay: Replay, filmed: bool) -> str:
         left_out = f"To keep the page small, the player omits the episodes {', '.join(replay.left_out)}."
     words = (
         "Without colour: measured. In colour: predicted, open loop from the warm-up (shaded). The lower curve shows "
-        f"the residuals of short predictions: segments of at most {CONTACT_S:g} s in contact and {FLIGHT_S:g} s in "
-        "flight, each from the start that fits it best; the dashed line is the noise. Click or drag on a curve to "
-        "move in time."
+        f"the residuals of short predictions: segments of at most {CUTS.contact_s:g} s in contact and "
+        f"{CUTS.flight_s:g} s in flight, each from the start that fits it best; the dashed line is the noise. Click or "
+        "drag on a curve to move in time."
     )
     if filmed:
         words += " Below: video frames after the warm-up; the difference is amplified four times."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..segments.thresholds import BY_ARGUMENT, threshold
+from ..trajectories.thresholds import BY_ARGUMENT, threshold
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ..segments.thresholds import BY_ARGUMENT, threshold
+from ..trajectories.thresholds import BY_ARGUMENT, threshold
 from .contact_thresholds import FrictionThresholds, ImpactThresholds, SegmentsThresholds, SlidingThresholds
 
 

@@ -19,7 +19,8 @@ from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to
 from ..physics.impulse_solver import tangent_axes
 from ..physics.world import State, World
 from ..trajectories.observations import Observations
-from ..trajectories.segmentation import GAP, GroundPlane, Segment, heights_of, size_of, without_rest
+from ..trajectories.segmentation import GroundPlane, Segment, heights_of, size_of, without_rest
+from ..trajectories.thresholds import TRACK_THRESHOLDS
 from ..trajectories.track_noise import Noise
 from .contact_phases import is_round
 from .segments import Segments
@@ -139,7 +140,7 @@ def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return first and last frames of the steady stretches that are long enough, cut into equal parts."""
     found: list[tuple[int, int]] = []
     steps = np.diff(times)
-    breaks = np.append(False, steps > GAP * np.median(steps))
+    breaks = np.append(False, steps > TRACK_THRESHOLDS.segmentation.gap * np.median(steps))
     edges = np.flatnonzero(np.append(True, (steady[1:] != steady[:-1]) | breaks[1:]))
     for first, end in itertools.pairwise([*edges.tolist(), len(times)]):
         length = times[end - 1] - times[first]

@@ -1,55 +1,10 @@
-"""Thresholds as fields of frozen dataclasses: the value, and in the field's metadata what is known about it."""
+"""Thresholds of the fits that commands share: input, preparation, phases; see `trajectories.thresholds`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass
 
-NOT_KNOWN, NOT_MEASURED, BY_ARGUMENT = "not known", "not measured alone", "by argument"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Threshold:
-    """What is known about a threshold."""
-
-    name: str
-    """Name of the field."""
-    value: Any
-    """The value in use."""
-    unit: str
-    """Unit of the value; "1" for ratios and counts."""
-    decides: str
-    """What the threshold decides."""
-    calibrated_on: str
-    """Data or argument that the value follows from."""
-    error_rates: str
-    """False alarms and misses, on data other than those of the calibration where nothing else is said."""
-    false_alarms: tuple[int, int] | None
-    """Number of false alarms, and of data sets without an effect that it was counted on; None where not counted."""
-
-
-def threshold(
-    value: Any,
-    unit: str,
-    decides: str,
-    calibrated_on: str = NOT_KNOWN,
-    error_rates: str = NOT_MEASURED,
-    false_alarms: tuple[int, int] | None = None,
-) -> Any:
-    """Return a dataclass field with a value in use and what is known about it; see `Threshold`."""
-    known = {
-        "unit": unit,
-        "decides": decides,
-        "calibrated_on": calibrated_on,
-        "error_rates": error_rates,
-        "false_alarms": false_alarms,
-    }
-    return field(default=value, metadata=known)
-
-
-def thresholds_of(group: Any) -> list[Threshold]:
-    """Return the thresholds of a group, in their order."""
-    return [Threshold(name=one.name, value=getattr(group, one.name), **one.metadata) for one in fields(group)]
+from ..trajectories.thresholds import BY_ARGUMENT, threshold
 
 
 @dataclass(frozen=True, kw_only=True)

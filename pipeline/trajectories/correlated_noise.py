@@ -24,9 +24,11 @@ from ..optimization.levenberg_marquardt import Solution
 from .innovations import WHITE, CorrelatedNoise, NoiseModel
 from .observations import Observations
 from .segmentation import Segment
+from .thresholds import TRACK_THRESHOLDS
 from .track_noise import FLOOR_M, FLOOR_RAD
 
 Array = NDArray[np.float64]
+LIMITS = TRACK_THRESHOLDS.track_noise
 
 LONGEST_S = 0.4
 """Maximum length [s] of a window. A longer one shows more of the correlation, but a force that changes within it may be
@@ -45,19 +47,8 @@ REMEMBERED = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Correlations from one frame to the next that are tried."""
 SHARES = (1.0, 0.75, 0.5, 0.25)
 """Shares of the variance that is correlated, that are tried."""
-SURE, SURE_ALONE = 20.0, 6.0
-"""Minimum of twice the gain in log-likelihood for noise to count as correlated: of positions and rotations together,
-and of each kind. White noise that is four times larger along one axis reached 10."""
-LIKELY = 2.0
-"""Noise models within this distance of the largest evidence are candidates (two thirds of the true ones are); the
-slowest is chosen."""
 FLOORS = (FLOOR_M, FLOOR_RAD)
 """Smallest standard deviations of position [m] and rotation [rad] at which correlation is looked for."""
-WRONG = 9.0
-"""Ratio of a window's mean square to the median over windows above which it holds more than noise: a contact or an
-outlier."""
-ENOUGH = 60
-"""Minimum number of residual degrees of freedom of all windows for an estimate."""
 ROBUST_SCALE = 3.0
 """Scale of the robust loss with which windows are fitted, in sigmas."""
 MOST_CORRELATED = 0.98
@@ -75,10 +66,10 @@ def estimate_noise_model(
         The noise model; standard deviations of position [m] and rotation [rad], None for uncorrelated ones.
     """
     found = [_likeliest(whole, flight, kind) for kind in (0, 1)]
-    if sum(one.evidence for one in found) < SURE:
+    if sum(one.evidence for one in found) < LIMITS.sure_both:
         return WHITE, (None, None)
     # rounding errors of exact values are correlated from frame to frame, too
-    sure = [one.evidence > SURE_ALONE and one.std > floor for one, floor in zip(found, FLOORS, strict=True)]
+    sure = [one.evidence > LIMITS.sure_alone and one.std > floor for one, floor in zip(found, FLOORS, strict=True)]
     if not any(sure):
         return WHITE, (None, None)
     noise = NoiseModel(*(one.noise if yes else CorrelatedNoise() for one, yes in zip(found, sure, strict=True)))
@@ -105,10 +96,10 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     Restricted maximum likelihood (Patterson & Thompson 1971): of the residuals of a polynomial in every window.
     """
     windows = _windows(whole, flight, kind)
-    if sum(w.left.size for w in windows) < ENOUGH:
+    if sum(w.left.size for w in windows) < LIMITS.enough:
         return _Found(CorrelatedNoise(), 0.0, 0.0)
     sizes = np.concatenate([(w.left**2).mean((1, 2)) for w in windows])
-    kept = [w.without(WRONG * float(np.median(sizes))) for w in windows]
+    kept = [w.without(LIMITS.wrong * float(np.median(sizes))) for w in windows]
     windows = [w for w in kept if len(w.left)]
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
     alone, white_std = _likelihood(windows, CorrelatedNoise())
@@ -122,7 +113,7 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
         tried.append((2 * (likelihood - alone), slow, noise, std))
     most, _, _, likeliest = max(tried)
     # forces are found from slow changes, where windows show the errors least: the larger slow part is the safe choice
-    likely = [(slow, noise, std) for evidence, slow, noise, std in tried if evidence > most - LIKELY]
+    likely = [(slow, noise, std) for evidence, slow, noise, std in tried if evidence > most - LIMITS.likely]
     _, noise, std = max(likely)
     return _Found(noise._replace(size=std / likeliest), likeliest, most)
 

@@ -12,32 +12,25 @@ from torch import Tensor
 from ..geometry.rotation import continuous_turns
 from .observations import Observations
 from .segmentation import Segment
+from .thresholds import TRACK_THRESHOLDS
 from .track_noise import FLOOR_M, FLOOR_RAD, LONG_S, MAD_TO_STD, Noise, moves
 
+LIMITS = TRACK_THRESHOLDS.track_noise
 WINDOW = 9
 """Frames of a window that a cubic follows in free flight: 0.09 s at 100 Hz, within 0.1 mm for 6 mm at 20 rad/s."""
 DEGREE = 3
 """Degree of the polynomial that is removed from a window."""
 SLOW_DEGREE = 7
 """Orders from the fourth to this one contain slow errors of a window and almost nothing of the flight."""
-OUTLIER_SIGMAS = 6.0
-"""Distance, in sigmas, from the cubic through the other frames of a window above which a frame is a wrong measurement;
-2e-9 of normal errors lie there."""
-KEEP_SIGMAS = 4.0
-"""Residuals above this many sigmas of a first, robust estimate are left out of the final one."""
-SURE_SIGMAS = 2.5
-"""Minimum excess of the correlation of neighbouring frames, in standard errors, to count as correlated."""
 MOST_CORRELATED = 0.95
 """Maximum correlation from frame to frame that is considered."""
-ENOUGH = 60
-"""Minimum number of residuals for an estimate, which then has a standard error of 10 %."""
 
 
 def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float | None, float | None]:
     """Return the standard deviations of position [m] and rotation [rad] by axis; None with too little flight.
 
     Each window of consecutive frames is fitted by a cubic; residuals are scaled to the same variance, and those beyond
-    `KEEP_SIGMAS` of a first, robust estimate are left out. Windows of a body with measured orientation are short,
+    `keep_sigmas` of a first, robust estimate are left out. Windows of a body with measured orientation are short,
     because a point away from its centre of mass does not follow a long cubic. A cubic follows a part of errors that are
     correlated over several frames, such as those of smoothed tracks; the result is the standard deviation of the full
     errors.
@@ -92,12 +85,12 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
     for kind in (0, 1):
         for segment, column, frames, away in _windows(whole, flight, kind, step=1):
             size = np.abs(away).max(1) / noise[kind]
-            if size.max() <= OUTLIER_SIGMAS:
+            if size.max() <= LIMITS.outlier_sigmas:
                 continue
             worst = int(size.argmax())
             rest = torch.as_tensor(np.delete(frames, worst))
             left = _cubic(whole, segment.episode, column, rest, kind)
-            if np.abs(left).max() / noise[kind] <= OUTLIER_SIGMAS:
+            if np.abs(left).max() / noise[kind] <= LIMITS.outlier_sigmas:
                 wrong.add((kind, segment.episode, int(frames[worst]), column))
             else:
                 kinked[segment.episode, torch.as_tensor(frames)] = True
@@ -128,7 +121,7 @@ def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: fl
                 if len(frames) < WINDOW:
                     continue
                 away = _cubic(whole, segment.episode, column, frames, kind)
-                if np.abs(away).max() > KEEP_SIGMAS * noise:
+                if np.abs(away).max() > LIMITS.keep_sigmas * noise:
                     continue
                 raw = away * np.sqrt(np.diag(left))[:, None]
                 square, product = square + float((raw**2).sum()), product + float((raw * (pair @ raw)).sum())
@@ -139,7 +132,7 @@ def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: fl
         return 1.0
     # with independent errors the ratio has this scatter
     scatter = np.sqrt(2 * ((seen @ seen).trace() - alone**2 / known) / count) / known
-    if product / square < alone / known + SURE_SIGMAS * scatter:
+    if product / square < alone / known + LIMITS.neighbours * scatter:
         return 1.0
     gap = np.abs(np.subtract.outer(np.arange(WINDOW), np.arange(WINDOW)))
     rhos = np.linspace(0.0, MOST_CORRELATED, 200)
@@ -211,8 +204,8 @@ def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind:
 
 def _spread(residuals: np.ndarray, floor: float) -> float | None:
     """Return the standard deviation without outliers, at least a floor; None for too few residuals."""
-    if len(residuals) < ENOUGH:
+    if len(residuals) < LIMITS.enough:
         return None
     first = MAD_TO_STD * float(np.median(np.abs(residuals)))
-    kept = residuals[np.abs(residuals) < KEEP_SIGMAS * max(first, floor)]
+    kept = residuals[np.abs(residuals) < LIMITS.keep_sigmas * max(first, floor)]
     return max(float(np.sqrt(np.mean(kept**2))), floor)

@@ -21,41 +21,11 @@ from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..physics.world import Body, World
 from .initial_state import FLIGHT_MARGIN_M, clearance
 from .observations import Observations
+from .thresholds import TRACK_THRESHOLDS
 from .track_noise import Noise
 
 Array = NDArray[np.float64]
-
-FLIGHT_S = 0.60
-"""Maximum length [s] of a flight segment; longer flights are cut into equal parts."""
-MIN_FLIGHT_S = 0.06
-"""Minimum length [s] of a flight between two contacts: a shorter one determines no acceleration and belongs to the
-contact."""
-CONTACT_S = 0.10
-"""Maximum length [s] of a contact segment."""
-MIN_FRAMES = 6
-"""Minimum number of frames of a segment: its state uses up the information of two."""
-LEAD_S = 0.03
-"""Length [s] of flight before and after a contact that is included, to determine the velocities before and after."""
-GAP = 2.5
-"""Maximum gap within a segment, in median frame intervals."""
-STILL_SIGMAS = 4.0
-"""Nothing moves in a segment where the means of its halves differ by less than this many standard errors."""
-KEPT_RESTS = 2
-"""Number of segments at rest in a row that are kept."""
-MOVE_SHARE = 0.75
-"""Share of its last or next move by which a point must be away from contact: whatever the bounce, one of its sides lies
-within half a move (study of diagnosis, pitfall P1)."""
-NOISE_SIGMAS = 3.0
-"""Standard errors of the measured heights by which the margin of flight grows."""
-MOST_LIFT = 0.5
-"""Maximum difference of an acceleration from gravity, as a share of gravity, for free fall: a known effect in the air
-is weaker."""
-SURE_SIGMAS = 5.0
-"""Minimum of that difference in standard errors."""
-LEAST_FALL = 0.2
-"""Minimum downward acceleration, as a share of gravity, of a parabola through all heights that counts as flight."""
-KINK_FRAMES = 3
-"""Number of frames before and after a bounce within a segment that are not free fall."""
+LIMITS = TRACK_THRESHOLDS.segmentation
 
 
 @dataclass(frozen=True)
@@ -122,18 +92,20 @@ def _cut_stretch(
     step = float(times[first : last + 1].diff().median()) if last > first else 1.0
     runs = _runs(clear[first : last + 1].tolist())
     flies = [
-        is_clear and b - a + 1 >= MIN_FRAMES and float(times[first + b] - times[first + a]) >= MIN_FLIGHT_S
+        is_clear
+        and b - a + 1 >= LIMITS.least_frames
+        and float(times[first + b] - times[first + a]) >= LIMITS.least_flight_s
         for is_clear, a, b in runs
     ]
     for fly, group in itertools.groupby(zip(flies, runs, strict=True), key=lambda pair: pair[0]):
         spans = [run for _, run in group]
         a, b = first + spans[0][1], first + spans[-1][2]
         if fly:
-            flight += [Segment(episode, *part) for part in _parts(a, b, step, FLIGHT_S, share=False)]
+            flight += [Segment(episode, *part) for part in _parts(a, b, step, LIMITS.flight_s, share=False)]
         elif not all(is_clear for is_clear, _, _ in spans):
-            lead = max(1, round(LEAD_S / step))
+            lead = max(1, round(LIMITS.lead_s / step))
             a, b = max(first, a - lead), min(last, b + lead)
-            contact += [Segment(episode, *part) for part in _parts(a, b, step, CONTACT_S, share=True)]
+            contact += [Segment(episode, *part) for part in _parts(a, b, step, LIMITS.contact_s, share=True)]
     return flight, contact
 
 
@@ -152,10 +124,10 @@ def without_rest(whole: Observations, items: Sequence[Segment], noise: Noise) ->
                 (values[p] * mask[p, :, None]).sum(0) / mask[p, :, None].sum(0).clamp_min(1.0)
                 for p in (slice(0, half), slice(half, None))
             ]
-            limit = STILL_SIGMAS * sigma * (2 / half) ** 0.5
+            limit = LIMITS.still * sigma * (2 / half) ** 0.5
             still &= bool(((parts[1] - parts[0]).abs() < limit).all())
         resting[item.episode] = resting.get(item.episode, 0) + 1 if still else 0
-        if resting[item.episode] <= KEPT_RESTS:
+        if resting[item.episode] <= LIMITS.kept_rests:
             kept.append(item)
     return kept
 
@@ -174,7 +146,7 @@ def _stretches(times: Tensor) -> list[tuple[int, int]]:
     if len(times) < 2:
         return []
     steps = times.diff()
-    cuts = (steps > GAP * steps.median()).nonzero()[:, 0].tolist()
+    cuts = (steps > LIMITS.gap * steps.median()).nonzero()[:, 0].tolist()
     edges = [-1, *cuts, len(times) - 1]
     return [(a + 1, b) for a, b in itertools.pairwise(edges)]
 
@@ -195,10 +167,10 @@ def _parts(first: int, last: int, step_s: float, longest_s: float, share: bool) 
     A contact may happen between two frames: shared ends lose none.
     """
     count = last - first + 1
-    if count < MIN_FRAMES:
+    if count < LIMITS.least_frames:
         return []
-    most = max(MIN_FRAMES, round(longest_s / step_s) + 1)
-    number = max(1, min(-(-count // most), count // MIN_FRAMES))
+    most = max(LIMITS.least_frames, round(longest_s / step_s) + 1)
+    number = max(1, min(-(-count // most), count // LIMITS.least_frames))
     edges = [first + round(k * (count - (1 if share else 0)) / number) for k in range(number + 1)]
     if share:
         return list(itertools.pairwise(edges))
@@ -222,18 +194,18 @@ def clear_frames(world: World, observations: Observations, noise: Noise) -> Tens
     if world.ground_normal is not None and world.ground_offset is not None:
         for column, index in enumerate(observations.free):
             heights = heights_of(world, world.bodies[index], observations, column)
-            margin = FLIGHT_MARGIN_M + NOISE_SIGMAS * float(
+            margin = FLIGHT_MARGIN_M + LIMITS.height_sigmas * float(
                 np.hypot(noise.position_m, noise.rotation_rad * size_of(world.bodies[index]))
             )
             clear &= _apart(heights, margin)
     others = clearance(replace(world, ground_normal=None), observations)
     if bool(torch.isfinite(others).any()):
-        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise.position_m)
+        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)
     for a in range(len(observations.free)):
         for b in range(a):
             reach = size_of(world.bodies[observations.free[a]]) + size_of(world.bodies[observations.free[b]])
             gap = (observations.position_m[:, :, a] - observations.position_m[:, :, b]).norm(dim=-1) - reach
-            clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + NOISE_SIGMAS * noise.position_m)
+            clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)
     return clear
 
 
@@ -273,7 +245,7 @@ def _apart(gaps: Tensor, margin: float) -> Tensor:
     moves = gaps.diff(dim=1).abs()
     edge = torch.zeros_like(gaps[:, :1])
     move = torch.maximum(torch.cat((edge, moves), 1), torch.cat((moves, edge), 1))
-    return (gaps > margin + MOVE_SHARE * move).all(-1)
+    return (gaps > margin + LIMITS.move_share * move).all(-1)
 
 
 def supported_frames(world: World, whole: Observations, flight: Sequence[Segment], noise: Noise) -> Tensor:
@@ -324,7 +296,7 @@ def _not_falling(t: Array, along: Array, strength: float, sigma: float) -> NDArr
         return held
     held[:] = True
     at = _kink(t, along, strength) if low is None else low
-    sides = [slice(0, max(at - KINK_FRAMES, 0)), slice(at + KINK_FRAMES + 1, len(t))]
+    sides = [slice(0, max(at - LIMITS.kink_frames, 0)), slice(at + LIMITS.kink_frames + 1, len(t))]
     falls = [_off_gravity(t[side], along[side], strength, sigma) for side in sides]
     if not off or any(sure and not differs for differs, sure in falls):
         for side, (_, sure) in zip(sides, falls, strict=True):
@@ -339,14 +311,14 @@ def _low_point(t: Array, along: Array, strength: float, sigma: float) -> int | N
     A free fall is lowest at one of its ends. A bounce is lower than frames before and after it by the height of the
     shortest flight, whichever they are.
     """
-    if len(t) < 2 * MIN_FRAMES:
+    if len(t) < 2 * LIMITS.least_frames:
         return None
     # two wrong frames in a row make no bounce
     smooth = np.median(np.lib.stride_tricks.sliding_window_view(along, 5), axis=1)
     before, after = np.minimum.accumulate(smooth), np.minimum.accumulate(smooth[::-1])[::-1]
     depth = smooth - np.maximum(before, after)
     at = int(depth.argmax())
-    least = max(strength * MIN_FLIGHT_S**2 / 8, SURE_SIGMAS * sigma)
+    least = max(strength * LIMITS.least_flight_s**2 / 8, LIMITS.lift_sigmas * sigma)
     return at + 2 if float(depth[at]) > least else None
 
 
@@ -358,12 +330,12 @@ def _off_gravity(t: Array, along: Array, strength: float, sigma: float) -> tuple
     solution = np.linalg.lstsq(powers, along, rcond=None)[0]
     error = 2 * sigma * float(np.sqrt(np.linalg.inv(powers.T @ powers)[0, 0]))
     fall = 2 * float(solution[0])
-    away, least = abs(fall - strength), MOST_LIFT * strength
-    off = away > least and away > SURE_SIGMAS * error
-    if off and fall > LEAST_FALL * strength:
+    away, least = abs(fall - strength), LIMITS.most_lift * strength
+    off = away > least and away > LIMITS.lift_sigmas * error
+    if off and fall > LIMITS.least_fall * strength:
         # an even fall is a flight under a force that nobody has named, not a support
-        off = float((along - powers @ solution).std()) > NOISE_SIGMAS * sigma
-    return off, len(t) >= MIN_FRAMES and SURE_SIGMAS * error < least
+        off = float((along - powers @ solution).std()) > LIMITS.height_sigmas * sigma
+    return off, len(t) >= LIMITS.least_frames and LIMITS.lift_sigmas * error < least
 
 
 def _kink(t: Array, along: Array, strength: float) -> int:

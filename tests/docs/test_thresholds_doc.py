@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cgwm.pipeline.segments.thresholds import NOT_KNOWN, Threshold
+from cgwm.pipeline.trajectories.thresholds import NOT_KNOWN, Threshold
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -175,6 +175,54 @@ SEGMENT_NUMERICS = {
 """Numbers of modules in `pipeline/segments` outside of the table, by the reason why they decide no verdict."""
 
 
+TRACK_NUMERICS = {
+    "end of a descent, or its grid": (
+        "correlated_noise.REMEMBERED",
+        "correlated_noise.SHARES",
+        "correlated_noise.ROBUST_SCALE",
+        "correlated_noise.MOST_CORRELATED",
+        "flight_noise.MOST_CORRELATED",
+        "state_uncertainty.MAX_STEP",
+        "state_uncertainty.DAMPINGS",
+        "state_uncertainty.ROBUST_SCALE",
+        "residuals.STATE_STEPS",
+    ),
+    "window of an estimate, and the polynomial in it": (
+        "correlated_noise.LONGEST_S",
+        "correlated_noise.LEAST_DEGREE, MOST_DEGREE",
+        "correlated_noise.CIRCLE_LEFT",
+        "correlated_noise.LARGEST_TURN",
+        "correlated_noise.LEAST",
+        "flight_noise.WINDOW",
+        "flight_noise.DEGREE",
+        "flight_noise.SLOW_DEGREE",
+        "track_noise.WINDOW",
+        "track_noise.LONG_FRAMES, LONG_S",
+    ),
+    "width of a prior, or size of a state": (
+        "residuals.STATE_SIZE",
+        "residuals.SPIN_STD_RAD_S",
+        "residuals.STATE_PRIOR_STD",
+        "track_noise.MAD_TO_STD",
+    ),
+    "bounds the duration or the resolution": (
+        "innovations.RESOLUTION_S",
+        "innovations.MOST_NUMBERS",
+        "state_uncertainty.MAX_ITEMS",
+        "observations.START_FRAMES",
+        "initial_state.MIN_FRAMES",
+    ),
+    "listed on the page: they refuse an input or begin a prediction, and decide no verdict": (
+        "initial_state.FLIGHT_MARGIN_M",
+        "initial_state.LINE_MISFIT",
+        "initial_state.LINE_SPREAD",
+        "observations.LONGEST_STEP_S",
+        "track_noise.FLOOR_M, FLOOR_RAD",
+    ),
+}
+"""Numbers of modules in `pipeline/trajectories` outside of the table, by the reason why they decide no verdict."""
+
+
 def file_of(module: str) -> Path:
     return ROOT / module if module.startswith(("datasets/", "schemas/")) else ROOT / "pipeline" / module
 
@@ -237,7 +285,9 @@ def test_what_is_not_known_of_a_threshold_is_said(one: Threshold) -> None:
 
 
 def test_every_threshold_of_the_table_is_read() -> None:
-    sources = (path for room in ("diagnose", "segments") for path in (ROOT / "pipeline" / room).rglob("*.py"))
+    sources = (
+        path for room in ("diagnose", "segments", "trajectories") for path in (ROOT / "pipeline" / room).rglob("*.py")
+    )
     text = "\n".join(path.read_text(encoding="utf-8") for path in sources)
     reads = set(re.findall(r"(?:limits|LIMITS|thresholds|THRESHOLDS\.\w+)\.(\w+)", text))
     assert {name.partition(".")[2] for name in TABLE} <= reads
@@ -258,7 +308,11 @@ def module_numbers(source: str) -> Iterator[str]:
 
 @pytest.mark.parametrize(
     ("room", "allowed"),
-    [("diagnose", set(NUMERICS)), ("segments", {name for names in SEGMENT_NUMERICS.values() for name in names})],
+    [
+        ("diagnose", set(NUMERICS)),
+        ("segments", {name for names in SEGMENT_NUMERICS.values() for name in names}),
+        ("trajectories", {name for names in TRACK_NUMERICS.values() for name in names}),
+    ],
 )
 def test_no_number_outside_of_the_table_decides_a_verdict(room: str, allowed: set[str]) -> None:
     found = {
