@@ -185,6 +185,7 @@ TRACK_NUMERICS = {
         "state_uncertainty.MAX_STEP",
         "state_uncertainty.DAMPINGS",
         "state_uncertainty.ROBUST_SCALE",
+        "residuals.SMOOTH_STEPS",
         "residuals.STATE_STEPS",
     ),
     "window of an estimate, and the polynomial in it": (
