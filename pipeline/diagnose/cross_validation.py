@@ -90,7 +90,7 @@ def _by_others(segments: Segments, parameters: Sequence[Parameter], values: Tens
     linear = linearised(segments, parameters, values)
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(values))
     episode = torch.tensor([item.episode for item in segments.items])
-    bounds = torch.tensor([p.limits for p in parameters]).to(values)
+    bounds = torch.tensor([p.limits for p in parameters]).reshape(-1, 2).to(values)
     found = torch.empty(len(episode), len(parameters)).to(values)
     for number in episode.unique().tolist():
         others = episode != number

@@ -9,6 +9,8 @@ import numpy as np
 
 from ...schemas import Remaining
 from ..optimization.uncertainty import student_quantile
+from ..segments.prepare import whole_flights
+from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence
@@ -36,7 +38,7 @@ def remaining_of(found: FlightFindings) -> Remaining | None:
     """Return what is left in flight beside the selected effects; None without flight."""
     if found.segments is None:
         return None
-    position, rotation = _residuals(found.segments)
+    position, rotation = _residuals(_whole(found, found.segments))
     std, slow, left = found.prepared.noise.position_m, found.slow, found.left
     return Remaining(
         position_rms_m=position,
@@ -49,6 +51,14 @@ def remaining_of(found: FlightFindings) -> Remaining | None:
         p_value=None if left is None else left.p_value,
         share_explained=min(max(found.common_share, 0.0), 1.0),
     )
+
+
+def _whole(found: FlightFindings, segments: Segments) -> Segments:
+    """Return segments of flights whole: where nothing slow shows, the search cuts them."""
+    items = whole_flights(segments.items)
+    if len(items) == len(segments.items):
+        return segments
+    return fit_states(found.prepared.segments("flight", found.world, items))
 
 
 def _residuals(segments: Segments) -> tuple[float, float | None]:

@@ -215,6 +215,11 @@ def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tup
             assert np.allclose(mine, c, atol=0.02)
 
 
+def test_a_drag_beside_a_tilt_of_each_episode_is_named() -> None:
+    named = found({"linear_drag": {"c": 0.3}}, tilt_m_s2=0.15, seed=3)
+    assert [one.evidence.candidate.spec for one in named.chosen] == ["linear_drag", "gravity_tilt@episode"]
+
+
 def test_a_drag_through_which_a_wind_acts_is_drawn_without_both() -> None:
     world = world_with("ball", {"quadratic_drag": {"k": 0.1}, "wind": {"w_x": 1.0}}, ground=False)
     prepared = prepare(world, tosses(world, 1, count=1, duration_s=0.3))
