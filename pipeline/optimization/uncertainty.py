@@ -59,8 +59,8 @@ ENOUGH_EPISODES = 8
 def correlation_of(names: Sequence[str], covariance: Array) -> Correlation:
     """Return the correlations of fitted coordinates with a covariance (P, P), in the form of `model.json`."""
     std = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
-    # of parameters that do the same it is 1, which rounding may exceed
-    matrix = np.clip(covariance / np.outer(std, std), -1.0, 1.0)
+    # of parameters that do the same it is 1, which rounding may exceed, and otherwise on the two sides of the diagonal
+    matrix = np.clip(0.5 * (covariance + covariance.T) / np.outer(std, std), -1.0, 1.0)
     return Correlation(parameters=tuple(names), matrix=tuple(map(tuple, matrix.tolist())))
 
 

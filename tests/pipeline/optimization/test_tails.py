@@ -22,3 +22,6 @@ def test_quantiles(dof: float) -> None:
 def test_parameters_that_do_the_same_are_correlated_by_no_more_than_1() -> None:
     (_, (below, itself)) = correlation_of(["a", "b"], np.array([[4.0, 2.0000002], [2.0000002, 1.0]])).matrix
     assert (below, itself) == (1.0, 1.0)
+    # nor one that rounding has left different on the two sides of the diagonal
+    matrix = correlation_of(["a", "b"], np.array([[4.0, -2.0], [-1.96, 1.0]])).matrix
+    assert matrix[0][1] == matrix[1][0] == pytest.approx(-0.99)
