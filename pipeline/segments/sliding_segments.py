@@ -87,22 +87,23 @@ def grounded_states(segments: Segments, state: State) -> State:
 def _impacts(world: World, whole: Observations, episode: int, seen: Tensor, noise: Noise) -> NDArray[np.bool_]:
     """Return the seen frames within one frame of a jump of the speed along the normal, or of the tilting."""
     body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
-    height = (whole.position_m[episode, seen, 0] @ normal)[:, None].numpy()
+    height = (whole.position_m[episode, seen, 0] @ normal).numpy()
     quat, turned = whole.quat_wxyz[episode, seen, 0], whole.has_orientation[episode, seen, 0].numpy() > 0
     level = tangent_axes(normal)[1:]
     jumps = np.zeros(len(seen), np.bool_)
-    for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
-        if (t < 0).sum() < 2 or (t > 0).sum() < 2:
-            continue
-        inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], 1))[3]
-        spread = float(np.linalg.norm(inverse))
-        least = max(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
-        jumps[k] = np.abs(inverse @ height[frames]).max() > least
-        if is_round(body) or not turned[frames].all():
-            continue  # an impact of a ball never changes its spin alone
-        turns = quat_log(quat_multiply(quat[frames], quat_conjugate(quat[k : k + 1])))  # world axes
-        tilting = np.linalg.norm(inverse @ (turns @ level.T).numpy())
-        jumps[k] |= tilting > max(LIMITS.jump_m_s / size_of(body), LIMITS.jump_sigmas * noise.rotation_rad * spread)
+    for places, frames, t in _windows(whole.times_s[episode, seen].numpy()):
+        inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], -1))[:, 3]
+        spread = np.linalg.norm(inverse, axis=1)
+        least = np.maximum(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
+        found = np.abs((inverse * height[frames]).sum(1)) > least
+        known = turned[frames].all(1)
+        if not is_round(body) and known.any():  # an impact of a ball never changes its spin alone
+            now = quat_conjugate(quat[torch.from_numpy(places)])[:, None]
+            turns = quat_log(quat_multiply(quat[torch.from_numpy(frames)], now))  # world axes
+            tilting = np.linalg.norm(np.einsum("nw,nwa->na", inverse, (turns @ level.T).numpy()), axis=1)
+            least = np.maximum(LIMITS.jump_m_s / size_of(body), LIMITS.jump_sigmas * noise.rotation_rad * spread)
+            found |= known & (tilting > least)
+        jumps[places] = found & ((t < 0).sum(1) >= 2) & ((t > 0).sum(1) >= 2)
     wide = jumps.copy()
     wide[1:] |= jumps[:-1]
     wide[:-1] |= jumps[1:]
@@ -115,25 +116,29 @@ def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, nois
     turned = whole.has_orientation[episode, seen, 0].numpy() > 0
     up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ normal).numpy()
     tilts = np.zeros(len(seen), np.bool_)
-    for k, frames, t in _windows(whole.times_s[episode, seen].numpy()):
+    for places, frames, t in _windows(whole.times_s[episode, seen].numpy()):
         known = turned[frames]
-        if known.sum() < 3:
-            continue
-        slope = np.linalg.pinv(np.stack([np.ones(int(known.sum())), t[known]], 1))[1]
-        spread = float(np.linalg.norm(slope))
-        least = max(LIMITS.tilting_rad_s, LIMITS.jump_sigmas * noise_rad * spread)
-        tilts[k] = np.linalg.norm(slope @ up[frames][known]) > least
+        # a frame that does not count is a row of zeros
+        slope = np.linalg.pinv(np.stack([np.ones_like(t), t], -1) * known[..., None])[:, 1]
+        least = np.maximum(LIMITS.tilting_rad_s, LIMITS.jump_sigmas * noise_rad * np.linalg.norm(slope, axis=1))
+        tilting = np.linalg.norm(np.einsum("nw,nwa->na", slope, up[frames]), axis=1)
+        tilts[places] = (known.sum(1) >= 3) & (tilting > least)
     return tilts
 
 
-def _windows(times: Array) -> Iterator[tuple[int, slice, Array]]:
-    """Yield the index of each frame (at least two), the frames within some steps of it, and their distance [s]."""
+def _windows(times: Array) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+    """Yield frames (n,) (of at least two), those within some steps of each (n, w), and their distance (n, w) [s].
+
+    Frames with as many others near them come together.
+    """
     step = float(np.median(np.diff(times)))
     side = max(SIDE_FRAMES, round(SIDE_S / step))
     reach = (side + 0.5) * step
     firsts, ends = np.searchsorted(times, times - reach), np.searchsorted(times, times + reach)
-    for k, (first, end) in enumerate(zip(firsts, ends, strict=True)):
-        yield k, slice(first, end), times[first:end] - times[k]
+    for width in np.unique(ends - firsts).tolist():
+        places = np.flatnonzero(ends - firsts == width)
+        frames = firsts[places, None] + np.arange(width)
+        yield places, frames, times[frames] - times[places, None]
 
 
 def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:
