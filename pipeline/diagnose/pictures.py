@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...schemas import DiagnoseResult, NextExperiment, NotConvergedError
+from ..physics.engine import rollout
 from ..physics.impulse_solver import tangent_axes
-from ..physics.rollout import simulate
 from ..physics.world import State, World
 from ..segments.candidates import without_effect
 from ..segments.prepare import Prepared, whole_flights
@@ -186,16 +186,13 @@ def effect_picture(prepared: Prepared, world: World, name: str) -> EffectPicture
         words = "the fastest measured flight, and last as long"
     else:
         return None
-    times = torch.linspace(0.0, length_s, FRAMES).to(world.gravity)
-    without = without_effect(world, name)
-    try:
-        places = [simulate(one, start, times).position_m[0, :, world.free[0]].double() for one in (world, without)]
-    except NotConvergedError:
+    found, bare = (_path(one, start, length_s) for one in (world, without_effect(world, name)))
+    if found is None or bare is None:
         return None
-    sides = [_from_side(world, start, place) for place in places]
+    sides = [_from_side(world, start, place) for place in (found, bare)]
     motions = DrawnMotion(f"with {name}", sides[0]), DrawnMotion("without it", sides[1])
-    apart = (places[0] - places[1]).norm(dim=1)
-    return EffectPicture(name, words, times.double().numpy(), motions, apart.numpy())
+    times = torch.linspace(0.0, length_s, FRAMES).double()
+    return EffectPicture(name, words, times.numpy(), motions, (found - bare).norm(dim=1).numpy())
 
 
 def _fastest(prepared: Prepared, flight: Segments) -> tuple[State, float]:
@@ -257,9 +254,10 @@ def _path(world: World, start: State, length_s: float) -> Tensor | None:
     """Return the places (T, 3) [m] of the free body; None where it cannot be simulated."""
     times = torch.linspace(0.0, length_s, FRAMES).to(world.gravity)
     try:
-        return simulate(world, start, times).position_m[0, :, world.free[0]].double()
+        place = rollout(world, start, times).position_m[0, :, world.free[0]].double()
     except NotConvergedError:
         return None
+    return place if bool(place.isfinite().all()) else None  # the kernel returns a rollout that diverged
 
 
 def binned_means(x: Array, values: Array, std: Array, bins: int = 4) -> list[tuple[float, float]]:
