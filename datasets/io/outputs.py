@@ -163,7 +163,9 @@ def is_own_file(path: Path, kind: FileKind) -> bool:
 
 def may_repeat(path: Path, kind: DirectoryKind | FileKind) -> bool:
     """Return whether a file is cgwm's own, of a kind that the same command writes with the same bytes again."""
-    return kind in _REPEATABLE and not path.is_symlink() and is_own_file(path, kind)  # pyright: ignore[reportArgumentType]
+    if kind not in _REPEATABLE or os.path.islink(path) or not os.path.isfile(path):  # neither fails on a long name
+        return False
+    return is_own_file(path, kind)  # pyright: ignore[reportArgumentType]
 
 
 @contextmanager
