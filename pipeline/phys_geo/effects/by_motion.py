@@ -78,8 +78,11 @@ def fit_effect_flights(
     scores = torch.stack([linear.score[episode == one].sum(0) for one in episode.unique().tolist()])
     excess = max(prepared.slow, float(linear.chi2.sum() / linear.dof.sum().clamp_min(1.0)), 1.0)
     covariance = few_covariance(information / excess + prior, scores.numpy() / excess, prior)
-    std = np.sqrt(np.diag(covariance))
-    if any(s > SEGMENT_THRESHOLDS.preparation.unobservable_share * p.prior[1] for s, p in zip(std, names, strict=True)):
+    with np.errstate(invalid="ignore"):
+        std = np.sqrt(np.diag(covariance))
+    share = SEGMENT_THRESHOLDS.preparation.unobservable_share
+    # of effects that do the same, rounding leaves no variance at all
+    if not all(s <= share * p.prior[1] for s, p in zip(std, names, strict=True)):
         return None
     parameters = tuple(
         fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True)
