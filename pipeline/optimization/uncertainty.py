@@ -81,8 +81,12 @@ def few_covariance(information: Array, scores: Array, prior: Array | None = None
     """
     curvature = inverse(information)
     count = len(scores)
-    spread = scores.T @ scores + (0.0 if prior is None else prior)
-    scatter = curvature @ spread @ curvature
+    # as a square, which rounding leaves with variances above 0 where parameters do nearly the same
+    parts = [curvature @ scores.T]
+    if prior is not None:
+        sizes, directions = np.linalg.eigh(prior)
+        parts.append(curvature @ (directions * np.sqrt(sizes.clip(0.0))))
+    scatter = sum((part @ part.T for part in parts), np.zeros_like(curvature))
     if count >= ENOUGH_EPISODES:
         return scatter
     if count < 2:
