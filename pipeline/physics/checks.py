@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...schemas import InputDataError
+from ...schemas import InputDataError, UsageError
+from ...schemas.materials import of_pair
 from ..geometry.rotation import quat_to_matrix
 from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of, plain
 from .contact_law import ContactLaw
-from .paper_law import stable_step
+from .pair_laws import laws_in_use
+from .paper_law import PaperLaw, stable_step
 from .world import State, World
 
 DEEPEST_SHARE = 0.25
@@ -51,17 +53,12 @@ def require_physical(world: World) -> None:
             "at most the sum of the two smaller ones: no distribution of mass has more",
         )
         _require((plain(body.radii) > 0).all(-1), plain(body.radii).amin(-1), f"{place}: radius", "m", "above 0")
-    law = world.contact
-    _require(plain(law.friction) >= 0, plain(law.friction), world.called("friction"), "1", "0 or more")
-    if isinstance(law, ContactLaw):
-        time, ratio = plain(law.contact_time_s), plain(law.damping_ratio)
-        _require(time > 0, time, world.called("contact_time_s"), "s", "above 0 s")
-        _require(ratio >= 0, ratio, world.called("damping_ratio"), "1", "0 or more")
-    else:
-        _require(
-            plain(law.stiffness_n_m) > 0, plain(law.stiffness_n_m), world.called("stiffness"), "N/m", "above 0 N/m"
+    if world.pair_laws and not isinstance(world.contact, ContactLaw):
+        raise UsageError(
+            f"the contact law '{world.contact.name}' has no laws of pairs of materials.", "closed_form with them."
         )
-        _require(plain(law.damping_n_s_m) >= 0, plain(law.damping_n_s_m), world.called("damping"), "N s/m", "0 or more")
+    for pair, law in ((None, world.contact), *world.pair_laws.items()):
+        _require_law(world, pair, law)
     bound = largest_step(world)
     if not 0 < world.step_s <= bound:
         raise InputDataError(
@@ -72,6 +69,18 @@ def require_physical(world: World) -> None:
         )
 
 
+def _require_law(world: World, pair: tuple[str, str] | None, law: ContactLaw | PaperLaw) -> None:
+    friction = plain(law.friction)
+    _require(friction >= 0, friction, world.called(of_pair("friction", pair)), "1", "0 or more")
+    if isinstance(law, ContactLaw):
+        time, ratio = plain(law.contact_time_s), plain(law.damping_ratio)
+        _require(time > 0, time, world.called(of_pair("contact_time_s", pair)), "s", "above 0 s")
+        _require(ratio >= 0, ratio, world.called(of_pair("damping_ratio", pair)), "1", "0 or more")
+        return
+    _require(plain(law.stiffness_n_m) > 0, plain(law.stiffness_n_m), world.called("stiffness"), "N/m", "above 0 N/m")
+    _require(plain(law.damping_n_s_m) >= 0, plain(law.damping_n_s_m), world.called("damping"), "N s/m", "0 or more")
+
+
 def largest_step(world: World) -> float:
     """Return the largest step [s] that the contact law admits.
 
@@ -80,7 +89,10 @@ def largest_step(world: World) -> float:
     law is unstable beyond `stable_step`, taken for one contact on the lightest body; several contacts at once need a
     smaller step.
     """
-    law = world.contact
+    return min(_largest_step(law, world) for law in laws_in_use(world).laws)
+
+
+def _largest_step(law: ContactLaw | PaperLaw, world: World) -> float:
     if isinstance(law, ContactLaw):
         swing = (1 - plain(law.damping_ratio).square()).clamp_min(0.0).sqrt()
         period = torch.where(swing > 0, math.pi * plain(law.contact_time_s) / swing.clamp_min(1e-12), torch.inf)

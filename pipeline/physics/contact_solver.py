@@ -130,7 +130,8 @@ class Contacts:
             else:
                 points = body_points(some[a], some[b], h, self.sharpness_per_m)
             if points is not None:
-                touch, axes = self._touch(points, some[a], None if b == GROUND else some[b], h, items)
+                law = self.world.law_of(a, b)
+                touch, axes = self._touch(points, some[a], None if b == GROUND else some[b], law, h, items)
                 found.append((number, points, touch, axes))
         if not found:
             return []
@@ -175,7 +176,7 @@ class Contacts:
         return found
 
     def _touch(
-        self, points: Points, a: Placed, b: Placed | None, h: Tensor, items: Tensor | None
+        self, points: Points, a: Placed, b: Placed | None, law: ContactLaw | PaperLaw, h: Tensor, items: Tensor | None
     ) -> tuple[Touch, Tensor]:
         velocity, spin = a.point_velocity(points.position), a.omega
         if b is not None:
@@ -183,7 +184,6 @@ class Contacts:
             axes = tangent_axes(points.normal)
         else:
             axes = self._ground_axes.expand(*points.gap.shape, 3, 3)
-        law = self.world.contact
         friction = take(law.friction, items)[:, None]
         if isinstance(law, ContactLaw):
             time, ratio = (take(x, items)[:, None] for x in (law.contact_time_s, law.damping_ratio))

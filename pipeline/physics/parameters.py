@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from ...schemas.materials import of_pair
+from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
+from .paper_law import PaperLaw
 from .world import Body, World, stretched_inertia
+
+Law = TypeVar("Law", bound=ContactLaw | PaperLaw)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,8 +183,11 @@ def mass_distribution(body: str, size_m: float) -> tuple[Parameter, ...]:
 def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tensor) -> World:
     """Return the world with the given values (B, P), in the units of `parameters`."""
     column = {parameter.name: values[:, index] for index, parameter in enumerate(parameters)}
-    law = world.contact
-    world = replace(world, contact=replace(law, **{name: column[name] for name in vars(law) if name in column}))
+    world = replace(
+        world,
+        contact=_with_coefficients(world.contact, None, column),
+        pair_laws={pair: _with_coefficients(law, pair, column) for pair, law in world.pair_laws.items()},
+    )
     world = replace(world, effects=tuple(_with_values(active, column) for active in world.effects))
     if "ground_shift_m" in column and world.ground_offset is not None:
         world = replace(world, ground_offset=world.ground_offset + column["ground_shift_m"])
@@ -187,6 +195,12 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
         changes = _mass_distribution_of(body, column)
         world = world.with_body(index, **changes) if changes else world
     return world
+
+
+def _with_coefficients(law: Law, pair: tuple[str, str] | None, column: Mapping[str, Tensor]) -> Law:
+    """Return the contact law of a pair of materials with the given coefficients (B,), by `of_pair` of their names."""
+    given = {name: column[of_pair(name, pair)] for name in vars(law) if of_pair(name, pair) in column}
+    return replace(law, **given) if given else law
 
 
 def _with_values(active: ActiveEffect, column: Mapping[str, Tensor]) -> ActiveEffect:

@@ -129,7 +129,7 @@ class Engine:
         """Return the batch size common to all tensors."""
         world = self.world
         tensors = [world.gravity, self.times, state.position_m, state.velocity_m_s, state.omega_body_rad_s]
-        tensors += [getattr(world.contact, name) for name in vars(world.contact)] if world.bodies else []
+        tensors += [value for law in world.laws for value in vars(law).values()] if world.bodies else []
         tensors += [world.ground_offset] + [value for active in world.effects for value in active.values.values()]
         tensors += [value for body in world.bodies for value in (body.mass, body.inertia, body.com, body.centers)]
         tensors += [drive.times_s for drive in self.drives.values()]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ...schemas import InputDataError, UsageError
+from ...schemas.materials import pair_of
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
@@ -48,6 +49,8 @@ class Body:
     """Position [m] and quat_wxyz of a fixed body, world frame, shape (1, 7)."""
     on_plane: Tensor | None = None
     """Indices of the spheres that the ground can touch, shape (K,); None for all."""
+    material: str | None = None
+    """Material, by which its pairs with others have their laws; None where it does not matter."""
 
     @property
     def free(self) -> bool:
@@ -68,7 +71,11 @@ class World:
     ground_offset: Tensor | None
     """Offset of the ground along its normal [m], shape (B,); None without a ground."""
     contact: ContactLaw | PaperLaw
-    """The contact law and its coefficients."""
+    """The contact law and its coefficients, for all pairs that `pair_laws` does not have."""
+    pair_laws: Mapping[tuple[str, str], ContactLaw] = field(default_factory=dict)
+    """The laws of pairs of materials, by `pair_of` of their names."""
+    ground_material: str | None = None
+    """Material of the ground; None where it does not matter."""
     step_s: float = 0.001
     """Largest time step [s]."""
     iterations: int = 10
@@ -126,6 +133,29 @@ class World:
                 "check the times (seconds?) and the step_s of the model.",
             )
         return [max(1, math.ceil(length / self.step_s - 1e-6)) for length in longest]
+
+    @property
+    def laws(self) -> tuple[ContactLaw | PaperLaw, ...]:
+        """All contact laws: that of pairs without a law of their own, then those of `pair_laws`."""
+        return (self.contact, *self.pair_laws.values())
+
+    def material_of(self, index: int) -> str | None:
+        """Return the material of a body, of the ground for -1."""
+        return self.ground_material if index < 0 else self.bodies[index].material
+
+    def law_of(self, a: int, b: int) -> ContactLaw | PaperLaw:
+        """Return the contact law of two bodies, by index; -1 is the ground."""
+        return self.law_between(self.material_of(a), self.material_of(b))
+
+    def law_between(self, first: str | None, second: str | None) -> ContactLaw | PaperLaw:
+        """Return the contact law of two materials in either order: `contact` where the pair has none of its own."""
+        pair = self.pair_between(first, second)
+        return self.contact if pair is None else self.pair_laws[pair]
+
+    def pair_between(self, first: str | None, second: str | None) -> tuple[str, str] | None:
+        """Return the pair of two materials where it has a law of its own, else None."""
+        pair = None if first is None or second is None else pair_of(first, second)
+        return pair if pair in self.pair_laws else None
 
     @property
     def up(self) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
 from ..contact_detection import GROUND, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
 from ..kinematic import Drive
+from ..pair_laws import laws_in_use
 from ..rigid_body import start
 from ..world import Body, State, World
 from . import wrenches
@@ -34,7 +35,9 @@ class Packed:
     table: Tensor
     """Values of each environment, shape (B, columns)."""
     steps: Tensor
-    """Step [s], stiffness, damping and start time [s] of each interval, shape (1 or B, intervals, 4)."""
+    """Step [s], stiffness, damping and start time [s] of each interval, then stiffness and damping of each further
+    contact law, shape (1 or B, intervals, 2 + 2 laws).
+    """
     geometry: Tensor
     """Centres in the body frame and radii of the spheres [m], shape (1 or B, spheres, 4)."""
     drives: Tensor
@@ -91,9 +94,9 @@ def pack(
     turned = turn is not None and len(world.bodies) > 1
     columns = _columns(world, state, turn, turned, effects)
     spheres = [_spheres(body) for body in world.bodies]
-    law, substeps = wrenches.closed_form(world), world.substeps(times)
+    laws, substeps = wrenches.closed_forms(world), world.substeps(times)
     counts = torch.tensor(substeps, dtype=torch.int32, device=times.device)
-    steps = _steps(law, times, counts)
+    steps = _steps(laws, times, counts)
     batch = max(
         x.shape[0]
         for x in (*columns, *spheres, steps, *(x for row in rows.values() for x in row))
@@ -143,26 +146,37 @@ def _structure(
         drives=tuple(driven.index(index) if index in driven else -1 for index in range(len(world.bodies))),
         spheres=tuple(body.radii.shape[-1] for body in world.bodies),
         pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
+        laws=_law_numbers(world),
         lowest=lowest,
         surface=wrenches.has_surface(world),
         elliptic=wrenches.has_ellipse(world),
     )
 
 
-def _steps(law: ContactLaw, times: Tensor, substeps: Tensor) -> Tensor:
-    """Return step, stiffness, damping and start time of the intervals (1 or B, intervals, 4); one row for none."""
+def _law_numbers(world: World) -> tuple[int, ...]:
+    """Return the number of each pair's contact law; none where all are the same."""
+    numbers = laws_in_use(world).of_pair
+    return numbers if any(numbers) else ()
+
+
+def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tensor:
+    """Return the rows of `Packed.steps` (1 or B, intervals, 2 + 2 laws); one row where there is no interval."""
     if times.shape[1] == 1:
-        return torch.cat((torch.zeros_like(times).expand(times.shape[0], 3), times), -1)[:, None]
+        zero = torch.zeros_like(times)
+        further = zero.expand(times.shape[0], 2 * len(laws) - 2)
+        return torch.cat((zero.expand(times.shape[0], 3), times, further), -1)[:, None]
     h = times.diff(dim=1) / substeps
-    stiffness, damping = coefficients(law.contact_time_s[:, None], law.damping_ratio[:, None], h)
-    return torch.stack(torch.broadcast_tensors(h, stiffness, damping, times[:, :-1]), -1)
+    each = [coefficients(law.contact_time_s[:, None], law.damping_ratio[:, None], h) for law in laws]
+    further = [value for pair in each[1:] for value in pair]
+    return torch.stack(torch.broadcast_tensors(h, *each[0], times[:, :-1], *further), -1)
 
 
 def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effects: list[Tensor]) -> list[Tensor]:
     """Return the columns of the table: first those of the world, then those of each body."""
     zero = torch.zeros_like(world.gravity[:, :1])
     offset = zero if world.ground_offset is None else world.ground_offset[:, None]
-    columns = [_turned(turn, world.gravity), offset, world.contact.friction[:, None]]
+    columns = [_turned(turn, world.gravity), offset]
+    columns += [law.friction[:, None] for law in wrenches.closed_forms(world)]
     if turned and turn is not None:
         columns.append(turn[None])
     columns += [_turned(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]

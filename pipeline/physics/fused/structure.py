@@ -14,7 +14,8 @@ THREADS = 32
 """Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
 BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 2, 22
 TURN_COLUMNS, WORLD_COLUMNS = 4, 5
-"""Columns of the table of environments, by subject, as `load` in `kernels/environment.cuh` reads them."""
+"""Columns of the table of environments, by subject, as `load` in `kernels/environment.cuh` reads them; each further
+contact law adds one to those of the world."""
 MOTION_COLUMNS = 13
 """Last columns of a body: position, orientation, velocity and spin."""
 _BUSY_THREADS = 262_144
@@ -61,6 +62,8 @@ class Structure:
     """Number of spheres of each body, shape (bodies,)."""
     pairs: tuple[tuple[int, int, int], ...]
     """Pairs of bodies that may touch, -1 for the ground, each with its number of contacts."""
+    laws: tuple[int, ...] = ()
+    """Number of the contact law of each pair; empty where all have the same one."""
     lowest: tuple[tuple[int, int], ...] = ()
     """First row and number of each body's spheres whose heights count; empty where heights do not."""
     carried: bool = False
@@ -76,6 +79,11 @@ class Structure:
         return sum(count for _, _, count in self.pairs)
 
     @property
+    def law_count(self) -> int:
+        """Number of contact laws."""
+        return max(self.laws, default=0) + 1
+
+    @property
     def slots(self) -> int:
         """Number of contacts per thread."""
         return max(1, -(-self.contacts // self.lanes))
@@ -83,7 +91,7 @@ class Structure:
     @property
     def table_width(self) -> int:
         """Number of columns of the table of environments."""
-        world = WORLD_COLUMNS + self.turned * TURN_COLUMNS
+        world = WORLD_COLUMNS + self.law_count - 1 + self.turned * TURN_COLUMNS
         world += self.effects * WRENCH_COLUMNS + self.twisted * TWIST_COLUMNS + self.magnets * MAGNET_COLUMNS
         world += self.surface * SURFACE_COLUMNS
         return world + len(self.free) * BODY_COLUMNS
@@ -114,7 +122,7 @@ class Structure:
             "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
             "BODIES": len(self.free), "PAIRS": len(self.pairs),
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
-            "LISTED": paired or alone, "CULLED": alone,
+            "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip
@@ -127,6 +135,7 @@ class Structure:
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
             "contact_start": _starts([count for _, _, count in self.pairs]),
+            "pair_law": self.laws,
             "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]

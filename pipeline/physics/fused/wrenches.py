@@ -27,6 +27,7 @@ from ..effects.torsional_friction import TorsionalFriction
 from ..effects.velocity_restitution import VelocityRestitution
 from ..effects.viscous_friction import ViscousFriction
 from ..effects.wind import Wind
+from ..pair_laws import laws_in_use
 from ..world import World
 
 _KNOWN = (
@@ -62,15 +63,17 @@ def reason_against(world: World) -> str | None:
     return _against_surface(world, acting)
 
 
-def closed_form(world: World) -> ContactLaw:
-    """Return the contact law of a world that the kernel supports.
+def closed_forms(world: World) -> list[ContactLaw]:
+    """Return the contact laws in use of a world that the kernel supports.
 
     Raises:
         UsageError: If the world has another contact law.
     """
-    if not isinstance(world.contact, ContactLaw):
+    laws = laws_in_use(world).laws
+    found = [law for law in laws if isinstance(law, ContactLaw)]
+    if len(found) < len(laws):
         raise UsageError(f"{_no_law(world)}.", todo="use simulate, which can.")
-    return world.contact
+    return found
 
 
 def _no_law(world: World) -> str:
@@ -160,7 +163,7 @@ def coefficients(world: World) -> list[Tensor]:
 
 def _surface(world: World, zero: Tensor) -> list[Tensor]:
     """Return the columns (1 or B, 1) of `Surface`; lengths and speeds of effects that do not act are 1."""
-    law = closed_form(world)
+    law = closed_forms(world)[0]  # the surface is that of one body on the ground
     values: dict[type[Effect], Values] = {type(active.effect): active.values for active in world.effects}
 
     def number(kind: type[Effect], name: str, otherwise: float = 0.0) -> Tensor:

@@ -16,7 +16,7 @@ INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocit
 // Adds the impulse of the adhesion of the ground to a body's velocity and angular momentum.
 INLINE void stick(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec& velocity,
                   Vec& spin) {
-    const Surface& s = env.law.surface;
+    const Surface& s = env.laws[0].surface;
     Real sum = Real(0), most = Real(0), each = reciprocal(s.reach);
     Vec arms = none();
     for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
@@ -34,7 +34,7 @@ INLINE void stick(const Problem& problem, const Environment& env, int b, const M
     arms = env.lanes.sum(arms);
     most = -env.lanes.least(-most);
     // the weights are normalised to that of the lowest sphere: the force does not depend on the number of spheres
-    Real pull = -(env.law.step_s * s.adhesion * most * reciprocal(at_least(sum, Number(1e-12))));
+    Real pull = -(env.laws[0].step_s * s.adhesion * most * reciprocal(at_least(sum, Number(1e-12))));
     velocity.z += env.constants[b].inverse_mass * pull * sum;
     spin.x += pull * arms.y;
     spin.y -= pull * arms.x;
@@ -59,7 +59,7 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
                   Vec& velocity, Vec& spin) {
     const Wrenches& w = env.wrenches;
     const Body& body = env.bodies[b];
-    Real h = env.law.step_s;
+    Real h = env.laws[0].step_s;
     Vec u = body.velocity - w.wind;
     // the tiny number keeps the derivative finite at rest
     Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
@@ -107,7 +107,7 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
 INLINE bool near_ground(const Environment& env, int b, const Motion& m) {
     Number low = plain(env.bodies[b].position.z - env.ground) - env.constants[b].reach;
     Number rate = plain(m.velocity.z) - size(m.omega) * env.constants[b].reach;
-    return low < Number(1e-6) || low + plain(env.law.step_s) * rate < Number(1e-6);
+    return low < Number(1e-6) || low + plain(env.laws[0].step_s) * rate < Number(1e-6);
 }
 
 #if PAIRED
@@ -173,7 +173,7 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
     const Motion &ma = motions[a], &mb = motions[b];
     Vec com_a = env.bodies[a].position, com_b = env.bodies[b].position;
     // points at a gap g approach at V + W g / 2 at most, so those beyond h V / (1 - h W / 2) cannot touch in this step
-    Number spins = size(ma.omega) + size(mb.omega), h = plain(env.law.step_s);
+    Number spins = size(ma.omega) + size(mb.omega), h = plain(env.laws[0].step_s);
     Number V = size(ma.velocity - mb.velocity) + size(ma.omega) * (ca.reach + Number(SMOOTHING_M)) +
                size(mb.omega) * (cb.reach + Number(SMOOTHING_M));
     Number near = Number(1e-9 + SMOOTHING_M) + h * (size(ma.velocity - mb.velocity) + size(ma.omega) * ca.reach +
@@ -198,7 +198,7 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
             Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
                                 dot(turn_b, mb.inverse_inertia * turn_b);
             Real mobility = mobility_trace(ma, c.arm) + mobility_trace(mb, c.arm_b);
-            if (prepare(c, env.law, facing.gap, speed, inverse_mass, mobility, weight)) {
+            if (prepare(c, env.laws[pair_law(p)], facing.gap, speed, inverse_mass, mobility, weight)) {
                 touching++;
             } else {
                 if (!env.warm || !(plain(env.before[c.slot].x) > Number(0)) || !(facing.sharp_gap < near)) continue;
@@ -270,7 +270,7 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
 #if CULLED
     // no point of the body sinks further in this step, up to rounding
     Number fall = size(motion.velocity) + size(motion.omega) * env.constants[a].reach;
-    Number far = plain(env.law.step_s) * fall + Number(1e-6);
+    Number far = plain(env.laws[0].step_s) * fall + Number(1e-6);
 #endif
 #if PAIRED
     int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
@@ -300,7 +300,7 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
 #if CULLED
         if (plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far) continue;
 #endif
-        bool touches = touch_ground(list[i], env.law, motion, rotation * held, height, radius, weights[i]);
+        bool touches = touch_ground(list[i], env.laws[pair_law(p)], motion, rotation * held, height, radius, weights[i]);
         if (touches) {
             add_row(moments, list[i], weights[i]);
             count++;
@@ -327,7 +327,7 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
     Real total = Real(0);
     EACH_CONTACT(list, first, count) total += weights[i];
     total = env.lanes.sum(total);
-    EACH_CONTACT(list, first, count) surface(list[i], env.law, motion, env.bodies[a].position, weights[i], total);
+    EACH_CONTACT(list, first, count) surface(list[i], env.laws[0], motion, env.bodies[a].position, weights[i], total);
 #endif
 }
 
@@ -387,7 +387,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #if PAIRED
         for (int i = 0; i < count; i++) {
             Contact& c = list[i];
-            if (sweep >= 0) c.impulse = swept(c, env.law, relative_velocity(c, motions));
+            if (sweep >= 0) c.impulse = swept(c, env.laws[0], relative_velocity(c, motions));
             linear[c.a] = linear[c.a] + c.impulse;
             angular[c.a] = angular[c.a] + cross(c.arm, c.impulse);
             if (c.b >= 0) {
@@ -398,11 +398,11 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #else
         EACH_CONTACT(list, 0, count) {
             Contact& c = list[i];
-            if (sweep >= 0) c.impulse = swept(c, env.law, motions[0].velocity + cross(motions[0].omega, c.arm));
+            if (sweep >= 0) c.impulse = swept(c, env.laws[0], motions[0].velocity + cross(motions[0].omega, c.arm));
             linear[0] = linear[0] + c.impulse;
             angular[0] = angular[0] + cross(c.arm, c.impulse);
 #if SURFACE
-            if (sweep >= 0) c.turning = turned_by(c, env.law, motions[0], touching);
+            if (sweep >= 0) c.turning = turned_by(c, env.laws[0], motions[0], touching);
             angular[0] = angular[0] + c.turning;
 #endif
         }
@@ -425,13 +425,13 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
     }
 #if RECORD
 #if PAIRED
-    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.law, env.bodies[list[i].a].position);
+    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.laws[0], env.bodies[list[i].a].position);
 #elif LISTED
-    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.law, env.bodies[0].position);
+    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.laws[0], env.bodies[0].position);
 #else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
-        if (list[i].on) note(env.tallies[i], list[i], env.law, env.bodies[0].position);
+        if (list[i].on) note(env.tallies[i], list[i], env.laws[0], env.bodies[0].position);
     }
 #endif
 #endif

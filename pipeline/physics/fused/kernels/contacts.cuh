@@ -1,4 +1,4 @@
-struct Law {
+struct Law {  // of a pair of materials, in a step
     Real step_s, inverse_step, stiffness, damping, friction;
 #if SURFACE
     Surface surface;
@@ -14,6 +14,9 @@ struct Motion {  // velocities of a body without contact, and inverse mass and i
 struct Contact {  // world frame, impulse on body a
     Vec arm, impulse;
     Real target, stop_n, stop_t;
+#if LAWS > 1
+    Real friction;
+#endif
 #if SURFACE
     Real friction, steady_x, steady_y;  // steady: fixed impulses (viscosity)
     Vec turning;                        // angular impulse of rolling and torsional friction
@@ -33,7 +36,7 @@ struct Contact {  // world frame, impulse on body a
 };
 
 INLINE Real friction_of(const Law& law, const Contact& c) {
-#if SURFACE
+#if SURFACE || LAWS > 1
     return c.friction;
 #else
     return law.friction;
@@ -50,6 +53,9 @@ INLINE Real mobility_trace(const Motion& m, Vec arm) {
 INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inverse_mass, Real mobility, Real& weight) {
     Real ahead = gap + law.step_s * speed;
     weight = Real(0);
+#if LAWS > 1
+    c.friction = law.friction;
+#endif
     if (!(plain(gap) < Number(0) || plain(ahead) < Number(0))) return false;
     Real depth = plain(ahead) < plain(gap) ? -ahead : -gap;
     weight = at_most(at_least(Number(1.0 / ONSET_M) * depth, Number(0)), Number(1));

@@ -1,6 +1,7 @@
 struct Problem {
     Input table;     // (environments, TABLE_WIDTH): numbers of each environment, in the order in which `load` reads
-    Input steps;     // (1 or environments, intervals, 4): step, stiffness, damping, time at the start
+    Input steps;     // (1 or environments, intervals, STEP_WIDTH): step, stiffness, damping, time at the start; then
+                     // stiffness and damping of each further law
     Input geometry;  // (1 or environments, spheres, 4): centres in the body frame, radii
     Input drives;    // (1 or environments, samples, 14): time, position, quaternion, velocity, angular velocity
     const int* __restrict__ substeps;      // of each interval
@@ -52,7 +53,7 @@ struct Environment {
     Lanes lanes;
     Vec gravity;
     Real ground;
-    Law law;
+    Law laws[LAWS];
 #if EFFECTS
     Wrenches wrenches;
 #endif
@@ -80,8 +81,9 @@ INLINE void load(const Problem& problem, Environment& env) {
     long long at = env.index * TABLE_WIDTH;
     env.gravity = table.vector(at);
     env.ground = table.at(at + 3);
-    env.law.friction = table.at(at + 4);
-    at += 5;
+    at += 4;
+    EACH_LAW
+    for (int l = 0; l < LAWS; l++) env.laws[l].friction = table.at(at++);
 #if TURNED
     Quat turn = {table.at(at), table.at(at + 1), table.at(at + 2), table.at(at + 3)};
     env.turn = matrix(turn);
@@ -108,7 +110,7 @@ INLINE void load(const Problem& problem, Environment& env) {
 #endif
 #endif
 #if SURFACE
-    Surface& s = env.law.surface;
+    Surface& s = env.laws[0].surface;
     s.stribeck = table.at(at);
     s.slow_speed = table.at(at + 1);
     s.even = table.at(at + 2);

@@ -3,11 +3,13 @@
 #define EACH_BODY
 #define EACH_SLOT
 #define EACH_PAIR
+#define EACH_LAW
 #define KEEP_LOOP
 #else
 #define INLINE __device__ __forceinline__
 #define EACH_BODY _Pragma("unroll")
 #define EACH_PAIR _Pragma("unroll 1")
+#define EACH_LAW _Pragma("unroll")
 #if UNROLLED
 #define EACH_SLOT _Pragma("unroll")
 #else

@@ -15,7 +15,7 @@ INLINE void step(const Problem& problem, Environment& env, Real time_after) {
         if (is_free(b)) {
             starts[b] = c.inverse_inertia * transposed(rotations[b], body.spin);
             motions[b].omega = rotations[b] * starts[b];
-            velocities[b] = body.velocity + env.law.step_s * env.gravity;
+            velocities[b] = body.velocity + env.laws[0].step_s * env.gravity;
 #if EFFECTS
             apply(problem, env, b, rotations[b], motions[b].omega, velocities[b], spins[b]);
             motions[b].omega = rotations[b] * (c.inverse_inertia * transposed(rotations[b], spins[b]));
@@ -32,7 +32,7 @@ INLINE void step(const Problem& problem, Environment& env, Real time_after) {
 #endif
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
-        if (is_free(b)) advance(env.bodies[b], env.constants[b], starts[b], velocities[b], spins[b], env.law.step_s);
+        if (is_free(b)) advance(env.bodies[b], env.constants[b], starts[b], velocities[b], spins[b], env.laws[0].step_s);
 #if DRIVEN
         if (drive_number(b) >= 0) drive(problem, env, b, time_after);
 #endif
@@ -165,15 +165,20 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
     write(problem, env, 0);
     KEEP_LOOP
     for (int frame = 1; frame < problem.frame_count; frame++) {
-        long long row = env.steps + 4LL * (frame - 1);
-        env.law.step_s = problem.steps.at(row);
-        env.law.inverse_step = reciprocal(env.law.step_s);
-        env.law.stiffness = problem.steps.at(row + 1);
-        env.law.damping = problem.steps.at(row + 2);
+        long long row = env.steps + (long long)STEP_WIDTH * (frame - 1);
+        Real step_s = problem.steps.at(row), inverse_step = reciprocal(step_s);
+        EACH_LAW
+        for (int l = 0; l < LAWS; l++) {
+            Law& law = env.laws[l];
+            law.step_s = step_s;
+            law.inverse_step = inverse_step;
+            law.stiffness = problem.steps.at(row + (l ? 2 + 2 * l : 1));
+            law.damping = problem.steps.at(row + (l ? 3 + 2 * l : 2));
+        }
         Real start = problem.steps.at(row + 3);
         int substeps = problem.substeps[frame - 1];
         KEEP_LOOP
-        for (int s = 1; s <= substeps; s++) step(problem, env, start + Number(s) * env.law.step_s);
+        for (int s = 1; s <= substeps; s++) step(problem, env, start + Number(s) * step_s);
         write(problem, env, frame);
     }
 #if CARRIED

@@ -24,10 +24,12 @@ from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
 from cgwm.pipeline.physics.kinematic import Drive
+from cgwm.pipeline.physics.pair_laws import laws_in_use
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import InputDataError, UsageError
+from cgwm.schemas.materials import of_pair, pair_of
 from helpers import fused_host, worlds
 from helpers.worlds import F64, ball_body, batch, box_body, state_of, times
 from torch import Tensor
@@ -269,9 +271,13 @@ def test_single_precision_of_a_fast_spin(fused: Fused) -> None:
 
 
 def of_parameters(engine: Any, world: World, frames: Tensor, driven: Any = None) -> Callable[[Tensor, int], Tensor]:
-    """Return the rollout as a function of 12 numbers of the state, the contact, the ground, and the centre of mass."""
+    """Return the rollout as a function of 12 numbers of the state, the contact, the ground, and the centre of mass.
+
+    The numbers of the contact are followed by those of each pair of materials.
+    """
     names = [replace(GROUND_SHIFT, name=f"{world.bodies[0].name}.com_{axis}_m") for axis in "xyz"]
-    named = (*CONTACT_PARAMETERS, GROUND_SHIFT, *names)
+    of_pairs = [replace(p, name=of_pair(p.name, pair)) for pair in world.pair_laws for p in CONTACT_PARAMETERS]
+    named = (*CONTACT_PARAMETERS, GROUND_SHIFT, *names, *of_pairs)
 
     def function(values: Tensor, repeats: int) -> Tensor:
         state, size = tossed(1, 0.07), len(values)
@@ -298,7 +304,8 @@ def of_parameters(engine: Any, world: World, frames: Tensor, driven: Any = None)
 def agree_with_derivatives(
     fused: Fused, world: World, first: list[float], frames: Tensor, driven: Any, spread: float
 ) -> None:
-    inputs = torch.tensor([[*first, 0.3, 0.004, 0.4, 0.001, 0.002, -0.001, 0.003]], dtype=F64)
+    of_pairs = [0.5, 0.005, 0.2] * len(world.pair_laws)
+    inputs = torch.tensor([[*first, 0.3, 0.004, 0.4, 0.001, 0.002, -0.001, 0.003, *of_pairs]], dtype=F64)
     inputs = inputs * (1 + spread * torch.arange(1 if driven else 2, dtype=F64)[:, None])
     value, jacobian = batched_jacobian(of_parameters(simulate, world, frames, driven), inputs)
     mine, its = batched_jacobian(of_parameters(fused, world, frames, driven), inputs)
@@ -316,6 +323,44 @@ def test_derivatives_of_a_toss(fused: Fused) -> None:
 def test_derivatives_of_bodies_that_touch(fused: Fused) -> None:
     world, _, driven = crowd()
     first = [0, 0, 0.053, 0.01, 0.02, 0.01, 0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
+    agree_with_derivatives(fused, world, first, times(0.05), driven, 0.0)
+
+
+def of_materials(world: World, **laws: ContactLaw) -> World:
+    """Return the world of `crowd` with a steel cube and a steel pusher on wood, and laws by pair of materials."""
+    materials = {"cube": "steel", "pusher": "steel", "box": "rubber", "top": "rubber"}
+    bodies = tuple(replace(body, material=materials.get(body.name)) for body in world.bodies)
+    pair_laws = {pair_of(*name.split("_")): law for name, law in laws.items()}
+    return replace(world, bodies=bodies, ground_material="wood", pair_laws=pair_laws)
+
+
+def test_pairs_of_materials_have_their_own_laws(fused: Fused) -> None:
+    world, state, driven = crowd()
+    like = state.position_m
+    driven = {name: Drive.of([track], like) for name, track in driven.items() if isinstance(track, Track)}
+    laws = {"steel_wood": worlds.law(0.1, 0.006, 0.8), "steel_steel": worlds.law(0.9, 0.003, 0.1),
+            "rubber_steel": ContactLaw(batch([0.7, 0.2])[0], batch(0.004), batch([0.2, 1.4])[0])}  # fmt: skip
+    plain = simulate(world, state, times(0.16), driven, True)
+    world = of_materials(world, **laws)
+    assert laws_in_use(world).of_pair == (0, 1, 2, 3, 1, 2, 1)
+    expected = simulate(world, state, times(0.16), driven, True)
+    assert (expected.position_m - plain.position_m).abs().amax((0, 1, 3))[:2].min() > 1e-4
+    agree(expected, fused(world, state, times(0.16), driven, True), 1e-9)
+
+
+def test_a_pair_with_the_law_of_all_others_changes_no_bit(fused: Fused) -> None:
+    world, state, driven = crowd()
+    same = of_materials(world, steel_wood=world.contact, rubber_steel=world.contact)
+    same_bits(fused(world, state, times(0.1), driven), fused(same, state, times(0.1), driven))
+    alone, start = world_of(box_body(), contact=worlds.law(0.6)), tossed()
+    listed = replace(of_materials(world_of(box_body())), pair_laws={("rubber", "wood"): worlds.law(0.6)})
+    same_bits(fused(alone, start, times(0.2)), fused(listed, start, times(0.2)))
+
+
+def test_derivatives_by_the_laws_of_pairs(fused: Fused) -> None:
+    world, _, driven = crowd()
+    first = [-0.006, 0, 0.053, 0.01, 0.02, 0.01, -0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
+    world = of_materials(world, steel_wood=worlds.law(), steel_steel=worlds.law())
     agree_with_derivatives(fused, world, first, times(0.05), driven, 0.0)
 
 
