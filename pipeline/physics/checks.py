@@ -16,6 +16,7 @@ from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of,
 from .contact_law import ContactLaw
 from .pair_laws import laws_in_use
 from .paper_law import PaperLaw, stable_step
+from .surface_detection import surface_depth
 from .world import State, World
 
 DEEPEST_SHARE = 0.25
@@ -157,7 +158,7 @@ class Overlap:
 
 @torch.no_grad()
 def overlaps(world: World, state: State) -> Iterator[Overlap]:
-    """Yield the overlap of each pair of bodies that can touch, and of bodies with the ground."""
+    """Yield the overlap of each pair of bodies that can touch, and of bodies with the ground and with surfaces."""
     rotations = quat_to_matrix(state.quat_wxyz)
     zero = torch.zeros_like(state.position_m[:, 0])
     placed = []
@@ -166,10 +167,13 @@ def overlaps(world: World, state: State) -> Iterator[Overlap]:
         com = (rotation @ body.com[..., None]).squeeze(-1) if body.free else torch.zeros_like(position)
         placed.append(Placed(body=body, reference=position + com, rotation=rotation, velocity=zero, omega=zero))
     for a, b in pairs_of(world):
-        depth = _depth(world, placed[a], None if b == GROUND else placed[b])
-        size = placed[a].reach if b == GROUND else torch.minimum(placed[a].reach, placed[b].reach)
-        other = "the ground" if b == GROUND else f"body '{world.bodies[b].name}'"
-        yield Overlap(world.bodies[a].name, other, depth, size.expand_as(depth))
+        surface = world.surface(b)
+        if surface is not None:
+            depth = surface_depth(placed[a], surface)
+        else:
+            depth = _depth(world, placed[a], None if b == GROUND else placed[b])
+        size = placed[a].reach if b < 0 else torch.minimum(placed[a].reach, placed[b].reach)
+        yield Overlap(world.bodies[a].name, world.named(b), depth, size.expand_as(depth))
 
 
 def _depth(world: World, a: Placed, b: Placed | None) -> Tensor:

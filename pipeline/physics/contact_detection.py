@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ..geometry.rotation import cross
+from .fixed_surface import HALF_SPACE
 from .smooth_distance import blended, log_sum_exp_distance, smooth_min
 from .world import Body, World
 
@@ -24,7 +25,7 @@ PAIR_SMOOTHING_M = 1e-3
 ROUNDING_M = 1e-9
 """Margin of the broad phase [m], for rounding: distances are computed again afterwards, in another order."""
 GROUND = -1
-"""Index of the ground as the second body of a pair."""
+"""Index of the ground as the second body of a pair; fixed surfaces follow, -2 being the first."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +91,12 @@ class Points:
 
 
 def pairs_of(world: World) -> list[tuple[int, int]]:
-    """List the pairs of bodies that can touch: each free body with the ground (-1) and with every other body."""
+    """List the pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies."""
     if not world.touching:
         return []
     bodies = world.bodies
     pairs = [(i, GROUND) for i, body in enumerate(bodies) if body.free and world.ground_normal is not None]
+    pairs += [(i, GROUND - 1 - s) for i, body in enumerate(bodies) if body.free for s in range(len(world.surfaces))]
     for i, first in enumerate(bodies):
         for j in range(i + 1, len(bodies)):
             if first.free or bodies[j].free:
@@ -103,10 +105,15 @@ def pairs_of(world: World) -> list[tuple[int, int]]:
 
 
 def slot_count(world: World, pair: tuple[int, int]) -> int:
-    """Return the number of contact points that a pair can have: one per sphere that can touch the other side."""
-    first = world.bodies[pair[0]]
-    if pair[1] == GROUND:
-        return first.radii.shape[-1] if first.on_plane is None else len(first.on_plane)
+    """Return the number of contacts that a pair can have: one per sphere that can touch, several with a mesh."""
+    first, surface = world.bodies[pair[0]], world.surface(pair[1])
+    plane = pair[1] == GROUND if surface is None else surface.kind == HALF_SPACE
+    if plane and first.on_plane is not None:
+        return len(first.on_plane)
+    if surface is not None:
+        return first.radii.shape[-1] * surface.contacts_per_sphere
+    if plane:
+        return first.radii.shape[-1]
     return first.radii.shape[-1] + world.bodies[pair[1]].radii.shape[-1]
 
 

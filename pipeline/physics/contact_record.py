@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from .contact_detection import GROUND, Placed, Points, all_body_points, ground_points, pairs_of, slot_count
 from .contact_solver import PairImpulses, put
+from .surface_detection import all_surface_points
 from .world import World
 
 SLIDES = 0.99
@@ -64,6 +65,7 @@ class Recorder:
             points = self._points(a, b, placed)
             total, weighted = torch.zeros_like(points.position), torch.zeros_like(points.position)
             weight, sliding = torch.zeros_like(points.gap), torch.zeros_like(points.gap)
+            facing, depth = torch.zeros_like(points.position), torch.zeros_like(points.gap)
             for step in (step for step in self.steps if step.pair == number):
                 normal = step.points.normal
                 along = (step.impulse_n_s * normal).sum(-1)
@@ -72,7 +74,12 @@ class Recorder:
                 total = total + self._spread(step, step.impulse_n_s)
                 weighted = weighted + self._spread(step, along[..., None] * step.points.position)
                 weight, sliding = weight + self._spread(step, along), sliding + self._spread(step, along * slides)
+                facing = facing + self._spread(step, along[..., None] * normal)
+                depth = depth + self._spread(step, along * step.points.gap)
             acted = weight > 0
+            surface = self.world.surface(b)
+            if surface is not None and surface.mesh is not None:
+                points = _as_acted(points, acted, facing, depth / weight.clamp_min(1e-30))
             place = torch.where(acted[..., None], weighted / weight.clamp_min(1e-30)[..., None], points.position)
             columns.append((total, place, points.normal, points.gap, (sliding > 0.5 * weight) & acted))
         self.steps = []
@@ -93,6 +100,9 @@ class Recorder:
         return put(wide, step.items, self.batch)
 
     def _points(self, a: int, b: int, placed: Sequence[Placed]) -> Points:
+        surface = self.world.surface(b)
+        if surface is not None:
+            return all_surface_points(placed[a], surface)
         if b == GROUND:
             slots = torch.arange(slot_count(self.world, (a, b)), device=placed[a].reference.device)
             return ground_points(self.world, placed[a], slots.expand(self.batch, -1))
@@ -104,3 +114,10 @@ class Recorder:
         bodies = [[pair[k] for pair, n in zip(self.pairs, counts, strict=True) for _ in range(n)] for k in (0, 1)]
         columns = (torch.stack([frame[k] for frame in self.frames], 1) for k in range(5))
         return ContactRecord(torch.tensor(bodies[0]), torch.tensor(bodies[1]), *columns)
+
+
+def _as_acted(points: Points, acted: Tensor, facing: Tensor, gap: Tensor) -> Points:
+    """Return contacts of a mesh with normal and gap of their impulses; slots may have others at the frame."""
+    size = facing.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-30)
+    normal = torch.where(acted[..., None], facing / size, points.normal)
+    return replace(points, normal=normal, gap=torch.where(acted, gap, points.gap))

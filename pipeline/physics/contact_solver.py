@@ -24,10 +24,12 @@ from .contact_detection import (
     slot_count,
 )
 from .contact_law import ContactLaw, Touch
+from .fixed_surface import FixedSurface
 from .friction_ellipse import Ellipse
 from .impulse_solver import ContactGroup, Impulses, Rows, solve_impulses, tangent_axes
 from .paper_law import PaperLaw, paper_impulses
 from .rigid_body import Inertia, Motion
+from .surface_detection import Nearby, near_surface, surface_points
 from .world import World
 
 
@@ -40,7 +42,7 @@ class PairImpulses:
     a: int
     """Index of body a."""
     b: int
-    """Index of body b, -1 for the ground."""
+    """Index of body b, -1 for the ground, -2 and below for fixed surfaces."""
     free: tuple[bool, bool]
     """Whether a and b move freely."""
     items: Tensor | None
@@ -115,23 +117,27 @@ class Contacts:
         candidates = self._candidates(placed, step_s)
         if not candidates:
             return []
-        items = _union([touching for touching, _ in candidates.values()])
+        items = _union([touching for touching, *_ in candidates.values()])
         some = [_select(body, items) for body in placed]
         h = take(step_s, items)
         found: list[tuple[int, Points, Touch, Tensor]] = []
-        for number, (_, depth) in candidates.items():
+        for number, (_, depth, nearby) in candidates.items():
             a, b = self.pairs[number]
+            surface = self.world.surface(b)
             if depth is not None:
                 near = take(depth, items)
                 most = int((near < ROUNDING_M).sum(1).max())
                 slots = near.topk(most, dim=1, largest=False, sorted=False).indices
                 reached = near.gather(1, slots) < ROUNDING_M
-                points = ground_points(_on(self.world, items), some[a], slots, reached)
+                if surface is None or nearby is None:
+                    points = ground_points(_on(self.world, items), some[a], slots, reached)
+                else:
+                    points = surface_points(some[a], _selected(surface, items), nearby.at(items), slots, reached)
             else:
                 points = body_points(some[a], some[b], h, self.sharpness_per_m)
             if points is not None:
                 law = self.world.law_of(a, b)
-                touch, axes = self._touch(points, some[a], None if b == GROUND else some[b], law, h, items)
+                touch, axes = self._touch(points, some[a], None if b < 0 else some[b], law, h, items, b == GROUND)
                 found.append((number, points, touch, axes))
         if not found:
             return []
@@ -140,7 +146,7 @@ class Contacts:
         results = []
         for (number, points, touch, axes), impulse in zip(found, impulses, strict=True):
             a, b = self.pairs[number]
-            free = (True, b != GROUND and self.world.bodies[b].free)
+            free = (True, b >= 0 and self.world.bodies[b].free)
             world_impulse = (impulse.linear[..., None, :] @ axes).squeeze(-2)
             angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
             friction = touch.friction
@@ -162,35 +168,51 @@ class Contacts:
             )
         return results
 
-    def _candidates(self, placed: Sequence[Placed], step_s: Tensor) -> dict[int, tuple[Tensor, Tensor | None]]:
-        """Return by pair which items (B,) may touch and, for the ground, the gap of each slot (B, S) [m]."""
-        found: dict[int, tuple[Tensor, Tensor | None]] = {}
+    def _candidates(
+        self, placed: Sequence[Placed], step_s: Tensor
+    ) -> dict[int, tuple[Tensor, Tensor | None, Nearby | None]]:
+        """Return by pair which items (B,) may touch and, for ground and surfaces, the gap of each slot (B, S) [m]."""
+        found: dict[int, tuple[Tensor, Tensor | None, Nearby | None]] = {}
         for number, (a, b) in enumerate(self.pairs):
-            if b == GROUND:
+            surface, nearby = self.world.surface(b), None
+            if surface is not None:
+                nearby = near_surface(placed[a], surface, step_s)
+                if nearby is None:
+                    continue
+                depth, touching = nearby.depth, (nearby.depth < ROUNDING_M).any(1)
+            elif b == GROUND:
                 depth = near_ground(self.world, placed[a], step_s)
                 touching = (depth < ROUNDING_M).any(1)
             else:
                 depth, touching = None, near_body(placed[a], placed[b], step_s, self.sharpness_per_m)
             if bool(touching.any()):
-                found[number] = (touching, depth)
+                found[number] = (touching, depth, nearby)
         return found
 
     def _touch(
-        self, points: Points, a: Placed, b: Placed | None, law: ContactLaw | PaperLaw, h: Tensor, items: Tensor | None
+        self,
+        points: Points,
+        a: Placed,
+        b: Placed | None,
+        law: ContactLaw | PaperLaw,
+        h: Tensor,
+        items: Tensor | None,
+        ground: bool,
     ) -> tuple[Touch, Tensor]:
         velocity, spin = a.point_velocity(points.position), a.omega
         if b is not None:
             velocity, spin = velocity - b.point_velocity(points.position), spin - b.omega
-            axes = tangent_axes(points.normal)
-        else:
+        if ground:
             axes = self._ground_axes.expand(*points.gap.shape, 3, 3)
+        else:
+            axes = tangent_axes(points.normal)
         friction = take(law.friction, items)[:, None]
         if isinstance(law, ContactLaw):
             time, ratio = (take(x, items)[:, None] for x in (law.contact_time_s, law.damping_ratio))
         else:
             time = ratio = torch.full_like(friction, torch.nan)  # the paper's law has other coefficients
         touch = Touch(
-            ground=b is None,
+            ground=ground,
             position=points.position,
             normal=points.normal,
             gap=points.gap,
@@ -233,7 +255,7 @@ class Contacts:
         for number, points, touch, axes in found:
             sides = []
             for index, sign in zip(self.pairs[number], (1.0, -1.0), strict=True):
-                if index != GROUND and self.world.bodies[index].free:
+                if index >= 0 and self.world.bodies[index].free:
                     inertia, body = self.inertias[index], placed[index]
                     arms = points.position - body.reference[:, None]
                     root = body.rotation @ take(inertia.root, items)
@@ -295,6 +317,11 @@ def _select(placed: Placed, items: Tensor | None) -> Placed:
     names = ("mass", "inertia", "com", "centers", "radii")
     some = replace(body, **{name: take(getattr(body, name), items) for name in names})
     return Placed(some, *(take(x, items) for x in (placed.reference, placed.rotation, placed.velocity, placed.omega)))
+
+
+def _selected(surface: FixedSurface, items: Tensor | None) -> FixedSurface:
+    position, quat, size = (take(x, items) for x in surface.tensors)
+    return replace(surface, position=position, quat_wxyz=quat, size=size)
 
 
 def _on(world: World, items: Tensor | None) -> World:

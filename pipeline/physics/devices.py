@@ -31,5 +31,8 @@ def _moved(thing: Any, device: torch.device, dtype: torch.dtype | None) -> Any:
     if isinstance(thing, tuple):
         return tuple(_moved(value, device, dtype) for value in thing)
     if is_dataclass(thing) and not isinstance(thing, type):
-        return replace(thing, **{f.name: _moved(getattr(thing, f.name), device, dtype) for f in fields(thing)})
+        moved = {f.name: _moved(getattr(thing, f.name), device, dtype) for f in fields(thing)}
+        # what has no tensors stays the same object, with what it has computed
+        changed = any(value is not getattr(thing, name) for name, value in moved.items())
+        return replace(thing, **moved) if changed else thing
     return thing

@@ -133,7 +133,7 @@ def lacking_derivatives(
 def _tensors(world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> Iterator[Tensor]:
     """Yield all tensors of a rollout's arguments."""
     drives = [command for command in driven.values() if isinstance(command, Drive)]
-    for holder in (world, *world.laws, state, *world.bodies, *drives):
+    for holder in (world, *world.laws, state, *world.bodies, *world.surfaces, *drives):
         yield from (value for value in vars(holder).values() if isinstance(value, Tensor) and value.is_floating_point())
     for active in world.effects:
         yield from active.values.values()

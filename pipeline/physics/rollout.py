@@ -133,6 +133,7 @@ class Engine:
         tensors += [world.ground_offset] + [value for active in world.effects for value in active.values.values()]
         tensors += [value for body in world.bodies for value in (body.mass, body.inertia, body.com, body.centers)]
         tensors += [drive.times_s for drive in self.drives.values()]
+        tensors += [value for surface in world.surfaces for value in surface.tensors]
         return max(x.shape[0] for x in tensors if isinstance(x, torch.Tensor))
 
     def begin(self, state: State) -> list[Motion]:

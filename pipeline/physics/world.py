@@ -16,6 +16,7 @@ from ...schemas.materials import pair_of
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
+from .fixed_surface import FixedSurface
 from .paper_law import PaperLaw
 from .smooth_distance import plane_contacts
 
@@ -76,6 +77,8 @@ class World:
     """The laws of pairs of materials, by `pair_of` of their names."""
     ground_material: str | None = None
     """Material of the ground; None where it does not matter."""
+    surfaces: tuple[FixedSurface, ...] = ()
+    """Fixed surfaces besides the ground."""
     step_s: float = 0.001
     """Largest time step [s]."""
     iterations: int = 10
@@ -118,6 +121,17 @@ class World:
             raise UsageError("this world has no ground.", todo="give the ground in capture.toml, under [world].")
         return self.ground_normal, self.ground_offset
 
+    def surface(self, index: int) -> FixedSurface | None:
+        """Return the fixed surface of the second index of a pair, -2 for the first one; None for others."""
+        return self.surfaces[-2 - index] if index < -1 else None
+
+    def named(self, index: int) -> str:
+        """Return what messages call the second of a pair: the ground, a surface or a body."""
+        surface = self.surface(index)
+        if surface is not None:
+            return f"surface '{surface.name}'"
+        return "the ground" if index < 0 else f"body '{self.bodies[index].name}'"
+
     def substeps(self, times_s: Tensor) -> list[int]:
         """Return the number of steps in each interval of times (B, T) [s], none of them longer than `step_s`.
 
@@ -140,11 +154,14 @@ class World:
         return (self.contact, *self.pair_laws.values())
 
     def material_of(self, index: int) -> str | None:
-        """Return the material of a body, of the ground for -1."""
+        """Return the material of a body, of the ground for -1, of a surface below."""
+        surface = self.surface(index)
+        if surface is not None:
+            return surface.material
         return self.ground_material if index < 0 else self.bodies[index].material
 
     def law_of(self, a: int, b: int) -> ContactLaw | PaperLaw:
-        """Return the contact law of two bodies, by index; -1 is the ground."""
+        """Return the contact law of two bodies, by index; -1 is the ground, surfaces follow."""
         return self.law_between(self.material_of(a), self.material_of(b))
 
     def law_between(self, first: str | None, second: str | None) -> ContactLaw | PaperLaw:

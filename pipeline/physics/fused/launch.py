@@ -12,7 +12,7 @@ from torch import Tensor
 from ...runtime import kernel_build
 from .structure import THREADS, Structure
 
-WRITTEN = (12, 13, 14)
+WRITTEN = (16, 17, 18)
 """Indices of the pointers to results: frames, their tangents and labels."""
 
 

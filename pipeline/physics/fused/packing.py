@@ -12,11 +12,13 @@ from torch import Tensor
 from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
 from ..contact_detection import GROUND, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
+from ..fixed_surface import HALF_SPACE, FixedSurface
 from ..kinematic import Drive
 from ..pair_laws import laws_in_use
 from ..rigid_body import start
 from ..world import Body, State, World
 from . import wrenches
+from .meshes import packed_meshes
 from .structure import Structure
 
 if TYPE_CHECKING:
@@ -40,6 +42,12 @@ class Packed:
     """
     geometry: Tensor
     """Centres in the body frame and radii of the spheres [m], shape (1 or B, spheres, 4)."""
+    surfaces: Tensor
+    """Positions [m], orientations and sizes [m] of the fixed surfaces, shape (1 or B, surfaces, 10)."""
+    mesh_numbers: Tensor
+    """Numbers of the meshes of surfaces, one after another, shape (N,)."""
+    mesh_indices: Tensor
+    """Integers of the meshes of surfaces, int32, shape (I,)."""
     drives: Tensor
     """Samples of the commands, shape (1 or B, samples, 14)."""
     substeps: Tensor
@@ -91,24 +99,35 @@ def pack(
     rows = {index: drive_rows(Drive.command(body.name, driven, like), turn) for index, body in enumerate(world.bodies)
             if body.motion == "driven"}  # fmt: skip
     effects = wrenches.coefficients(world)
-    turned = turn is not None and len(world.bodies) > 1
+    turned = turn is not None and (len(world.bodies) > 1 or bool(world.surfaces))
     columns = _columns(world, state, turn, turned, effects)
     spheres = [_spheres(body) for body in world.bodies]
+    surfaces = [_surface(surface, turn) for surface in world.surfaces]
     laws, substeps = wrenches.closed_forms(world), world.substeps(times)
     counts = torch.tensor(substeps, dtype=torch.int32, device=times.device)
     steps = _steps(laws, times, counts)
     batch = max(
         x.shape[0]
-        for x in (*columns, *spheres, steps, *(x for row in rows.values() for x in row))
+        for x in (*columns, *spheres, *surfaces, steps, *(x for row in rows.values() for x in row))
     )  # fmt: skip
     listed, lowest = _listed_spheres(world)
+    meshes = packed_meshes(world.surfaces)
     return Packed(
         structure=_structure(
-            world, record=record, effects=bool(effects), turned=turned, driven=list(rows), lowest=lowest
+            world,
+            record=record,
+            effects=bool(effects),
+            turned=turned,
+            driven=list(rows),
+            lowest=lowest,
+            mesh_starts=meshes.starts,
         ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
         geometry=_joined(spheres, batch),
+        surfaces=_joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
+        mesh_numbers=meshes.numbers.to(times),
+        mesh_indices=meshes.indices.to(times.device),
         drives=_joined([row for row, _ in rows.values()], batch) if rows else times.new_zeros(1, 0, 14),
         substeps=counts,
         spheres=listed,
@@ -121,7 +140,14 @@ def pack(
 
 
 def _structure(
-    world: World, *, record: bool, effects: bool, turned: bool, driven: list[int], lowest: tuple[tuple[int, int], ...]
+    world: World,
+    *,
+    record: bool,
+    effects: bool,
+    turned: bool,
+    driven: list[int],
+    lowest: tuple[tuple[int, int], ...],
+    mesh_starts: tuple[tuple[int, int], ...],
 ) -> Structure:
     """Return the constants of the kernel, for one thread per environment and without derivatives.
 
@@ -132,6 +158,7 @@ def _structure(
         turned: Whether the rotation of the kernel's frame is in the table.
         driven: Indices of the driven bodies.
         lowest: First row and number of the candidates for the lowest sphere of each body.
+        mesh_starts: First number and index of each surface's mesh.
     """
     return Structure(
         single=world.gravity.dtype == torch.float32,
@@ -148,6 +175,8 @@ def _structure(
         pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
         laws=_law_numbers(world),
         lowest=lowest,
+        surfaces=tuple(surface.kind for surface in world.surfaces),
+        mesh_starts=mesh_starts,
         surface=wrenches.has_surface(world),
         elliptic=wrenches.has_ellipse(world),
     )
@@ -218,6 +247,13 @@ def _spheres(body: Body) -> Tensor:
     return torch.cat((body.centers.expand(batch, -1, -1), body.radii.expand(batch, -1)[..., None]), -1)
 
 
+def _surface(surface: FixedSurface, turn: Tensor | None) -> Tensor:
+    """Return pose in the kernel's frame and size of a surface, shape (1 or B, 1, 10)."""
+    parts = (_turned(turn, surface.position), _turned_quat(turn, surface.quat_wxyz), surface.size)
+    batch = max(part.shape[0] for part in parts)
+    return torch.cat([part.expand(batch, -1) for part in parts], -1)[:, None]
+
+
 def _listed_spheres(world: World) -> tuple[Tensor, tuple[tuple[int, int], ...]]:
     """Return the row of the sphere of each contact (C,), and the place in it of the candidates for each lowest sphere.
 
@@ -232,9 +268,11 @@ def _contact_spheres(world: World, starts: list[int]) -> Tensor:
     """Return the row of the sphere of each contact, shape (C,)."""
     parts = [torch.zeros(0, dtype=torch.int64, device=world.gravity.device)]
     for a, b in pairs_of(world):
-        on_plane = world.bodies[a].on_plane if b == GROUND else None
-        for index in (a,) if b == GROUND else (b, a):
-            parts.append(_rows(world.bodies[index], on_plane, starts[index]))
+        surface = world.surface(b)
+        plane = b == GROUND or (surface is not None and surface.kind == HALF_SPACE)
+        for index in (a,) if b < 0 else (b, a):
+            rows = _rows(world.bodies[index], world.bodies[a].on_plane if plane else None, starts[index])
+            parts.append(rows if surface is None else rows.repeat_interleave(surface.contacts_per_sphere))
     return torch.cat(parts).to(torch.int32)
 
 

@@ -94,13 +94,13 @@ def roll(
     if world.effects:
         require_physical(world)  # an effect may give a body an impossible inertia
     packed = pack(world, state, times_s, driven or {}, record_contacts)
-    values, tangents = _values_and_tangents(packed.table, packed.steps, packed.geometry, packed.drives)
+    values, tangents = _values_and_tangents(packed.table, packed.steps, packed.geometry, packed.surfaces, packed.drives)
     dual = any(tangent is not None for tangent in tangents)
     if dual and record_contacts:
         raise UsageError("the fused kernel has no derivatives of the contact record.", "record_contacts=False.")
     batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
     structure = packed.structure
-    chosen = lanes or lanes_for(structure.contacts, batch, structure.single, dual, bodies > 1)
+    chosen = lanes or lanes_for(structure.contacts, batch, structure.single, dual, structure.paired)
     structure = replace(structure, dual=dual, lanes=chosen)
     frames = values[0].new_empty(batch, count, bodies, FRAME_WIDTH)
     frame_tangents = torch.empty_like(frames) if dual else None
@@ -108,6 +108,7 @@ def roll(
     strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
     pointers = [x for pair in zip(values, tangents, strict=True) for x in pair]
     pointers += [packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last]
+    pointers += [packed.mesh_numbers, packed.mesh_indices]
     run(structure, (*pointers, frames, frame_tangents, labels, None), (batch, count, world.iterations, *strides))
     if frame_tangents is not None:
         frames = forward_ad.make_dual(frames, frame_tangents)

@@ -75,11 +75,13 @@ class FusedStepper:
         """See :class:`Stepper`; the next call overwrites the state."""
         resident = self._started()
         packed = resident.packed
-        pointers = (packed.table, None, packed.steps, None, packed.geometry, None, packed.drives, None)
+        pointers = (packed.table, None, packed.steps, None, packed.geometry, None)
+        pointers += (packed.surfaces, None, packed.drives, None)
         pointers += (packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last)
+        pointers += (packed.mesh_numbers, packed.mesh_indices)
         pointers += (resident.frames, None, None, resident.carried)
         # without strides: all arrays are of one environment
-        self._run(packed.structure, pointers, (1, 2, self._world.iterations, 0, 0, 0, 0))
+        self._run(packed.structure, pointers, (1, 2, self._world.iterations, 0, 0, 0, 0, 0))
         last = read_frames(self._world, self._times, packed, resident.frames, None)
         return State(*(getattr(last, name)[:, -1] for name in State.__dataclass_fields__))
 
@@ -107,9 +109,11 @@ class _Resident:
     @staticmethod
     def of(packed: Packed) -> _Resident:
         kind, bodies = packed.structure, len(packed.structure.free)
-        lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, bodies > 1)
+        lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, kind.paired)
         structure = replace(kind, lanes=lanes, carried=True)
-        arrays = {name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "drives")}
+        arrays = {
+            name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "surfaces", "drives")
+        }
         drives = arrays["drives"]
         return _Resident(
             packed=replace(packed, structure=structure, **arrays),

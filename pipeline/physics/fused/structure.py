@@ -7,8 +7,11 @@ from dataclasses import dataclass
 
 from ...runtime import kernel_build
 from ..contact_detection import PAIR_SMOOTHING_M
+from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..impulse_solver import CONTACT_ONSET_M
+from ..surface_detection import FAR_M
+from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
 
 THREADS = 32
 """Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
@@ -28,6 +31,7 @@ _FILES = (
     "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
     "contacts",  # contacts with ground and unions of spheres: contact_detection, impulse_solver, smooth_distance
     "environment",  # what the kernel is given, and the state of an environment read from it
+    "fixed_surface",  # distances of spheres to fixed surfaces: physics/fixed_surface and physics/surface_mesh
     "collision",  # flight, and the contacts of a step with their impulses: formulas of rigid_body and contact_solver
     "rollout",  # an environment from its first frame to its last, and what is written of it
 )
@@ -66,6 +70,10 @@ class Structure:
     """Number of the contact law of each pair; empty where all have the same one."""
     lowest: tuple[tuple[int, int], ...] = ()
     """First row and number of each body's spheres whose heights count; empty where heights do not."""
+    surfaces: tuple[int, ...] = ()
+    """Kind of each fixed surface, as in `fixed_surface.KINDS`."""
+    mesh_starts: tuple[tuple[int, int], ...] = ()
+    """First number and first index of each surface's mesh; of those that are none, of no meaning."""
     carried: bool = False
     """Whether each launch continues where the previous one ended."""
     surface: bool = False
@@ -77,6 +85,11 @@ class Structure:
     def contacts(self) -> int:
         """Number of contacts that an environment may have."""
         return sum(count for _, _, count in self.pairs)
+
+    @property
+    def paired(self) -> bool:
+        """Whether contacts have normals of their own, not only that of the ground."""
+        return len(self.free) > 1 or bool(self.surfaces)
 
     @property
     def law_count(self) -> int:
@@ -113,14 +126,16 @@ class Structure:
 
     def source(self, host: bool = False) -> str:
         """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry."""
-        paired = len(self.free) > 1
+        paired = self.paired
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
         held = not paired and (alone or self._fits_registers)
         constants = {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
             "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
-            "BODIES": len(self.free), "PAIRS": len(self.pairs),
+            "BODIES": len(self.free), "PAIRS": len(self.pairs), "FIXED": len(self.surfaces),
+            "MESHES": self.surfaces.count(MESH), "MESH_CONTACTS": MESH_CONTACTS,
+            "HALF_SPACE_KIND": HALF_SPACE, "BOX_KIND": BOX, "MESH_KIND": MESH,
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
@@ -129,6 +144,8 @@ class Structure:
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
         lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define ONSET_M {CONTACT_ONSET_M!r}"]
         lines += [f"#define NEWTON_STEPS {NEWTON_STEPS}", f"#define FLATTEST {FLATTEST!r}"]
+        lines += [f"#define ORDER_{axis} {value!r}" for axis, value in zip("XYZ", ORDER, strict=True)]
+        lines += [f"#define FLAT_SINE {FLAT!r}", f"#define FAR_M {FAR_M!r}"]
         lines += [f"#define LEAST_FRICTION {LEAST!r}", f"#define CLOSE {CLOSE!r}"]
         lists = {
             "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
@@ -136,6 +153,8 @@ class Structure:
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
             "contact_start": _starts([count for _, _, count in self.pairs]),
             "pair_law": self.laws,
+            "surface_kind": self.surfaces, "mesh_number_start": [start for start, _ in self.mesh_starts],
+            "mesh_index_start": [start for _, start in self.mesh_starts],
             "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],
         }  # fmt: skip
         functions = [_function(name, values) for name, values in lists.items()]

@@ -83,7 +83,8 @@ def _no_law(world: World) -> str:
 def _against_surface(world: World, acting: Sequence[Effect]) -> str | None:
     """Return why the kernel does not support the contact effects of a world; None where it does, or without any."""
     surface = next((effect for effect in acting if isinstance(effect, _SURFACE)), None)
-    if surface is not None and (len(world.bodies) > 1 or world.ground_normal is None):
+    alone = len(world.bodies) == 1 and not world.surfaces
+    if surface is not None and (not alone or world.ground_normal is None):
         return f"the kernel has '{surface.name}' for one body on the ground only"
     directed = next((effect for effect in acting if isinstance(effect, _DIRECTED)), None)
     if directed is not None and world.ground_normal is not None and world.ground_normal.tolist() != [0.0, 0.0, 1.0]:

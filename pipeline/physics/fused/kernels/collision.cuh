@@ -88,6 +88,12 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
     Number along = plain(c.impulse.z), x = plain(c.impulse.x), y = plain(c.impulse.y), across = root(x * x + y * y);
 #endif
     Vec point = com + c.arm;
+#if MESHES
+    tally.facing[0] += along * plain(c.normal.x);
+    tally.facing[1] += along * plain(c.normal.y);
+    tally.facing[2] += along * plain(c.normal.z);
+    tally.depth += along * plain(c.gap);
+#endif
     tally.impulse[0] += plain(c.impulse.x);
     tally.impulse[1] += plain(c.impulse.y);
     tally.impulse[2] += plain(c.impulse.z);
@@ -217,6 +223,56 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
     return touching;
 }
 
+#if FIXED
+// Finds the contacts of a body with a fixed surface and distributes the effective mass among them; returns how many
+// touch.
+__device__ int touch_surface(const Problem& problem, const Environment& env, int p, const Mat* rotations,
+                             const Motion* motions, Contact* list, Real* weights, int& count) {
+    int a = pair_a(p), s = -2 - pair_b(p), first = count;
+    const Motion& m = motions[a];
+    Vec com = env.bodies[a].position;
+    Number h = plain(env.laws[0].step_s), reach = env.constants[a].reach;
+    // no point of the body moves further in this step, up to rounding
+    Number margin = h * (size(m.velocity) + size(m.omega) * reach) + Number(1e-6);
+    Fixed fixed = fixed_surface(problem, env, s);
+    if (least_distance(problem, fixed, s, transposed(fixed.rotation, com - fixed.position)) - reach < margin) {
+        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+        Searched searched;
+        searched.sphere = -1;
+        for (int k = behind; k < contact_count(p); k += LANES) {
+            Vec center;
+            Real radius, weight;
+            Meeting meeting;
+            if (!meet(problem, env, fixed, p, k, rotations[a], margin, searched, center, radius, meeting)) continue;
+            Real gap = meeting.distance - radius;
+            if (!(plain(gap) < margin)) continue;
+            Contact& c = list[count];
+            c.normal = meeting.outward;
+            c.arm = center - com - radius * meeting.outward;
+            c.arm_b = none();
+            c.a = a;
+            c.b = -2;
+            c.slot = (start + k) / LANES;
+            Real speed = dot(m.velocity + cross(m.omega, c.arm), c.normal);
+            Vec turn = cross(c.arm, c.normal);
+            Real inverse_mass = m.inverse_mass + dot(turn, m.inverse_inertia * turn);
+            if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility_trace(m, c.arm), weight)) continue;
+#if MESHES && RECORD
+            c.gap = gap;
+#endif
+            if (env.warm) {
+                Vec along = env.before[c.slot], one, two;
+                tangents(env, c.normal, one, two);
+                c.impulse = along.x * c.normal + along.y * one + along.z * two;
+            }
+            weights[count++] = weight;
+        }
+    }
+    if (env.lanes.any(count > first)) share_out_pair(env.lanes, list, weights, first, count, motions);
+    return count - first;
+}
+#endif
+
 // Divides the effective mass of a body by the number of groups of contacts on it; `groups` counts them by body.
 INLINE void split(Contact* list, int count, const int* groups) {
     for (int i = 0; i < count; i++) {
@@ -248,7 +304,7 @@ INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
         Vec one, two;
         tangents(env, c.normal, one, two);
         Vec along = vec(dot(c.impulse, c.normal), dot(c.impulse, one), dot(c.impulse, two));
-        env.before[c.slot] = c.b < 0 ? c.impulse : along;
+        env.before[c.slot] = c.b == -1 ? c.impulse : along;
     }
 #elif LISTED
     forget(env);
@@ -343,6 +399,10 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         int a = pair_a(p), b = pair_b(p), touching = 0;
         if (b >= 0) {
             touching = touch_pair(problem, env, p, rotations, motions, list, weights, count);
+#if FIXED
+        } else if (b < -1) {
+            touching = touch_surface(problem, env, p, rotations, motions, list, weights, count);
+#endif
         } else if (env.lanes.any(near_ground(env, a, motions[a]))) {
             touching = -count;
             touch_plane(problem, env, p, rotations[a], motions[a], list, weights, count);

@@ -26,7 +26,10 @@ struct Contact {  // world frame, impulse on body a
 #endif
 #if PAIRED
     Vec normal, arm_b;
-    int a, b;
+    int a, b;  // b: -1 for the ground, -2 for a fixed surface
+#if MESHES && RECORD
+    Real gap;
+#endif
 #endif
 #if LISTED
     int slot;
@@ -268,7 +271,7 @@ INLINE Vec relative_velocity(const Contact& c, const Motion* bodies) {
     return velocity;
 }
 
-// Distributes the effective mass among the touching contacts of two bodies: those from `first` on in every lane's list.
+// Distributes the effective mass among the touching contacts of a pair: those from `first` on in every lane's list.
 __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* weights, int first, int end,
                                const Motion* bodies) {
     Real totals[SLOTS];
@@ -282,7 +285,7 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
                 const Contact& c = list[first + j];
                 normal = c.normal;
                 turn_a = bodies[c.a].inverse_inertia * cross(c.arm, normal);
-                turn_b = bodies[c.b].inverse_inertia * cross(c.arm_b, normal);
+                if (c.b >= 0) turn_b = bodies[c.b].inverse_inertia * cross(c.arm_b, normal);
                 weight = weights[first + j] * c.stop_n;
             }
             normal = lanes.from(normal, source);
@@ -291,9 +294,10 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
             weight = lanes.from(weight, source);
             for (int i = first; i < end; i++) {
                 const Contact& c = list[i];
-                Real mass = bodies[c.a].inverse_mass + bodies[c.b].inverse_mass;
-                Real along = mass * dot(c.normal, normal) + dot(cross(c.arm, c.normal), turn_a) +
-                             dot(cross(c.arm_b, c.normal), turn_b);
+                Real mass = bodies[c.a].inverse_mass;
+                if (c.b >= 0) mass += bodies[c.b].inverse_mass;
+                Real along = mass * dot(c.normal, normal) + dot(cross(c.arm, c.normal), turn_a);
+                if (c.b >= 0) along += dot(cross(c.arm_b, c.normal), turn_b);
                 totals[i] += weight * along * along;
             }
         }

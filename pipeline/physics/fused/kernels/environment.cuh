@@ -3,11 +3,14 @@ struct Problem {
     Input steps;     // (1 or environments, intervals, STEP_WIDTH): step, stiffness, damping, time at the start; then
                      // stiffness and damping of each further law
     Input geometry;  // (1 or environments, spheres, 4): centres in the body frame, radii
+    Input surfaces;  // (1 or environments, FIXED, 10): position, quaternion, size
     Input drives;    // (1 or environments, samples, 14): time, position, quaternion, velocity, angular velocity
     const int* __restrict__ substeps;      // of each interval
     const int* __restrict__ spheres;       // of each contact: row of the geometry
     const int* __restrict__ drive_starts;  // of each driven body: row of its first sample
     const int* __restrict__ drive_last;    // (1 or environments, driven bodies): index of the last interval
+    const Number* __restrict__ mesh_numbers;  // of each mesh, see `TriangleMesh`
+    const int* __restrict__ mesh_indices;
     Number* __restrict__ frames;           // (environments, frames, bodies, 16)
     Number* __restrict__ frame_tangents;
     Number* __restrict__ labels;           // (environments, frames, contacts, 12)
@@ -15,6 +18,7 @@ struct Problem {
     int environments, frame_count, sweeps;
     long long steps_stride, geometry_stride, drive_stride;
     int drive_last_stride;
+    long long surface_stride;
 };
 
 struct Body {
@@ -45,10 +49,13 @@ struct Constants {
 
 struct Tally {  // sums over the contacts since the last frame
     Number impulse[3], weighted[3], weight, sliding;
+#if MESHES
+    Number facing[3], depth;  // normal and gap, weighted by the impulse along the normal
+#endif
 };
 
 struct Environment {
-    long long index, geometry, steps, drives;
+    long long index, geometry, steps, drives, surfaces;
     int drive_last;
     Lanes lanes;
     Vec gravity;

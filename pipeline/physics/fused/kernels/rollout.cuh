@@ -97,6 +97,10 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
     EACH_PAIR
     for (int p = 0; p < PAIRS; p++) {
         int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, a = pair_a(p);
+#if FIXED
+        Searched searched;
+        searched.sphere = -1;
+#endif
         EACH_SLOT
         for (int s = 0; s < SLOTS; s++) {
             int k = behind + s * LANES;
@@ -112,6 +116,26 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
                 point = facing.point;
             } else
 #endif
+#if FIXED
+            if (pair_b(p) < -1) {
+                Vec center;
+                Real radius;
+                Meeting meeting;
+                const Mat& turn = rotations[a];
+                Fixed fixed = fixed_surface(problem, env, -2 - pair_b(p));
+                if (meet(problem, env, fixed, p, k, turn, Number(0), searched, center, radius, meeting)) {
+                    gap = meeting.distance - radius;
+                    normal = meeting.outward;
+                    point = center - radius * normal;
+                } else {
+                    gap = Real(Number(FAR_M));
+                    point = none();
+#if TURNED
+                    normal = env.turn * normal;
+#endif
+                }
+            } else
+#endif
             {
                 long long row = env.geometry + 4LL * problem.spheres[start + k];
                 Real radius = problem.geometry.at(row + 3);
@@ -123,6 +147,14 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
             Tally& tally = env.tallies[(start + k) / LANES];
 #else
             Tally& tally = env.tallies[s];
+#endif
+#if MESHES
+            bool weighs = pair_b(p) < -1 && surface_kind(-2 - pair_b(p)) == MESH_KIND && tally.weight > Number(0);
+            if (weighs) {  // at the frame, the slot may have another contact than that which acted
+                Vec facing = vec(Real(tally.facing[0]), Real(tally.facing[1]), Real(tally.facing[2]));
+                normal = Real(Number(1) / greater(size(facing), Number(1e-30))) * facing;
+                gap = Real(tally.depth / tally.weight);
+            }
 #endif
             write_label(problem, env, frame, start + k, tally, normal, plain(gap), point);
         }
@@ -144,6 +176,7 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
     env.lanes = lanes;
     env.steps = index * problem.steps_stride;
     env.geometry = index * problem.geometry_stride;
+    env.surfaces = index * problem.surface_stride;
     env.drives = index * problem.drive_stride;
     env.drive_last = index * problem.drive_last_stride;
     load(problem, env);
@@ -188,15 +221,17 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
 
 #define PARAMETERS                                                                                                   \
     const Number *table, const Number *table_t, const Number *steps, const Number *steps_t, const Number *geometry,  \
-        const Number *geometry_t, const Number *drives, const Number *drives_t, const int *substeps,                 \
-        const int *spheres, const int *drive_starts, const int *drive_last, Number *frames, Number *frame_tangents,  \
-        Number *labels, Number *carried, int environments, int frame_count, int sweeps, int steps_stride,            \
-        int geometry_stride, int drive_stride, int drive_last_stride
+        const Number *geometry_t, const Number *surfaces, const Number *surfaces_t, const Number *drives,            \
+        const Number *drives_t, const int *substeps, const int *spheres, const int *drive_starts,                    \
+        const int *drive_last, const Number *mesh_numbers, const int *mesh_indices, Number *frames,                  \
+        Number *frame_tangents, Number *labels, Number *carried, int environments, int frame_count, int sweeps,      \
+        int steps_stride, int geometry_stride, int surface_stride, int drive_stride, int drive_last_stride
 #define PROBLEM                                                                                                      \
     {                                                                                                                \
-        {table, table_t}, {steps, steps_t}, {geometry, geometry_t}, {drives, drives_t}, substeps, spheres,           \
-            drive_starts, drive_last, frames, frame_tangents, labels, carried, environments, frame_count, sweeps,    \
-            steps_stride, geometry_stride, drive_stride, drive_last_stride                                           \
+        {table, table_t}, {steps, steps_t}, {geometry, geometry_t}, {surfaces, surfaces_t}, {drives, drives_t},      \
+            substeps, spheres, drive_starts, drive_last, mesh_numbers, mesh_indices, frames, frame_tangents, labels, \
+            carried, environments, frame_count, sweeps, steps_stride, geometry_stride, drive_stride,                 \
+            drive_last_stride, surface_stride                                                                        \
     }
 
 #if !HOST
