@@ -321,6 +321,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
                 com_m=body.com_m or _three(found.mass_properties.com_m),
                 photo_pose=found.photo_pose or Pose(),
                 shape=body.shape,
+                material=body.material,
                 collision_distance_m=found.collision_distance_m,
                 radius_factor=scene.radius_factor,
             )

@@ -8,10 +8,14 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from .base import FileModel
+from .materials import pair_of, repeated
 from .quantities import (
+    ContactTime,
     Coordinate,
+    DampingRatio,
     Deviation,
     FrameRate,
+    Friction,
     Gravity,
     Instant,
     Length,
@@ -81,6 +85,8 @@ class Ground(FileModel):
     """Unit normal, world frame, pointing out of the ground."""
     offset_m: Coordinate = 0.0
     """Height of the plane along the normal [m]."""
+    material: Name | None = None
+    """Its material, where it matters what touches it."""
 
     @field_validator("normal")
     @classmethod
@@ -169,6 +175,8 @@ class Body(FileModel):
     """Left out: from the photos (stage SG-GS)."""
     photo_pose: Pose | None = None
     """T_world_body while the photos were taken; default identity (see `Capture`)."""
+    material: Name | None = None
+    """Its material, one of [[materials]], where it matters what touches it."""
     photo_box: PhotoBox | None = None
     """Where the body is in photos without masks; left out: found on the ground (stage SG-GS)."""
 
@@ -178,11 +186,35 @@ class Body(FileModel):
         return None if value is None else physical_inertia(value)
 
 
+class Material(FileModel):
+    """A material of bodies and of the ground."""
+
+    name: Name
+    friction: Friction | None = None
+    """Coulomb coefficient of a contact with itself [1]. A pair that [[pairs]] does not give has the geometric mean of
+    its two materials' numbers, where both have one."""
+
+
+class MaterialPair(FileModel):
+    """What is known before the fit about contacts between two materials, in either order."""
+
+    materials: tuple[Name, Name]
+    """Two names of [[materials]], or one twice."""
+    friction: Friction | None = None
+    """Coulomb coefficient [1]."""
+    contact_time_s: ContactTime | None = None
+    """Natural contact time [s]."""
+    damping_ratio: DampingRatio | None = None
+    """Damping ratio of a contact [1]."""
+
+
 class Measurement(FileModel):
     """How well the tracks are measured; estimated from the data where left out."""
 
     position_std_m: Deviation | None = None
     rotation_std_rad: Deviation | None = None
+    force_std_n: Deviation | None = None
+    """Of a component of a measured force [N]."""
 
 
 class Episode(FileModel):
@@ -273,12 +305,35 @@ class Calibration(FileModel):
         return self
 
 
+def _require_known_materials(manifest: CaptureManifest) -> None:
+    """Refuse materials and pairs that are named twice, or that [[materials]] does not have."""
+    known = [material.name for material in manifest.materials]
+    twice = repeated(known)
+    if twice is not None:
+        raise ValueError(f"two [[materials]] have the name '{twice}'; names must differ")
+    ground = manifest.world.ground
+    named = [(f"body '{body.name}'", body.material) for body in manifest.bodies]
+    named += [("[world].ground", None if ground is None else ground.material)]
+    named += [("[[pairs]]", name) for pair in manifest.pairs for name in pair.materials]
+    for where, name in named:
+        if name is not None and name not in known:
+            listed = f"they are {', '.join(known)}" if known else "there are none"
+            raise ValueError(f"{where} names the material '{name}', which is not among [[materials]]; {listed}")
+    again = repeated(" and ".join(f"'{name}'" for name in pair_of(*pair.materials)) for pair in manifest.pairs)
+    if again is not None:
+        raise ValueError(f"two [[pairs]] are of {again}; each pair of materials stands once, in either order")
+
+
 class CaptureManifest(FileModel):
     """`capture.toml`."""
 
     format: Literal["cgwm-capture/1"]
     world: World = World()
     bodies: tuple[Body, ...] = ()
+    materials: tuple[Material, ...] = ()
+    """Materials that bodies and ground may have."""
+    pairs: tuple[MaterialPair, ...] = ()
+    """Contact parameters of pairs of materials, as far as they are known."""
     measurement: Measurement = Measurement()
     splits: dict[Name, tuple[str, ...]] = {}
     episodes: dict[str, Episode] = {}
@@ -291,6 +346,7 @@ class CaptureManifest(FileModel):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"two bodies have the name '{twice[0]}'; names must differ")
+        _require_known_materials(self)
         for split, episodes in self.splits.items():
             if len(set(episodes)) != len(episodes):
                 raise ValueError(f"split '{split}' names an episode twice")

@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+
+def repeated(names: Iterable[str]) -> str | None:
+    """Return the first name that stands twice, or None."""
+    seen: set[str] = set()
+    return next((name for name in names if name in seen or seen.add(name)), None)
+
 
 def pair_of(first: str, second: str) -> tuple[str, str]:
     """Return the pair of two materials, the same for either order."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -10,6 +9,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from .base import FileModel
 from .capture import Ground, Name, Pose, Shape, physical_inertia
 from .described import NotDescribed
+from .materials import pair_of, repeated
 from .quantities import (
     ContactTime,
     DampingRatio,
@@ -40,12 +40,6 @@ Interval = Annotated[tuple[Value, Value], AfterValidator(_ordered)]
 Colour3 = tuple[Colour, Colour, Colour]
 ROUNDING = 1e-6
 """Largest relative difference of numbers that are the same but for rounding."""
-
-
-def repeated(names: Iterable[str]) -> str | None:
-    """Return the first name that stands twice, or None."""
-    seen: set[str] = set()
-    return next((name for name in names if name in seen or seen.add(name)), None)
 
 
 class FittedParameter(FileModel):
@@ -148,6 +142,8 @@ class BodyModel(FileModel):
     """Colliding spheres (PLY, body frame); none: the visual ones collide."""
     collision_distance_m: Annotated[float, Field(ge=0, le=1e5)] | None = None
     """Largest distance between the colliding spheres' surface and the visual (or given) surface [m]."""
+    material: Name | None = None
+    """Material, by which its contacts with others have the laws of `pairs`; None for that of `contact`."""
     radius_factor: RadiusFactor = 2.0
     """Collision radius of a sphere in units of its Gaussian scale s."""
 
@@ -166,6 +162,13 @@ class ContactParameters(FileModel):
     """Natural contact time tau = sqrt(m_eff / K) [s]."""
     damping_ratio: DampingRatio = 0.3
     """zeta [1]; together with tau it fixes the restitution e(zeta)."""
+
+
+class PairContact(ContactParameters):
+    """The contact law's numbers of a pair of materials."""
+
+    materials: tuple[Name, Name]
+    """The two materials, in either order."""
 
 
 class Solver(FileModel):
@@ -235,7 +238,9 @@ class ModelFile(FileModel):
     ground: Ground | None = None
     bodies: tuple[BodyModel, ...]
     contact: ContactParameters | None = None
-    """None until the stage phys-geo has run."""
+    """None until the stage phys-geo has run; the law of all contacts that `pairs` does not have."""
+    pairs: tuple[PairContact, ...] = ()
+    """The laws of pairs of materials."""
     parameters: tuple[FittedParameter, ...] = ()
     correlations: tuple[Correlation, ...] = ()
     """Of parameters that were fitted together; between two of these blocks, none is known."""
@@ -276,6 +281,11 @@ class ModelFile(FileModel):
             twice = repeated(names)
             if twice is not None:
                 raise ValueError(f"two {what} the name '{twice}'")
+        again = repeated(" and ".join(f"'{name}'" for name in pair_of(*pair.materials)) for pair in self.pairs)
+        if again is not None:
+            raise ValueError(f"two pairs are of {again}; each pair of materials stands once, in either order")
+        if self.pairs and self.contact is None:
+            raise ValueError("pairs without contact: the law of all other contacts is missing")
         return self
 
 

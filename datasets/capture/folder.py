@@ -150,6 +150,8 @@ class CaptureFolder:
         if path is None:
             return CheckedTracks({}, 0, ())
         tracks, normalised = read_tracks(path, self.body_names)
+        for name, track in tracks.items():
+            _require_exerted(path, self.body(name), track)
         unturned = [name for name, track in tracks.items() if track.quat_wxyz is not None and not track.turns]
         unturned = [name for name in unturned if self.body(name).motion == "free"]
         for name in unturned:
@@ -308,3 +310,19 @@ def _videos_in(camera: Path) -> dict[str, Path]:
             )
         found[episode] = path
     return found
+
+
+def _require_exerted(path: Path, body: Body, track: Track) -> None:
+    """Refuse measured forces of a body that is not driven, and torques without forces."""
+    if track.force_n is None and track.torque_n_m is None:
+        return
+    if body.motion != "driven":
+        raise InputDataError(
+            f"{path}: body '{body.name}' has columns of force or torque, but its motion is '{body.motion}'.",
+            "the force that a driven body exerts on what it touches; other bodies leave these columns empty.",
+            f"empty them in the rows of '{body.name}', or make it driven in capture.toml.",
+        )
+    if track.force_n is None:
+        raise InputDataError(
+            f"{path}: body '{body.name}' has a torque but no force.", "force_x_n, force_y_n and force_z_n with it."
+        )

@@ -21,9 +21,17 @@ _POSITION = ("px_m", "py_m", "pz_m")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 _OMEGA = ("wx_rad_s", "wy_rad_s", "wz_rad_s")
+_FORCE = ("force_x_n", "force_y_n", "force_z_n")
+_TORQUE = ("torque_x_n_m", "torque_y_n_m", "torque_z_n_m")
 _REQUIRED = ("time_s", "body", *_POSITION)
-_OPTIONAL_GROUPS = {"quat_wxyz": _QUATERNION, "velocity_m_s": _VELOCITY, "omega_body_rad_s": _OMEGA}
-COLUMNS = (*_REQUIRED, *_QUATERNION, *_VELOCITY, *_OMEGA)
+_OPTIONAL_GROUPS = {
+    "quat_wxyz": _QUATERNION,
+    "velocity_m_s": _VELOCITY,
+    "omega_body_rad_s": _OMEGA,
+    "force_n": _FORCE,
+    "torque_n_m": _TORQUE,
+}
+COLUMNS = (*_REQUIRED, *(column for columns in _OPTIONAL_GROUPS.values() for column in columns))
 """The columns of a track file, in the order in which they are written."""
 SHORTEST_STEP_S = 1e-9
 """Smallest difference of two times [s]; velocities from smaller ones would overflow."""
@@ -43,6 +51,10 @@ class Track:
     """Velocity of the body frame's origin [m/s], world frame, shape (T, 3), or None."""
     omega_body_rad_s: Array | None = None
     """Angular velocity [rad/s], BODY frame, shape (T, 3), or None; of a centroid along the axes of the world."""
+    force_n: Array | None = None
+    """Force that the body exerts on what it touches [N], world frame, shape (T, 3), or None; of driven bodies only."""
+    torque_n_m: Array | None = None
+    """Torque that it exerts about its frame's origin [N m], world axes, shape (T, 3), or None."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -59,9 +71,9 @@ class Track:
             keep &= self.time_s >= start_s
         if end_s is not None:
             keep &= self.time_s <= end_s
-        optional = (self.quat_wxyz, self.velocity_m_s, self.omega_body_rad_s)
-        kept = (None if value is None else value[keep] for value in optional)
-        return Track(self.time_s[keep], self.position_m[keep], *kept)
+        optional = {name: getattr(self, name) for name in _OPTIONAL_GROUPS}
+        kept = {name: None if value is None else value[keep] for name, value in optional.items()}
+        return Track(self.time_s[keep], self.position_m[keep], **kept)
 
 
 class Episode(NamedTuple):
@@ -151,7 +163,7 @@ def _text(value: float) -> str:
 
 def _check_header(path: Path, header: list[str]) -> None:
     allowed = ", ".join(COLUMNS)
-    todo = "correct the header; values are in SI units (m, s, rad)."
+    todo = "correct the header; values are in SI units (m, s, rad, N)."
     if not header:
         raise InputDataError(f"{path}: the file is empty.", f"a header line of {allowed}.")
     for column in header:
@@ -180,8 +192,7 @@ def _track(path: Path, body: str, header: list[str], rows: list[tuple[int, list[
         time_s=time_s,
         position_m=position_m,
         quat_wxyz=quat_wxyz,
-        velocity_m_s=found["velocity_m_s"],
-        omega_body_rad_s=found["omega_body_rad_s"],
+        **{name: values for name, values in found.items() if name != "quat_wxyz"},
     )
     if len(track) < 2:
         raise InputDataError(

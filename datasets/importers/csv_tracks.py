@@ -24,11 +24,13 @@ from .recordings import SI, Units, read_text, require_name, track_files, write_t
 
 Array = NDArray[np.float64]
 
-COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
-"""Quantities that a column may contain; `body`, the orientation (q, four) and the spin (w, three) are optional."""
+COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz", "wx", "wy", "wz", "fx", "fy", "fz")
+"""Quantities that a column may contain; `body`, the orientation (q, four), the spin (w, three) and the force that the
+body exerts (f, three) are optional."""
 _REQUIRED = ("time", "px", "py", "pz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _SPIN = ("wx", "wy", "wz")
+_FORCE = ("fx", "fy", "fz")
 _NAMES = {
     "time": ("time", "t", "timestamp", "timestamps", "stamp"),
     "body": ("body", "object", "rigid_body"),
@@ -38,6 +40,7 @@ _NAMES = {
         f"w{axis}": (f"w{axis}", f"w{axis}_rad", f"omega_{axis}", f"omega_{axis}_rad", f"angular_velocity_{axis}")
         for axis in "xyz"
     },
+    **{f"f{axis}": (f"f{axis}", f"f{axis}_n", f"force_{axis}", f"force_{axis}_n") for axis in "xyz"},
 }
 _UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
 _LENGTHS, _TIMES = ("m", "cm", "mm", "in"), ("s", "ms", "us", "ns")
@@ -113,7 +116,7 @@ def _left_out_warnings(left_out: Counter[str], files: int) -> tuple[str, ...]:
     named = ", ".join(f"{shown(name)}{place}" for name, place in places.items())
     return (
         f"columns that were not read: {named}. Read are time, body, px, py, pz, qw, qx, qy, qz and "
-        "wx, wy, wz (rad/s; beside orientations with --spin-frame).",
+        "wx, wy, wz (rad/s; beside orientations with --spin-frame), fx, fy, fz (N).",
     )
 
 
@@ -141,7 +144,8 @@ def _tracks(
     tracks = {}
     for name, values in by_body.items():
         parts = _Parts.of(header, np.array(values))
-        track = header.units.track(f"{path}: {name}", parts.time, parts.position, parts.quat, parts.omega)
+        where = f"{path}: {name}"
+        track = header.units.track(where, parts.time, parts.position, parts.quat, parts.omega, parts.force)
         tracks[name] = _with_body_spin(track) if spin_frame == "world" else track
     return tracks
 
@@ -158,13 +162,19 @@ class _Parts:
     """Orientations, shape (T, 4)."""
     omega: Array | None
     """Angular velocities, shape (T, 3)."""
+    force: Array | None
+    """Forces that the body exerts [N], shape (T, 3); NaN where they were not measured."""
 
     @staticmethod
     def of(header: _Header, table: Array) -> _Parts:
         """Divide a table whose columns are in the order of `COLUMNS`, without those that the file lacks."""
-        spins = _SPIN[0] in header.index
-        end = table.shape[1] - (3 if spins else 0)
-        return _Parts(table[:, 0], table[:, 1:4], table[:, 4:8] if end > 4 else None, table[:, end:] if spins else None)
+        found: dict[str, Array | None] = {}
+        place = 4
+        for name, group in (("quat", _QUATERNION), ("omega", _SPIN), ("force", _FORCE)):
+            width = len(group) if group[0] in header.index else 0
+            found[name] = table[:, place : place + width] if width else None
+            place += width
+        return _Parts(table[:, 0], table[:, 1:4], **found)
 
 
 def _with_body_spin(track: Track) -> Track:
@@ -223,7 +233,7 @@ def _require_columns(path: Path, names: list[str], index: Mapping[str, int]) -> 
     """Check that time and position have columns, and either all or none of the orientation and of the spin."""
     lacking = [key for key in _REQUIRED if key not in index]
     group = _QUATERNION
-    for some in (_QUATERNION, _SPIN):
+    for some in (_QUATERNION, _SPIN, _FORCE):
         if not lacking and any(key in index for key in some):
             group, lacking = some, [key for key in some if key not in index]
     if lacking:

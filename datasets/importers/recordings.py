@@ -80,6 +80,7 @@ class Units:
         position: Array,
         quat_wxyz: Array | None = None,
         omega_rad_s: Array | None = None,
+        force_n: Array | None = None,
     ) -> Track:
         """Return a track in metres and seconds, without a shift of its times.
 
@@ -91,12 +92,16 @@ class Units:
             position: Shape (T, 3), in the unit of length.
             quat_wxyz: Shape (T, 4), or None for a centroid.
             omega_rad_s: Angular velocity [rad/s] in the frame of a track file, shape (T, 3), or None.
+            force_n: Force that the body exerts on what it touches [N], world frame, shape (T, 3), or None; not finite
+                in all samples where it was not measured at all.
 
         Raises:
             InputDataError: If fewer than two samples are left, times do not increase, are not finite or step so far
                 that they are no seconds, positions spread so far that they are no metres, or quaternions are not unit.
         """
-        _require_as_many(where, times=time, positions=position, orientations=quat_wxyz, spins=omega_rad_s)
+        _require_as_many(
+            where, times=time, positions=position, orientations=quat_wxyz, spins=omega_rad_s, forces=force_n
+        )
         seen = np.asarray(np.isfinite(position).all(1))
         if quat_wxyz is not None:
             seen &= np.isfinite(quat_wxyz).all(1)
@@ -115,7 +120,11 @@ class Units:
         omega = None if omega_rad_s is None else _spin(where, omega_rad_s[seen])
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
         track = Track(
-            time * _TIMES_S[self.time or "s"], position * _LENGTHS_M[self.length or "m"], quat, omega_body_rad_s=omega
+            time * _TIMES_S[self.time or "s"],
+            position * _LENGTHS_M[self.length or "m"],
+            quat,
+            omega_body_rad_s=omega,
+            force_n=None if force_n is None else _force(where, force_n[seen]),
         )
         for name, unit, values in (("times", "s", track.time_s), ("positions", "m", track.position_m)):
             if (largest := float(np.abs(values).max())) > LARGEST:
@@ -335,6 +344,22 @@ def _spin(where: str, omega_rad_s: Array) -> Array:
             "convert them to rad/s.",
         )
     return omega_rad_s
+
+
+def _force(where: str, force_n: Array) -> Array | None:
+    """Return measured forces (T, 3), which are known for every sample; None where they are for none."""
+    known = np.isfinite(force_n).all(1)
+    if not known.any():
+        return None
+    if not known.all():
+        raise InputDataError(
+            f"{where}: {np.count_nonzero(~known)} of {len(force_n)} samples have no finite force.",
+            "three finite numbers for every sample with a pose of a driven body, none for others.",
+            "fill them in, or leave out the lines.",
+        )
+    if (largest := float(np.abs(force_n).max())) > LARGEST:
+        raise InputDataError(f"{where}: forces up to {largest:.4g} N.", f"up to {LARGEST:g} N.")
+    return force_n
 
 
 def _unit(where: str, quat_wxyz: Array) -> Array:

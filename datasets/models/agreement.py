@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...schemas import BodyModel, Correlation, InputDataError, ModelFile
+from ...schemas.materials import of_pair
 from ...schemas.model import ContactParameters
 from ..capture.consistency import check_gravity
 from ..shapes.ply import Splats
@@ -60,6 +61,7 @@ def require_contact(file: ModelFile, path: Path) -> None:
     Raises:
         InputDataError: If it has; whatever needs the law says so by itself, so only `validate` asks.
     """
+    _require_pairs(file, path)
     names = {parameter.name for parameter in file.parameters} & set(ContactParameters.model_fields)
     if file.contact is None and names:
         raise InputDataError(
@@ -69,11 +71,28 @@ def require_contact(file: ModelFile, path: Path) -> None:
         )
 
 
+def _require_pairs(file: ModelFile, path: Path) -> None:
+    """Refuse a contact parameter of a pair of materials that the model does not have."""
+    known = {of_pair(name, entry.materials) for entry in file.pairs for name in ContactParameters.model_fields}
+    for parameter in file.parameters:
+        base, bracket, _ = parameter.name.partition("[")
+        if bracket and base in ContactParameters.model_fields and parameter.name not in known:
+            raise InputDataError(
+                f"{path}: the parameter '{parameter.name}' is of a pair of materials that pairs does not have.",
+                f"{', '.join(sorted(known)) or 'none: pairs is empty'}.",
+                "correct the name, or fit the model again.",
+            )
+
+
 def _values(file: ModelFile) -> Iterator[tuple[str, float, str]]:
     """Yield the names of parameters, their values in the model, and the places of those."""
     if file.contact is not None:
         for name in type(file.contact).model_fields:
             yield name, getattr(file.contact, name), f"contact.{name}"
+    for entry in file.pairs:
+        for name in ContactParameters.model_fields:
+            place = f"{name} of the pair {' and '.join(entry.materials)}"
+            yield of_pair(name, entry.materials), getattr(entry, name), place
     for body in file.bodies:
         yield f"{body.name}.mass_kg", body.mass_kg, f"mass_kg of body '{body.name}'"
         for axis, value in zip("xyz", body.com_m, strict=True):

@@ -14,7 +14,6 @@ from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
 from ...schemas import (
     BodyModel,
-    ContactParameters,
     FitFile,
     FittedParameter,
     Ground,
@@ -24,6 +23,7 @@ from ...schemas import (
     Solver,
     UsageError,
 )
+from ...schemas.materials import pair_of
 from ..physics.effects.registry import effect_of
 from ..physics.rollout_cost import durations
 from ..physics.world import World, inertia_elements
@@ -33,6 +33,7 @@ from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
+from .material_pairs import require_known_pairs, start_laws
 from .tracks.contact_result import PhysicsFit
 from .tracks.earlier_estimates import GROUND, EarlierEstimates
 from .tracks.part_choice import SCALE
@@ -58,6 +59,7 @@ def fit_motion(
         NotConvergedError: If the fit diverges.
     """
     _require_fittable(model, capture, config)
+    require_known_pairs(capture, split)
     ready = replace(model, file=_physics_start(model, capture, config))
     started = time.perf_counter()
     found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
@@ -91,11 +93,14 @@ def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> Non
 def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelFile:
     """Return the model file from which the fit of the physics starts."""
     effects = with_effects(model.file.effects, config.effects)
+    laws = start_laws(model.file, capture.manifest)
     # warnings of an earlier fit of the physics do not apply to this one
     stale = set(model.fit.stages.get("phys-geo", {}).get("warnings", ()))
     return model.file.model_copy(
         update={
-            "contact": model.file.contact or ContactParameters(),
+            "bodies": _of_materials(model.file.bodies, capture),
+            "contact": laws.contact,
+            "pairs": laws.pairs,
             # the ground of the capture, as an earlier fit may have moved the model's
             "ground": capture.manifest.world.ground or model.file.ground,
             "solver": Solver(step_s=config.step_s),
@@ -103,6 +108,12 @@ def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelF
             "warnings": tuple(text for text in model.file.warnings if text not in stale),
         }
     )
+
+
+def _of_materials(bodies: Sequence[BodyModel], capture: Capture) -> tuple[BodyModel, ...]:
+    """Return the bodies with the materials of the capture."""
+    materials = {body.name: body.material for body in capture.manifest.bodies}
+    return tuple(body.model_copy(update={"material": materials.get(body.name)}) for body in bodies)
 
 
 def _fitted_motion(
@@ -117,7 +128,8 @@ def _fitted_motion(
         spans = durations(episodes)
         with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
             earlier = EarlierEstimates.of(ready.file.parameters, ready.file.correlations)
-            found = fit_with_effects(world, episodes, config, noise, warm_started, capture.groups, earlier)
+            medians = start_laws(ready.file, capture.manifest).medians
+            found = fit_with_effects(world, episodes, config, noise, warm_started, capture.groups, earlier, medians)
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
         return replace(found, warnings=(*found.warnings, *warnings))
@@ -180,6 +192,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
         update={
             "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),
             "contact": found.contact,
+            "pairs": tuple(found.pairs.get(pair_of(*entry.materials), entry) for entry in file.pairs),
             "ground": _with_offset(file.ground, kept, found),
             "parameters": (*found.parameters, *kept),
             "correlations": (*found.correlations, *correlations),

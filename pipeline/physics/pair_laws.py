@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .contact_detection import pairs_of
 from .contact_law import ContactLaw
@@ -33,6 +33,13 @@ def laws_in_use(world: World) -> LawsInUse:
         of_pair=tuple(used.index(key) for key in keys),
         materials=tuple(used),
     )
+
+
+def with_only_law(world: World) -> World:
+    """Return a world whose contacts are all of one pair of materials with the law of that pair as its `contact`."""
+    used = laws_in_use(world)
+    only = used.materials[0] if len(used.materials) == 1 else None
+    return world if only is None else replace(world, contact=used.laws[0], pair_laws={})
 
 
 def _each_once(keys: Sequence[tuple[str, str] | None]) -> list[tuple[str, str] | None]:

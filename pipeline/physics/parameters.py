@@ -13,6 +13,7 @@ from torch import Tensor
 from ...schemas.materials import of_pair
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
+from .pair_laws import laws_in_use
 from .paper_law import PaperLaw
 from .world import Body, World, stretched_inertia
 
@@ -107,6 +108,50 @@ GROUND_SHIFT = Parameter(
 )
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
 """Coefficients of the contact law."""
+
+
+def contact_parameters(world: World, medians: Mapping[str, float] | None = None) -> list[Parameter]:
+    """Return the coefficients of the contact laws in use, those of pairs of materials named as `friction[steel,wood]`.
+
+    Args:
+        world: The world.
+        medians: Medians of their priors by name, where more is known than the priors of `CONTACT_PARAMETERS` say.
+    """
+    known = medians or {}
+    return [
+        _of_pair(parameter, pair, known.get(of_pair(parameter.name, pair)))
+        for pair in laws_in_use(world).materials
+        for parameter in CONTACT_PARAMETERS
+    ]
+
+
+def _of_pair(parameter: Parameter, pair: tuple[str, str] | None, median: float | None) -> Parameter:
+    """Return a coefficient of the law of a pair of materials, with another median of its prior where it is given."""
+    if median is not None:
+        low, high = parameter.bounds
+        parameter = replace(parameter, prior=(min(max(median, low), high), parameter.prior[1]))
+    if pair is None:
+        return parameter
+    reveals = f"{parameter.reveals}, between {pair[0]} and {pair[1]}"
+    return replace(parameter, name=of_pair(parameter.name, pair), reveals=reveals)
+
+
+def contact_values(world: World) -> dict[str, float]:
+    """Return the coefficients of the contact laws in use by the names of `contact_parameters`; of the first item."""
+    used = laws_in_use(world)
+    return {
+        of_pair(name, pair): float(value[0])
+        for pair, law in zip(used.materials, used.laws, strict=True)
+        for name, value in vars(law).items()
+        if isinstance(value, Tensor)
+    }
+
+
+def base_name(name: str) -> str:
+    """Return the name of a parameter without the pair of materials, or the group, that it belongs to."""
+    return name.partition("[")[0]
+
+
 PRIOR_SCALES = 5.0
 """Standard deviation of the prior of an effect's parameter, in units of its scale."""
 

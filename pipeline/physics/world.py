@@ -22,7 +22,7 @@ from .smooth_distance import plane_contacts
 
 if TYPE_CHECKING:
     from ...datasets.models.model import Model
-    from ...schemas import EffectModel
+    from ...schemas import ContactParameters, EffectModel
 
 MOST_STEPS = 2_000_000_000
 """Maximum number of steps of a rollout: some hours; the kernels count them in 32 bits."""
@@ -211,16 +211,20 @@ class World:
             _body(model, index, tensor, None if geometry is None else geometry.bodies[index])
             for index in range(len(file.bodies))
         ]
-        law = ContactLaw(
-            *(tensor(v) for v in (file.contact.friction, file.contact.contact_time_s, file.contact.damping_ratio))
-        )
+        from .pair_laws import with_only_law  # it needs the pairs of a world
+
+        def law_of(numbers: ContactParameters) -> ContactLaw:
+            return ContactLaw(*(tensor(v) for v in (numbers.friction, numbers.contact_time_s, numbers.damping_ratio)))
+
         ground = file.ground
-        return World(
+        world = World(
             bodies=tuple(bodies),
             gravity=tensor(file.gravity_m_s2),
             ground_normal=tensor(ground.normal)[0] if ground else None,
             ground_offset=tensor(ground.offset_m) if ground else None,
-            contact=law,
+            contact=law_of(file.contact),
+            pair_laws={pair_of(*pair.materials): law_of(pair) for pair in file.pairs},
+            ground_material=ground.material if ground else None,
             step_s=file.solver.step_s,
             iterations=file.solver.sweeps,
             effects=tuple(
@@ -228,6 +232,7 @@ class World:
             ),
             source="" if model.root is None else model.place,
         )
+        return with_only_law(world) if file.pairs else world
 
     def with_body(self, index: int, **changes: Tensor) -> World:
         """Return a copy in which some tensors of one body are replaced."""
@@ -295,6 +300,7 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         radii=radii,
         place=place,
         on_plane=on_plane,
+        material=entry.material,
     )
 
 

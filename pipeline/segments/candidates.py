@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..physics.effects.effect import ActiveEffect, Effect
-from ..physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, effect_parameters
+from ..physics.parameters import GROUND_SHIFT, Parameter, contact_parameters, contact_values, effect_parameters
 from ..physics.world import World
 from .segments import Kind
 
@@ -131,12 +131,12 @@ def base_parameters(world: World, kind: Kind) -> list[Parameter]:
         acting = {a.effect.name for a in world.effects if a.effect.phase != "contact"}
         return [p for p in own if p.name.partition(".")[0] in acting]
     ground = [GROUND_SHIFT] if world.ground_normal is not None else []
-    return [*CONTACT_PARAMETERS, *ground, *own]
+    return [*contact_parameters(world), *ground, *own]
 
 
 def base_values(world: World, parameters: Sequence[Parameter]) -> Tensor:
     """Return the model's values (P,) of parameters in fitted coordinates; 0 for candidates and the ground shift."""
-    law = vars(world.contact)
+    law = contact_values(world)
     own = {f"{a.effect.name}.{name}": float(value[0]) for a in world.effects for name, value in a.values.items()}
-    values = [p.encode(float(law[p.name][0])) if p.name in law else own.get(p.name, 0.0) for p in parameters]
+    values = [p.encode(law[p.name]) if p.name in law else own.get(p.name, 0.0) for p in parameters]
     return torch.tensor(values, dtype=torch.float64).to(world.gravity)

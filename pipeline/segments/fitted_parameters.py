@@ -8,7 +8,7 @@ import torch
 
 from ...schemas import FittedParameter
 from ..optimization.uncertainty import REACH
-from ..physics.parameters import Parameter
+from ..physics.parameters import Parameter, base_name
 from .thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.preparation
@@ -56,6 +56,6 @@ def bound_warnings(parameters: Sequence[Parameter], fitted: Sequence[FittedParam
         side, unit = ("upper" if upper else "lower"), "" if found.unit == "1" else f" {found.unit}"
         texts.append(
             f"{found.name} ended on its {side} bound ({found.estimate:.3g}{unit}), which is not an estimate: "
-            f"{meaning[found.name.partition('[')[0]][upper]}."
+            f"{(meaning.get(found.name) or meaning[base_name(found.name)])[upper]}."
         )
     return texts

@@ -101,6 +101,7 @@ def fit_with_effects(
     warm_started: bool = False,
     groups: Mapping[str, str] | None = None,
     earlier: EarlierEstimates | None = None,
+    medians: Mapping[str, float] | None = None,
 ) -> PhysicsFit:
     """Fit the world as `fit_physics` does, after checking its effects' needs and cutting throws at their release.
 
@@ -110,7 +111,8 @@ def fit_with_effects(
     """
     _require_needs(world, episodes)
     released_s, warnings = find_releases(world, episodes, noise)
-    found = fit_physics(world, after_release(episodes, released_s), config, noise, warm_started, groups, earlier)
+    thrown = after_release(episodes, released_s)
+    found = fit_physics(world, thrown, config, noise, warm_started, groups, earlier, medians)
     return replace(found, warnings=(*found.warnings, *warnings))
 
 

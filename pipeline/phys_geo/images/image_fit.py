@@ -29,7 +29,7 @@ from ....datasets.models.model import Model
 from ....datasets.shapes.meshes import Mesh
 from ....datasets.shapes.ply import Splats
 from ....schemas import PhysConfig, UsageError
-from ...physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, effect_parameters
+from ...physics.parameters import GROUND_SHIFT, Parameter, contact_parameters, effect_parameters
 from ...physics.world import World
 from ...runtime.checkpoint import Checkpoint
 from ...runtime.device import resolve_device
@@ -140,7 +140,7 @@ def _require_shared_effects(world: World) -> None:
 def _estimate_from_tracks(world: World, fit: PhysicsFit) -> TracksEstimate:
     """Return the fit's estimates and their covariance in fitted coordinates."""
     estimate = {p.name: p.estimate for p in fit.parameters}
-    names: list[Parameter] = list(CONTACT_PARAMETERS)
+    names = [parameter for parameter in contact_parameters(world) if parameter.name in estimate]
     values = [parameter.encode(estimate[parameter.name]) for parameter in names]
     if fit.ground_offset_m is not None and world.ground_offset is not None:
         names.append(GROUND_SHIFT)

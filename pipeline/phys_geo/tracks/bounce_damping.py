@@ -42,4 +42,4 @@ def with_bounces(
     if bounces is None:
         return world, start
     damping = torch.tensor([damping_of(bounces).value]).to(world.gravity)
-    return placed(world, [DAMPING_RATIO], damping), [(p, value) for p, value in start if p is not DAMPING_RATIO]
+    return placed(world, [DAMPING_RATIO], damping), [(p, value) for p, value in start if p.name != DAMPING_RATIO.name]

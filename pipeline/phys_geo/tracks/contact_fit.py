@@ -28,13 +28,18 @@ import numpy as np
 from ....datasets.capture.tracks import Episode, Track
 from ....datasets.io.progress import note
 from ....schemas import FitChoice, InputDataError, PhysConfig
+from ....schemas.materials import of_pair
 from ...optimization.importance_sampling import episode_covariance
+from ...physics.contact_detection import GROUND, pairs_of
 from ...physics.effects import ActiveEffect, load_effect
+from ...physics.pair_laws import laws_in_use
 from ...physics.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_TIME,
     GROUND_SHIFT,
     Parameter,
+    contact_parameters,
+    contact_values,
     effect_parameters,
     mass_distribution,
 )
@@ -87,6 +92,7 @@ def fit_physics(
     warm_started: bool = False,
     groups: Mapping[str, str] | None = None,
     earlier: EarlierEstimates | None = None,
+    medians: Mapping[str, float] | None = None,
 ) -> PhysicsFit:
     """Fit contact parameters and ground height to measured tracks, and effects and mass distribution where asked for.
 
@@ -101,6 +107,7 @@ def fit_physics(
             with half as many generations; otherwise it starts at the medians of the priors.
         groups: Group of each episode that belongs to one, for effects with group-specific parameters.
         earlier: What an earlier fit found: kept where these episodes do not observe it.
+        medians: Medians of the priors of contact parameters that are known better than usual, by name.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
@@ -110,7 +117,7 @@ def fit_physics(
     note(f"phys-geo: motion of {len(episodes)} episode{'' if len(episodes) == 1 else 's'}")
     data = _FitData.of(world, episodes, noise)
     earlier = earlier or EarlierEstimates()
-    ready = _fitted_before(world, data, config, warm_started, groups, earlier)
+    ready = _fitted_before(world, data, config, warm_started, groups, earlier, medians or {})
     batch = _with_initial_states(ready.world, data, config.warmup_s)
     record = FitRecord(
         episodes=len(episodes),
@@ -181,7 +188,9 @@ class _FitData:
             spans=spans,
             noise_estimated=estimated,
             noise=Noise(noise[0] or estimated[0], noise[1] or estimated[1]),
-            bounces=None if airborne else restitution_of(world, whole_episodes(world, episodes)),
+            bounces=None
+            if airborne or len(laws_in_use(world).laws) > 1
+            else restitution_of(world, whole_episodes(world, episodes)),
             airborne=airborne,
         )
 
@@ -219,11 +228,13 @@ def _fitted_before(
     warm_started: bool,
     groups: Mapping[str, str] | None,
     earlier: EarlierEstimates,
+    medians: Mapping[str, float],
 ) -> _Ready:
     """Fit mass distribution and effects, which short windows identify better than the open-loop error."""
     # with few episodes the search cannot separate the ground's height from the bouncing; shooting can
     height = world.ground_normal is not None and len(data.episodes) >= ENOUGH_EPISODES
-    names = [*CONTACT_PARAMETERS, *([GROUND_SHIFT] if height else [])]
+    contact = _of_seen_pairs(world, contact_parameters(world, medians), data.episodes)
+    names = [*contact, *([GROUND_SHIFT] if height else [])]
     start = [(p, _start(world, p) if warm_started else p.prior[0]) for p in names]
     world, start = with_bounces(world, start, data.bounces)
     world, mass, choice = _with_chosen_parts(world, data, config, start)
@@ -239,7 +250,7 @@ def _fitted_before(
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
         if effects.ground is not None:  # bodies at rest identify it better than the ends of rollouts
-            start = [(p, value) for p, value in start if p in CONTACT_PARAMETERS]
+            start = [(p, value) for p, value in start if p is not GROUND_SHIFT]
     return _Ready(world=world, start=start, mass=mass, effects=effects, choice=choice)
 
 
@@ -357,7 +368,20 @@ def _start(world: World, parameter: Parameter) -> float:
     if parameter is GROUND_SHIFT:
         return 0.0
     low, high = parameter.bounds
-    return min(max(float(getattr(world.contact, parameter.name)[0]), low), high)
+    return min(max(contact_values(world)[parameter.name], low), high)
+
+
+def _of_seen_pairs(world: World, parameters: Sequence[Parameter], episodes: Sequence[Episode]) -> list[Parameter]:
+    """Return the contact parameters of pairs of materials whose bodies are together in an episode."""
+    tracked = [set(tracks) for _, tracks in episodes]
+    moving = {body.name for body in world.bodies if body.motion != "fixed"}
+    seen = set()
+    for a, b in pairs_of(world):
+        bodies = {world.bodies[index].name for index in (a, b) if index != GROUND} & moving
+        if any(bodies <= names for names in tracked):
+            pair = world.pair_between(world.material_of(a), world.material_of(b))
+            seen |= {of_pair(parameter.name, pair) for parameter in CONTACT_PARAMETERS}
+    return [parameter for parameter in parameters if parameter.name in seen or not pairs_of(world)]
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:

@@ -12,10 +12,12 @@ import torch
 
 from ....datasets.capture.tracks import Track
 from ....datasets.shapes.ply import Splats
-from ....schemas import ContactParameters, Correlation, FitChoice, FittedParameter
+from ....schemas import ContactParameters, Correlation, FitChoice, FittedParameter, PairContact
+from ....schemas.materials import of_pair
 from ...optimization.uncertainty import correlation_of
-from ...physics.contact_law import restitution
-from ...physics.parameters import CONTACT_PARAMETERS, DAMPING_RATIO, GROUND_SHIFT, Parameter
+from ...physics.contact_law import ContactLaw, restitution
+from ...physics.paper_law import PaperLaw
+from ...physics.parameters import CONTACT_PARAMETERS, CONTACT_TIME, DAMPING_RATIO, GROUND_SHIFT, Parameter
 from ...physics.world import State, World
 from ...report.page import listed
 from ...segments.first_contact_fit import EffectEstimate
@@ -173,6 +175,8 @@ class PhysicsFit:
 
     contact: ContactParameters
     """Contact parameters for `model.json`."""
+    pairs: dict[tuple[str, str], PairContact] = field(default_factory=dict)
+    """Those of pairs of materials, by pair."""
     parameters: tuple[FittedParameter, ...]
     """Fitted and derived parameters, with intervals, for `model.json`."""
     ground_offset_m: float | None
@@ -228,7 +232,7 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
         fitted[-1] = absolute_ground(fitted[-1], float(world.ground_offset[0]))
     fitted = [_kept(estimate.kept[p.name]) if p.name in estimate.kept else p for p in fitted]
     value = {p.name: p.estimate for p in fitted}
-    contact = ContactParameters(**{key: value[key] for key in ("friction", "contact_time_s", "damping_ratio")})
+    contact = _numbers(None, world.contact, value)
     warnings += _unseen_warning([p for p in fitted if p.state == "not_observable"])
     if record.episodes < ENOUGH_EPISODES:
         warnings.append(
@@ -236,6 +240,10 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
         )
     return PhysicsFit(
         contact=contact,
+        pairs={
+            pair: PairContact(materials=pair, **_numbers(pair, law, value).model_dump())
+            for pair, law in world.pair_laws.items()
+        },
         parameters=(*fitted, *_derived(world, names, estimate.values, covariance)),
         ground_offset_m=value.get("ground_offset_m"),
         noise=noise,
@@ -244,6 +252,14 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
         starts=estimate.starts,
         correlations=(correlation_of([p.name for p in fitted], covariance),),
     )
+
+
+def _numbers(
+    pair: tuple[str, str] | None, law: ContactLaw | PaperLaw, fitted: Mapping[str, float]
+) -> ContactParameters:
+    """Return the numbers of the law of a pair of materials, fitted or those that it had."""
+    before = {p.name: float(getattr(law, p.name)[0]) for p in CONTACT_PARAMETERS}
+    return ContactParameters(**{name: fitted.get(of_pair(name, pair), old) for name, old in before.items()})
 
 
 def _interval_assumption(shooting: ShootingRecord | None) -> str:
@@ -303,7 +319,19 @@ def _kept(found: FittedParameter) -> FittedParameter:
 def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance: np.ndarray) -> list[FittedParameter]:
     """Return restitution, stiffness and damping of a single contact below the centre of mass, to first order."""
     index = {parameter.name: k for k, parameter in enumerate(names)}
-    tau, zeta = index["contact_time_s"], index["damping_ratio"]
+    derived = []
+    for pair in (None, *world.pair_laws):
+        places = [index.get(of_pair(p.name, pair)) for p in (CONTACT_TIME, DAMPING_RATIO)]
+        if places[0] is not None and places[1] is not None:
+            derived += _derived_of(world, pair, (places[0], places[1]), best, covariance)
+    return derived
+
+
+def _derived_of(
+    world: World, pair: tuple[str, str] | None, places: tuple[int, int], best: np.ndarray, covariance: np.ndarray
+) -> list[FittedParameter]:
+    """Return the derived quantities of the law whose contact time and damping ratio are at the given places."""
+    tau, zeta = places
     mass = float(world.bodies[world.free[0]].mass[0])
     formulas = {
         "restitution": ("1", lambda z: restitution(z[zeta].exp())),
@@ -323,7 +351,7 @@ def _derived(world: World, names: list[Parameter], best: np.ndarray, covariance:
         )
         derived.append(
             FittedParameter(
-                name=name,
+                name=of_pair(name, pair),
                 unit=unit,
                 estimate=estimate,
                 std_error=std,

@@ -13,7 +13,7 @@ from ....datasets.capture.tracks import Episode
 from ....datasets.io.progress import progress
 from ....schemas import PhysConfig
 from ...optimization.importance_sampling import SearchResult
-from ...physics.parameters import GROUND_SHIFT, Parameter
+from ...physics.parameters import CONTACT_TIME, FRICTION, GROUND_SHIFT, Parameter, base_name
 from ...physics.world import World
 from ...trajectories.track_noise import Noise
 from .contact_result import ContactEstimate, ShootingRecord
@@ -71,7 +71,9 @@ def shoot_contact(
     """
     parameters = _with_ground(world, names, ground_known)
     prior = _prior(parameters)
-    shots = _descended(world, data, parameters, _starts(prior, search, len(data.episodes)), prior, noise, config)
+    shots = _descended(
+        world, data, parameters, _starts(parameters, prior, search, len(data.episodes)), prior, noise, config
+    )
     shot = shots[0]
     shared, covariance, growth = tempered(shot, prior, MODEL_EXCESS)
     errors = open_loop_errors(world, data.batch.observations, data.batch.warm, parameters)
@@ -112,14 +114,15 @@ def _prior(parameters: Sequence[Parameter]) -> ShootingPrior:
     )
 
 
-def _starts(prior: ShootingPrior, search: SearchResult, episodes: int) -> list[np.ndarray]:
+def _starts(
+    parameters: Sequence[Parameter], prior: ShootingPrior, search: SearchResult, episodes: int
+) -> list[np.ndarray]:
     """Return the starts of the descents (P,): the search's result and, with few episodes, `STARTS`."""
     middle = prior.mean.numpy()
     starts = [np.concatenate([search.mean, middle[len(search.mean) :]])]
     for friction, contact_time in () if episodes >= SEVERAL_EPISODES else STARTS:
-        start = middle.copy()
-        start[:2] += np.log([friction, contact_time])  # the first two of `CONTACT_PARAMETERS`
-        starts.append(start)
+        times = {FRICTION.name: friction, CONTACT_TIME.name: contact_time}
+        starts.append(middle + np.log([times.get(base_name(p.name), 1.0) for p in parameters]))
     return starts
 
 

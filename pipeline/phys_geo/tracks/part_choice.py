@@ -19,7 +19,7 @@ from ....datasets.io.progress import note
 from ....schemas import FitChoice, HeldOutFall, PhysConfig
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.effects.registry import FLIGHT_ALIASES
-from ...physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, Parameter, effect_parameters
+from ...physics.parameters import GROUND_SHIFT, Parameter, contact_parameters, effect_parameters
 from ...physics.world import World
 from ...segments.held_out_gain import LEAST_EPISODES, ContactLinearization, HeldOutGain
 from ...trajectories.initial_state import flight_frames
@@ -113,7 +113,7 @@ class _Comparison:
         added = [name for name in dict.fromkeys((SCALE, *RIVALS, *DRAGS)) if name not in own]
         neutral = tuple(ActiveEffect.of(load_effect(name), {}, world.gravity) for name in added)
         wide = replace(world, effects=(*world.effects, *neutral))
-        base = [(p, p.prior[0]) for p in (*CONTACT_PARAMETERS, GROUND_SHIFT)]
+        base = [(p, p.prior[0]) for p in (*contact_parameters(world), GROUND_SHIFT)]
         further: list[tuple[str, Parameter, float]] = []
         for part in MASS_PARTS:
             further += [(part, p, value) for p, value in mass_parameters(world, (part,))]

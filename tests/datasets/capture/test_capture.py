@@ -247,7 +247,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'name = "tip"\n',
             'name = "tip"\nmass = 0.3\n',
             "C/capture.toml, line 6: [[bodies]] 'tip' has an unknown field 'mass'.\n"
-            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, photo_box. "
+            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, photo_box. "
             "Did you mean 'mass_kg'?\n"
             "Next: correct the field.",
         ),
@@ -255,21 +255,21 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'format = "cgwm-capture/1"\n',
             "",
             "C/capture.toml: the top level lacks the field 'format'.\n"
-            "Allowed: format, world, bodies, measurement, splits, episodes, video, calibration.\n"
+            "Allowed: format, world, bodies, materials, pairs, measurement, splits, episodes, video, calibration.\n"
             "Next: correct the field.",
         ),
         (
             'name = "cube"\n',
             "mass_kg = 1.0\n",
             "C/capture.toml, line 2: [[bodies]] lacks the field 'name'.\n"
-            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, photo_box.\n"
+            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, photo_box.\n"
             "Next: correct the field.",
         ),
         (
             "[splits]",
             "[split]",
             "C/capture.toml, line 7: the top level has an unknown field 'split'.\n"
-            "Allowed: format, world, bodies, measurement, splits, episodes, video, calibration. "
+            "Allowed: format, world, bodies, materials, pairs, measurement, splits, episodes, video, calibration. "
             "Did you mean 'splits'?\nNext: correct the field.",
         ),
         (
@@ -320,6 +320,37 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             "C/capture.toml: [episodes] names '002', which has neither track nor video.\n"
             "Allowed: 000, 001. Did you mean '001'?\n"
             "Next: correct the name, or add tracks/<episode>.csv or videos/<camera>/<episode> to C.",
+        ),
+        (
+            'name = "cube"\n',
+            'name = "cube"\nmaterial = "stel"\n',
+            "C/capture.toml: body 'cube' names the material 'stel', which is not among [[materials]]; there are none.\n"
+            "Next: correct the field.",
+        ),
+        (
+            "[video]",
+            '[[materials]]\nname = "steel"\n[[materials]]\nname = "steel"\n[video]',
+            "C/capture.toml: two [[materials]] have the name 'steel'; names must differ.\nNext: correct the field.",
+        ),
+        (
+            "[video]",
+            '[[materials]]\nname = "steel"\n[[pairs]]\nmaterials = ["steel", "wood"]\n[video]',
+            "C/capture.toml: [[pairs]] names the material 'wood', which is not among [[materials]]; they are steel.\n"
+            "Next: correct the field.",
+        ),
+        (
+            "[video]",
+            '[[materials]]\nname = "a"\n[[materials]]\nname = "b"\n'
+            '[[pairs]]\nmaterials = ["a", "b"]\n[[pairs]]\nmaterials = ["b", "a"]\n[video]',
+            "C/capture.toml: two [[pairs]] are of 'a' and 'b'; each pair of materials stands once, in either order.\n"
+            "Next: correct the field.",
+        ),
+        (
+            "[video]",
+            '[[materials]]\nname = "a"\nrestitution = 0.3\n[video]',
+            "C/capture.toml, line 14: [[materials]] 'a' has an unknown field 'restitution'.\n"
+            "Allowed: name, friction. Did you mean 'friction'?\n"
+            "Next: correct the field.",
         ),
         (
             "{ left = ",

@@ -10,6 +10,7 @@ from cgwm.schemas import InputDataError
 
 HEADER = "time_s,body,px_m,py_m,pz_m,qw,qx,qy,qz"
 ALL_COLUMNS = "time_s, body, px_m, py_m, pz_m, qw, qx, qy, qz, vx_m_s, vy_m_s, vz_m_s, wx_rad_s, wy_rad_s, wz_rad_s"
+ALL_COLUMNS += ", force_x_n, force_y_n, force_z_n, torque_x_n_m, torque_y_n_m, torque_z_n_m"
 
 
 def random_track(seed: int, count: int = 5, full: bool = True) -> Track:
@@ -25,6 +26,8 @@ def random_track(seed: int, count: int = 5, full: bool = True) -> Track:
         quat_wxyz=quat_wxyz,
         velocity_m_s=rng.normal(size=(count, 3)),
         omega_body_rad_s=rng.normal(size=(count, 3)),
+        force_n=rng.normal(size=(count, 3)),
+        torque_n_m=rng.normal(size=(count, 3)),
     )
 
 
@@ -46,7 +49,7 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     read, normalised = read_tracks(tmp_path / "a.csv", ["tip", "cube"])
     assert normalised == 0 and set(read) == {"cube", "tip"}
     for name, track in tracks.items():
-        for column in ("time_s", "position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s"):
+        for column in Track.__dataclass_fields__:
             expected, found = getattr(track, column), getattr(read[name], column)
             assert (expected is None and found is None) or np.array_equal(expected, found)
     rows = (tmp_path / "a.csv").read_text().splitlines()[1:]
@@ -95,7 +98,7 @@ def test_unit_in_a_header_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", "time_s,body,px_mm,py_mm,pz_mm", "0,cube,1,2,3")
     assert message(path) == (
         f"T, line 1: unknown column 'px_mm'.\nAllowed: {ALL_COLUMNS}. Did you mean 'px_m'?\n"
-        "Next: correct the header; values are in SI units (m, s, rad)."
+        "Next: correct the header; values are in SI units (m, s, rad, N)."
     )
 
 

@@ -1,0 +1,129 @@
+"""Contact laws by pair of materials at the start of a fit, and what is known about them before.
+
+A pair has the numbers that [[pairs]] of the capture gives; its friction, where it is not given, the geometric mean of
+those of its two materials. What is left open starts at the medians of the priors. Given numbers are medians of priors
+as well: the fit estimates every pair that its episodes show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from ...datasets.capture.capture import Capture
+from ...schemas import CaptureManifest, ContactParameters, InputDataError, ModelFile, PairContact
+from ...schemas.materials import of_pair, pair_of
+from ..physics.parameters import CONTACT_PARAMETERS
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class TouchingBodies:
+    """Two bodies that can touch, or one and the ground."""
+
+    bodies: tuple[str, ...]
+    """Their names; one for a body and the ground."""
+    pair: Pair | None
+    """Their materials; None where one of them has none."""
+
+    def __str__(self) -> str:
+        return " and ".join(f"'{name}'" for name in self.bodies) + (" and the ground" if len(self.bodies) == 1 else "")
+
+
+def touching_bodies(manifest: CaptureManifest) -> Iterator[TouchingBodies]:
+    """Yield the bodies that can touch: each free one with the ground, and with every other body."""
+    bodies, ground = manifest.bodies, manifest.world.ground
+    for index, body in enumerate(bodies):
+        if body.motion == "free" and ground is not None:
+            yield TouchingBodies((body.name,), _pair(body.material, ground.material))
+        for other in bodies[index + 1 :]:
+            if "free" in (body.motion, other.motion):
+                yield TouchingBodies((body.name, other.name), _pair(body.material, other.material))
+
+
+def _pair(first: str | None, second: str | None) -> Pair | None:
+    return None if first is None or second is None else pair_of(first, second)
+
+
+def given_numbers(manifest: CaptureManifest) -> dict[Pair, dict[str, float]]:
+    """Return the contact parameters of pairs of materials that a capture knows, by pair and name."""
+    single = {material.name: material.friction for material in manifest.materials}
+    pairs = {pair_of(first, second) for first in single for second in single}
+    found: dict[Pair, dict[str, float]] = {}
+    for first, second in sorted(pairs):
+        one, other = single[first], single[second]
+        if one is not None and other is not None:
+            found[first, second] = {"friction": math.sqrt(one * other)}
+    for entry in manifest.pairs:
+        numbers = {p.name: getattr(entry, p.name) for p in CONTACT_PARAMETERS}
+        known = {name: value for name, value in numbers.items() if value is not None}
+        pair = pair_of(*entry.materials)
+        found[pair] = found.get(pair, {}) | known
+    return found
+
+
+def require_known_pairs(capture: Capture, split: str) -> None:
+    """Refuse pairs of materials whose friction nobody gave, and which no episode can show.
+
+    Raises:
+        InputDataError: With the materials and the bodies of the first such pair.
+    """
+    known = {pair for pair, numbers in given_numbers(capture.manifest).items() if "friction" in numbers}
+    moving = {body.name for body in capture.manifest.bodies if body.motion != "fixed"}
+    asked = [one for one in touching_bodies(capture.manifest) if one.pair is not None and one.pair not in known]
+    shown = [set(capture.tracks(name)) for name in capture.episodes(split)] if asked else []
+    open_pairs = {one.pair for one in asked if any(set(one.bodies) & moving <= tracked for tracked in shown)}
+    for one in asked:
+        if one.pair is not None and one.pair not in open_pairs:
+            first, second = one.pair
+            raise InputDataError(
+                f"{capture.root / 'capture.toml'}: nothing gives the friction of '{first}' and '{second}' (of {one}), "
+                f"and no episode of split '{split}' shows them together.",
+                f'[[pairs]] with materials = ["{first}", "{second}"] and friction, or friction of both materials.',
+                "give it, or leave out the material of one of the two, which then has the contact of all other pairs.",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartLaws:
+    """Contact laws at the start of a fit."""
+
+    contact: ContactParameters
+    """The law of all pairs that have none of their own; of the only pair in use where there is one."""
+    pairs: tuple[PairContact, ...]
+    """The laws of pairs of materials."""
+    medians: Mapping[str, float]
+    """Medians of the priors of contact parameters that the capture gives, by name."""
+
+
+def start_laws(file: ModelFile, manifest: CaptureManifest) -> StartLaws:
+    """Return the laws of all pairs of materials of a model, from an earlier fit or from what the capture gives.
+
+    Where all contacts are of one pair, its law is `contact`: the names of its parameters are plain ones.
+    """
+    given = given_numbers(manifest)
+    used = dict.fromkeys(one.pair for one in touching_bodies(manifest))
+    earlier = {pair_of(*entry.materials): entry for entry in file.pairs}
+    contact = file.contact or ContactParameters()
+    only = next(iter(used)) if len(used) == 1 else None
+    if only is not None:
+        contact = earlier.get(only, _law(contact, given.get(only, {}), file.contact is not None))
+    laws = {
+        pair: earlier.get(pair, PairContact(materials=pair, **_law(contact, given.get(pair, {}), False).model_dump()))
+        for pair in sorted({*given, *(pair for pair in used if pair is not None)})
+        if pair != only
+    }
+    medians = {of_pair(name, pair): value for pair, numbers in given.items() if pair in used and pair != only
+               for name, value in numbers.items()}  # fmt: skip
+    return StartLaws(
+        contact=ContactParameters(**contact.model_dump(include=set(ContactParameters.model_fields))),
+        pairs=tuple(laws.values()),
+        medians=medians | (given.get(only, {}) if only is not None else {}),
+    )
+
+
+def _law(contact: ContactParameters, given: Mapping[str, float], fitted: bool) -> ContactParameters:
+    """Return a law with given numbers, which those of an earlier fit precede."""
+    return contact if fitted else contact.model_copy(update=dict(given))
