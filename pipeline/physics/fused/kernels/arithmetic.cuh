@@ -78,6 +78,14 @@ __device__ inline Number plain(Real x) { return x.value; }
 typedef Number Real;
 __device__ inline Number plain(Real x) { return x; }
 #endif
+// Whether a number that multiplies a term is 0, so that the term need not be computed; with derivatives it is needed.
+__device__ inline bool absent(Real x) {
+#if HOST && !DUAL
+    return x == Number(0);
+#else
+    return false;
+#endif
+}
 __device__ inline Real at_least(Real x, Number low) { return plain(x) >= low ? x : Real(low); }
 __device__ inline Real at_most(Real x, Number high) { return plain(x) <= high ? x : Real(high); }
 __device__ inline Real square(Real x) { return x * x; }

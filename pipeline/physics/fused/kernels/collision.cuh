@@ -17,6 +17,7 @@ INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocit
 INLINE void stick(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec& velocity,
                   Vec& spin) {
     const Surface& s = env.laws[0].surface;
+    if (absent(s.adhesion)) return;
     Real sum = Real(0), most = Real(0), each = reciprocal(s.reach);
     Vec arms = none();
     for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
@@ -65,8 +66,13 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
     Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
     Vec a = w.acceleration - drag * u + w.magnus * cross(omega, u);
 #if MAGNETS
-    Real height = height_of(problem, env, b, rotation);
-    for (int i = 0; i < MAGNETS; i++) a.z = a.z - w.magnets[i] * exponential(-height * reciprocal(w.magnet_ranges[i]));
+    bool pulled = false;
+    for (int i = 0; i < MAGNETS; i++) pulled = pulled || !absent(w.magnets[i]);
+    Real height = pulled ? height_of(problem, env, b, rotation) : Real(0);
+    for (int i = 0; i < MAGNETS; i++) {
+        if (absent(w.magnets[i])) continue;
+        a.z = a.z - w.magnets[i] * exponential(-height * reciprocal(w.magnet_ranges[i]));
+    }
 #endif
     velocity = velocity + h * a;
     spin = spin - h * w.spin_damping * body.spin;
@@ -438,6 +444,8 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
     }
 #if SURFACE
     Real touching = Real(env.lanes.sum(Number(count)));
+    const Sym& J = motions[0].inverse_inertia;
+    Real across = reciprocal((J.xx + J.yy) * touching), about = reciprocal(J.zz * touching);
 #endif
     // warm start: the impulses of the previous step
     int sweep = env.lanes.any(env.warm) ? -1 : 0;
@@ -462,8 +470,10 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             linear[0] = linear[0] + c.impulse;
             angular[0] = angular[0] + cross(c.arm, c.impulse);
 #if SURFACE
-            if (sweep >= 0) c.turning = turned_by(c, env.laws[0], motions[0], touching);
-            angular[0] = angular[0] + c.turning;
+            if (env.laws[0].surface.twisting) {
+                if (sweep >= 0) c.turning = turned_by(c, env.laws[0], motions[0], across, about);
+                angular[0] = angular[0] + c.turning;
+            }
 #endif
         }
 #endif

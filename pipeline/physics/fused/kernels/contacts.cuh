@@ -185,10 +185,9 @@ INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real w
     c.turning = none();
 }
 
-// Angular impulse of rolling and torsional friction after one iteration; `count` contacts act on the same spin.
-INLINE Vec turned_by(const Contact& c, const Law& law, const Motion& a, Real count) {
-    const Sym& J = a.inverse_inertia;
-    Real across = reciprocal((J.xx + J.yy) * count), about = reciprocal(J.zz * count);
+// Angular impulse of rolling and torsional friction after one iteration. `across` and `about` are the reciprocals of
+// the mobility about horizontal axes and about the normal, times the number of contacts that act on the same spin.
+INLINE Vec turned_by(const Contact& c, const Law& law, const Motion& a, Real across, Real about) {
     Real x = c.turning.x - across * a.omega.x, y = c.turning.y - across * a.omega.y;
     Real z = c.turning.z - about * a.omega.z;
     Real roll = shortened(x * x + y * y, law.surface.rolling * c.impulse.z);

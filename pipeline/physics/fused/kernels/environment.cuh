@@ -132,6 +132,9 @@ INLINE void load(const Problem& problem, Environment& env) {
     s.ratio = table.at(at + 19);
     s.adhesion = table.at(at + 20);
     s.reach = table.at(at + 21);
+    s.spotted = false;
+    for (int i = 0; i < 9; i++) s.spotted = s.spotted || !absent(s.spots[i]);
+    s.twisting = !absent(s.rolling) || !absent(s.torsion);
     at += 22;
 #endif
     EACH_BODY

@@ -208,6 +208,10 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
             law.stiffness = problem.steps.at(row + (l ? 2 + 2 * l : 1));
             law.damping = problem.steps.at(row + (l ? 3 + 2 * l : 2));
         }
+#if SURFACE
+        Surface& surface = env.laws[0].surface;
+        damp(surface, step_s, Real(0), surface.stiffness, surface.damping);
+#endif
         Real start = problem.steps.at(row + 3);
         int substeps = problem.substeps[frame - 1];
         KEEP_LOOP

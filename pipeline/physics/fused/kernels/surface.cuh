@@ -6,6 +6,8 @@ struct Surface {
     Real viscous, rolling, torsion;  // N s/m; m; m
     Real restitution, time, ratio;   // growth of the damping ratio with speed; contact time, ratio
     Real adhesion, reach;            // N; m
+    bool spotted, twisting;          // whether friction depends on position; whether rolling or torsion has friction
+    Real stiffness, damping;         // of a step, of a contact without speed
 };
 
 // The quadratic B-spline of width 3.
@@ -18,8 +20,12 @@ INLINE Real spline(Real x) {
 
 // Friction of a contact at (x, y) with slip velocity (u, v), both along the axes of the ground.
 INLINE Real friction_at(const Surface& s, Real friction, Real x, Real y, Real u, Real v) {
-    Real speed = root(u * u + v * v + Real(Number(1e-24)));
-    Real sum = friction + s.stribeck * exponential(-(speed * reciprocal(s.slow_speed)));
+    Real sum = friction;
+    if (!absent(s.stribeck)) {
+        Real speed = root(u * u + v * v + Real(Number(1e-24)));
+        sum += s.stribeck * exponential(-(speed * reciprocal(s.slow_speed)));
+    }
+    if (!s.spotted) return at_least(sum, Number(0));
     Real each = reciprocal(s.spot_m);
     for (int i = 0; i < 3; i++) {
         Real along = spline(each * x - Real(Number(i - 1)));
@@ -29,9 +35,9 @@ INLINE Real friction_at(const Surface& s, Real friction, Real x, Real y, Real u,
 }
 
 // Stiffness and damping of a step if the damping ratio grows with the speed, as in `coefficients` of
-// `physics/contact_law.py`.
-INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness, Real& damping) {
-    Real fast = plain(speed) < Number(0) ? -speed : speed, ratio = s.ratio;
+// `physics/contact_law.py`; `fast` is the size of the speed.
+INLINE void damp(const Surface& s, Real step_s, Real fast, Real& stiffness, Real& damping) {
+    Real ratio = s.ratio;
     Real grows = Real(Number(3.28)) + Number(1.16) * ratio;
     ratio += Number(0.375) * (Real(Number(1)) + ratio * grows) * s.restitution * fast;
     Real eta = step_s * reciprocal(s.time), gap = Real(Number(1)) - ratio * ratio;
@@ -47,6 +53,16 @@ INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness,
     Real trace = Number(2) * decay * cosine, determinant = decay * decay;
     stiffness = Real(Number(1)) + determinant - trace;
     damping = Number(0.5) * (Real(Number(3)) - trace - determinant) - stiffness;
+}
+
+// The same at a speed with a sign; where the ratio does not grow, those of the present step are stored already.
+INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness, Real& damping) {
+    if (absent(s.restitution)) {
+        stiffness = s.stiffness;
+        damping = s.damping;
+        return;
+    }
+    damp(s, step_s, plain(speed) < Number(0) ? -speed : speed, stiffness, damping);
 }
 
 #if ELLIPTIC
@@ -75,6 +91,20 @@ INLINE Real share_of(Real size, Real limit) {
 // Projects an impulse onto the ellipse |M^-1 j| <= limit.
 INLINE void put_in(const Ellipse& e, Real limit, Real& x, Real& y) {
     const Real tiny = Real(Number(1e-24));
+#if HOST
+    // where the contact sticks, a predicted branch takes roots and divisions out of the chain of iterations
+    Number mean = plain(e.mean), even = plain(e.even), mixed = plain(e.mixed);
+    Number along = mean * plain(x) - even * plain(x) - mixed * plain(y);
+    Number across = mean * plain(y) - mixed * plain(x) + even * plain(y);
+    Number most = plain(limit) * (mean * mean - even * even - mixed * mixed);
+    if (along * along + across * across < Number(1 - 1e-6) * most * most - Number(1e-24)) return;
+    if (absent(e.even) && absent(e.mixed)) {
+        Real scale = at_most(limit * e.mean * inverse_root(x * x + y * y + tiny), Number(1));
+        x = scale * x;
+        y = scale * y;
+        return;
+    }
+#endif
     Real square = e.even * e.even + e.mixed * e.mixed, twice = Number(2) * e.mean;
     Real half_trace = e.mean * e.mean + square, root_det = e.mean * e.mean - square;
     Real turned_x = e.even * x + e.mixed * y, turned_y = e.mixed * x - e.even * y;
