@@ -92,16 +92,7 @@ class Points:
 
 def pairs_of(world: World) -> list[tuple[int, int]]:
     """List the pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies."""
-    if not world.touching:
-        return []
-    bodies = world.bodies
-    pairs = [(i, GROUND) for i, body in enumerate(bodies) if body.free and world.ground_normal is not None]
-    pairs += [(i, GROUND - 1 - s) for i, body in enumerate(bodies) if body.free for s in range(len(world.surfaces))]
-    for i, first in enumerate(bodies):
-        for j in range(i + 1, len(bodies)):
-            if first.free or bodies[j].free:
-                pairs.append((i, j) if first.free else (j, i))
-    return pairs
+    return world.pairs
 
 
 def slot_count(world: World, pair: tuple[int, int]) -> int:

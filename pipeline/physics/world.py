@@ -149,6 +149,20 @@ class World:
         return [max(1, math.ceil(length / self.step_s - 1e-6)) for length in longest]
 
     @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """The pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies."""
+        if not self.touching:
+            return []
+        free = self.free
+        pairs = [(i, -1) for i in free if self.ground_normal is not None]
+        pairs += [(i, -2 - s) for i in free for s in range(len(self.surfaces))]
+        for i, first in enumerate(self.bodies):
+            for j in range(i + 1, len(self.bodies)):
+                if first.free or self.bodies[j].free:
+                    pairs.append((i, j) if first.free else (j, i))
+        return pairs
+
+    @property
     def laws(self) -> tuple[ContactLaw | PaperLaw, ...]:
         """All contact laws: that of pairs without a law of their own, then those of `pair_laws`."""
         return (self.contact, *self.pair_laws.values())
@@ -159,6 +173,10 @@ class World:
         if surface is not None:
             return surface.material
         return self.ground_material if index < 0 else self.bodies[index].material
+
+    def materials_of(self, a: int, b: int) -> tuple[str, str] | None:
+        """Return the materials of a pair, by index, where they have a law of their own; else None."""
+        return self.pair_between(self.material_of(a), self.material_of(b))
 
     def law_of(self, a: int, b: int) -> ContactLaw | PaperLaw:
         """Return the contact law of two bodies, by index; -1 is the ground, surfaces follow."""
@@ -211,7 +229,6 @@ class World:
             _body(model, index, tensor, None if geometry is None else geometry.bodies[index])
             for index in range(len(file.bodies))
         ]
-        from .pair_laws import with_only_law  # it needs the pairs of a world
 
         def law_of(numbers: ContactParameters) -> ContactLaw:
             return ContactLaw(*(tensor(v) for v in (numbers.friction, numbers.contact_time_s, numbers.damping_ratio)))
@@ -232,7 +249,13 @@ class World:
             ),
             source="" if model.root is None else model.place,
         )
-        return with_only_law(world) if file.pairs else world
+        return world._with_only_law() if file.pairs else world
+
+    def _with_only_law(self) -> World:
+        """Return the world; where all contacts are of one pair of materials, with the law of that pair as `contact`."""
+        used = {self.materials_of(a, b) for a, b in self.pairs}
+        only = next(iter(used)) if len(used) == 1 else None
+        return self if only is None else replace(self, contact=self.pair_laws[only], pair_laws={})
 
     def with_body(self, index: int, **changes: Tensor) -> World:
         """Return a copy in which some tensors of one body are replaced."""

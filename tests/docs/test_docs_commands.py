@@ -121,8 +121,10 @@ def words_of(command: str) -> list[str]:
 
 
 def test_the_manifest_is_legal(tmp_path: Path) -> None:
-    (text,) = blocks("docs/capture.md", "toml")
+    text, materials = blocks("docs/capture.md", "toml")
     path = tmp_path / "capture.toml"
+    path.write_text('format = "cgwm-capture/1"\n' + materials)
+    assert read_toml(path, CaptureManifest).pairs[0].friction == 0.3
     path.write_text(text)
     manifest = read_toml(path, CaptureManifest)
     assert manifest.bodies[0].mass_kg == 0.37
@@ -145,7 +147,7 @@ def test_the_plan_is_legal(tmp_path: Path) -> None:
 
 
 def test_the_error_is_what_is_printed(tmp_path: Path) -> None:
-    (text,) = blocks("docs/capture.md", "toml")
+    text = blocks("docs/capture.md", "toml")[0]
     path = tmp_path / "capture.toml"
     path.write_text(text.replace("mass_kg", "mass"))
     with pytest.raises(InputDataError) as error:

@@ -30,7 +30,6 @@ from ....datasets.io.progress import note
 from ....schemas import FitChoice, InputDataError, PhysConfig
 from ....schemas.materials import of_pair
 from ...optimization.importance_sampling import episode_covariance
-from ...physics.contact_detection import GROUND, pairs_of
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.pair_laws import laws_in_use
 from ...physics.parameters import (
@@ -376,12 +375,11 @@ def _of_seen_pairs(world: World, parameters: Sequence[Parameter], episodes: Sequ
     tracked = [set(tracks) for _, tracks in episodes]
     moving = {body.name for body in world.bodies if body.motion != "fixed"}
     seen = set()
-    for a, b in pairs_of(world):
-        bodies = {world.bodies[index].name for index in (a, b) if index != GROUND} & moving
+    for a, b in world.pairs:
+        bodies = {world.bodies[index].name for index in (a, b) if index >= 0} & moving
         if any(bodies <= names for names in tracked):
-            pair = world.pair_between(world.material_of(a), world.material_of(b))
-            seen |= {of_pair(parameter.name, pair) for parameter in CONTACT_PARAMETERS}
-    return [parameter for parameter in parameters if parameter.name in seen or not pairs_of(world)]
+            seen |= {of_pair(parameter.name, world.materials_of(a, b)) for parameter in CONTACT_PARAMETERS}
+    return [parameter for parameter in parameters if parameter.name in seen or not world.pairs]
 
 
 def _span(tracks: dict[str, Track]) -> tuple[float, float]:
