@@ -190,9 +190,10 @@ class _Solved:
             inverse = np.linalg.inv(normal)
             slope, state = inverse @ (flight.basis.T @ solved[:, 2:]).T[0], inverse @ flight.basis.T @ solved[:, 3]
             left, bend = flight.height - flight.basis @ state, flight.drag - flight.basis @ slope
-            pull += bend @ solved[:, 3]
-            information += bend @ solved[:, 2]
-            cost += 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1] + left @ solved[:, 3]
+            pull += float(bend @ solved[:, 3])
+            information += float(bend @ solved[:, 2])
+            size = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
+            cost += float(size + left @ solved[:, 3])
             states.append(state)
             slopes.append(slope)
             spread.append(inverse)

@@ -136,7 +136,7 @@ def library(structure: Structure, flags: tuple[str, ...] = ("-O1",)) -> ctypes.C
     """Return the kernel of a structure, built now or, of the same source and compiler, by an earlier run of tests."""
     assert COMPILER is not None
     source = SHIM + structure.source(host=True) + ENTRY
-    command = [COMPILER, "-std=c++17", "-shared", "-fPIC", *WARNINGS, *flags]
+    command = [COMPILER, "-std=c++14", "-shared", "-fPIC", *WARNINGS, *flags]
 
     def build(folder: Path) -> Path:
         (folder / "rollout.cpp").write_text(source)

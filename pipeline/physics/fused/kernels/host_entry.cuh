@@ -1,16 +1,23 @@
+struct Queue { const Problem* problem; int environments, next; };
+
+static void* work(void* shared) {
+    Queue& queue = *static_cast<Queue*>(shared);
+    for (int first; (first = __atomic_fetch_add(&queue.next, 8, __ATOMIC_RELAXED)) < queue.environments;) {
+        for (int index = first; index < first + 8 && index < queue.environments; index++) {
+            Lanes lanes = {0, false};
+            roll(*queue.problem, index, lanes);
+        }
+    }
+    return nullptr;
+}
+
 extern "C" void run(int threads, PARAMETERS) {
     const Problem problem = PROBLEM;
-    std::atomic<int> next(0);
-    auto work = [&]() {
-        for (int first; (first = next.fetch_add(8)) < environments;) {
-            for (int index = first; index < first + 8 && index < environments; index++) {
-                Lanes lanes = {0, false};
-                roll(problem, index, lanes);
-            }
-        }
-    };
-    std::vector<std::thread> others;
-    for (int k = 1; k < threads; k++) others.emplace_back(work);
-    work();
-    for (std::thread& other : others) other.join();
+    Queue queue = {&problem, environments, 0};
+    pthread_t* others = new pthread_t[threads];
+    int count = 0;  // where the system gives no more threads, those that there are do the work
+    while (count + 1 < threads && pthread_create(&others[count], nullptr, work, &queue) == 0) count++;
+    work(&queue);
+    while (count > 0) pthread_join(others[--count], nullptr);
+    delete[] others;
 }

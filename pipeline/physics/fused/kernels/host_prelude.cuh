@@ -1,6 +1,4 @@
-#include <atomic>
 #include <cmath>
-#include <thread>
-#include <vector>
+#include <pthread.h>
 #define __device__
 #define __restrict__ __restrict
