@@ -584,9 +584,9 @@ def test_the_wrong_kind_is_named(dataset: Path, model: Path, tmp_path: Path, for
 
 
 @pytest.mark.parametrize("format_", ["ply", "glb", "bop", "nerfstudio"])
-def test_what_exists_stays(dataset: Path, model: Path, tmp_path: Path, format_: ExportFormat) -> None:
+def test_what_exists_stays(short: Path, model: Path, tmp_path: Path, format_: ExportFormat) -> None:
     out = tmp_path / ("out.glb" if format_ == "glb" else "out")
-    thing = dataset if format_ in DATASET_FORMATS else model
+    thing = short if format_ in DATASET_FORMATS else model
     out.write_text("mine") if format_ == "glb" else (out / "mine").mkdir(parents=True)
     if format_ != "glb":
         (out / "mine" / "notes.txt").write_text("mine")

@@ -313,6 +313,7 @@ def test_photos_have_features_and_markers_where_the_manifest_says(film_set: Set)
     assert np.median(np.linalg.norm(offsets, axis=1)) < 1.0
 
 
+@pytest.mark.evidence
 def test_same_arguments_same_bytes(fall: Path, tmp_path: Path) -> None:
     """From one plan; `test_a_plan_repeats_itself` has the plan."""
     assert sha256(made("fall", tmp_path / "again", seed=2)) == sha256(fall)

@@ -14,6 +14,7 @@ from cgwm.datasets.synthetic.hidden_effects import draw_mystery, make_mystery, o
 from cgwm.datasets.synthetic.hidden_effects.mystery import CHOICES
 from cgwm.pipeline.demo import mystery
 from cgwm.pipeline.demo.mystery import judged, run_mystery
+from cgwm.pipeline.diagnose import stage
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     DiagnoseResult,
@@ -42,6 +43,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory):
     out = tmp_path_factory.mktemp("mystery") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mystery, "draw_mystery", short)
+        patch.setattr(stage, "next_motions", lambda *_: None)  # they take seconds, and have tests of their own
         result = run_mystery(out, SEED, "cpu", physics=QUICK)
     return out, result
 

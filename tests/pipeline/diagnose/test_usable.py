@@ -110,6 +110,7 @@ def test_one_kind_of_motion_alone_is_said_in_the_verdict(tmp_path: Path) -> None
     model = write_capture(tmp_path / "high", truth, tosses(truth, 3, count=5, duration_s=0.35, height_m=(2.0, 3.0)))
     found = diagnose(model, tmp_path / "high")
     assert found.sentence.endswith("Only flight was measured, so the verdict does not cover contact.")
+    assert found.next_motions is not None and found.next_motions.motions  # which does
 
 
 def test_milliseconds_are_told_before_a_fit_as_well(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from cgwm.pipeline.physics import Body, Rollout, State, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.friction_ellipse import FLATTEST, Ellipse
 from cgwm.pipeline.physics.impulse_solver import in_disc
 from helpers.worlds import F64, batch, box_body, law, state_of, times, world_of
@@ -31,11 +32,11 @@ def matrix(a: float, b: float, mu: float = MU) -> np.ndarray:
 def slid(
     body: Body, effects: tuple[ActiveEffect, ...], velocities: Sequence[tuple[float, float]], duration: float
 ) -> Rollout:
-    """Roll out a slide for each velocity, all in one batch."""
+    """Roll out a slide for each velocity, all in one batch, in the kernel where a compiler is (`test_fused.py`)."""
     lowest = float((body.radii - body.centers[..., 2]).amax())
     at = (0.0, 0.0, lowest - G * 0.004**2)
     state = State.joined(*(state_of((at, UP, (*velocity, 0.0), (0.0, 0.0, 0.0))) for velocity in velocities))
-    return simulate(replace(world_of(body, contact=law(MU)), effects=effects), state, times(duration))
+    return roll_out(replace(world_of(body, contact=law(MU)), effects=effects), state, times(duration))
 
 
 def expected(M: np.ndarray, velocity: tuple[float, float], at: np.ndarray) -> np.ndarray:
@@ -84,7 +85,7 @@ def test_without_a_grain_it_is_the_disc() -> None:
     body = box_body(half=(0.05, 0.04, 0.03))
     start = state_of(((0, 0, 0.06), (1, 0.2, 0.1, 0.3), (0.8, 0.3, 0.0), (2.0, 3.0, 1.0)))
     with_it, without = (
-        simulate(replace(world_of(body), effects=effects), start, times(0.3)) for effects in ((grain(0, 0),), ())
+        roll_out(replace(world_of(body), effects=effects), start, times(0.3)) for effects in ((grain(0, 0),), ())
     )
     torch.testing.assert_close(with_it.position_m, without.position_m, rtol=0, atol=1e-9)
 
@@ -112,7 +113,7 @@ def test_a_tumbling_box_gains_no_energy() -> None:
     body = box_body()
     start = state_of(((0, 0, 0.08), (1, 0.3, 0.2, 0.5), (1.5, -0.8, 0.0), (6.0, -4.0, 9.0)))
     world = replace(world_of(body, contact=law(MU)), effects=(grain(0.2, -0.1),))
-    rollout = simulate(world, start, times(0.6))
+    rollout = roll_out(world, start, times(0.6))
     omega, velocity = rollout.omega_body_rad_s[0, :, 0], rollout.velocity_m_s[0, :, 0]
     mass = float(body.mass)
     energy = 0.5 * mass * velocity.square().sum(-1) + mass * G * rollout.position_m[0, :, 0, 2]
@@ -130,7 +131,7 @@ def test_a_slope_holds_along_the_rough_way_alone() -> None:
     world = world_of(body, contact=law(MU))
     world = replace(world, gravity=torch.tensor(gravity, dtype=F64), effects=(grain(0.1, 0.0),))
     start = state_of(((0, 0, 0.002 - G * 0.004**2), UP, (0, 0, 0), (0, 0, 0)), count=2)
-    rollout = simulate(world, start, times(0.2), None, True)
+    rollout = roll_out(world, start, times(0.2), None, True)
     assert rollout.contacts is not None
     slope = G * (math.sin(angle) - 0.2 * math.cos(angle))
     for axis, moved in ((0, False), (1, True)):
@@ -147,7 +148,7 @@ def test_derivatives_agree_with_differences() -> None:
         """Return the ends (B, 3) for numbers (B, 3)."""
         world = replace(world_of(box_body()), effects=(grain(values[:, 0], values[:, 1]),))
         world = replace(world, contact=replace(world.contact, friction=values[:, 2]))
-        return simulate(world, start, times(0.04)).position_m[:, -1, 0]
+        return simulate(world, start, times(0.02)).position_m[:, -1, 0]
 
     values = torch.tensor([(0.1, -0.05, MU), (0.0, 0.0, MU), (0.3, 0.2, MU)], dtype=F64)
     found = torch.autograd.functional.jacobian(lambda x: end(x).sum(0), values).transpose(0, 1)

@@ -153,7 +153,7 @@ def test_a_box_with_nothing_in_it_is_refused(capture, low, high):
     views, _ = unmasked(capture)
     empty = with_bodies(capture, Body(name="block", photo_box=PhotoBox(min_m=low, max_m=high)))
     with pytest.raises(InputDataError, match=r"nothing solid where body 'block' is looked for(.|\n)*correct photo_box"):
-        separate(empty, views, [], Ground(), None, CONFIG)
+        separate(empty, views, [], Ground(), None, CONFIG.model_copy(update={"iterations": 8}))
 
 
 def test_a_box_the_wrong_way_round_is_refused():

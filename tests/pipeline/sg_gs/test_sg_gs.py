@@ -10,7 +10,7 @@ import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.rendering.render import render
-from cgwm.pipeline.sg_gs import bodies
+from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement, refine
 from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.schemas import InputDataError, SplatConfig
@@ -169,7 +169,8 @@ def test_geometry_comes_first_on_request_or_where_maps_are(capture, result, tmp_
 
 def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result, refined, monkeypatch):
     monkeypatch.setattr(bodies, "refine", lambda *_: refined[0])  # of the same photos, which `result` has compared
-    config = CONFIG.model_copy(update={"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1})
+    monkeypatch.setattr(mcmc, "REFINED_EVERY", 20)
+    config = CONFIG.model_copy(update={"spheres": 250, "adaptive_iterations": 40, "sh_degree": 1})
     adapted = fit_scene(capture, config)
     scene = adapted.scene
     assert scene is not None
