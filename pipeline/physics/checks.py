@@ -12,6 +12,7 @@ from torch import Tensor
 from ...schemas import InputDataError, UsageError
 from ...schemas.materials import of_pair
 from ..geometry.rotation import quat_to_matrix
+from .chain import require_chains
 from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of, plain
 from .contact_law import ContactLaw
 from .pair_laws import laws_in_use
@@ -54,6 +55,7 @@ def require_physical(world: World) -> None:
             "at most the sum of the two smaller ones: no distribution of mass has more",
         )
         _require((plain(body.radii) > 0).all(-1), plain(body.radii).amin(-1), f"{place}: radius", "m", "above 0")
+    require_chains(world)
     if world.pair_laws and not isinstance(world.contact, ContactLaw):
         raise UsageError(
             f"the contact law '{world.contact.name}' has no laws of pairs of materials.", "closed_form with them."

@@ -43,10 +43,14 @@ class Placed:
     omega: Tensor
     """Angular velocity [rad/s], shape (n, 3)."""
 
+    @property
+    def origin(self) -> Tensor:
+        """The reference point in the body frame [m], shape (1 or n, 3)."""
+        return self.body.com if self.body.free else torch.zeros_like(self.body.com)
+
     def arms(self, chosen: Tensor | None = None) -> Tensor:
         """Return the spheres (n, N or K, 3) [m] relative to the reference point, world axes."""
-        origin = self.body.com if self.body.free else torch.zeros_like(self.body.com)
-        return pick(self.body.centers - origin[:, None], chosen) @ self.rotation.transpose(-1, -2)
+        return pick(self.body.centers - self.origin[:, None], chosen) @ self.rotation.transpose(-1, -2)
 
     def centers(self, chosen: Tensor | None = None) -> Tensor:
         """Return the centres (n, N or K, 3) [m] of its spheres, or of the chosen ones (n, K)."""
@@ -69,8 +73,7 @@ class Placed:
     @cached_property
     def reach(self) -> Tensor:
         """The radius (n or 1,) [m] of a ball about the reference point that holds all spheres, without derivatives."""
-        origin = plain(self.body.com) if self.body.free else torch.zeros_like(plain(self.body.com))
-        arms = plain(self.body.centers) - origin[:, None]
+        arms = plain(self.body.centers) - plain(self.origin)[:, None]
         return (arms.square().sum(-1).sqrt() + plain(self.body.radii)).amax(-1)
 
 
@@ -121,7 +124,7 @@ def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
         if body.on_plane is not None:
             centers, radii = centers[:, body.on_plane], radii[:, body.on_plane]
         axes = torch.stack((normal.expand_as(still.omega), cross(normal.expand_as(still.omega), still.omega)), -1)
-        height, rate = _along(centers - plain(body.com)[:, None], still.rotation.transpose(-1, -2) @ axes).unbind(-1)
+        height, rate = _along(centers - still.origin[:, None], still.rotation.transpose(-1, -2) @ axes).unbind(-1)
         gap = height + (still.reference @ normal - plain(offset))[:, None] - radii
         return torch.minimum(gap, gap + plain(step_s)[:, None] * (rate + (still.velocity @ normal)[:, None]))
 

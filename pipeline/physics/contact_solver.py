@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...schemas import UsageError
 from ..geometry.rotation import cross
+from .chain_stepping import ChainStepper, owners
 from .contact_detection import (
     GROUND,
     ROUNDING_M,
@@ -26,7 +27,7 @@ from .contact_detection import (
 from .contact_law import ContactLaw, Touch
 from .fixed_surface import FixedSurface
 from .friction_ellipse import Ellipse
-from .impulse_solver import ContactGroup, Impulses, Rows, solve_impulses, tangent_axes
+from .impulse_solver import ContactGroup, Impulses, Rows, solve_with_joints, tangent_axes
 from .paper_law import PaperLaw, paper_impulses
 from .rigid_body import Inertia, Motion
 from .surface_detection import Nearby, near_surface, surface_points
@@ -89,10 +90,13 @@ class Contacts:
     Args:
         world: The world.
         inertias: The inertias of its bodies, in the world's order.
+        chains: Its chains in the rollout.
     """
 
-    def __init__(self, world: World, inertias: Sequence[Inertia]) -> None:
+    def __init__(self, world: World, inertias: Sequence[Inertia], chains: Sequence[ChainStepper] = ()) -> None:
         self.world = world
+        self.chains = chains
+        self.links = owners(chains)
         self.inertias = inertias
         self.pairs = pairs_of(world)
         self.effects = [active for active in world.effects if active.effect.has("contact")]
@@ -116,8 +120,8 @@ class Contacts:
         """
         candidates = self._candidates(placed, step_s)
         if not candidates:
-            return []
-        items = _union([touching for touching, *_ in candidates.values()])
+            return self._joints_alone()
+        items = None if self.chains else _union([touching for touching, *_ in candidates.values()])
         some = [_select(body, items) for body in placed]
         h = take(step_s, items)
         found: list[tuple[int, Points, Touch, Tensor]] = []
@@ -140,13 +144,13 @@ class Contacts:
                 touch, axes = self._touch(points, some[a], None if b < 0 else some[b], law, h, items, b == GROUND)
                 found.append((number, points, touch, axes))
         if not found:
-            return []
+            return self._joints_alone()
         warm = self._warm(found, items, before, step_s.shape[0])
         impulses = self._impulses(found, some, items, warm)
         results = []
         for (number, points, touch, axes), impulse in zip(found, impulses, strict=True):
             a, b = self.pairs[number]
-            free = (True, b >= 0 and self.world.bodies[b].free)
+            free = (True, b >= 0 and self.world.moves(b))
             world_impulse = (impulse.linear[..., None, :] @ axes).squeeze(-2)
             angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
             friction = touch.friction
@@ -167,6 +171,22 @@ class Contacts:
                 )
             )
         return results
+
+    def _joints_alone(self) -> list[PairImpulses]:
+        """Solve the impulses of the joints of chains that nothing touches."""
+        if self.chains:
+            self._solve([], [])
+        return []
+
+    def _solve(self, groups: list[ContactGroup], warm: Sequence[Tensor | None]) -> list[Impulses]:
+        rows = [chain.rows for chain in self.chains if chain.rows is not None and any(chain.rows.active)]
+        rubbing = [chain for chain in self.chains if chain.rows is not None and any(chain.rows.active)]
+        iterations = self.world.iterations
+        old = [chain.impulses if iterations > 1 else None for chain in rubbing]
+        found, rubbed = solve_with_joints(groups, iterations, warm, rows, old)
+        for chain, impulses in zip(rubbing, rubbed, strict=True):
+            chain.impulses = impulses
+        return found
 
     def _candidates(
         self, placed: Sequence[Placed], step_s: Tensor
@@ -255,13 +275,18 @@ class Contacts:
         for number, points, touch, axes in found:
             sides = []
             for index, sign in zip(self.pairs[number], (1.0, -1.0), strict=True):
-                if index >= 0 and self.world.bodies[index].free:
-                    inertia, body = self.inertias[index], placed[index]
-                    arms = points.position - body.reference[:, None]
+                if index < 0 or not self.world.moves(index):
+                    continue
+                inertia, body = self.inertias[index], placed[index]
+                arms = points.position - body.reference[:, None]
+                if index in self.links:
+                    chain, link = self.links[index]
+                    sides.append(chain.contact_rows(link, sign, arms, axes))
+                else:
                     root = body.rotation @ take(inertia.root, items)
                     sides.append(Rows.of(index, sign, arms, axes, take(inertia.mass, items).rsqrt(), root))
             groups.append(ContactGroup.of(touch, axes, tuple(sides)))
-        return solve_impulses(groups, self.world.iterations, warm)
+        return self._solve(groups, warm)
 
     def _warm(
         self,

@@ -12,9 +12,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ..runtime.kernel_build import compiler
+from .chain import Joint
 from .contact_detection import pairs_of, slot_count
 from .fused import simulate_fused, unsupported
 from .fused.host import lacking, simulate_on_host
+from .joint_command import JointCommand
 from .kinematic import Drive
 from .rollout import Rollout, simulate
 from .world import State, World
@@ -34,7 +36,7 @@ def rollout(
     world: World,
     state: State,
     times_s: Tensor,
-    driven: Mapping[str, Track | Drive] | None = None,
+    driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
     """Simulate a world, in the fused kernel where that supports it: on CUDA, or on a CPU with a C++ compiler.
@@ -119,7 +121,11 @@ def ragged_rollout(
 
 
 def lacking_derivatives(
-    world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive], record_contacts: bool
+    world: World,
+    state: State,
+    times_s: Tensor,
+    driven: Mapping[str, Track | Drive | JointCommand],
+    record_contacts: bool,
 ) -> str | None:
     """Return the requested derivatives that the kernel does not support, in words; None for none."""
     tensors = list(_tensors(world, state, times_s, driven))
@@ -130,13 +136,18 @@ def lacking_derivatives(
     return None
 
 
-def _tensors(world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> Iterator[Tensor]:
+def _tensors(
+    world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive | JointCommand]
+) -> Iterator[Tensor]:
     """Yield all tensors of a rollout's arguments."""
     drives = [command for command in driven.values() if isinstance(command, Drive)]
     for holder in (world, *world.laws, state, *world.bodies, *world.surfaces, *drives):
         yield from (value for value in vars(holder).values() if isinstance(value, Tensor) and value.is_floating_point())
     for active in world.effects:
         yield from active.values.values()
+    for holder in (*(joint for chain in world.chains for joint in chain.joints), *driven.values()):
+        if isinstance(holder, (Joint, JointCommand)):
+            yield from (value for value in vars(holder).values() if isinstance(value, Tensor))
     yield times_s
 
 

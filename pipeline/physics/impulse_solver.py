@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,6 +21,9 @@ from torch import Tensor
 from ..geometry.rotation import cross
 from .contact_law import Touch, coefficients
 from .friction_ellipse import TINY, Ellipse
+
+if TYPE_CHECKING:
+    from .joint_rows import JointRows
 
 CONTACT_ONSET_M = 2e-4
 """Depth [m] from which a contact takes its full share of a body's mass; below, the share grows smoothly."""
@@ -38,7 +42,11 @@ class Rows:
     jacobian: Tensor
     """Mass-weighted rows of each contact along its normal and two tangents, shape (n, 3 C, 6)."""
     root: Tensor
-    """Matrix S with inverse inertia = S S^T, world axes, shape (n, 3, 3)."""
+    """Matrix S with inverse inertia = S S^T, world axes, shape (n, 3, 3); of a link the rows (n, 3, nv) of its angular
+    velocity.
+    """
+    linked: bool = False
+    """Whether the body is a link of a chain, and `body` the root of the chain."""
 
     @staticmethod
     def of(
@@ -62,6 +70,15 @@ class Rows:
         linear = sign * axes * inverse_mass_root[:, None, None, None]
         turning = sign * cross(arms[:, :, None], axes).flatten(1, 2) @ root
         return Rows(body, sign, torch.cat((linear.flatten(1, 2), turning), -1), root)
+
+    def turned(self, torque: Tensor) -> Tensor:
+        """Return the change (n, nv, 1) of the mass-weighted velocity by an angular impulse (n, 3) on body a."""
+        turning = self.sign * self.root.transpose(1, 2) @ torque[..., None]
+        return turning if self.linked else torch.cat((torch.zeros_like(turning), turning), 1)
+
+    def spin(self, change: Tensor) -> Tensor:
+        """Return the relative angular velocity (n, 3) that a change (n, nv, 1) makes."""
+        return self.sign * (self.root @ (change if self.linked else change[:, 3:])).squeeze(-1)
 
 
 def tangent_axes(normal: Tensor) -> Tensor:
@@ -189,15 +206,33 @@ def solve_impulses(groups: Sequence[ContactGroup], iterations: int, warm: Sequen
         warm: Initial impulses (n, C, 3) [N s] along the axes of each group, None for zero: those of the previous step,
             so that slow modes that few iterations do not resolve converge over the following steps.
     """
+    return solve_with_joints(groups, iterations, warm, (), ())[0]
+
+
+def solve_with_joints(
+    groups: Sequence[ContactGroup],
+    iterations: int,
+    warm: Sequence[Tensor | None],
+    joints: Sequence[JointRows],
+    joint_warm: Sequence[Tensor | None],
+) -> tuple[list[Impulses], list[Tensor]]:
+    """Solve the impulses of all groups, and those (n, J, 3) of the joints of chains after each iteration over them."""
     groups = _splitting(groups)
+    rubbed = [
+        torch.zeros_like(rows.target[..., :1].expand(-1, -1, 3)) if old is None else old
+        for rows, old in zip(joints, joint_warm, strict=True)
+    ]
     found = [
         Impulses(torch.zeros_like(group.relative) if old is None else old)
         for group, old in zip(groups, warm, strict=True)
     ]
     for _ in range(iterations):
-        velocities = _all_velocities(groups, found)
+        velocities = _all_velocities(groups, found, joints, rubbed)
         found = [_iterate(group, given, *now) for group, given, now in zip(groups, found, velocities, strict=True)]
-    return found
+        if joints:
+            moved = _moved(groups, found, joints, rubbed)
+            rubbed = [rows.solve(old, moved[rows.body])[0] for rows, old in zip(joints, rubbed, strict=True)]
+    return found, rubbed
 
 
 def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
@@ -219,14 +254,30 @@ def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
     return split
 
 
-def _all_velocities(groups: Sequence[ContactGroup], impulses: Sequence[Impulses]) -> list[tuple[Tensor, Tensor | None]]:
+def _all_velocities(
+    groups: Sequence[ContactGroup],
+    impulses: Sequence[Impulses],
+    joints: Sequence[JointRows] = (),
+    rubbed: Sequence[Tensor] = (),
+) -> list[tuple[Tensor, Tensor | None]]:
     """Return for each group the velocities of its points (n, C, 3) and its spin (n, 3) under all impulses."""
-    moved: dict[int, Tensor] = {}
+    moved = _moved(groups, impulses, joints, rubbed)
+    return [_velocities(group, moved) for group in groups]
+
+
+def _moved(
+    groups: Sequence[ContactGroup],
+    impulses: Sequence[Impulses],
+    joints: Sequence[JointRows],
+    rubbed: Sequence[Tensor],
+) -> dict[int, Tensor]:
+    """Return the change (n, nv, 1) of the mass-weighted velocity of each body, and of each chain under its root."""
+    moved = {rows.body: rows.motion(given) for rows, given in zip(joints, rubbed, strict=True)}
     for group, given in zip(groups, impulses, strict=True):
         for side in group.sides:
             motion = _motion(side, group, given)
             moved[side.body] = motion if side.body not in moved else moved[side.body] + motion
-    return [_velocities(group, moved) for group in groups]
+    return moved
 
 
 def _motion(side: Rows, group: ContactGroup, impulses: Impulses) -> Tensor:
@@ -235,8 +286,7 @@ def _motion(side: Rows, group: ContactGroup, impulses: Impulses) -> Tensor:
     if impulses.angular is None:
         return motion
     torque = (impulses.angular[..., None, :] @ group.axes).squeeze(-2).sum(1)
-    turning = side.sign * side.root.transpose(1, 2) @ torque[..., None]
-    return motion + torch.cat((torch.zeros_like(turning), turning), 1)
+    return motion + side.turned(torque)
 
 
 def _velocities(group: ContactGroup, moved: dict[int, Tensor]) -> tuple[Tensor, Tensor | None]:
@@ -246,7 +296,7 @@ def _velocities(group: ContactGroup, moved: dict[int, Tensor]) -> tuple[Tensor, 
         change = moved[side.body]
         relative = relative + (side.jacobian @ change).squeeze(-1).unflatten(1, (-1, 3))
         if omega is not None:
-            omega = omega + side.sign * (side.root @ change[:, 3:]).squeeze(-1)
+            omega = omega + side.spin(change)
     return relative, omega
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...schemas import InputDataError
 from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from .joint_command import JointCommand
 from .rigid_body import Motion
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class Drive:
         return Drive(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
     @staticmethod
-    def command(body: str, driven: Mapping[str, Track | Drive], like: Tensor) -> Drive:
+    def command(body: str, driven: Mapping[str, Track | Drive | JointCommand], like: Tensor) -> Drive:
         """Return the command of a driven body as a `Drive`.
 
         Raises:
@@ -54,6 +55,8 @@ class Drive:
                 todo=f"add rows for '{body}' to the episode's tracks file.",
             )
         command = driven[body]
+        if isinstance(command, JointCommand):
+            raise InputDataError(f"the driven body '{body}' has a command of joints.", "a track, or a Drive.")
         return command if isinstance(command, Drive) else Drive.of([command], like)
 
     @staticmethod

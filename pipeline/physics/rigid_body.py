@@ -40,7 +40,9 @@ class Inertia:
 
     @staticmethod
     def of(body: Body) -> Inertia:
-        """Compute the constants of a body once for a rollout."""
+        """Compute the constants of a body once for a rollout; links of chains, which may have no mass, need none."""
+        if body.motion == "link":
+            return Inertia(body.mass, body.inertia, body.inertia, body.inertia)
         inverse = torch.linalg.inv(body.inertia)
         return Inertia(body.mass, inverse, torch.linalg.cholesky(inverse), body.inertia)
 

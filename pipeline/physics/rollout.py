@@ -13,11 +13,13 @@ from torch import Tensor
 
 from ...schemas import NotConvergedError
 from ..geometry.rotation import quat_to_matrix
+from .chain_stepping import ChainStepper
 from .checks import require_physical, require_state
 from .contact_detection import Placed
 from .contact_record import ContactRecord, Recorder
 from .contact_solver import Contacts, PairImpulses
 from .effects.effect import BodyMotion, changed_by_effects
+from .joint_command import JointCommand
 from .kinematic import Drive
 from .rigid_body import Inertia, Motion, advance, finish, start
 from .world import State, World
@@ -51,7 +53,7 @@ def simulate(
     world: World,
     state: State,
     times_s: Tensor,
-    driven: Mapping[str, Track | Drive] | None = None,
+    driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
     """Simulate a world from an initial state, open loop.
@@ -60,7 +62,8 @@ def simulate(
         world: The world; its tensors and the state's broadcast over the batch B.
         state: The state at the first time; driven and fixed bodies take theirs from `driven` or keep it.
         times_s: Frame times [s], increasing, shape (T,) or (B, T).
-        driven: The command of each driven body: a track, or a prepared `Drive`.
+        driven: The command of each driven body: a track, or a prepared `Drive`; of the servos of a chain, under the
+            name of the chain: a `JointCommand`.
         record_contacts: Whether to keep the contacts of every frame.
 
     Returns:
@@ -106,7 +109,9 @@ class Engine:
         driven: The command of each driven body.
     """
 
-    def __init__(self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive]) -> None:
+    def __init__(
+        self, world: World, state: State, times_s: Tensor, driven: Mapping[str, Track | Drive | JointCommand]
+    ) -> None:
         world = self.world = changed_by_effects(world)
         if world.effects:
             require_physical(world)  # an effect may have made a body that cannot be
@@ -117,11 +122,12 @@ class Engine:
         self.wrenches = [active for active in world.effects if active.effect.has("wrench")]
         self.flows = [active for active in world.effects if active.effect.has("flow")]
         self.drives = self._commands(driven, state.position_m.detach())
+        self.chains = [ChainStepper(world, chain, state, driven) for chain in world.chains]
         self.batch = self._batch(state)
-        self.contacts = Contacts(world, self.inertias)
+        self.contacts = Contacts(world, self.inertias, self.chains)
         self.touched: list[PairImpulses] = []
 
-    def _commands(self, driven: Mapping[str, Track | Drive], like: Tensor) -> dict[int, Drive]:
+    def _commands(self, driven: Mapping[str, Track | Drive | JointCommand], like: Tensor) -> dict[int, Drive]:
         bodies = enumerate(self.world.bodies)
         return {k: Drive.command(body.name, driven, like) for k, body in bodies if body.motion == "driven"}
 
@@ -134,6 +140,7 @@ class Engine:
         tensors += [value for body in world.bodies for value in (body.mass, body.inertia, body.com, body.centers)]
         tensors += [drive.times_s for drive in self.drives.values()]
         tensors += [value for surface in world.surfaces for value in surface.tensors]
+        tensors += [x for chain in self.chains for x in chain.tensors]
         return max(x.shape[0] for x in tensors if isinstance(x, torch.Tensor))
 
     def begin(self, state: State) -> list[Motion]:
@@ -148,12 +155,19 @@ class Engine:
             else:
                 motion = Motion(position, quat, torch.zeros_like(position), torch.zeros_like(position))
             motions.append(self._whole(motion))
+        for chain in self.chains:
+            for index, motion in zip(
+                chain.dynamics.indices, chain.begin(state, self.times[:, 0], self.batch), strict=True
+            ):
+                motions[index] = self._whole(motion)
         return motions
 
-    def commanded(self, motions: list[Motion], driven: Mapping[str, Track | Drive]) -> list[Motion]:
+    def commanded(self, motions: list[Motion], driven: Mapping[str, Track | Drive | JointCommand]) -> list[Motion]:
         """Replace the commands, and return the motions with driven bodies at the start of the new ones."""
         self.drives = self._commands(driven, motions[0].com)
         first = self.times[:, 0]
+        for chain in self.chains:
+            chain.commanded(driven)
         return [self._whole(self.drives[k].at(first)) if k in self.drives else m for k, m in enumerate(motions)]
 
     def _whole(self, motion: Motion) -> Motion:
@@ -170,9 +184,13 @@ class Engine:
             self._free(index, motion, rotations[index], h) if self.world.bodies[index].free else motion
             for index, motion in enumerate(motions)
         ]
+        time = self.times[:, interval - 1] + (substep + 1) * self.lengths[:, interval - 1] / count
+        for chain in self.chains:
+            for index, motion in zip(chain.dynamics.indices, chain.free(h, time), strict=True):
+                ahead[index] = self._whole(motion)
         touched = self.contacts.resolve(self._place(ahead, rotations), h, self.touched)
         self.touched = touched
-        velocity, spin = self._after(ahead, touched)
+        velocity, spin, wrenches = self._after(ahead, touched)
         moved = []
         for index, body in enumerate(self.world.bodies):
             if body.free:
@@ -180,10 +198,12 @@ class Engine:
                 inertia = self.inertias[index]
                 moved.append(advance(inertia, motions[index], velocity[index], spin[index], h, semi_implicit))
             elif index in self.drives:
-                time = self.times[:, interval - 1] + (substep + 1) * self.lengths[:, interval - 1] / count
                 moved.append(self._whole(self.drives[index].at(time)))
             else:
                 moved.append(motions[index])
+        for chain in self.chains:
+            for index, motion in zip(chain.dynamics.indices, chain.after(wrenches, h), strict=True):
+                moved[index] = self._whole(motion)
         return moved, touched
 
     def _free(self, index: int, motion: Motion, rotation: Tensor, h: Tensor) -> Motion:
@@ -247,14 +267,21 @@ class Engine:
         """Return the bodies at their current poses."""
         return self._place(motions, [quat_to_matrix(m.quat_wxyz) for m in motions])
 
-    def _after(self, ahead: list[Motion], touched: list[PairImpulses]) -> tuple[list[Tensor], list[Tensor]]:
-        """Return velocities and angular momenta after the impulses of contact."""
+    def _after(
+        self, ahead: list[Motion], touched: list[PairImpulses]
+    ) -> tuple[list[Tensor], list[Tensor], dict[int, tuple[Tensor, Tensor]]]:
+        """Return velocities and angular momenta after the impulses of contact, and what acts on links of chains."""
         velocity, spin = [m.velocity for m in ahead], [m.spin for m in ahead]
+        wrenches: dict[int, tuple[Tensor, Tensor]] = {}
         for pair in touched:
             for index, (impulse, moment) in pair.on_bodies(ahead).items():
+                if not self.world.bodies[index].free:
+                    old = wrenches.get(index, (0.0, 0.0))
+                    wrenches[index] = (impulse + old[0], moment + old[1])
+                    continue
                 velocity[index] = velocity[index] + impulse / self.inertias[index].mass[:, None]
                 spin[index] = spin[index] + moment
-        return velocity, spin
+        return velocity, spin, wrenches
 
     def frame(self, motions: list[Motion]) -> tuple[Tensor, ...]:
         """Return the fields of the `State` (B, nb, ...) of the motions."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...schemas import InputDataError, UsageError
 from ...schemas.materials import pair_of
+from .chain import Chain
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
@@ -35,7 +36,7 @@ class Body:
     name: str
     """Name of the body, unique in the world."""
     motion: str
-    """How the body moves: "free", "driven" or "fixed"."""
+    """How the body moves: "free", "driven", "fixed", or "link" of a chain."""
     mass: Tensor
     """Mass [kg], shape (B,)."""
     inertia: Tensor
@@ -55,7 +56,7 @@ class Body:
 
     @property
     def free(self) -> bool:
-        """Whether the body moves by physics."""
+        """Whether the body moves by physics, on its own."""
         return self.motion == "free"
 
 
@@ -93,6 +94,8 @@ class World:
     """
     own_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Group- or episode-specific values of effects' parameters: by episode, then by `effect.parameter`."""
+    chains: tuple[Chain, ...] = ()
+    """Jointed bodies, whose links are bodies with motion "link"."""
     source: str = ""
     """File of the model that it was built from, for messages; empty where there is none."""
 
@@ -109,6 +112,16 @@ class World:
     def free(self) -> list[int]:
         """Indices of the free bodies."""
         return [index for index, body in enumerate(self.bodies) if body.free]
+
+    def chain_of(self, index: int) -> int:
+        """Return the number of the chain of which a body is a link, -1 for none."""
+        name = self.bodies[index].name
+        return next((k for k, chain in enumerate(self.chains) if name in chain.links), -1)
+
+    def moves(self, index: int) -> bool:
+        """Return whether contact moves a body: a free one, or a link that a joint or a free root moves."""
+        chain = self.chain_of(index) if self.chains else -1
+        return self.bodies[index].free or (chain >= 0 and self.chains[chain].moves(self.bodies[index].name))
 
     @property
     def ground(self) -> tuple[Tensor, Tensor]:
@@ -150,16 +163,24 @@ class World:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """The pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies."""
+        """The pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies.
+
+        Links of chains are as free bodies; but links of one chain do not touch each other, and a link that no joint
+        moves only touches what moves.
+        """
         if not self.touching:
             return []
-        free = self.free
-        pairs = [(i, -1) for i in free if self.ground_normal is not None]
-        pairs += [(i, -2 - s) for i in free for s in range(len(self.surfaces))]
-        for i, first in enumerate(self.bodies):
+        solid = [body.radii.shape[-1] > 0 for body in self.bodies]
+        moves = [self.moves(k) and has for k, has in enumerate(solid)]
+        chain = [self.chain_of(k) if self.chains else -1 for k in range(len(self.bodies))]
+        moving = [k for k, does in enumerate(moves) if does]
+        pairs = [(i, -1) for i in moving if self.ground_normal is not None]
+        pairs += [(i, -2 - s) for i in moving for s in range(len(self.surfaces))]
+        for i in range(len(self.bodies)):
             for j in range(i + 1, len(self.bodies)):
-                if first.free or self.bodies[j].free:
-                    pairs.append((i, j) if first.free else (j, i))
+                apart = chain[i] < 0 or chain[i] != chain[j]
+                if apart and (moves[i] or moves[j]) and solid[i] and solid[j]:
+                    pairs.append((i, j) if moves[i] else (j, i))
         return pairs
 
     @property

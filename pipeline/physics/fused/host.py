@@ -21,6 +21,7 @@ from ....schemas import UsageError
 from ...runtime import kernel_build
 from ...runtime.kernel_build import compiler
 from ...runtime.resources import kernel_threads
+from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..rollout import Rollout
 from ..world import State, World
@@ -58,7 +59,7 @@ def simulate_on_host(
     world: World,
     state: State,
     times_s: Tensor,
-    driven: Mapping[str, Track | Drive] | None = None,
+    driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
 ) -> Rollout:
     """Simulate a world by the fused kernel, for tensors on the CPU; arguments as in `simulate_fused`.

@@ -13,18 +13,19 @@ from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
 from ..contact_detection import GROUND, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
 from ..fixed_surface import HALF_SPACE, FixedSurface
+from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..pair_laws import laws_in_use
 from ..rigid_body import start
 from ..world import Body, State, World
-from . import wrenches
+from . import tree, wrenches
 from .meshes import packed_meshes
 from .structure import Structure
 
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
 
-MOST_CONTACTS = 4096
+MOST_CONTACTS = 16_384
 """Maximum number of possible contacts of an environment."""
 
 
@@ -83,7 +84,7 @@ def pack(
     world: World,
     state: State,
     times_s: Tensor,
-    driven: Mapping[str, Track | Drive],
+    driven: Mapping[str, Track | Drive | JointCommand],
     record: bool,
 ) -> Packed:
     """Pack the arguments of `simulate_fused`, for one thread per environment; derivatives flow through.
@@ -96,8 +97,10 @@ def pack(
     turn = None if world.ground_normal is None else _upright(world.ground_normal)
     times = times_s if times_s.ndim == 2 else times_s[None]
     like = state.position_m.detach()
+    roots = [chain.root for chain in world.chains if chain.base == "driven"]
     rows = {index: drive_rows(Drive.command(body.name, driven, like), turn) for index, body in enumerate(world.bodies)
-            if body.motion == "driven"}  # fmt: skip
+            if body.motion == "driven" or body.name in roots}  # fmt: skip
+    commands = tree.command_rows(world, driven, like)
     effects = wrenches.coefficients(world)
     turned = turn is not None and (len(world.bodies) > 1 or bool(world.surfaces))
     columns = _columns(world, state, turn, turned, effects)
@@ -108,10 +111,13 @@ def pack(
     steps = _steps(laws, times, counts)
     batch = max(
         x.shape[0]
-        for x in (*columns, *spheres, *surfaces, steps, *(x for row in rows.values() for x in row))
+        for x in (
+            *columns, *spheres, *surfaces, steps, *(x for row in (*rows.values(), *commands.values()) for x in row)
+        )
     )  # fmt: skip
     listed, lowest = _listed_spheres(world)
     meshes = packed_meshes(world.surfaces)
+    every = [*rows.values(), *commands.values()]
     return Packed(
         structure=_structure(
             world,
@@ -121,6 +127,7 @@ def pack(
             driven=list(rows),
             lowest=lowest,
             mesh_starts=meshes.starts,
+            commanded=list(commands),
         ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
@@ -128,12 +135,12 @@ def pack(
         surfaces=_joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
         mesh_numbers=meshes.numbers.to(times),
         mesh_indices=meshes.indices.to(times.device),
-        drives=_joined([row for row, _ in rows.values()], batch) if rows else times.new_zeros(1, 0, 14),
+        drives=_joined([row for row, _ in every], batch) if every else times.new_zeros(1, 0, 14),
         substeps=counts,
         spheres=listed,
-        drive_starts=_drive_starts(rows, times),
-        drive_last=_joined([last[:, None] for _, last in rows.values()], batch).to(torch.int32)
-        if rows
+        drive_starts=_drive_starts(every, times),
+        drive_last=_joined([last[:, None] for _, last in every], batch).to(torch.int32)
+        if every
         else counts.new_zeros(1, 0),
         turn=turn,
     )
@@ -148,6 +155,7 @@ def _structure(
     driven: list[int],
     lowest: tuple[tuple[int, int], ...],
     mesh_starts: tuple[tuple[int, int], ...],
+    commanded: list[int],
 ) -> Structure:
     """Return the constants of the kernel, for one thread per environment and without derivatives.
 
@@ -159,6 +167,7 @@ def _structure(
         driven: Indices of the driven bodies.
         lowest: First row and number of the candidates for the lowest sphere of each body.
         mesh_starts: First number and index of each surface's mesh.
+        commanded: Numbers of the chains whose joints have a command.
     """
     return Structure(
         single=world.gravity.dtype == torch.float32,
@@ -179,6 +188,7 @@ def _structure(
         mesh_starts=mesh_starts,
         surface=wrenches.has_surface(world),
         elliptic=wrenches.has_ellipse(world),
+        tree=tree.tree_of(world, len(driven), commanded) if world.chains else None,
     )
 
 
@@ -209,6 +219,7 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     if turned and turn is not None:
         columns.append(turn[None])
     columns += [_turned(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
+    columns += tree.columns(world, state)
     for index, body in enumerate(world.bodies):
         position, quat, velocity = (x[:, index] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
         still = torch.zeros_like(position)
@@ -220,6 +231,8 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
             columns += [body.mass.reciprocal()[:, None], inertia, body.com]
         else:
             velocity, spin = still, still
+            if body.motion == "link":
+                velocity, spin = tree.link_motion(world, index, state)
             columns += [zero, zero.expand(-1, 6), zero.expand(-1, 3)]
         columns += [_turned(turn, position), _turned_quat(turn, quat), _turned(turn, velocity), _turned(turn, spin)]
     return columns
@@ -235,8 +248,8 @@ def drive_rows(drive: Drive, turn: Tensor | None) -> tuple[Tensor, Tensor]:
     return torch.cat(parts, -1), drive.last
 
 
-def _drive_starts(rows: Mapping[int, tuple[Tensor, Tensor]], like: Tensor) -> Tensor:
-    lengths = [row.shape[1] for row, _ in rows.values()]
+def _drive_starts(rows: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> Tensor:
+    lengths = [row.shape[1] for row, _ in rows]
     starts = [sum(lengths[:index]) for index in range(len(lengths))]
     return torch.tensor(starts, dtype=torch.int32, device=like.device)
 

@@ -16,6 +16,7 @@ from ...runtime import kernel_build
 from ..checks import require_physical, require_state
 from ..contact_record import ContactRecord
 from ..effects.effect import changed_by_effects
+from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..rollout import Rollout
 from ..world import State, World
@@ -44,7 +45,7 @@ def simulate_fused(
     world: World,
     state: State,
     times_s: Tensor,
-    driven: Mapping[str, Track | Drive] | None = None,
+    driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
     lanes: int | None = None,
 ) -> Rollout:
@@ -59,7 +60,8 @@ def simulate_fused(
         world: The world; its tensors and the state's broadcast over the batch B.
         state: The state at the first time; driven and fixed bodies take theirs from `driven` or keep it.
         times_s: Frame times [s], increasing, shape (T,) or (B, T).
-        driven: The command of each driven body: a track, or a prepared `Drive`.
+        driven: The command of each driven body: a track, or a prepared `Drive`; of the servos of a chain, under the
+            name of the chain: a `JointCommand`.
         record_contacts: Whether to keep the contacts of every frame.
         lanes: Threads per environment, a power of two up to 32; None for the default.
 
@@ -82,7 +84,7 @@ def roll(
     world: World,
     state: State,
     times_s: Tensor,
-    driven: Mapping[str, Track | Drive] | None = None,
+    driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
     lanes: int | None = None,
 ) -> Rollout:

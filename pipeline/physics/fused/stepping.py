@@ -38,6 +38,8 @@ class FusedStepper:
 
     def __init__(self, world: World, interval_s: float, run: Launch | None = None) -> None:
         reason = unsupported(world) if run is None else None
+        if world.chains:
+            reason = "its motion from interval to interval has no place for joints"
         if reason is not None:
             raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="step it on the CPU.")
         require_physical(world)

@@ -10,8 +10,10 @@ from ..contact_detection import PAIR_SMOOTHING_M
 from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..impulse_solver import CONTACT_ONSET_M
+from ..joint_rows import LIMIT_TIME_S
 from ..surface_detection import FAR_M
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
+from .tree import Tree
 
 THREADS = 32
 """Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
@@ -29,9 +31,11 @@ _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, Tru
 _FILES = (
     "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
     "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
+    "chain",  # links of chains and their joints, as read from the table
     "contacts",  # contacts with ground and unions of spheres: contact_detection, impulse_solver, smooth_distance
     "environment",  # what the kernel is given, and the state of an environment read from it
     "fixed_surface",  # distances of spheres to fixed surfaces: physics/fixed_surface and physics/surface_mesh
+    "chain_motion",  # kinematics, equations of motion and joints of chains: formulas of chain_dynamics and joint_rows
     "collision",  # flight, and the contacts of a step with their impulses: formulas of rigid_body and contact_solver
     "rollout",  # an environment from its first frame to its last, and what is written of it
 )
@@ -80,6 +84,8 @@ class Structure:
     """Whether effects act on the contact of one body with the ground."""
     elliptic: bool = False
     """Whether friction depends on the direction."""
+    tree: Tree | None = None
+    """Links of chains; None for none."""
 
     @property
     def contacts(self) -> int:
@@ -107,6 +113,8 @@ class Structure:
         world = WORLD_COLUMNS + self.law_count - 1 + self.turned * TURN_COLUMNS
         world += self.effects * WRENCH_COLUMNS + self.twisted * TWIST_COLUMNS + self.magnets * MAGNET_COLUMNS
         world += self.surface * SURFACE_COLUMNS
+        if self.tree is not None:
+            world += self.tree.table_width
         return world + len(self.free) * BODY_COLUMNS
 
     @property
@@ -127,6 +135,7 @@ class Structure:
     def source(self, host: bool = False) -> str:
         """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry."""
         paired = self.paired
+        tree = self.tree or Tree()
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
         held = not paired and (alone or self._fits_registers)
         constants = {
@@ -139,6 +148,8 @@ class Structure:
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
+            "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
+            "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
@@ -147,6 +158,7 @@ class Structure:
         lines += [f"#define ORDER_{axis} {value!r}" for axis, value in zip("XYZ", ORDER, strict=True)]
         lines += [f"#define FLAT_SINE {FLAT!r}", f"#define FAR_M {FAR_M!r}"]
         lines += [f"#define LEAST_FRICTION {LEAST!r}", f"#define CLOSE {CLOSE!r}"]
+        lines += [f"#define LIMIT_TIME_S {LIMIT_TIME_S!r}"]
         lists = {
             "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
@@ -156,8 +168,10 @@ class Structure:
             "surface_kind": self.surfaces, "mesh_number_start": [start for start, _ in self.mesh_starts],
             "mesh_index_start": [start for _, start in self.mesh_starts],
             "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],
+            "group_of": tree.groups(self.free),
+            "body_link": [tree.bodies.index(b) if b in tree.bodies else -1 for b in range(len(self.free))],
         }  # fmt: skip
-        functions = [_function(name, values) for name, values in lists.items()]
+        functions = [_function(name, values) for name, values in lists.items()] + tree.lists()
         return "\n".join((*lines, kernel_file("language"), *functions, *map(kernel_file, _FILES)))
 
 

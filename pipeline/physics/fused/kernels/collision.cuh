@@ -178,8 +178,8 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
 
 // Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch. The list also
 // has contacts that just opened, because their impulses of the previous step act until the first iteration.
-__device__ int touch_pair(const Problem& problem, const Environment& env, int p, const Mat* rotations,
-                          const Motion* motions, Contact* list, Real* weights, int& count) {
+__device__ int touch_pair(const Problem& problem, Environment& env, int p, const Mat* rotations,
+                          Motion* motions, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), b = pair_b(p), first = count, touching = 0;
     const Constants &ca = env.constants[a], &cb = env.constants[b];
     const Motion &ma = motions[a], &mb = motions[b];
@@ -194,6 +194,10 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
     Number limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
     if (size(com_a - com_b) - ca.reach - cb.reach - Number(SMOOTHING_M) < limit) {
         int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+#if LINKS
+        reveal(env, motions, a);
+        reveal(env, motions, b);
+#endif
         for (int k = behind; k < contact_count(p); k += LANES) {
             Facing facing;
             Real weight;
@@ -206,10 +210,16 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
             c.b = b;
             c.slot = (start + k) / LANES;
             Real speed = dot(relative_velocity(c, motions), c.normal);
+#if LINKS
+            Real inverse_mass = Real(0), mobility = Real(0);
+            add_mobility(ma, c.arm, c.normal, inverse_mass, mobility);
+            add_mobility(mb, c.arm_b, c.normal, inverse_mass, mobility);
+#else
             Vec turn_a = cross(c.arm, c.normal), turn_b = cross(c.arm_b, c.normal);
             Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
                                 dot(turn_b, mb.inverse_inertia * turn_b);
             Real mobility = mobility_trace(ma, c.arm) + mobility_trace(mb, c.arm_b);
+#endif
             if (prepare(c, env.laws[pair_law(p)], facing.gap, speed, inverse_mass, mobility, weight)) {
                 touching++;
             } else {
@@ -232,8 +242,8 @@ __device__ int touch_pair(const Problem& problem, const Environment& env, int p,
 #if FIXED
 // Finds the contacts of a body with a fixed surface and distributes the effective mass among them; returns how many
 // touch.
-__device__ int touch_surface(const Problem& problem, const Environment& env, int p, const Mat* rotations,
-                             const Motion* motions, Contact* list, Real* weights, int& count) {
+__device__ int touch_surface(const Problem& problem, Environment& env, int p, const Mat* rotations, Motion* motions,
+                             Contact* list, Real* weights, int& count) {
     int a = pair_a(p), s = -2 - pair_b(p), first = count;
     const Motion& m = motions[a];
     Vec com = env.bodies[a].position;
@@ -243,6 +253,9 @@ __device__ int touch_surface(const Problem& problem, const Environment& env, int
     Fixed fixed = fixed_surface(problem, env, s);
     if (least_distance(problem, fixed, s, transposed(fixed.rotation, com - fixed.position)) - reach < margin) {
         int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+#if LINKS
+        reveal(env, motions, a);
+#endif
         Searched searched;
         searched.sphere = -1;
         for (int k = behind; k < contact_count(p); k += LANES) {
@@ -260,9 +273,15 @@ __device__ int touch_surface(const Problem& problem, const Environment& env, int
             c.b = -2;
             c.slot = (start + k) / LANES;
             Real speed = dot(m.velocity + cross(m.omega, c.arm), c.normal);
+#if LINKS
+            Real inverse_mass = Real(0), mobility = Real(0);
+            add_mobility(m, c.arm, c.normal, inverse_mass, mobility);
+#else
             Vec turn = cross(c.arm, c.normal);
             Real inverse_mass = m.inverse_mass + dot(turn, m.inverse_inertia * turn);
-            if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility_trace(m, c.arm), weight)) continue;
+            Real mobility = mobility_trace(m, c.arm);
+#endif
+            if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight)) continue;
 #if MESHES && RECORD
             c.gap = gap;
 #endif
@@ -279,12 +298,40 @@ __device__ int touch_surface(const Problem& problem, const Environment& env, int
 }
 #endif
 
+#if LINKS
+// Finds the contacts of a link with the ground, and distributes the effective mass among them as between two bodies.
+__device__ int touch_plane_link(const Problem& problem, Environment& env, int p, const Mat* rotations, Motion* motions,
+                                Contact* list, Real* weights, int& count) {
+    int a = pair_a(p), first = count, start = contact_start(p);
+    reveal(env, motions, a);
+    Vec up = vec(Real(0), Real(0), Real(1));
+    for (int k = (env.lanes.lane - start % LANES + LANES) % LANES; k < contact_count(p); k += LANES) {
+        long long row = env.geometry + 4LL * problem.spheres[start + k];
+        Contact& c = list[count];
+        c.arm = rotations[a] * problem.geometry.vector(row) - problem.geometry.at(row + 3) * up;
+        c.normal = up;
+        c.arm_b = none();
+        c.a = a;
+        c.b = -1;
+        c.slot = (start + k) / LANES;
+        Real gap = env.bodies[a].position.z - env.ground + c.arm.z, inverse_mass = Real(0), mobility = Real(0);
+        Real speed = relative_velocity(c, motions).z;
+        add_mobility(motions[a], c.arm, up, inverse_mass, mobility);
+        if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weights[count])) continue;
+        c.impulse = env.before[c.slot];
+        count++;
+    }
+    if (env.lanes.any(count > first)) share_out_pair(env.lanes, list, weights, first, count, motions);
+    return count - first;
+}
+#endif
+
 // Divides the effective mass of a body by the number of groups of contacts on it; `groups` counts them by body.
 INLINE void split(Contact* list, int count, const int* groups) {
     for (int i = 0; i < count; i++) {
         Contact& c = list[i];
-        int most = groups[c.a];
-        if (c.b >= 0 && groups[c.b] > most) most = groups[c.b];
+        int most = groups[group_of(c.a)], other = c.b >= 0 ? group_of(c.b) : -1;
+        if (other >= 0 && groups[other] > most) most = groups[other];
         Number share = most > 1 ? Number(1) / Number(most) : Number(1);
         c.stop_n = share * c.stop_n;
         c.stop_t = share * c.stop_t;
@@ -396,8 +443,13 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
 // Finds the contacts of a step and their impulses, and adds these to the bodies' velocities and angular momenta.
 INLINE void collide(const Problem& problem, Environment& env, const Mat* rotations, Motion* motions, Vec* velocities,
                     Vec* spins) {
+#if HOST && LANES == 1 && SLOTS > 2048
+    static thread_local Contact list[SLOTS];  // too large for a stack
+    static thread_local Real weights[SLOTS];
+#else
     Contact list[SLOTS];
     Real weights[SLOTS];
+#endif
     int count = 0;
 #if PAIRED
     int groups[BODIES] = {};
@@ -410,19 +462,30 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             touching = touch_surface(problem, env, p, rotations, motions, list, weights, count);
 #endif
         } else if (env.lanes.any(near_ground(env, a, motions[a]))) {
+#if LINKS
+            if (body_link(a) >= 0) {
+                touching = touch_plane_link(problem, env, p, rotations, motions, list, weights, count);
+            } else
+#endif
+            {
             touching = -count;
             touch_plane(problem, env, p, rotations[a], motions[a], list, weights, count);
             touching += count;
+            }
         }
         if (env.lanes.any(touching > 0) && env.lanes.sum(Number(touching)) > Number(0)) {
-            groups[a]++;
-            if (b >= 0 && is_free(b)) groups[b]++;
+            groups[group_of(a)]++;
+            if (b >= 0 && group_of(b) >= 0) groups[group_of(b)]++;
         }
     }
     split(list, count, groups);
     if (!env.lanes.any(count > 0)) {
         forget(env);
+#if LINKS
+        if (!env.lanes.any(env.chain.active)) return;
+#else
         return;
+#endif
     }
 #else
     if (!env.lanes.any(near_ground(env, 0, motions[0]))) {
@@ -449,6 +512,15 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
     // warm start: the impulses of the previous step
     int sweep = env.lanes.any(env.warm) ? -1 : 0;
+#if LINKS
+    // a single iteration starts at zero
+    if (problem.sweeps < 2) {
+        for (int k = 0; k < 3 * JOINTS; k++) env.chain.impulses[k] = Real(0);
+    }
+    if (env.lanes.any(env.chain.active)) sweep = -1;
+    bool reached[LINKS];  // in any environment of the warp
+    for (int l = 0; l < LINKS; l++) reached[l] = env.lanes.any(env.chain.known[l]);
+#endif
     do {
         EACH_BODY
         for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
@@ -475,6 +547,23 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
                 angular[0] = angular[0] + c.turning;
             }
 #endif
+        }
+#endif
+#if LINKS
+        push_joints(env.chain);
+        for (int l = 0; l < LINKS; l++) {
+            int b = link_body[l];
+            if (!reached[l]) continue;
+            Vec impulse = env.lanes.sum(linear[b]), moment = env.lanes.sum(angular[b]);
+            if (env.chain.known[l]) push_link(env.chain, l, impulse, moment);
+        }
+        if (sweep >= 0 && env.chain.active) sweep_joints(env.chain, env.laws[0].step_s);
+        for (int l = 0; l < LINKS; l++) {
+            int b = link_body[l];
+            if (!env.chain.known[l]) continue;
+            motions[b].velocity = free_velocities[b];
+            motions[b].omega = free_omegas[b];
+            gain(env.chain, l, motions[b].velocity, motions[b].omega);
         }
 #endif
         EACH_BODY

@@ -9,6 +9,10 @@ struct Motion {  // velocities of a body without contact, and inverse mass and i
     Vec velocity, omega;
     Real inverse_mass;
     Sym inverse_inertia;  // world axes
+#if LINKS
+    const Column* columns;  // of a link of a chain, `depth` of them
+    int depth;
+#endif
 };
 
 struct Contact {  // world frame, impulse on body a
@@ -49,6 +53,31 @@ INLINE Real friction_of(const Law& law, const Contact& c) {
 INLINE Real mobility_trace(const Motion& m, Vec arm) {
     return Number(3) * m.inverse_mass + trace(m.inverse_inertia) * dot(arm, arm) - dot(arm, m.inverse_inertia * arm);
 }
+
+#if LINKS
+// Adds what a body's point moves along a direction by an impulse along it, and the sum of that over three directions.
+INLINE void add_mobility(const Motion& m, Vec arm, Vec normal, Real& inverse_mass, Real& trace_of) {
+    Vec turn = cross(arm, normal);
+    inverse_mass += m.inverse_mass + dot(turn, m.inverse_inertia * turn);
+    trace_of += mobility_trace(m, arm);
+    for (int k = 0; k < m.depth; k++) {
+        Vec moved = m.columns[k].linear + cross(m.columns[k].turning, arm);
+        inverse_mass += square(dot(normal, moved));
+        trace_of += dot(moved, moved);
+    }
+}
+
+// Velocity and angular velocity of a body by an impulse along a direction, with its moment.
+INLINE void response_of(const Motion& m, Vec normal, Vec turn, Vec& linear, Vec& angular) {
+    linear = m.inverse_mass * normal;
+    angular = m.inverse_inertia * turn;
+    for (int k = 0; k < m.depth; k++) {
+        Real along = dot(m.columns[k].linear, normal) + dot(m.columns[k].turning, turn);
+        linear = linear + along * m.columns[k].linear;
+        angular = angular + along * m.columns[k].turning;
+    }
+}
+#endif
 
 // Sets the target velocity of a contact and returns whether it touches. `stop_n` and `stop_t` temporarily hold its
 // effective mass and its tangential mobility, until `share_out` replaces them. `weight` is its weight among redundant
@@ -282,9 +311,16 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
             Real weight = Real(0);
             if (source == lanes.lane && j < theirs) {
                 const Contact& c = list[first + j];
+#if LINKS
+                Vec other = none();
+                response_of(bodies[c.a], c.normal, cross(c.arm, c.normal), normal, turn_a);
+                if (c.b >= 0) response_of(bodies[c.b], c.normal, cross(c.arm_b, c.normal), other, turn_b);
+                normal = normal + other;
+#else
                 normal = c.normal;
                 turn_a = bodies[c.a].inverse_inertia * cross(c.arm, normal);
                 if (c.b >= 0) turn_b = bodies[c.b].inverse_inertia * cross(c.arm_b, normal);
+#endif
                 weight = weights[first + j] * c.stop_n;
             }
             normal = lanes.from(normal, source);
@@ -293,8 +329,12 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
             weight = lanes.from(weight, source);
             for (int i = first; i < end; i++) {
                 const Contact& c = list[i];
+#if LINKS
+                Real mass = Real(1);
+#else
                 Real mass = bodies[c.a].inverse_mass;
                 if (c.b >= 0) mass += bodies[c.b].inverse_mass;
+#endif
                 Real along = mass * dot(c.normal, normal) + dot(cross(c.arm, c.normal), turn_a);
                 if (c.b >= 0) along += dot(cross(c.arm_b, c.normal), turn_b);
                 totals[i] += weight * along * along;

@@ -70,6 +70,9 @@ struct Environment {
     Body bodies[BODIES];
     Constants constants[BODIES];
     int cursors[BODIES];
+#if LINKS
+    Chain chain;
+#endif
 #if HELD
     Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
     Real radii[SLOTS];
@@ -136,6 +139,9 @@ INLINE void load(const Problem& problem, Environment& env) {
     for (int i = 0; i < 9; i++) s.spotted = s.spotted || !absent(s.spots[i]);
     s.twisting = !absent(s.rolling) || !absent(s.torsion);
     at += 22;
+#endif
+#if LINKS
+    at = load_chain(table, at, env.chain);
 #endif
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {

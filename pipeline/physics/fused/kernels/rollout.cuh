@@ -12,6 +12,10 @@ INLINE void step(const Problem& problem, Environment& env, Real time_after) {
         motions[b].omega = body.spin;
         motions[b].inverse_mass = Real(0);
         motions[b].inverse_inertia = no_inertia();
+#if LINKS
+        motions[b].columns = 0;
+        motions[b].depth = 0;
+#endif
         if (is_free(b)) {
             starts[b] = c.inverse_inertia * transposed(rotations[b], body.spin);
             motions[b].omega = rotations[b] * starts[b];
@@ -27,16 +31,22 @@ INLINE void step(const Problem& problem, Environment& env, Real time_after) {
         }
         motions[b].velocity = velocities[b];
     }
-#if PAIRS
+#if LINKS
+    kick(problem, env, time_after, rotations, motions, velocities);
+#endif
+#if PAIRS || LINKS
     collide(problem, env, rotations, motions, velocities, spins);
 #endif
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
         if (is_free(b)) advance(env.bodies[b], env.constants[b], starts[b], velocities[b], spins[b], env.laws[0].step_s);
 #if DRIVEN
-        if (drive_number(b) >= 0) drive(problem, env, b, time_after);
+        if (drive_number(b) >= 0 && body_link(b) < 0) drive(problem, env, b, time_after);
 #endif
     }
+#if LINKS
+    settle(problem, env, time_after);
+#endif
 }
 
 INLINE void write_vector(const Problem& problem, long long at, Vec v) {
@@ -187,6 +197,9 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
     for (int b = 0; b < BODIES; b++) {
         if (drive_number(b) >= 0) drive(problem, env, b, problem.steps.at(env.steps + 3));
     }
+#endif
+#if LINKS
+    spread(env);
 #endif
 #if RECORD
     EACH_SLOT

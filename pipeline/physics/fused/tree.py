@@ -1,0 +1,191 @@
+"""Layout of chains for a fused kernel: their tree as constants, their numbers as columns, their commands as rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...geometry.rotation import quat_rotate
+from ..chain import Chain, joints_of
+from ..joint_command import JointCommand
+from ..world import State, World
+
+LINK_COLUMNS, JOINT_COLUMNS, COMMAND_WIDTH = 20, 9, 14
+"""Columns of a link and of a moving joint, as `load_chain` in `kernels/chain.cuh` reads them, and numbers of a row of a
+command: the time of its knot and five coefficients of two joints."""
+_NUMBERS = ("lower", "upper", "stiffness", "damping", "armature", "friction", "torque_limit")
+_KINDS = {"hinge": 2, "slide": 3, "fixed": 4}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tree:
+    """Links of all chains of a world, one chain after another, parents before children."""
+
+    bodies: tuple[int, ...] = ()
+    """Index of the body of each link."""
+    parents: tuple[int, ...] = ()
+    """Link that carries it, -1 for a root."""
+    kinds: tuple[int, ...] = ()
+    """0: root that is fixed or driven, 1: free root, 2: hinge, 3: slide, 4: fixed joint."""
+    dofs: tuple[int, ...] = ()
+    """First coordinate of its own in the generalised velocity, -1 for none."""
+    joints: tuple[int, ...] = ()
+    """Moving joint of each link, -1 for none."""
+    above: tuple[tuple[int, ...], ...] = ()
+    """Coordinates that move each link, from the root on."""
+    dof_links: tuple[int, ...] = ()
+    """Link of each coordinate."""
+    dof_above: tuple[tuple[int, ...], ...] = ()
+    """Coordinates above each coordinate, from the root on, and itself."""
+    joint_dofs: tuple[int, ...] = ()
+    """Coordinate of each moving joint."""
+    roots: tuple[int, ...] = ()
+    """Root link of each chain."""
+    firsts: tuple[int, ...] = ()
+    """First moving joint of each chain."""
+    counts: tuple[int, ...] = ()
+    """Number of moving joints of each chain."""
+    commands: tuple[int, ...] = ()
+    """Number of the command of each chain's joints among all commands, -1 for none."""
+    heavy: bool = False
+    """Whether any link that moves has a mass."""
+
+    @property
+    def depth(self) -> int:
+        """Largest number of coordinates that move a link."""
+        return max((len(row) for row in self.above), default=0)
+
+    @property
+    def table_width(self) -> int:
+        """Number of columns."""
+        return LINK_COLUMNS * len(self.bodies) + JOINT_COLUMNS * len(self.joint_dofs)
+
+    def groups(self, free: Sequence[bool]) -> list[int]:
+        """Return for each body the one under which its contacts count: a chain's root; -1 where it cannot move."""
+        found = [index if moves else -1 for index, moves in enumerate(free)]
+        for link, body in enumerate(self.bodies):
+            if self.above[link]:
+                found[body] = self.bodies[self._root(link)]
+        return found
+
+    def _root(self, link: int) -> int:
+        return link if self.parents[link] < 0 else self._root(self.parents[link])
+
+    def lists(self) -> list[str]:
+        """Return the source of the lists of constants."""
+        if not self.bodies:
+            return []
+        depth = self.depth
+        padded = {
+            name: [k for row in rows for k in (*row, *[0] * (depth - len(row)))]
+            for name, rows in (("link_above", self.above), ("dof_above", self.dof_above))
+        }
+        lists = {
+            "link_body": self.bodies, "link_parent": self.parents, "link_kind": self.kinds, "link_dof": self.dofs,
+            "link_joint": self.joints, "link_depth": [len(row) for row in self.above],
+            "link_root": [self._root(link) for link in range(len(self.bodies))], "dof_link": self.dof_links,
+            "dof_depth": [len(row) for row in self.dof_above], "joint_dof": self.joint_dofs, "chain_root": self.roots,
+            "chain_joint": self.firsts, "chain_joints": self.counts, "chain_command": self.commands, **padded,
+        }  # fmt: skip
+        return [
+            f"__device__ static const int {name}[] = {{{', '.join(map(str, values)) or '0'}}};"
+            for name, values in lists.items()
+        ]
+
+
+def tree_of(world: World, drives: int, commanded: Sequence[int]) -> Tree:
+    """Return the tree of a world's chains.
+
+    Args:
+        world: The world.
+        drives: Number of commands before those of the joints.
+        commanded: Numbers of the chains whose joints have a command.
+    """
+    rows: dict[str, list] = {name: [] for name in Tree.__dataclass_fields__ if name != "heavy"}
+    for number, chain in enumerate(world.chains):
+        _append(rows, world, chain)
+        rows["commands"].append(drives + list(commanded).index(number) if number in commanded else -1)
+    moving = [body for body, above in zip(rows["bodies"], rows["above"], strict=True) if above]
+    heavy = any(bool((world.bodies[body].mass != 0).any()) for body in moving)
+    return Tree(**{name: tuple(values) for name, values in rows.items()}, heavy=heavy)
+
+
+def _append(rows: dict[str, list], world: World, chain: Chain) -> None:
+    """Append the links of a chain to the lists of a tree."""
+    offset = len(rows["bodies"])
+    rows["roots"].append(offset)
+    rows["firsts"].append(len(rows["joint_dofs"]))
+    rows["counts"].append(len(chain.moving))
+    for place, (name, parent) in enumerate(zip(chain.links, chain.parents, strict=True)):
+        link, first = offset + place, len(rows["dof_links"])
+        joint = None if parent < 0 else chain.joints[place - 1]
+        kind = int(chain.base == "free") if joint is None else _KINDS[joint.kind]
+        before = rows["above"][offset + parent] if parent >= 0 else ()
+        own = 6 if kind == 1 else int(kind in (2, 3))
+        rows["bodies"].append(world.body_names.index(name))
+        rows["parents"].append(offset + parent if parent >= 0 else -1)
+        rows["kinds"].append(kind)
+        rows["dofs"].append(first if own else -1)
+        rows["joints"].append(len(rows["joint_dofs"]) if kind in (2, 3) else -1)
+        rows["above"].append((*before, *range(first, first + own)))
+        rows["dof_links"] += [link] * own
+        rows["dof_above"] += [(*before, *range(first, dof + 1)) for dof in range(first, first + own)]
+        if kind in (2, 3):
+            rows["joint_dofs"].append(first)
+
+
+def columns(world: World, state: State) -> list[Tensor]:
+    """Return the columns of the chains: those of all links, then those of all moving joints."""
+    links, joints = [], []
+    zero = state.position_m.new_zeros(1, 1)
+    for chain in world.chains:
+        for place, name in enumerate(chain.links):
+            body = world.bodies[world.body_names.index(name)]
+            if place:
+                joint = chain.joints[place - 1]
+                links += [joint.position, joint.quat_wxyz, joint.axis]
+            else:
+                links += [zero.expand(1, 3), zero + zero.new_tensor([[1.0, 0.0, 0.0, 0.0]]), zero.expand(1, 3)]
+            inertia = body.inertia.flatten(1)
+            links += [body.mass[:, None], torch.cat([inertia[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1), body.com]
+        values, speeds = joints_of(world, state, chain)
+        for k, joint in enumerate(chain.moving):
+            joints += [getattr(joint, name)[:, None] for name in _NUMBERS]
+            joints += [values[:, k : k + 1], speeds[:, k : k + 1]]
+    return [*links, *joints]
+
+
+def link_motion(world: World, index: int, state: State) -> tuple[Tensor, Tensor]:
+    """Return velocity and angular velocity (B, 3) of a link at the start, world frame, as its chain moves it."""
+    chain = world.chains[world.chain_of(index)]
+    still = torch.zeros_like(state.position_m[:, index])
+    if world.bodies[index].name == chain.root and chain.base == "free":
+        omega = quat_rotate(state.quat_wxyz[:, index], state.omega_body_rad_s[:, index])
+        return state.velocity_m_s[:, index], omega
+    return still, still
+
+
+def command_rows(world: World, driven: Mapping[str, object], like: Tensor) -> dict[int, tuple[Tensor, Tensor]]:
+    """Return by chain the rows (1 or B, knots * ceil(joints / 2), 14) of its command, and the last piece's index."""
+    found = {}
+    for number, chain in enumerate(world.chains):
+        command = JointCommand.of(chain, driven, like)
+        if command is not None:
+            found[number] = _rows(command)
+    return found
+
+
+def _rows(command: JointCommand) -> tuple[Tensor, Tensor]:
+    times, pieces = command.times_s, command.coefficients
+    batch, knots, joints = max(times.shape[0], pieces.shape[0]), times.shape[1], pieces.shape[2]
+    pieces = pieces.expand(batch, -1, -1, -1)
+    if joints % 2:
+        pieces = torch.cat((pieces, torch.zeros_like(pieces[:, :, :1])), 2)
+    pairs = pieces.unflatten(2, (-1, 2)).flatten(3)
+    time = times.expand(batch, -1)[:, :, None, None].expand(-1, -1, pairs.shape[2], 1)
+    padding = torch.zeros_like(pairs[..., : COMMAND_WIDTH - 1 - pairs.shape[-1]])
+    rows = torch.cat((time, pairs, padding), -1).flatten(1, 2)
+    return rows, torch.full((1,), knots - 1, device=times.device)

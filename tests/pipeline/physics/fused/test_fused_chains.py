@@ -1,0 +1,177 @@
+"""The fused kernel against the torch engine for worlds with chains: values and forward derivatives."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cgwm.pipeline.optimization.forward_mode import batched_jacobian
+from cgwm.pipeline.physics import Body, Rollout, State, World, simulate
+from cgwm.pipeline.physics.chain import Chain, Joint, with_joints
+from cgwm.pipeline.physics.devices import on_device
+from cgwm.pipeline.physics.fused import simulate_fused
+from cgwm.pipeline.physics.fused.packing import reason_against
+from cgwm.pipeline.physics.fused.rollout import roll
+from cgwm.pipeline.physics.joint_command import JointCommand
+from cgwm.pipeline.physics.kinematic import Drive
+from cgwm.pipeline.runtime import kernel_build
+from helpers import fused_host
+from helpers.chains import chained, double_pendulum, link, still
+from helpers.worlds import F64, ball_body, batch, times
+
+CUDA = torch.cuda.is_available() and kernel_build.available()
+NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
+NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
+POSES = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
+
+Fused = Callable[..., Rollout]
+Case = tuple[World, State, dict[str, Any]]
+
+
+def on_cuda(
+    world: World, state: State, times_s: torch.Tensor, driven: Any, record: bool = False, **more: Any
+) -> Rollout:
+    driven = {k: on_device(v, "cuda") for k, v in driven.items()}
+    return simulate_fused(*(on_device(x, "cuda") for x in (world, state, times_s)), driven, record, **more)
+
+
+def on_host(*arguments: Any, **more: Any) -> Rollout:
+    return roll(fused_host.run, *arguments, **more)
+
+
+@pytest.fixture(params=[pytest.param(on_host, marks=NEEDS_COMPILER), pytest.param(on_cuda, marks=NEEDS_GPU)])
+def fused(request: pytest.FixtureRequest) -> Fused:
+    return request.param
+
+
+def hand(base: str) -> Case:
+    """Return two fingers of two joints on a palm that squeeze a ball of many spheres, on the ground or carried.
+
+    One joint has dry friction and one a limit that it reaches; one finger ends in a slide, and a tip is welded on.
+    """
+    spheres = ((0.05, 0.0, 0.0, 0.012), (0.08, 0.0, 0.0, 0.012))
+    names = ("left", "left_tip", "right", "right_tip", "nail")
+    bodies: list[Body] = [link("palm", 0.4 if base == "free" else 0.0, spheres=((0.0, 0.0, -0.02, 0.02),))]
+    bodies += [link(name, 0.02, com=(0.04, 0, 0), spheres=spheres if name != "nail" else spheres[:1]) for name in names]
+    same: dict[str, Any] = {"damping": 0.02, "armature": 1e-3, "torque_limit": 0.4}
+    joints = (
+        Joint.of("l1", "hinge", "left", "palm", position_m=(0, 0.05, 0), stiffness=2.0, friction=0.01, **same),
+        Joint.of("l2", "slide", "left_tip", "left", position_m=(0.08, 0, 0), axis=(1, 0, 0), stiffness=50.0, **same),
+        Joint.of("r1", "hinge", "right", "palm", position_m=(0, -0.05, 0), stiffness=2.0, lower=-0.1, **same),
+        Joint.of("r2", "hinge", "right_tip", "right", position_m=(0.08, 0, 0), stiffness=2.0, upper=0.15, **same),
+        Joint.of("r3", "fixed", "nail", "right_tip", position_m=(0.02, 0.0, 0.0), quat_wxyz=(0.9, 0.1, 0.2, 0.3)),
+    )
+    chain = Chain(name="hand", root="palm", base=base, joints=joints)
+    turns = torch.linspace(0, 5.5, 8, dtype=F64)
+    centers = 0.02 * torch.stack((turns.cos(), turns.sin(), 0.2 * turns.sin()), -1)
+    ball = replace(ball_body(0.012, 0.1), centers=centers[None], radii=torch.full((1, 8), 0.012, dtype=F64))
+    world = chained(chain, *bodies, ball, step_s=0.004)
+    world = replace(world, ground_offset=batch(-0.04))
+    state = still(7)
+    state.position_m[:, 6] = torch.tensor([0.1, 0.0, -0.002])
+    state.velocity_m_s[:, 6, 1] = 0.1
+    state = with_joints(world, state, {"l1": -0.05, "r2": 0.1}, {"r1": 0.3})
+    values = torch.tensor([[0.0, 0.0, 0.0, 0.0], [-0.4, 0.01, 0.4, 0.3], [-0.5, -0.01, 0.3, 0.2]], dtype=F64)
+    commands: dict[str, Any] = {"hand": JointCommand.targets(batch([0.0, 0.06, 0.1]), values[None], "cubic")}
+    if base == "driven":
+        samples = torch.linspace(0, 0.2, 5, dtype=F64)[None]
+        speed = torch.tensor([[0.0, 0.1, 0.2], [0.1, 0.0, 0.3], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0]], dtype=F64)[None]
+        place = (state.position_m[:, 0], state.quat_wxyz[:, 0])
+        commands["palm"] = Drive.from_velocities(samples, *place, speed, 2 * speed)
+    return world, state, commands
+
+
+@pytest.mark.parametrize("base", ["fixed", "driven", "free"])
+def test_poses_and_contacts_are_those_of_the_torch_engine(fused: Fused, base: str) -> None:
+    world, state, commands = hand(base)
+    when = times(0.12, 50.0)
+    expected = simulate(world, state, when, commands, record_contacts=True)
+    found = fused(world, state, when, commands, True, lanes=1 if base == "free" else None)
+    assert expected.contacts is not None and found.contacts is not None
+    acted = expected.contacts.impulse_n_s.norm(dim=-1).sum((0, 1)) > 0
+    assert len(set(expected.contacts.body_a[acted].tolist())) >= 3  # fingers, ball and ground are in contact
+    for name in POSES:
+        np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(found.contacts.impulse_n_s.cpu(), expected.contacts.impulse_n_s, atol=1e-9)
+
+
+def test_derivatives_are_those_of_the_torch_engine(fused: Fused) -> None:
+    world, state, commands = hand("free")
+    chain = world.chains[0]
+    when = times(0.024, 125.0)
+
+    def moved(run: Callable[..., Rollout]) -> Callable[[torch.Tensor, int], torch.Tensor]:
+        def final(x: torch.Tensor, _: int) -> torch.Tensor:
+            joints = [
+                replace(j, stiffness=j.stiffness + x[:, 0], armature=j.armature + 1e-3 * x[:, 1]) for j in chain.joints
+            ]
+            joints[0] = replace(joints[0], friction=joints[0].friction + 0.01 * x[:, 2])
+            changed = replace(world, chains=(replace(chain, joints=tuple(joints)),)).with_body(
+                1, mass=0.02 + 0.01 * x[:, 3]
+            )
+            start = with_joints(changed, state, {"l1": -0.05 + x[:, 4]}, {"r1": 0.3 + x[:, 5]})
+            command = commands["hand"]
+            shifted = JointCommand(command.times_s, command.coefficients + x[:, 6, None, None, None])
+            found = run(changed, start, when, {"hand": shifted})
+            return torch.cat([getattr(found, name)[:, -1].flatten(1) for name in POSES], -1)
+
+        return final
+
+    point = torch.zeros(1, 7, dtype=F64)
+    value, jacobian = batched_jacobian(moved(simulate), point)
+    found, derivative = batched_jacobian(moved(fused), point)
+    np.testing.assert_allclose(found.cpu(), value, atol=1e-10)
+    assert (jacobian.abs().amax((0, 1)) > 1e-6).all()
+    np.testing.assert_allclose(derivative.cpu(), jacobian, atol=1e-8 * float(jacobian.abs().max()))
+
+
+def test_links_without_mass_have_a_diagonal_admittance(fused: Fused) -> None:
+    world, state, commands = hand("fixed")
+    bodies = tuple(
+        replace(b, mass=0 * b.mass, inertia=0 * b.inertia) if b.motion == "link" else b for b in world.bodies
+    )
+    world = replace(world, bodies=bodies)
+    when = times(0.1, 50.0)
+    expected, found = (run(world, state, when, commands) for run in (simulate, fused))
+    for name in POSES:
+        np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
+
+
+def test_two_chains_touch_each_other(fused: Fused) -> None:
+    arms = []
+    bodies: list[Body] = []
+    for side in (0, 1):
+        chain, links = double_pendulum("free" if side else "fixed", damping=0.01, armature=1e-4)
+        new = {body.name: f"{body.name}{side}" for body in links}
+        joints = tuple(replace(j, name=f"{j.name}{side}", link=new[j.link], parent=new[j.parent]) for j in chain.joints)
+        arms.append(replace(chain, name=f"arm{side}", root=new["base"], joints=joints))
+        shape = {"centers": batch([[0.05, 0.0, 0.0], [0.1, 0.0, 0.0]]), "radii": batch([0.02, 0.02])}
+        bodies += [replace(body, name=new[body.name], **shape) for body in links]
+    world = chained(tuple(arms), *bodies, step_s=0.002)
+    world = replace(world, ground_offset=batch(-0.25))
+    state = still(6)
+    state.position_m[:, 3] = torch.tensor([0.03, 0.0, -0.07])
+    state = with_joints(world, state, {"second0": 0.8, "second1": 0.5})
+    when = times(0.2, 20.0)
+    expected, found = (run(world, state, when, {}, True) for run in (simulate, fused))
+    assert expected.contacts is not None
+    acted = expected.contacts.impulse_n_s.norm(dim=-1).sum((0, 1)) > 0
+    assert bool((acted & (expected.contacts.body_b >= 0)).any()) and bool(
+        (acted & (expected.contacts.body_b < 0)).any()
+    )
+    for name in POSES:
+        np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-8, err_msg=name)
+
+
+def test_a_hand_of_160_spheres_and_two_objects_of_250_stay_in_the_kernel() -> None:
+    names = [f"f{k}" for k in range(16)]
+    row = tuple((0.001 * k, 0.0, 0.0, 0.01) for k in range(10))
+    bodies = [link("palm", 0.0), *(link(name, spheres=row) for name in names)]
+    joints = tuple(
+        Joint.of(f"j{k}", "hinge", name, "palm" if k % 4 == 0 else names[k - 1]) for k, name in enumerate(names)
+    )
+    objects = [replace(ball_body(0.01, name=name, copies=250)) for name in ("one", "two")]
+    world = chained(Chain(name="hand", root="palm", base="fixed", joints=joints), *bodies, *objects)
+    assert reason_against(world) is None

@@ -1,0 +1,336 @@
+"""Laws of jointed bodies: kinematics and equations of motion of MuJoCo, energy, momentum, servos, limits, friction."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from cgwm.pipeline.geometry.rotation import cross, quat_rotate
+from cgwm.pipeline.optimization.forward_mode import batched_jacobian
+from cgwm.pipeline.physics import Body, State, World, simulate
+from cgwm.pipeline.physics.chain import Chain, Joint, joints_of, require_chains, with_joints
+from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Place
+from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.joint_command import JointCommand
+from cgwm.schemas import InputDataError, UsageError
+from helpers.chains import chained, double_pendulum, link, still
+from helpers.worlds import F64, ball_body, batch, times
+
+POSES = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
+
+
+def words(numbers: list[float]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def tree(base: str, generator: torch.Generator) -> tuple[Chain, list[Body], str]:
+    """Return a random tree of five links with a slide and a fixed joint, and the same in MJCF."""
+
+    def numbers(count: int) -> list[float]:
+        return torch.randn(count, generator=generator, dtype=F64).tolist()
+
+    parents, kinds = (0, 1, 1, 3), ("hinge", "slide", "fixed", "hinge")
+    bodies, joints, xml = [], [], ["" for _ in range(5)]
+    for k in range(5):
+        mass, com = 0.2 + 0.1 * k, [0.05 * x for x in numbers(3)]
+        squares = [0.01 + 0.02 * abs(x) for x in numbers(3)]
+        moments = [mass * (squares[1] + squares[2]), mass * (squares[0] + squares[2]), mass * (squares[0] + squares[1])]
+        bodies.append(replace(link(f"l{k}", mass, com=tuple(com)), inertia=batch(np.diag(moments))))
+        inertial = f'<inertial pos="{words(com)}" mass="{mass!r}" diaginertia="{words(moments)}"/>'
+        if k == 0:
+            joint = "<freejoint/>" if base == "free" else ""
+            xml[0] = f'<body name="l0">{joint}{inertial}'
+            continue
+        place, axis, quat = [0.1 * x for x in numbers(3)], numbers(3), numbers(4)
+        quat = [x / math.hypot(*quat) for x in quat]
+        joints.append(
+            Joint.of(
+                f"j{k}", kinds[k - 1], f"l{k}", f"l{parents[k - 1]}",
+                position_m=place, quat_wxyz=quat, axis=axis, armature=0.01 * k,
+            )
+        )  # fmt: skip
+        kind = kinds[k - 1]
+        moving = f'<joint name="j{k}" type="{kind}" axis="{words(axis)}" armature="{0.01 * k!r}"/>'
+        xml[k] = (
+            f'<body name="l{k}" pos="{words(place)}" quat="{words(quat)}">{moving if kind != "fixed" else ""}{inertial}'
+        )
+    nested = f"{xml[0]}{xml[1]}{xml[2]}</body>{xml[3]}{xml[4]}</body></body></body></body>"
+    chain = Chain(name="tree", root="l0", base=base, joints=tuple(joints))
+    head = '<mujoco><compiler angle="radian" fusestatic="false"/><option gravity="0.3 -0.7 -9.81"/><worldbody>'
+    return chain, bodies, f"{head}{nested}</worldbody></mujoco>"
+
+
+@pytest.mark.parametrize("base", ["fixed", "free"])
+def test_poses_mass_matrix_and_forces_are_those_of_mujoco(base: str) -> None:
+    generator = torch.Generator().manual_seed(3)
+    chain, bodies, xml = tree(base, generator)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    dynamics = ChainDynamics(chain, bodies)
+    for _ in range(5):
+        values, speeds = torch.randn(2, 1, 3, generator=generator, dtype=F64)
+        position, velocity, spin = torch.randn(3, 1, 3, generator=generator, dtype=F64)
+        quat = torch.nn.functional.normalize(torch.randn(1, 4, generator=generator, dtype=F64))
+        if base == "fixed":
+            position, velocity, spin = (torch.zeros(1, 3, dtype=F64) for _ in range(3))
+            quat = batch([1.0, 0.0, 0.0, 0.0])
+        else:
+            data.qpos[:7], data.qvel[:3] = torch.cat((position, quat), -1)[0], velocity[0]
+            data.qvel[3:6] = quat_rotate(quat * torch.tensor([1.0, -1, -1, -1]), spin)[0]  # MuJoCo: body axes
+        data.qpos[-3:], data.qvel[-3:] = values[0], speeds[0]
+        mujoco.mj_forward(model, data)
+        motion = ChainMotion(position, quat, velocity, spin, values, speeds)
+        links = dynamics.links(motion)
+        for k, moved in enumerate(links):
+            body = data.body(f"l{k}")
+            np.testing.assert_allclose(moved.com[0], body.xpos, atol=1e-12)
+            np.testing.assert_allclose(
+                moved.quat_wxyz[0] * torch.sign(moved.quat_wxyz[0, 0] * body.xquat[0]), body.xquat, atol=1e-12
+            )
+            found = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body.id, found, 0)
+            np.testing.assert_allclose(torch.cat((moved.spin, moved.velocity), -1)[0], found, atol=1e-11)
+        turn = np.eye(model.nv)  # from our generalised velocity to MuJoCo's
+        place = _Place.of(dynamics, motion)
+        mass = place.mass_matrix()[0].numpy() + np.diag([0.0] * dynamics.base_size + [0.01, 0.02, 0.04])
+        bias = place.bias(motion, batch([0.3, -0.7, -9.81]), None)[0].numpy()
+        if base == "free":
+            turn[3:6, 3:6] = data.body("l0").xmat.reshape(3, 3).T
+        theirs = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, theirs)
+        np.testing.assert_allclose(mass, turn.T @ theirs @ turn, atol=1e-12)
+        np.testing.assert_allclose(bias, turn.T @ data.qfrc_bias, atol=1e-11)
+
+
+def test_values_are_read_from_poses_and_written_into_them() -> None:
+    chain, bodies, _ = tree("free", torch.Generator().manual_seed(5))
+    world = chained(chain, *bodies, ground=False)
+    given, speeds = {"j1": 2.0, "j2": -0.2, "j4": -3.0}, {"j1": 0.5, "j2": 0.3, "j4": -0.7}
+    state = with_joints(world, still(5), given, speeds)
+    values, rates = joints_of(world, state, chain)
+    np.testing.assert_allclose(values[0], list(given.values()), atol=1e-14)
+    np.testing.assert_allclose(rates[0], list(speeds.values()), atol=1e-14)
+    around = replace(chain, joints=(replace(chain.joints[0], lower=batch(2.5), upper=batch(6.5)), *chain.joints[1:]))
+    turned = with_joints(replace(world, chains=(around,)), still(5), {"j1": 6.0})
+    np.testing.assert_allclose(joints_of(world, turned, around)[0][0, 0], 6.0, atol=1e-14)
+
+
+def test_a_floating_chain_keeps_its_momentum_and_its_energy() -> None:
+    chain, bodies = double_pendulum("free")
+    world = chained(chain, *bodies, ground=False, gravity=0.0, step_s=0.002)
+    state = with_joints(world, still(3), {"second": 1.0}, {"first": 4.0, "second": -6.0})
+    found = rollout(world, state, times(0.4, 10.0))
+    mass = torch.cat([body.mass for body in bodies])[:, None]
+    com = torch.stack([body.com[0] for body in bodies])
+    inertia = torch.stack([body.inertia[0] for body in bodies])
+    arm = quat_rotate(found.quat_wxyz, com)
+    place, omega = found.position_m + arm, quat_rotate(found.quat_wxyz, found.omega_body_rad_s)
+    velocity = found.velocity_m_s + cross(omega, arm)
+    linear = (mass * velocity).sum(2)[0]
+    own = quat_rotate(found.quat_wxyz, (inertia @ found.omega_body_rad_s[..., None]).squeeze(-1))
+    angular = (mass * cross(place, velocity) + own).sum(2)[0]
+    energy = 0.5 * (mass * velocity.square()).sum((2, 3)) + 0.5 * (
+        found.omega_body_rad_s * (inertia @ found.omega_body_rad_s[..., None]).squeeze(-1)
+    ).sum((2, 3))
+    assert linear[0].norm() > 0.01
+    np.testing.assert_allclose(linear, linear[:1].expand_as(linear), atol=1e-4 * float(linear[0].norm()))
+    np.testing.assert_allclose(angular, angular[:1].expand_as(angular), atol=2e-4 * float(angular[0].norm()))
+    np.testing.assert_allclose(energy[0], float(energy[0, 0]) * np.ones(5), rtol=2e-4)
+
+
+def test_a_double_pendulum_keeps_its_energy_for_ten_seconds() -> None:
+    chain, bodies = double_pendulum()
+    world = chained(chain, *bodies, ground=False, step_s=0.001)
+    state = with_joints(world, still(3), {"first": -0.3, "second": 1.2})
+    found = rollout(world, state, times(10.0, 25.0))
+    dynamics = ChainDynamics(chain, bodies)
+    count = found.position_m.shape[1]
+    frames = State(*(getattr(found, name)[0] for name in POSES))
+    values, speeds = joints_of(world, frames, chain)
+    zero = torch.zeros(count, 3, dtype=F64)
+    turn = frames.quat_wxyz[:, 0]
+    energy = dynamics.energy(ChainMotion(zero, turn, zero, zero, values, speeds), world.gravity)
+    lowest = -9.81 * (0.3 * 0.05 + 0.2 * 0.15)
+    assert float(speeds[:, 1].abs().max()) > 10.0  # it turns over
+    np.testing.assert_allclose(energy, float(energy[0]), atol=1e-3 * (float(energy[0]) - lowest))
+
+
+def servo(**numbers: float) -> tuple[World, State]:
+    """Return one link on a servo that turns about z, without gravity along its motion."""
+    bodies = (link("palm", 0.0), link("finger", 0.02))
+    joint = Joint.of("knuckle", "hinge", "finger", "palm", **numbers)
+    world = chained(Chain(name="hand", root="palm", base="fixed", joints=(joint,)), *bodies, ground=False)
+    return world, still(2)
+
+
+def angles(world: World, state: State, driven: Mapping[str, object], seconds: float, rate: float) -> torch.Tensor:
+    """Return the value of the first joint in the frames of a rollout."""
+    found = rollout(world, state, times(seconds, rate), driven)
+    frames = [getattr(found, name)[0] for name in POSES]
+    return joints_of(world, State(*frames), world.chains[0])[0][:, 0]
+
+
+def test_a_servo_follows_a_step_as_the_position_actuator_of_mujoco_does() -> None:
+    world, state = servo(stiffness=0.3, damping=0.01, armature=0.001)
+    found = angles(world, state, {"hand": JointCommand.hold_still(batch([0.5]))}, 0.3, 100.0)
+    moment = 0.001 + float(world.bodies[1].inertia[0, 2, 2]) + 0.02 * 0.05**2
+    xml = f"""<mujoco><option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/><worldbody><body>
+        <joint name="j" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="{moment} {moment} {moment}"/>
+        </body></worldbody><actuator><position joint="j" kp="0.3" kv="0.01"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.5
+    theirs = [0.0]
+    for _ in range(30):
+        mujoco.mj_step(model, data, 10)
+        theirs.append(float(data.qpos[0]))
+    assert max(theirs) > 0.55  # it overshoots
+    np.testing.assert_allclose(found, theirs, atol=0.02 * 0.5)
+
+
+def test_a_servo_pushes_with_its_limit_and_a_joint_stops_at_its_own() -> None:
+    free, state = servo(stiffness=50.0, armature=0.01, torque_limit=0.1, upper=0.4)
+    found = angles(free, state, {"hand": JointCommand.hold_still(batch([2.0]))}, 0.6, 100.0)
+    moment = 0.01 + float(free.bodies[1].inertia[0, 2, 2]) + 0.02 * 0.05**2
+    reach = 0.5 * 0.1 / moment * torch.arange(5, dtype=F64).square() * 1e-4
+    np.testing.assert_allclose(found[:5], reach, rtol=1e-9, atol=1e-12)
+    assert float(found.max()) < 0.41 and abs(float(found[-1]) - 0.4) < 0.002
+
+
+def test_dry_friction_holds_below_its_bound_and_brakes_above() -> None:
+    speed = {"knuckle": 1.0}
+    world, state = servo(friction=0.002)
+    moment = float(world.bodies[1].inertia[0, 2, 2]) + 0.02 * 0.05**2
+    found = angles(world, with_joints(world, state, {}, speed), {}, 0.1, 100.0)
+    stop = moment / 0.002
+    moved = torch.tensor([t - 0.5 * t**2 / stop if t < stop else 0.5 * stop for t in np.arange(11) / 100])
+    assert 0.01 < stop < 0.08
+    np.testing.assert_allclose(found, moved, atol=1e-4)
+    held = replace(world, gravity=batch([0.0, -0.15, 0.0]))  # 0.00015 N m at the joint
+    assert float(angles(held, state, {}, 0.2, 20.0).abs().max()) < 1e-9
+
+
+def test_two_yielding_fingers_squeeze_a_ball_with_gain_times_deflection() -> None:
+    names = ("left", "right")
+    spheres = ((0.1, 0.0, 0.0, 0.01),)
+    bodies = [link("palm", 0.0), *(link(name, 0.02, com=(0.05, 0, 0), spheres=spheres) for name in names)]
+    joints = [
+        Joint.of(
+            f"{name}_joint", "hinge", name, "palm", position_m=(0, y, 0), stiffness=2.0, damping=0.05, armature=1e-3
+        )
+        for name, y in zip(names, (0.04, -0.04), strict=True)
+    ]
+    chain = Chain(name="hand", root="palm", base="fixed", joints=tuple(joints))
+    ball = replace(ball_body(0.0295, 0.05), name="ball")
+    world = chained(chain, *bodies, ball, ground=False, gravity=0.0, step_s=0.002)
+    state = still(4)
+    state.position_m[:, 3, 0] = 0.1
+    state = with_joints(world, state, {})
+    target = {"hand": JointCommand.hold_still(batch([-0.2, 0.2]))}
+    found = rollout(world, state, times(0.6, 20.0), target, record_contacts=True)
+    last = State(*(getattr(found, k)[:, -1] for k in POSES))
+    values = joints_of(world, last, chain)[0][0]
+    record = found.contacts
+    assert record is not None
+    forces = record.impulse_n_s[0, -1].norm(dim=-1) / 0.05
+    for row, value, wanted in ((1, values[0], -0.2), (2, values[1], 0.2)):
+        force = float(forces[(record.body_a == row) | (record.body_b == row)].sum())
+        normal_arm = 0.1 * math.cos(float(value))  # the contact's normal is along y
+        assert force > 2.0
+        assert abs(force * normal_arm - 2.0 * abs(wanted - float(value))) < 0.01 * force * normal_arm
+    assert float(last.velocity_m_s[0, 3].norm()) < 1e-3
+
+
+def test_a_driven_root_carries_its_links_and_their_inertia_acts_on_the_joints() -> None:
+    from cgwm.pipeline.physics.kinematic import Drive
+
+    bodies = [link("cart", 0.0), link("pole", 0.3)]
+    chain = Chain(
+        name="c", root="cart", base="driven", joints=(Joint.of("pin", "hinge", "pole", "cart", axis=(0, 1, 0)),)
+    )
+    world = chained(chain, *bodies, ground=False, gravity=0.0, step_s=0.001)
+    state = with_joints(world, still(2), {"pin": math.pi / 2})  # the pole hangs along -z
+    samples = torch.linspace(0, 0.1, 101, dtype=F64)[None]
+    speed = torch.zeros(1, 100, 3, dtype=F64)
+    speed[..., 0] = 2.0 * samples[:, 1:]  # the cart accelerates at 2 m/s2
+    drive = Drive.from_velocities(samples, state.position_m[:, 0], state.quat_wxyz[:, 0], speed, 0 * speed)
+    found = rollout(world, state, times(0.05, 100.0), {"cart": drive})
+    frames = [getattr(found, k)[0] for k in POSES]
+    values, _ = joints_of(world, State(*frames), chain)
+    moment = float(bodies[1].inertia[0, 1, 1]) + 0.3 * 0.05**2
+    rate = 0.3 * 0.05 * 2.0 / moment  # the pole lags behind
+    wanted = math.pi / 2 + 0.5 * rate * torch.arange(6, dtype=F64).square() * 1e-4
+    np.testing.assert_allclose(values[:, 0], wanted, atol=0.05 * float(wanted[-1] - wanted[0]))
+
+
+def test_derivatives_are_those_of_differences() -> None:
+    chain, bodies = double_pendulum(stiffness=0.5, damping=0.02, armature=1e-4, friction=0.001, lower=-0.2)
+    bodies[2] = replace(bodies[2], centers=batch([[0.1, 0.0, 0.0]]), radii=batch([0.01]))
+    base = chained(chain, *bodies, step_s=0.002)
+    base = replace(base, ground_offset=batch(-0.02))
+
+    def moved(x: torch.Tensor, _: int = 1) -> torch.Tensor:
+        count = x.shape[0]
+        joints = tuple(replace(j, stiffness=0.5 + x[:, 0], armature=1e-4 + 1e-3 * x[:, 1]) for j in chain.joints)
+        world = replace(base, chains=(replace(chain, joints=joints),))
+        world = world.with_body(2, mass=0.2 + x[:, 2])
+        state = with_joints(world, still(3, count), {"second": 0.3 + x[:, 3]}, {"first": x[:, 4]})
+        knots = JointCommand.targets(batch([0.0, 0.05, 0.1]), x[:, 5:11].unflatten(1, (3, 2)), "cubic")
+        return simulate(world, state, times(0.06, 50.0), {"arm": knots}).position_m[:, -1, 2]
+
+    point = torch.tensor([[0.1, 0.2, 0.05, 0.1, 0.3, 0.1, 0.2, 0.3, -0.1, 0.2, 0.4]], dtype=F64)
+    exact = batched_jacobian(moved, point)[1][0]
+    step = 1e-6
+    shifts = step * torch.eye(point.shape[1], dtype=F64)
+    with torch.no_grad():
+        differences = (moved(point + shifts) - moved(point - shifts)).T / (2 * step)
+    np.testing.assert_allclose(exact, differences, atol=1e-6 * float(differences.abs().max()))
+    assert float(differences.abs().amin()) >= 0 and float(differences.abs().max()) > 1e-3
+
+
+def test_commands_go_through_their_knots_and_speeds_are_integrated() -> None:
+    knots, values = batch([0.0, 0.5, 1.5]), batch([[0.0], [1.0], [0.5]])
+    when = torch.tensor([0.0, 0.25, 0.5, 1.0, 1.5, 2.0], dtype=F64)
+
+    def at(command: JointCommand) -> list[float]:
+        return [float(command.at(t[None])[0, 0]) for t in when]
+
+    assert at(JointCommand.targets(knots, values, "zero")) == [0.0, 0.0, 1.0, 1.0, 0.5, 0.5]
+    assert at(JointCommand.targets(knots, values, "linear")) == pytest.approx([0.0, 0.5, 1.0, 0.75, 0.5, 0.5])
+    cubic = at(JointCommand.targets(knots, values, "cubic"))
+    assert cubic[::2] == pytest.approx([0.0, 1.0, 0.5]) and cubic[5] == 0.5
+    parabola = JointCommand.targets(knots, knots[..., None] ** 2, "cubic")  # a parabola's inner slope is exact
+    assert float(parabola.at(batch(0.5) + 1e-6)[0, 0] - 0.25) / 1e-6 == pytest.approx(1.0, abs=1e-5)
+    linear = at(JointCommand.speeds(knots, values, batch([0.2]), "linear"))
+    assert linear == pytest.approx([0.2, 0.2 + 0.0625, 0.45, 0.45 + 0.4375, 1.2, 1.2])
+    with pytest.raises(UsageError, match="zero, linear, cubic"):
+        JointCommand.targets(knots, values, "spline")
+
+
+def test_what_cannot_be_a_chain_is_refused() -> None:
+    chain, bodies = double_pendulum()
+    world = chained(chain, *bodies, ground=False)
+    loop = replace(chain, joints=(*chain.joints, replace(chain.joints[1], name="third", parent="base")))
+    with pytest.raises(InputDataError, match="'lower' is carried by two joints: a loop"):
+        require_chains(replace(world, chains=(loop,)))
+    with pytest.raises(InputDataError, match="several joints are called 'first'"):
+        twice = replace(chain, joints=(chain.joints[0], replace(chain.joints[1], name="first")))
+        require_chains(replace(world, chains=(twice,)))
+    with pytest.raises(InputDataError, match="moves links without mass"):
+        require_chains(world.with_body(2, mass=batch(0.0)))
+    with pytest.raises(InputDataError, match="is a link of no chain"):
+        require_chains(replace(world, chains=()))
+    with pytest.raises(InputDataError, match="its limits are 1 and 0"):
+        Joint.of("a", "hinge", "b", "c", lower=1.0, upper=0.0)
+    with pytest.raises(UsageError, match="there is no moving joint 'elbow'"):
+        with_joints(world, still(3), {"elbow": 1.0})
+    apart = with_joints(world, still(3), {})
+    apart.position_m[0, 2, 1] += 0.01
+    with pytest.raises(InputDataError, match="link 'lower' is 10 mm and 0 rad off its joint 'second'"):
+        simulate(world, apart, times(0.01))
+    servoed = replace(chain, joints=(replace(chain.joints[0], stiffness=batch(1.0)), chain.joints[1]))
+    with pytest.raises(InputDataError, match="have servos and no command"):
+        simulate(replace(world, chains=(servoed,)), with_joints(world, still(3), {}), times(0.01))
