@@ -23,6 +23,8 @@ TURN_COLUMNS, WORLD_COLUMNS = 4, 5
 contact law adds one to those of the world."""
 MOTION_COLUMNS = 13
 """Last columns of a body: position, orientation, velocity and spin."""
+_LONG_LIST = 8
+"""Number of constants from which a list is an array in memory, and not a chain of comparisons."""
 _BUSY_THREADS = 262_144
 """Number of threads that fill an H200; more environments get fewer threads each."""
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
@@ -196,5 +198,11 @@ def _starts(counts: Sequence[int]) -> list[int]:
 
 def _function(name: str, values: Iterable[int]) -> str:
     """Return the source of a function that looks up a list, which the compiler resolves for a known index."""
+    values = list(values)
+    if len(values) > _LONG_LIST:
+        listed = ", ".join(str(int(value)) for value in values)
+        return f"__device__ static const int {name}_list[] = {{{listed}}};\n" + (
+            f"INLINE int {name}(int i) {{ return {name}_list[i]; }}"
+        )
     cases = "".join(f"i == {index} ? {int(value)} : " for index, value in enumerate(values))
     return f"INLINE int {name}(int i) {{ return {cases}0; }}"

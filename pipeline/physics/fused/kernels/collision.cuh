@@ -342,8 +342,13 @@ INLINE void split(Contact* list, int count, const int* groups) {
 // Discards the impulses of the previous step.
 INLINE void forget(Environment& env) {
     if (!env.warm) return;
+#if PAIRED
+    for (int i = 0; i < env.kept_count; i++) env.before[env.kept[i]] = none();
+    env.kept_count = 0;
+#else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) env.before[i] = none();
+#endif
     env.warm = false;
 }
 
@@ -358,7 +363,9 @@ INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
         tangents(env, c.normal, one, two);
         Vec along = vec(dot(c.impulse, c.normal), dot(c.impulse, one), dot(c.impulse, two));
         env.before[c.slot] = c.b == -1 ? c.impulse : along;
+        env.kept[i] = c.slot;
     }
+    env.kept_count = count;
 #elif LISTED
     forget(env);
     for (int i = 0; i < count; i++) env.before[list[i].slot] = list[i].impulse;

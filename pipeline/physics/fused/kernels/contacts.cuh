@@ -248,12 +248,34 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     nearest = Number(1e30);
     for (int i = 0; i < spheres.count; i++) nearest = lesser(nearest, gap_to(spheres, i, point));
     if (nearest - width > limit) return false;
+#if HOST
+    // only spheres within the width of the nearest one take part: they are found once
+    const int most = 64;
+    int members[most], found = 0;
+    Number gaps[most];
+    for (int i = 0; i < spheres.count && found <= most; i++) {
+        Number gap = gap_to(spheres, i, point) - nearest;
+        if (!(gap < width)) continue;
+        if (found < most) {
+            members[found] = i;
+            gaps[found] = gap;
+        }
+        found++;
+    }
+    bool few = found <= most;
+#define EACH_MEMBER for (int m = 0; m < (few ? found : spheres.count); m++)
+#define MEMBER int i = few ? members[m] : m; Number gap = few ? gaps[m] : gap_to(spheres, i, point) - nearest;
+#else
+#define EACH_MEMBER for (int i = 0; i < spheres.count; i++)
+#define MEMBER Number gap = gap_to(spheres, i, point) - nearest;
+#endif
     // solve sum over spheres of max(0, t - x)^2 = width^2 for t: Newton from above, where the sum is convex and rising
     Number t = width;
     for (int round = 0; round < 40; round++) {
         Number squares = Number(0), sum = Number(0);
-        for (int i = 0; i < spheres.count; i++) {
-            Number below = t - (gap_to(spheres, i, point) - nearest);
+        EACH_MEMBER {
+            MEMBER
+            Number below = t - gap;
             if (below > Number(0)) {
                 squares += below * below;
                 sum += below;
@@ -266,8 +288,9 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     // once the set of active spheres is known: the closed form and its derivative
     Real first = Real(0), second = Real(0);
     Number count = Number(0);
-    for (int i = 0; i < spheres.count; i++) {
-        if (!(gap_to(spheres, i, point) - nearest < t)) continue;
+    EACH_MEMBER {
+        MEMBER
+        if (!(gap < t)) continue;
         Vec away = at - spheres.center(i);
         Real x = root(dot(away, away)) - spheres.radius(i) - Real(nearest);
         first += x;
@@ -278,8 +301,9 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     Real solved = reciprocal(Real(count)) * (first + root(inside));
     Real cubes = Real(0);
     Vec gradient = none();
-    for (int i = 0; i < spheres.count; i++) {
-        if (!(gap_to(spheres, i, point) - nearest < t)) continue;
+    EACH_MEMBER {
+        MEMBER
+        if (!(gap < t)) continue;
         Vec away = at - spheres.center(i);
         Real length = root(dot(away, away));
         Real a = Number(1 / SMOOTHING_M) * (solved - (length - spheres.radius(i) - Real(nearest)));

@@ -81,6 +81,9 @@ struct Environment {
     // normal and tangents
     Vec before[SLOTS];
     bool warm;  // whether any of them is not zero
+#if PAIRED
+    int kept[SLOTS], kept_count;  // the slots that may not be zero
+#endif
 #if RECORD
     Tally tallies[SLOTS];
 #endif
@@ -169,6 +172,9 @@ INLINE void load(const Problem& problem, Environment& env) {
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) env.before[i] = none();
     env.warm = false;
+#if PAIRED
+    env.kept_count = 0;
+#endif
 #if HELD
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
@@ -197,6 +203,10 @@ INLINE void resume(const Problem& problem, Environment& env) {
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) env.before[i] = vec(row[3 * i], row[3 * i + 1], row[3 * i + 2]);
     env.warm = row[3 * SLOTS] > Number(0);
+#if PAIRED
+    for (int i = 0; i < SLOTS; i++) env.kept[i] = i;
+    env.kept_count = SLOTS;
+#endif
 }
 
 // Stores the state that `resume` reads in the next launch.

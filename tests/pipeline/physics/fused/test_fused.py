@@ -596,7 +596,7 @@ def test_what_the_kernel_does_not_have() -> None:
     assert "do not touch anything" in (reason_against(flying) or "")
     published = PaperLaw(friction=batch(0.3), stiffness_n_m=batch(1e4), damping_n_s_m=batch(10.0))
     assert "'published'" in (reason_against(replace(world, contact=published)) or "")
-    assert "its bodies may have 4104 contacts" in (reason_against(crowded(2044)) or "")
+    assert "its bodies may have 16392 contacts" in (reason_against(crowded(8188)) or "")
 
 
 def crowded(count: int) -> World:

@@ -1,0 +1,175 @@
+"""Cost of a sub-step of a robot hand that turns a cube: cgwm on the CPU or CUDA, MuJoCo and MuJoCo Warp beside it.
+
+    python benchmarks/leap.py leap_hand/robots/hands/leap_hand/leap_hand_right.urdf --environments 64
+    python benchmarks/leap.py ... --device cuda --single --environments 4096
+
+The hand is the LEAP hand (16 joints; dexsuite/dex-urdf, MIT) with about 160 spheres, the cube has 64. Servos close the
+fingers to random targets at knots, so that the cube is held and rolled. CPU figures are CPU time of the process for each
+environment and sub-step; those of CUDA are wall time of all environments together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from cgwm.datasets.robots import read_articulation
+from cgwm.pipeline.physics import Body, ContactLaw, State, World
+from cgwm.pipeline.physics.articulated import Servo, chain_of
+from cgwm.pipeline.physics.chain import with_joints
+from cgwm.pipeline.physics.devices import on_device
+from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.joint_command import JointCommand
+from cgwm.pipeline.sg_gs.link_spheres import link_spheres
+from torch import Tensor
+
+HALF_M, SIDE = 0.0325, 4
+STIFFNESS, DAMPING, ARMATURE = 3.0, 0.1, 1e-3
+
+
+def scene(urdf: Path, spheres: Path | None, massless: bool, step_s: float) -> World:
+    """Return the hand, palm up, and a cube on it."""
+    hand = read_articulation(urdf).welded()
+    if spheres is not None and spheres.exists():
+        stored = np.load(spheres)
+        found = {link.name: (stored[f"{link.name}_c"], stored[f"{link.name}_r"]) for link in hand.links}
+    else:
+        found = link_spheres(hand, 160)
+        if spheres is not None:
+            np.savez(spheres, **{f"{k}_{n}": v for k, pair in found.items() for n, v in zip("cr", pair, strict=True)})
+    chain, links = chain_of(
+        hand, found, "fixed", Servo(stiffness=STIFFNESS, damping=DAMPING, armature=ARMATURE), massless=massless
+    )
+    radius = HALF_M / SIDE
+    ticks = torch.linspace(-1, 1, SIDE, dtype=torch.float64) * (HALF_M - radius)
+    mass = 0.108
+
+    def one(value: object) -> Tensor:
+        return torch.as_tensor(value, dtype=torch.float64)[None]
+
+    cube = Body(
+        name="cube", motion="free", mass=one(mass), inertia=one(mass * 2 / 3 * HALF_M**2 * np.eye(3)),
+        com=one([0.0, 0.0, 0.0]), centers=torch.cartesian_prod(ticks, ticks, ticks)[None],
+        radii=torch.full((1, SIDE**3), radius, dtype=torch.float64),
+    )  # fmt: skip
+    law = ContactLaw(one(0.5), one(0.005), one(1.0))
+    return World(
+        bodies=(*links, cube), gravity=one([9.81, 0.0, 0.0]), ground_normal=None, ground_offset=None, contact=law,
+        step_s=step_s, chains=(chain,),
+    )  # fmt: skip
+
+
+def start(world: World, environments: int, seed: int) -> tuple[State, JointCommand]:
+    """Return states with the cube above the palm, and commands that close the fingers."""
+    generator = torch.Generator().manual_seed(seed)
+    bodies, chain = len(world.bodies), world.chains[0]
+    zero = torch.zeros(environments, bodies, 3, dtype=torch.float64)
+    turn = torch.zeros(environments, bodies, 4, dtype=torch.float64)
+    turn[..., 0] = 1.0
+    place = zero.clone()
+    place[:, -1] = torch.tensor([-0.055, 0.01, 0.115]) + 0.003 * torch.randn(environments, 3, generator=generator)
+    state = with_joints(world, State(place, turn, zero, zero.clone()), {})
+    lower, upper = chain.numbers("lower")[0], chain.numbers("upper")[0]
+    count = len(chain.moving)
+    share = 0.35 + 0.3 * torch.rand(environments, 5, count, generator=generator, dtype=torch.float64)
+    side = torch.tensor([name in ("0", "4", "8") for name in chain.joint_names])
+    wanted = torch.where(side, 0.3 * (share - 0.5), (share * upper).clamp(max=1.2))
+    wanted[:, 0] = 0.0
+    knots = torch.linspace(0, 0.8, 5, dtype=torch.float64)[None]
+    return state, JointCommand.targets(knots, torch.maximum(torch.minimum(wanted, upper), lower), "linear")
+
+
+def contacts(world: World, state: State, command: JointCommand, seconds: float) -> float:
+    """Return the mean number of contacts that act in a frame of the first environments."""
+    few = state.at(slice(0, 4))
+    found = rollout(world, few, torch.linspace(0, seconds, 9, dtype=torch.float64), {world.chains[0].name: command.select(torch.arange(4))}, True)  # fmt: skip
+    assert found.contacts is not None
+    return float((found.contacts.impulse_n_s[:, 1:].norm(dim=-1) > 0).sum(-1).double().mean())
+
+
+def measure(world: World, environments: int, seconds: float, device: str, single: bool) -> dict[str, float]:
+    """Return the cost of an environment's sub-step, and what the cube does."""
+    state, command = start(world, environments, 0)
+    acting = contacts(world, state, command, seconds)
+    frames = torch.linspace(0, seconds, 3, dtype=torch.float64)
+    kind = torch.float32 if single else torch.float64
+    world, state, frames, command = (on_device(x, device, kind) for x in (world, state, frames, command))
+    driven = {world.chains[0].name: command}
+    rollout(world, state, frames[:2], driven)
+    if device == "cuda":
+        torch.cuda.synchronize()
+    cpu, wall = time.process_time(), time.perf_counter()
+    found = rollout(world, state, frames, driven)
+    if device == "cuda":
+        torch.cuda.synchronize()
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    steps = environments * sum(world.substeps(frames[None]))
+    height = found.position_m[:, -1, -1, 0]
+    return {
+        "cpu_us_a_step": 1e6 * cpu / steps, "env_steps_a_s": steps / wall, "contacts": acting,
+        "finite": float(torch.isfinite(found.position_m).all()), "held": float((height.abs() < 0.15).double().mean()),
+    }  # fmt: skip
+
+
+def mujoco_cost(urdf: Path, seconds: float, step_s: float) -> dict[str, float]:
+    """Return the CPU time of a step of MuJoCo with the same URDF, servos and cube, one environment."""
+    import mujoco
+
+    text = urdf.read_text()
+    compiler = (
+        f'<mujoco><compiler strippath="false" discardvisual="true" meshdir="{urdf.parent}" fusestatic="true"/></mujoco>'
+    )
+    spec = mujoco.MjSpec.from_string(text.replace("<link", f"{compiler}<link", 1))
+    names = [joint.name for joint in spec.joints]
+    for joint in spec.joints:
+        joint.armature = ARMATURE
+    for name in names:
+        actuator = spec.add_actuator(name=f"servo{name}", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=STIFFNESS, kv=DAMPING)
+    cube = spec.worldbody.add_body(name="cube", pos=[-0.055, 0.01, 0.115])
+    cube.add_freejoint()
+    cube.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[HALF_M] * 3, mass=0.108)
+    spec.option.gravity, spec.option.timestep = [9.81, 0.0, 0.0], step_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model = spec.compile()
+    model.geom_contype[:-1], model.geom_conaffinity[:-1] = 1, 2  # the links touch the cube alone
+    model.geom_contype[-1], model.geom_conaffinity[-1] = 2, 1
+    data = mujoco.MjData(model)
+    rng, count = np.random.default_rng(0), 0
+    began, steps = time.process_time(), round(seconds / step_s)
+    upper = model.actuator_trnid[:, 0]
+    for k in range(steps):
+        if k % max(1, steps // 5) == 0:
+            data.ctrl[:] = np.clip((0.35 + 0.3 * rng.random(model.nu)) * model.jnt_range[upper, 1], None, 1.2)
+        mujoco.mj_step(model, data)
+        count += data.ncon
+    return {"mujoco_us_a_step": 1e6 * (time.process_time() - began) / steps, "mujoco_contacts": count / steps}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("urdf", type=Path)
+    parser.add_argument("--spheres", type=Path, help="file that keeps the spheres between runs")
+    parser.add_argument("--environments", type=int, default=64)
+    parser.add_argument("--seconds", type=float, default=0.8)
+    parser.add_argument("--step", type=float, default=0.004)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--single", action="store_true")
+    arguments = parser.parse_args()
+    for massless in (False, True):
+        world = scene(arguments.urdf, arguments.spheres, massless, arguments.step)
+        spheres = sum(body.radii.shape[-1] for body in world.bodies)
+        found = measure(world, arguments.environments, arguments.seconds, arguments.device, arguments.single)
+        print(json.dumps({"links": "without mass" if massless else "with mass", "spheres": spheres, **found}))
+    try:
+        print(json.dumps(mujoco_cost(arguments.urdf, arguments.seconds, arguments.step)))
+    except ImportError:
+        print("mujoco is not installed")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,241 @@
+"""Links and joints of an articulated body, as a robot's file describes them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import InputDataError
+from ..shapes.meshes import Mesh
+
+Array = NDArray[np.float64]
+LARGEST_M = 20.0
+"""Extent of a link [m] beyond which its mesh is taken for one in millimetres."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GeometryOfLink:
+    """A solid that is fixed to a link: a box, a ball, a cylinder, a capsule or a mesh."""
+
+    kind: str
+    """"box", "sphere", "cylinder", "capsule" or "mesh"."""
+    size_m: tuple[float, ...]
+    """Half extents of a box; radius of a ball; radius and half length along z of a cylinder or capsule; else ()."""
+    rotation: Array
+    """Orientation in the link's frame, shape (3, 3)."""
+    position_m: Array
+    """Origin in the link's frame [m], shape (3,)."""
+    mesh: Mesh | None = None
+    """The mesh, scaled [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinkOfRobot:
+    """A link: its mass, and what collides."""
+
+    name: str
+    """Name of the link."""
+    mass_kg: float
+    """Mass [kg]."""
+    com_m: Array
+    """Centre of mass in the link's frame [m], shape (3,)."""
+    inertia_kg_m2: Array
+    """Inertia about the centre of mass, axes of the link's frame, shape (3, 3)."""
+    geometry: tuple[GeometryOfLink, ...]
+    """What collides; empty for a link that nothing touches."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointOfRobot:
+    """A joint between two links."""
+
+    name: str
+    """Name of the joint."""
+    kind: str
+    """"hinge", "slide" or "fixed"."""
+    parent: str
+    """Name of the link that carries the other."""
+    link: str
+    """Name of the link that the joint carries; a hinge's axis goes through its origin."""
+    position_m: Array
+    """Origin of the link's frame in the parent's at value 0 [m], shape (3,)."""
+    quat_wxyz: Array
+    """Its orientation there, shape (4,)."""
+    axis: Array
+    """Axis in the link's frame, shape (3,)."""
+    lower: float = -math.inf
+    """Smallest value [rad or m]."""
+    upper: float = math.inf
+    """Largest value [rad or m]."""
+    stiffness: float = 0.0
+    """Servo gain [N m/rad or N/m]."""
+    damping: float = 0.0
+    """Viscous damping [N m s/rad or N s/m]."""
+    armature: float = 0.0
+    """Reflected inertia [kg m2 or kg]."""
+    friction: float = 0.0
+    """Dry friction [N m or N]."""
+    torque_limit: float = math.inf
+    """Largest torque or force of the servo [N m or N]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Articulation:
+    """A tree of links, the root first, and its joints, parents before children."""
+
+    name: str
+    """Name of the robot."""
+    path: Path
+    """The file it was read from."""
+    links: tuple[LinkOfRobot, ...]
+    """The links in the order of the joints, the root first."""
+    joints: tuple[JointOfRobot, ...]
+    """The joint of each link but the root."""
+
+    @staticmethod
+    def tree(name: str, path: Path, links: dict[str, LinkOfRobot], joints: list[JointOfRobot]) -> Articulation:
+        """Order links and joints from the root on.
+
+        Raises:
+            InputDataError: If they are not one tree.
+        """
+        carried: dict[str, JointOfRobot] = {}
+        for joint in joints:
+            for end in (joint.parent, joint.link):
+                if end not in links:
+                    raise InputDataError(f"{path}: joint '{joint.name}' names the link '{end}', which is not there.")
+            if joint.link in carried:
+                raise InputDataError(
+                    f"{path}: link '{joint.link}' is carried by the joints '{carried[joint.link].name}' and "
+                    f"'{joint.name}': a loop.",
+                    "a tree: one joint above each link.",
+                    "leave out the joint that closes the loop.",
+                )
+            carried[joint.link] = joint
+        roots = [link for link in links if link not in carried]
+        if len(roots) != 1:
+            found = "no link is the root: the joints are a ring" if not roots else f"several roots: {', '.join(roots)}"
+            raise InputDataError(f"{path}: {found}.", "one tree of links.", "join the links, or leave out the others.")
+        order, placed = [roots[0]], []
+        for link in order:
+            below = [joint for joint in joints if joint.parent == link]
+            placed += below
+            order += [joint.link for joint in below]
+        if len(order) != len(links):
+            lost = next(link for link in links if link not in order)
+            raise InputDataError(f"{path}: link '{lost}' hangs in a ring of joints.", "one tree of links.")
+        if len({joint.name for joint in placed}) < len(placed):
+            names = [joint.name for joint in placed]
+            twice = next(one for one in names if names.count(one) > 1)
+            raise InputDataError(f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.")
+        return Articulation(name=name, path=path, links=tuple(links[link] for link in order), joints=tuple(placed))
+
+    def require_limits(self) -> None:
+        """Check that each moving joint has limits, which a servo's command needs.
+
+        Raises:
+            InputDataError: If one has none.
+        """
+        for joint in self.joints:
+            if joint.kind != "fixed" and not (math.isfinite(joint.lower) and math.isfinite(joint.upper)):
+                raise InputDataError(
+                    f"{self.path}: joint '{joint.name}' has a servo and no limits.",
+                    "<limit lower=... upper=.../>, or range=... in MJCF.",
+                    "give it limits.",
+                )
+
+    def require_geometry(self) -> None:
+        """Check that each link with mass below a joint that moves has collision geometry.
+
+        Raises:
+            InputDataError: If one has none.
+        """
+        for link in self.links:
+            if link.mass_kg > 0 and not link.geometry:
+                raise InputDataError(
+                    f"{self.path}: link '{link.name}' has no collision geometry, so nothing could touch it.",
+                    "<collision> with a box, sphere, cylinder or mesh.",
+                    "add one, or ask for links without it by bare_links=True.",
+                )
+
+    def require_metres(self) -> None:
+        """Check that no mesh is far too large, as one in millimetres is.
+
+        Raises:
+            InputDataError: If one is.
+        """
+        for link in self.links:
+            for part in link.geometry:
+                if part.mesh is not None and float(np.ptp(part.mesh.vertices, axis=0).max()) > LARGEST_M:
+                    size = float(np.ptp(part.mesh.vertices, axis=0).max())
+                    raise InputDataError(
+                        f"{self.path}: the mesh of link '{link.name}' is {size:.3g} m long; its numbers look like "
+                        "millimetres.",
+                        f"meshes in metres, up to {LARGEST_M:g} m.",
+                        'give the mesh scale="0.001 0.001 0.001".',
+                    )
+
+    def welded(self) -> Articulation:
+        """Return the articulation with links behind fixed joints made part of the links that carry them."""
+        links = {link.name: link for link in self.links}
+        home: dict[str, tuple[str, Array, Array]] = {self.links[0].name: (self.links[0].name, np.eye(3), np.zeros(3))}
+        joints = []
+        for joint in self.joints:
+            carrier, turn, shift = home[joint.parent]
+            turned, moved = turn @ matrix_of(joint.quat_wxyz), shift + turn @ joint.position_m
+            if joint.kind == "fixed":
+                links[carrier] = _merged(links[carrier], links.pop(joint.link), turned, moved)
+                home[joint.link] = (carrier, turned, moved)
+                continue
+            home[joint.link] = (joint.link, np.eye(3), np.zeros(3))
+            quat = _product(quat_of_matrix(turn), joint.quat_wxyz)
+            joints.append(replace(joint, parent=carrier, position_m=moved, quat_wxyz=quat))
+        return Articulation.tree(self.name, self.path, links, joints)
+
+
+def matrix_of(quat_wxyz: Array) -> Array:
+    """Return the rotation (3, 3) of a unit quaternion (4,)."""
+    w, x, y, z = quat_wxyz / np.linalg.norm(quat_wxyz)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quat_of_matrix(matrix: Array) -> Array:
+    """Return the quaternion (4,), w first, of a rotation (3, 3): the largest eigenvector of its quadratic form."""
+    m = matrix
+    form = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    return np.linalg.eigh(form)[1][:, -1]
+
+
+def _product(a: Array, b: Array) -> Array:
+    w, v, s, u = a[0], a[1:], b[0], b[1:]
+    return np.concatenate(([w * s - v @ u], w * u + s * v + np.cross(v, u)))
+
+
+def _merged(carrier: LinkOfRobot, link: LinkOfRobot, turn: Array, shift: Array) -> LinkOfRobot:
+    """Return a link and another one that is fixed to it at a place, as one."""
+    mass = carrier.mass_kg + link.mass_kg
+    com = shift + turn @ link.com_m
+    centre = (carrier.mass_kg * carrier.com_m + link.mass_kg * com) / mass if mass > 0 else carrier.com_m
+    inertia = carrier.inertia_kg_m2 + turn @ link.inertia_kg_m2 @ turn.T
+    for weight, place in ((carrier.mass_kg, carrier.com_m), (link.mass_kg, com)):
+        arm = place - centre
+        inertia = inertia + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    parts = [replace(p, rotation=turn @ p.rotation, position_m=shift + turn @ p.position_m) for p in link.geometry]
+    return replace(carrier, mass_kg=mass, com_m=centre, inertia_kg_m2=inertia, geometry=(*carrier.geometry, *parts))

@@ -1,0 +1,176 @@
+"""Reader of MJCF by MuJoCo's own compiler: bodies, joints, position servos and collision geometry."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import InputDataError
+from ..shapes.meshes import Mesh
+from .articulation import Articulation, GeometryOfLink, JointOfRobot, LinkOfRobot
+
+Array = NDArray[np.float64]
+_GEOMS = {2: "sphere", 3: "capsule", 5: "cylinder", 6: "box", 7: "mesh"}
+
+
+def read_mjcf(path: Path) -> Articulation:
+    """Read the first tree of bodies of an MJCF file; see `read_articulation`.
+
+    The frame of a link whose joint does not lie at its body's origin is moved to the joint. A body with several joints
+    becomes as many links, of which the last has its mass and geometry. Collision geometry is what has contype or
+    conaffinity.
+    """
+    import mujoco
+
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputDataError(f"{path}: MuJoCo cannot read it: {error}.", "an MJCF file.") from error
+    if model.neq:
+        raise InputDataError(
+            f"{path}: it has {model.neq} equality constraints (loops or joints that mimic others).",
+            "a tree of independent joints.",
+            "leave <equality> out.",
+        )
+    trees = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    if len(trees) != 1:
+        names = ", ".join(model.body(body).name for body in trees)
+        raise InputDataError(f"{path}: it has {len(trees)} bodies in the world: {names}.", "one tree of bodies.")
+    links: dict[str, LinkOfRobot] = {}
+    joints: list[JointOfRobot] = []
+    ends: dict[int, tuple[str, Array]] = {}
+    for body in range(1, model.nbody):
+        _append(path, model, body, links, joints, ends)
+    return Articulation.tree(path.stem, path, links, joints)
+
+
+def _append(
+    path: Path, model: Any, body: int, links: dict[str, LinkOfRobot], joints: list[JointOfRobot],
+    ends: dict[int, tuple[str, Array]],
+) -> None:  # fmt: skip
+    """Append the links and joints of a body; `ends` has for each body its last link and that link's place in it."""
+    name = model.body(body).name or f"body{body}"
+    numbers = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+    kinds = [int(model.jnt_type[number]) for number in numbers]
+    root = model.body_parentid[body] == 0
+    wrong = [kind for kind in kinds if kind not in (2, 3) and not (root and kind == 0)]
+    if wrong:
+        joint = model.joint(numbers[kinds.index(wrong[0])]).name
+        raise InputDataError(
+            f"{path}: joint '{joint}' is a {'ball' if wrong[0] == 1 else 'free'} joint.",
+            "hinge, slide; free for the root.",
+            "model a ball joint by three hinges.",
+        )
+    moving = [number for number, kind in zip(numbers, kinds, strict=True) if kind != 0]
+    if root and (moving or kinds):
+        parent, place = "", np.zeros(3)
+        if moving:
+            links["world"] = LinkOfRobot(
+                name="world", mass_kg=0.0, com_m=np.zeros(3), inertia_kg_m2=np.zeros((3, 3)), geometry=()
+            )
+            parent = "world"
+    else:
+        parent, place = ("", np.zeros(3)) if root else ends[int(model.body_parentid[body])]
+    position, quat = model.body_pos[body] - place, model.body_quat[body]
+    anchor = np.zeros(3)
+    for count, number in enumerate(moving):
+        last = count == len(moving) - 1
+        own = name if last else f"{name}/{model.joint(number).name or number}"
+        shift = model.jnt_pos[number] - anchor
+        joints.append(_joint(model, number, parent, own, position + _rotation(quat) @ shift, quat))
+        links[own] = _link(model, body, own, model.jnt_pos[number] if last else None)
+        parent, position, quat, anchor = own, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), model.jnt_pos[number].copy()
+    if not moving:
+        links[name] = _link(model, body, name, np.zeros(3))
+        if parent:
+            joints.append(
+                JointOfRobot(
+                    name=f"{name}/fixed", kind="fixed", parent=parent, link=name, position_m=position, quat_wxyz=quat,
+                    axis=np.array([0.0, 0.0, 1.0]),
+                )
+            )  # fmt: skip
+    ends[body] = (name, anchor)
+
+
+def _joint(model: Any, number: int, parent: str, link: str, position: Array, quat: Array) -> JointOfRobot:
+    dof = model.jnt_dofadr[number]
+    limited = bool(model.jnt_limited[number])
+    servo = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == number]
+    stiffness, extra, limit = 0.0, 0.0, math.inf
+    if servo:
+        stiffness = max(0.0, -float(model.actuator_biasprm[servo[0], 1]))
+        extra = max(0.0, -float(model.actuator_biasprm[servo[0], 2]))
+        if model.actuator_forcelimited[servo[0]]:
+            limit = float(model.actuator_forcerange[servo[0], 1])
+    return JointOfRobot(
+        name=model.joint(number).name or f"joint{number}",
+        kind="hinge" if model.jnt_type[number] == 3 else "slide",
+        parent=parent,
+        link=link,
+        position_m=position,
+        quat_wxyz=quat.copy(),
+        axis=model.jnt_axis[number].copy(),
+        lower=float(model.jnt_range[number, 0]) if limited else -math.inf,
+        upper=float(model.jnt_range[number, 1]) if limited else math.inf,
+        stiffness=stiffness,
+        damping=float(model.dof_damping[dof]) + extra,
+        armature=float(model.dof_armature[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        torque_limit=limit,
+    )
+
+
+def _link(model: Any, body: int, name: str, origin: Array | None) -> LinkOfRobot:
+    """Return a link with its frame at `origin` of a body; for None one without mass."""
+    if origin is None:
+        return LinkOfRobot(name=name, mass_kg=0.0, com_m=np.zeros(3), inertia_kg_m2=np.zeros((3, 3)), geometry=())
+    turn = _rotation(model.body_iquat[body])
+    geoms = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+    parts = [
+        _geometry(model, geom, origin)
+        for geom in geoms
+        if (model.geom_contype[geom] or model.geom_conaffinity[geom]) and int(model.geom_type[geom]) in _GEOMS
+    ]
+    return LinkOfRobot(
+        name=name,
+        mass_kg=float(model.body_mass[body]),
+        com_m=model.body_ipos[body] - origin,
+        inertia_kg_m2=turn @ np.diag(model.body_inertia[body]) @ turn.T,
+        geometry=tuple(parts),
+    )
+
+
+def _geometry(model: Any, geom: int, origin: Array) -> GeometryOfLink:
+    kind, size = _GEOMS[int(model.geom_type[geom])], model.geom_size[geom]
+    sizes = {"sphere": size[:1], "capsule": size[:2], "cylinder": size[:2], "box": size[:3], "mesh": size[:0]}[kind]
+    mesh = None
+    if kind == "mesh":
+        data = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[data], model.mesh_vertnum[data]
+        face, faces = model.mesh_faceadr[data], model.mesh_facenum[data]
+        mesh = Mesh(
+            np.asarray(model.mesh_vert[first : first + count], dtype=np.float64),
+            np.asarray(model.mesh_face[face : face + faces], dtype=np.int64),
+        )
+    return GeometryOfLink(
+        kind=kind,
+        size_m=tuple(float(x) for x in sizes),
+        rotation=_rotation(model.geom_quat[geom]),
+        position_m=model.geom_pos[geom] - origin,
+        mesh=mesh,
+    )
+
+
+def _rotation(quat: Array) -> Array:
+    w, x, y, z = quat
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
