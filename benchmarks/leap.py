@@ -4,8 +4,8 @@
     python benchmarks/leap.py ... --device cuda --single --environments 4096
 
 The hand is the LEAP hand (16 joints; dexsuite/dex-urdf, MIT) with about 160 spheres, the cube has 64. Servos close the
-fingers to random targets at knots, so that the cube is held and rolled. CPU figures are CPU time of the process for each
-environment and sub-step; those of CUDA are wall time of all environments together.
+fingers to random targets at knots, so that the cube is held and rolled. CPU figures are CPU time of the process for
+each environment and sub-step; those of CUDA are wall time of all environments together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from cgwm.datasets.robots import read_articulation
 from cgwm.pipeline.physics import Body, ContactLaw, State, World
 from cgwm.pipeline.physics.articulated import Servo, chain_of
-from cgwm.pipeline.physics.chain import with_joints
+from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
@@ -86,7 +86,8 @@ def start(world: World, environments: int, seed: int) -> tuple[State, JointComma
 def contacts(world: World, state: State, command: JointCommand, seconds: float) -> float:
     """Return the mean number of contacts that act in a frame of the first environments."""
     few = state.at(slice(0, 4))
-    found = rollout(world, few, torch.linspace(0, seconds, 9, dtype=torch.float64), {world.chains[0].name: command.select(torch.arange(4))}, True)  # fmt: skip
+    frames = torch.linspace(0, seconds, 9, dtype=torch.float64)
+    found = rollout(world, few, frames, {world.chains[0].name: command.select(torch.arange(len(few.position_m)))}, True)
     assert found.contacts is not None
     return float((found.contacts.impulse_n_s[:, 1:].norm(dim=-1) > 0).sum(-1).double().mean())
 
@@ -151,7 +152,8 @@ def mujoco_cost(urdf: Path, seconds: float, step_s: float) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Measure what the command line asks for, and print one JSON object a line."""
+    parser = argparse.ArgumentParser(description="Cost of a sub-step of a hand that turns a cube.")
     parser.add_argument("urdf", type=Path)
     parser.add_argument("--spheres", type=Path, help="file that keeps the spheres between runs")
     parser.add_argument("--environments", type=int, default=64)

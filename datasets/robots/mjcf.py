@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ def read_mjcf(path: Path) -> Articulation:
     becomes as many links, of which the last has its mass and geometry. Collision geometry is what has contype or
     conaffinity.
     """
-    import mujoco
+    mujoco: Any = importlib.import_module("mujoco")
 
     try:
         model = mujoco.MjModel.from_xml_path(str(path))

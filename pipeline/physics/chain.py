@@ -1,33 +1,26 @@
 """Jointed bodies: links in a tree, joined by hinges, slides and fixed joints, with servos, limits and friction.
 
 A link is a body of the world whose motion is "link"; its pose follows from the pose of the chain's base and the values
-of the joints. The joints' values are in the state through the poses of the links: `joints_of` reads them,
-`with_joints` writes them.
+of the joints. The joints' values are in the state through the poses of the links: see `chain_state.py`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from ...schemas import InputDataError, UsageError
-from ..geometry.rotation import cross, quat_conjugate, quat_exp, quat_multiply, quat_rotate
-
-if TYPE_CHECKING:
-    from .world import Body, State, World
+from ...schemas import InputDataError
+from ..geometry.rotation import cross, quat_exp, quat_multiply, quat_rotate
 
 KINDS = ("hinge", "slide", "fixed")
 """Joints that a chain can have."""
 BASES = ("free", "driven", "fixed")
 """How the root link of a chain moves."""
-OFF_JOINT_M, OFF_JOINT_RAD = 1e-5, 1e-4
-"""Maximum distance [m] and angle [rad] of a given link pose from the one that its joint admits: rounding of tracks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,188 +199,6 @@ class Chain:
             positions.append(positions[parent] + quat_rotate(quats[parent], offset))
             quats.append(quat_multiply(quats[parent], turn).expand(batch, 4))
         return torch.stack(positions, 1), torch.stack(quats, 1)
-
-
-def require_chains(world: World) -> None:
-    """Check that the chains of a world are trees of its links and can be simulated.
-
-    Raises:
-        InputDataError: If one is not, with the chain and the body or joint.
-        UsageError: If the world has effects or a contact law that do not act on links.
-    """
-    names = [joint.name for chain in world.chains for joint in chain.joints]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputDataError(f"several joints are called '{twice[0]}'.", todo="give each joint a name of its own.")
-    owner: dict[str, str] = {}
-    bodies = {body.name: body for body in world.bodies}
-    for chain in world.chains:
-        _require_tree(world, chain, bodies, owner)
-    for name, body in bodies.items():
-        if body.motion == "link" and name not in owner:
-            raise InputDataError(f"{world.called(f'body {name!r}')} is a link of no chain.", todo="add it to a chain.")
-    if not world.chains:
-        return
-    if world.contact.name != "closed_form":
-        raise UsageError("the published contact law does not know jointed bodies.", "the contact law closed_form.")
-    acting = [active.effect.name for active in world.effects if active.effect.has("wrench")]
-    if acting:
-        raise UsageError(
-            f"the effect '{acting[0]}' acts on free bodies alone, and this world has jointed ones.",
-            "effects of contact, of gravity and of the measurement.",
-            "leave the effect out.",
-        )
-
-
-def _require_tree(world: World, chain: Chain, bodies: Mapping[str, Body], owner: dict[str, str]) -> None:
-    place = world.called(f"chain '{chain.name}'")
-    if chain.base not in BASES:
-        raise InputDataError(f"{place}: its base is '{chain.base}'.", ", ".join(BASES) + ".")
-    seen: list[str] = []
-    for link, parent in zip(chain.links, ("", *(joint.parent for joint in chain.joints)), strict=True):
-        if link not in bodies or bodies[link].motion != "link":
-            raise InputDataError(f"{place}: '{link}' is not a body with motion \"link\" of this world.")
-        if link in owner:
-            raise InputDataError(f"{place}: '{link}' is carried by two joints: a loop.", "a tree of links.")
-        if parent and parent not in seen:
-            raise InputDataError(
-                f"{place}: '{link}' hangs on '{parent}', which is not among the links before it.",
-                "a tree of links, parents before children.",
-            )
-        owner[link] = chain.name
-        seen.append(link)
-    if not chain.joints or (chain.base != "free" and not chain.moving):
-        raise InputDataError(f"{place}: none of its joints moves.", todo="take a driven or fixed body instead.")
-    _require_inertia(place, chain, bodies)
-
-
-def _require_inertia(place: str, chain: Chain, bodies: Mapping[str, Body]) -> None:
-    """Check that each joint that moves has something to move: mass below it, reflected inertia or damping."""
-    heavy = {name: bool((bodies[name].mass > 0).all()) for name in chain.links}
-    for index, joint in enumerate(chain.moving):
-        below = [name for name, row in zip(chain.links, chain.above, strict=True) if row[index]]
-        own = joint.armature + joint.damping + joint.stiffness
-        if not any(heavy[name] for name in below) and not bool((own > 0).all()):
-            raise InputDataError(
-                f"{place}: joint '{joint.name}' moves links without mass and has no inertia of its own.",
-                "a link with mass, or reflected inertia, damping or servo gain above 0.",
-            )
-    if chain.base == "free" and not heavy[chain.root]:
-        raise InputDataError(f"{place}: its free root '{chain.root}' has no mass.", "a mass above 0 kg.")
-
-
-def joints_of(world: World, state: State, chain: Chain) -> tuple[Tensor, Tensor]:
-    """Return values [rad or m] and speeds (B, joints) of the moving joints of a chain, from the poses of its links.
-
-    A hinge's value is the one in the middle of its limits, where it has two, plus or minus half a turn; else between
-    minus and plus half a turn.
-
-    Raises:
-        InputDataError: If a link is not where its joint admits it, with the environment.
-    """
-    rows = [world.body_names.index(name) for name in chain.links]
-    values, speeds = [], []
-    for joint, row, up in zip(chain.joints, rows[1:], chain.parents[1:], strict=True):
-        parent = rows[up]
-        position, quat, velocity = (x[:, row] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
-        above, turn = state.position_m[:, parent], state.quat_wxyz[:, parent]
-        offset = quat_rotate(quat_conjugate(turn), position - above) - joint.position
-        turned = quat_multiply(quat_conjugate(joint.quat_wxyz), quat_multiply(quat_conjugate(turn), quat))
-        value = _value(joint, offset, turned)
-        _require_joint(joint, offset, turned, value)
-        if joint.kind == "fixed":
-            continue
-        omega = quat_rotate(turn, state.omega_body_rad_s[:, parent])
-        axis = quat_rotate(quat, joint.axis)
-        if joint.kind == "hinge":
-            speed = (axis * (quat_rotate(quat, state.omega_body_rad_s[:, row]) - omega)).sum(-1)
-        else:
-            carried = state.velocity_m_s[:, parent] + cross(omega, position - above)
-            speed = (axis * (velocity - carried)).sum(-1)
-        values.append(value)
-        speeds.append(speed)
-    if not values:
-        nothing = state.position_m.new_zeros(state.position_m.shape[0], 0)
-        return nothing, nothing
-    return torch.stack(values, -1), torch.stack(speeds, -1)
-
-
-def _value(joint: Joint, offset: Tensor, turned: Tensor) -> Tensor:
-    """Return the value (B,) of a joint from the link's offset and turn against its place at value 0."""
-    if joint.kind == "slide":
-        return (quat_rotate(joint.quat_wxyz, joint.axis) * offset).sum(-1)
-    along = (turned[:, 1:] * joint.axis).sum(-1)
-    value = 2 * torch.atan2(along, turned[:, 0])
-    middle = 0.5 * (joint.lower + joint.upper)
-    middle = torch.where(torch.isfinite(middle), middle, torch.zeros_like(middle)).detach()
-    return value - 2 * math.pi * torch.round((value.detach() - middle) / (2 * math.pi))
-
-
-def _require_joint(joint: Joint, offset: Tensor, turned: Tensor, value: Tensor) -> None:
-    with torch.no_grad():
-        if joint.kind == "slide":
-            offset = offset - quat_rotate(joint.quat_wxyz, joint.axis) * value[:, None]
-        elif joint.kind == "hinge":
-            turned = quat_multiply(turned, quat_exp(-joint.axis * value[:, None]))
-        far = offset.square().sum(-1).sqrt() / OFF_JOINT_M
-        angle = 2 * turned[:, 1:].square().sum(-1).sqrt() / OFF_JOINT_RAD
-        wrong = ((far > 1) | (angle > 1)).nonzero()
-        if len(wrong):
-            item = int(wrong[0, 0])
-            raise InputDataError(
-                f"the start of environment {item}: link '{joint.link}' is "
-                f"{1e3 * OFF_JOINT_M * float(far[item]):.3g} mm and "
-                f"{OFF_JOINT_RAD * float(angle[item]):.3g} rad off its joint '{joint.name}'.",
-                f"up to {1e3 * OFF_JOINT_M:g} mm and {OFF_JOINT_RAD:g} rad.",
-                "make the start with with_joints.",
-            )
-
-
-def with_joints(
-    world: World,
-    state: State,
-    values: Mapping[str, float | Tensor],
-    speeds: Mapping[str, float | Tensor] | None = None,
-) -> State:
-    """Return a state in which the links of all chains are where the joints put them.
-
-    Args:
-        world: The world.
-        state: Poses and velocities of the other bodies and of the roots, shapes (B, nb, ...).
-        values: Values by joint name [rad or m], numbers or shape (B,); 0 for joints that are left out.
-        speeds: Speeds by joint name [rad/s or m/s]; 0 for joints that are left out.
-
-    Raises:
-        UsageError: If a name is not that of a joint that moves.
-    """
-    known = [name for chain in world.chains for name in chain.joint_names]
-    unknown = [name for given in (values, speeds or {}) for name in given if name not in known]
-    if unknown:
-        raise UsageError(f"there is no moving joint '{unknown[0]}'.", ", ".join(known) + ".")
-    for chain in world.chains:
-        state = _posed(world, state, chain, values, speeds or {})
-    return state
-
-
-def _posed(
-    world: World, state: State, chain: Chain, values: Mapping[str, float | Tensor], speeds: Mapping[str, float | Tensor]
-) -> State:
-    rows = [world.body_names.index(name) for name in chain.links]
-    like = state.position_m
-    columns = []
-    for given in (values, speeds):
-        parts = [torch.as_tensor(given.get(name, 0.0)).to(like).reshape(-1) for name in chain.joint_names]
-        batch = max([like.shape[0], *(len(part) for part in parts)])
-        columns.append(torch.stack([part.expand(batch) for part in parts], -1) if parts else like.new_zeros(batch, 0))
-    value, speed = columns
-    root = rows[0]
-    position, quat = chain.poses(state.position_m[:, root], state.quat_wxyz[:, root], value)
-    first = (state.velocity_m_s[:, root], quat_rotate(state.quat_wxyz[:, root], state.omega_body_rad_s[:, root]))
-    linear, omega = link_velocities(chain, position, quat, first, speed)
-    fields = [x.expand(position.shape[0], -1, -1).clone() for x in state.tensors]
-    for field, values_ in zip(fields, (position, quat, linear, quat_rotate(quat_conjugate(quat), omega)), strict=True):
-        field[:, rows] = values_
-    return type(state)(*fields)
 
 
 def link_velocities(

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import cross, quat_conjugate, quat_rotate
-from .chain import Chain, joints_of
+from .chain import Chain
 from .chain_dynamics import ChainDynamics, ChainMotion, Kick, target_of
+from .chain_state import joints_of
 from .impulse_solver import Rows
 from .joint_command import JointCommand
 from .joint_rows import JointRows

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from ...geometry.rotation import quat_rotate
-from ..chain import Chain, joints_of
+from ..chain import Chain
+from ..chain_state import joints_of
 from ..joint_command import JointCommand
 from ..world import State, World
 

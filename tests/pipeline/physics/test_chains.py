@@ -11,8 +11,9 @@ import torch
 from cgwm.pipeline.geometry.rotation import cross, quat_rotate
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, State, World, simulate
-from cgwm.pipeline.physics.chain import Chain, Joint, joints_of, require_chains, with_joints
+from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Place
+from cgwm.pipeline.physics.chain_state import joints_of, require_chains, with_joints
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.schemas import InputDataError, UsageError

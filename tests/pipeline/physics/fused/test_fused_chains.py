@@ -9,7 +9,8 @@ import pytest
 import torch
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, Rollout, State, World, simulate
-from cgwm.pipeline.physics.chain import Chain, Joint, with_joints
+from cgwm.pipeline.physics.chain import Chain, Joint
+from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.fused.packing import reason_against
