@@ -33,7 +33,7 @@ DATASETS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("files", ("io",)),
     ("files", ("shapes",)),
     ("files", ("capture",)),
-    ("formats", ("importers", "models", "rollouts", "synthetic")),
+    ("formats", ("importers", "models", "robots", "rollouts", "synthetic")),
     ("formats", ("exports",)),
 )
 """Floors of `datasets/`, the lowest first."""
