@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion
 
 from ...datasets.shapes import meshes
 from ...datasets.shapes.meshes import Mesh
@@ -52,6 +51,8 @@ def mesh_volume(mesh: Mesh, resolution: int = 72) -> Volume:
     """Convert a closed mesh to a grid with about `resolution` points along its longest side."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     pitch = float((high - low).max()) / (resolution - 6)
+    from scipy.ndimage import binary_erosion
+
     # An irrational shift keeps rays off vertices and edges, where parity is ambiguous.
     origin = low - pitch * (3 + np.array([0.3178, 0.2361, 0.1417]))
     shape = tuple(int(n) for n in np.ceil((high - origin) / pitch).astype(int) + 4)

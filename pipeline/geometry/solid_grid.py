@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import KDTree
 
 Array = NDArray[Any]
@@ -128,6 +127,8 @@ def crossings(field: Array, origin: Array, pitch: float) -> Array:
 
 def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
     """Return the distance [m] from each grid point to the nearest surface point, shape (X, Y, Z)."""
+    from scipy.ndimage import distance_transform_edt
+
     cells = np.clip(np.rint((surface - origin) / pitch).astype(int), 0, np.array(shape) - 1)
     representative = np.full(shape, -1)
     representative[tuple(cells.T)] = np.arange(surface.shape[0])
@@ -142,5 +143,7 @@ def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: f
 
 
 def _interpolate(values: Array, origin: Array, pitch: float, points: Array) -> Array:
+    from scipy.ndimage import map_coordinates
+
     coordinates = ((points - origin) / pitch).T
     return map_coordinates(values, coordinates, order=1, mode="nearest")

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 
 from ..optimization.uncertainty import REACH, student_quantile
 from ..physics.contact_law import ContactLaw
@@ -266,6 +265,8 @@ def _found_noise(flights: Sequence[_Flight]) -> _Noise:
         # exponential priors, in the logarithms
         prior += 2 * (noise.lift_m_s2 / LIFT_MEAN - x[3] + noise.shaken_m / SHAKEN_MEAN - x[4])
         return _Solved.of(some, noise).cost + prior
+
+    from scipy.optimize import minimize
 
     ends = []
     for shaken in (SHAKEN_MEAN, MUCH_SHAKEN):  # the likelihood may have a maximum with and one without

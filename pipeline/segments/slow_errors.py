@@ -20,7 +20,6 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
 
 from ...datasets.io.progress import note
@@ -362,6 +361,8 @@ def _climbed(
             return -contrasts.likelihood(_decoded(z, kinds, level))
         except RuntimeError:  # a covariance that is singular to rounding is not one of measurements
             return 1e12
+
+    from scipy.optimize import minimize
 
     options = {"maxfev": STEPS, "xatol": 0.03, "fatol": 0.1}
     ends = [minimize(cost, np.array(start), method="Nelder-Mead", options=options) for start in starts]

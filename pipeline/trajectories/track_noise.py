@@ -50,13 +50,17 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
         if flying and track.quat_wxyz is None:
             window = max(LONG_FRAMES, round(LONG_S / float(np.median(np.diff(track.time_s)))))
             window, degree = min(window, len(track.time_s)), 3
-        for first in range(0, len(track.time_s) - window + 1, max(window // 2, 1)):
-            rows = slice(first, first + window)
-            t = track.time_s[rows] - track.time_s[rows].mean()
-            positions.append(_residual(t, track.position_m[rows][:, moves(track.position_m)], degree).ravel())
-            if track.quat_wxyz is not None:
-                turn = Rotation.from_quat(track.quat_wxyz[rows], scalar_first=True)
-                rotations.append(_residual(t, (turn[WINDOW // 2].inv() * turn).as_rotvec(), degree).ravel())
+        first = np.arange(0, len(track.time_s) - window + 1, max(window // 2, 1))
+        if not len(first):
+            continue
+        rows = first[:, None] + np.arange(window)
+        t = track.time_s[rows] - track.time_s[rows].mean(1, keepdims=True)
+        positions.append(_residuals(t, track.position_m[:, moves(track.position_m)][rows], degree).ravel())
+        if track.quat_wxyz is not None:
+            turn = Rotation.from_quat(track.quat_wxyz, scalar_first=True)
+            middle = turn[np.repeat(rows[:, WINDOW // 2], window)]
+            turned = (middle.inv() * turn[rows.ravel()]).as_rotvec().reshape(*rows.shape, 3)
+            rotations.append(_residuals(t, turned, degree).ravel())
     return Noise(max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD))
 
 
@@ -66,11 +70,18 @@ def moves(position_m: np.ndarray) -> np.ndarray:
     return changes if changes.any() else np.ones(3, bool)
 
 
-def _residual(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
-    """Return the residuals of a polynomial, scaled for the degrees of freedom that it uses."""
-    basis = np.vander(t, degree + 1)
-    residual = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
-    return residual * np.sqrt(len(t) / (len(t) - degree - 1))
+def _residuals(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
+    """Return the residuals (W, n, k) of polynomials of windows, scaled for the degrees of freedom that they use.
+
+    Args:
+        t: Times from the mean of each window [s], shape (W, n).
+        values: What the polynomials follow, shape (W, n, k).
+        degree: Of the polynomials.
+    """
+    basis = np.linalg.qr((t / np.abs(t).max(1, keepdims=True))[..., None] ** np.arange(degree + 1))[0]
+    residuals = values - basis @ (basis.mT @ values)
+    count = t.shape[1]
+    return residuals * np.sqrt(count / (count - degree - 1))
 
 
 def _spread(residuals: list[np.ndarray]) -> float:
