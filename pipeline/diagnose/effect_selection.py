@@ -230,6 +230,8 @@ def _equals(
 def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode: NDArray[np.int64]) -> list[Evidence]:
     """Return the equals with the rivals that are not worse in most episodes, the simplest of all first.
 
+    Simplest is what acts alone, then what has the fewest parameters: a wind acts through a drag, a tilt does not.
+
     Beside slow errors a difference counts where it is the same from episode to episode (a paired t-test): no model of
     such errors is exact, and a misfit of one episode is one error, not one in each frame.
 
@@ -250,7 +252,13 @@ def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode
         # what the better one gains by its further parameters in the data that they are fitted to is no evidence
         if float(own.mean()) - max(more, 0) / len(own) <= LIMITS.paired_t * error:
             found.append(other)
-    return sorted(found, key=lambda e: (len(e.candidate.effect.parameters), e.delta_bic, e.name))
+    return sorted(found, key=_complexity)
+
+
+def _complexity(one: Evidence) -> tuple[bool, int, float, str]:
+    """Return what equals are ordered by: whether they act through another effect, their parameters, and BIC."""
+    bic = math.inf if one.delta_bic is None else one.delta_bic
+    return "drag" in one.candidate.effect.needs, len(one.candidate.effect.parameters), bic, one.name
 
 
 def _contains(

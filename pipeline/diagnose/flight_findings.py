@@ -33,7 +33,7 @@ from .coupled_effects import DRAGS
 from .cross_validation import held_out_loss
 from .effect_selection import SelectionStep
 from .falsification import Consistency, consistency
-from .flight_search import flight_search
+from .flight_search import flight_search, reselected
 from .group_values import with_group_values
 from .own_tilt import TILTS, own_tilt_step, own_tilts
 from .thresholds import THRESHOLDS
@@ -180,7 +180,13 @@ def _searched(
     steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
     steps, after_flight, flight = _with_own_tilts(prepared, steps, after_flight, flight, candidates, slow)
     if flight is not None and slow is not None:
-        steps, after_flight, flight = _with_the_needed(steps, after_flight, flight)
+        needed, after_flight, flight = _with_the_needed(steps, after_flight, flight)
+        if len(needed) < len(steps):  # rivals in the presence of what has gone are none beside what stands
+            common = [step for step in needed if step.flagged and step.own_std is None]
+            own = [step for step in needed if step not in common]
+            found = (after_flight, flight)
+            needed, after_flight, flight = reselected(prepared, common, own, found, candidates, scatter)
+        steps = needed
     if flight is not None and slow is not None:
         steps, after_flight, flight = with_group_values(prepared, steps, after_flight, flight, candidates, scatter)
     prepared, quick = prepared.with_own(after_flight), quick.with_own(after_flight)

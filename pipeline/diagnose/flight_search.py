@@ -46,7 +46,7 @@ def flight_search(
     coupled = _coupled(prepared, world, steps, candidates, scatter)
     if coupled is not None and held_out_loss(coupled[2], coupled[1]) < losses[0]:
         return coupled
-    return _reselected(prepared, steps, current, flight, candidates, scatter)
+    return reselected(prepared, steps[:-1], steps[-1:], (current, flight), candidates, scatter)
 
 
 def _forward_selection(
@@ -81,18 +81,28 @@ def _forward_selection(
     return steps, losses, current, flight
 
 
-def _reselected(
+def reselected(
     prepared: Prepared,
     steps: Sequence[SelectionStep],
-    current: World,
-    flight: Segments,
+    others: Sequence[SelectionStep],
+    found: tuple[World, Segments],
     candidates: Sequence[Candidate],
     scatter: float,
 ) -> tuple[list[SelectionStep], World, Segments]:
-    """Select each effect but the last again, in the presence of the effects selected after it."""
+    """Select each of some effects again, in the presence of all the others that are selected now.
+
+    Args:
+        prepared: The episodes.
+        steps: The steps that are taken again.
+        others: The other steps, which stay.
+        found: World with all selected effects, and the flight segments with states fitted by it.
+        candidates: All candidates.
+        scatter: Factor by which variances exceed those of the noise.
+    """
+    current, flight = found
     chosen = list(steps)
-    for place in range(len(chosen) - 1):
-        without = without_effect(current, chosen[place].best.name)
+    for place, old in enumerate(steps):
+        without = without_effect(current, old.best.name)
         if len(without.effects) < len(current.effects) - 1:
             continue  # another effect acts through this one
         states = fit_states(flight.in_world(without))
@@ -101,7 +111,7 @@ def _reselected(
         if refitted is not None:
             chosen[place] = step
             current, flight = refitted.world, refitted.segments[0]
-    return chosen, current, flight
+    return [*chosen, *others], current, flight
 
 
 def _coupled(

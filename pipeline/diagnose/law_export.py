@@ -90,8 +90,7 @@ def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False, presen
     """
     require_law_file(path, overwrite)
     law = result.residual_law
-    known = {term for name in (*result.selected, *present) for term in SELECTED_TERMS.get(name, ())}
-    terms = () if law is None else tuple(term for term in law.terms if term.term not in known)
+    terms = () if law is None else further_terms(law, (*result.selected, *present))
     if law is None or not terms:
         what = "has no residual law" if law is None else "leaves a residual that follows none of the known terms"
         raise InputDataError(
@@ -104,6 +103,12 @@ def save_law(result: DiagnoseResult, path: Path, overwrite: bool = False, presen
         with new_file(path, "effect", overwrite) as partial:
             partial.write_text(source, encoding="utf-8")
     return f"{path}:{CLASS}"
+
+
+def further_terms(law: ResidualLaw, effects: Sequence[str]) -> tuple[LawTerm, ...]:
+    """Return the terms of a law that belong to none of the effects with these names."""
+    known = {term for name in effects for term in SELECTED_TERMS.get(name, ())}
+    return tuple(term for term in law.terms if term.term not in known)
 
 
 def law_source(law: ResidualLaw, path: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from ...schemas import ResidualLaw
 from ..report.page import listed
 from ..segments.prepare import Prepared
+from .law_export import further_terms
 from .verdict import Findings
 
 _ORGANISED = {
@@ -43,7 +44,7 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
-    return f"Missing: {named}.{_apart(findings)}{_rest(findings)}"
+    return f"Missing: {named}.{_apart(findings)}{_rest(findings, law)}"
 
 
 def _own(findings: Findings) -> str:
@@ -70,16 +71,35 @@ def _apart(findings: Findings) -> str:
     return "".join(words)
 
 
-def _rest(findings: Findings) -> str:
-    """Return what is left beside the selected effects."""
+def _rest(findings: Findings, law: ResidualLaw | None) -> str:
+    """Return what is left beside the selected effects, and the law of the residual, which can be added with them."""
     if not findings.remaining:
         return ""
+    names = [one.evidence.candidate.spec for one in findings.chosen]
+    names += [active.effect.name for active in findings.base.effects]
+    further = () if law is None else further_terms(law, names)
+    if not further:
+        return _left(findings)
+    terms = listed([f"{term.coefficient:.3g} {term.unit} [{term.term}]" for term in further])
+    return (
+        f"{_left(findings, True)} A law describes a part of it: {terms}; `--save-law FILE.py` makes an effect of it "
+        "that is added in the same step."
+    )
+
+
+def _left(findings: Findings, law: bool = False) -> str:
+    """Return what is left beside the selected effects.
+
+    Args:
+        findings: The findings.
+        law: Whether a law describes a part of it, which is then no error of the tracking alone.
+    """
     found = findings.flight
     if found.repeats and found.left is not None:
         share = f"{100 * found.common_share:.0f} % of what repeats from episode to episode is explained"
         what = "a constant force" if found.left.coordinate == "constant" else f"a force by {found.left.coordinate}"
         return f" In addition, something remains unexplained: {share}, and {what} remains."
-    if found.slow is not None:
+    if found.slow is not None and not law:
         return (
             " In addition, something remains unexplained; it differs from episode to episode, as errors of the "
             "tracking do."

@@ -47,7 +47,7 @@ class Refit:
     covariance: Tensor
     """Covariance in fitted coordinates, shape (P, P)."""
     segments: tuple[Segments, ...]
-    """The parts, with their states."""
+    """The parts, with their states, in the world with the estimates."""
     cost: float
     """Chi2 of flight, plus rho of the excess of contact, plus the priors."""
     by_segment: tuple[Tensor, ...]
@@ -94,15 +94,16 @@ def refit(
     states = [part.observations.state for part in problem.parts]
     point = Point(values=values[None], states=State.joined(*states).tensors)
     end = descend(problem, point, policy)
-    columns = None
+    found = world
     if parameters:
         columns = torch.stack([p.decode(end.point.values[0, k]) for k, p in enumerate(parameters)])[None]
+        found = apply_parameters(world, parameters, columns)
     return Refit(
-        world=world if columns is None else apply_parameters(world, parameters, columns),
+        world=found,
         parameters=tuple(parameters),
         values=end.point.values[0],
         covariance=torch.linalg.pinv(end.information()[0], hermitian=True),
-        segments=tuple(part for part, _ in problem.at(end.point)),
+        segments=tuple(part.in_world(found) for part, _ in problem.at(end.point)),
         cost=float(end.cost[0]),
         by_segment=end.item_cost.split(problem.sizes),
     )

@@ -1,12 +1,18 @@
 """Slow errors of the tracks: they are found in whole flights, are no effect, and hide none that repeats."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose import flight_findings
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep, _with_unproven, select_next
+from cgwm.pipeline.diagnose.evidence import Evidence
+from cgwm.pipeline.diagnose.flight_findings import _searched, _without
 from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.pictures import effect_picture
 from cgwm.pipeline.diagnose.remaining import remaining_of
@@ -14,12 +20,14 @@ from cgwm.pipeline.diagnose.rest_tilts import rests_confirm  # pyright: ignore[r
 from cgwm.pipeline.diagnose.verdict import Findings, find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects import load_effect
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments.candidates import Candidate
-from cgwm.pipeline.segments.prepare import prepare, whole_flights
+from cgwm.pipeline.segments.prepare import Prepared, prepare, whole_flights
 from cgwm.pipeline.segments.repeated_forces import repeated_force  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.residual_wrench import ResidualWrenches
-from cgwm.pipeline.segments.slow_errors import moving  # pyright: ignore[reportMissingImports]
-from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, axis_innovations  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.segments.segments import Segments
+from cgwm.pipeline.segments.slow_errors import SlowErrors, moving  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel, axis_innovations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.segmentation import Segment
 from helpers.diagnosis_data import tosses, world_with
 
@@ -99,6 +107,51 @@ def test_a_drag_is_named_beside_slow_errors_with_the_right_number() -> None:
     assert [one.evidence.name for one in named.chosen] == ["linear_drag"]
     estimate, error = named.chosen[0].evidence.estimates["c"]
     assert abs(estimate - 0.3) < 3 * error and error < 0.03
+
+
+def test_rivals_in_the_presence_of_an_effect_that_has_gone_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside another drag, what is left of a drag may be a scale of gravity; without that one it may not."""
+
+    def both(prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float):
+        flight, steps = prepared.flight, []
+        assert flight is not None
+        for name in ("quadratic_drag", "linear_drag"):
+            step = select_next(flight, world, [Candidate(name, load_effect(name))], prepared.groups, False, scatter)
+            refitted = step.best.refitted
+            assert refitted is not None
+            steps.append(step)
+            world, flight = refitted.world, refitted.segments[0]
+        other = Candidate("gravity_scale", load_effect("gravity_scale"))
+        steps[-1] = replace(steps[-1], equals=(steps[-1].best, replace(steps[-1].best, candidate=other)))
+        return steps, world, flight
+
+    def the_last(steps: list[SelectionStep], world: World, flight: Segments):
+        return steps[1:], *_without(flight, world, {"quadratic_drag"})
+
+    monkeypatch.setattr(flight_findings, "flight_search", both)
+    monkeypatch.setattr(flight_findings, "_with_the_needed", the_last)
+    flying = tosses(world_with("ball", {"linear_drag": {"c": 0.3}}, False), 2, count=4, duration_s=0.6)
+    world = world_with("ball", ground=False)
+    errors = NoiseModel(position=CorrelatedNoise(share=0.5, time_s=0.02, slow=1.0, slow_time_s=0.2))
+    prepared = prepare(world, flying).with_slow_noise(world, errors)
+    slow = SlowErrors(errors, errors, evidence=100.0, sway_evidence=0.0)
+    left = _searched(prepared, prepared, world, LIBRARY, slow)
+    assert [[one.name for one in step.equals] for step in left.steps] == [["linear_drag"]]
+    remaining = remaining_of(left)
+    # with the drag: the noise of three coordinates; without it, centimetres
+    assert remaining is not None and remaining.position_rms_m < 3 * prepared.noise.position_m
+
+
+def test_of_rivals_the_one_that_acts_alone_comes_first() -> None:
+    """A wind acts through a drag, and a tilt without one: it is no simpler, however well it fits."""
+
+    def rival(name: str, bic: float) -> Evidence:
+        refitted = SimpleNamespace(by_segment=[torch.tensor([1.0, 2.0, 3.0])])
+        return cast(Evidence, SimpleNamespace(candidate=Candidate(name, load_effect(name)), name=name,
+                                              refitted=refitted, delta_bic=bic))  # fmt: skip
+
+    wind, tilt = rival("wind", -2.0), rival("gravity_tilt", -1.0)
+    assert _with_unproven([wind], [wind, tilt], np.arange(3)) == [tilt, wind]
 
 
 def test_a_tilt_that_differs_from_episode_to_episode_is_named_as_such() -> None:
