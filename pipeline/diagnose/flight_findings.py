@@ -88,20 +88,34 @@ class FlightFindings:
         return is_significant(self.after) or self.repeats or self.own_law is not None
 
     @property
+    def explained_share(self) -> float:
+        """Share of the excess of the omnibus statistic over 1 that the selected effects explain."""
+        if self.before is None or self.after is None or self.before.statistic <= 1:
+            return 0.0
+        return 1 - (self.after.statistic - 1) / (self.before.statistic - 1)
+
+    @property
     def repeats(self) -> bool:
         """Whether a residual repeats from episode to episode beside the selected effects."""
         return self.left is not None and self.left.p_value < LIMITS.repeated_p
+
+    @property
+    def differs(self) -> bool:
+        """Whether what is left differs from episode to episode and follows nothing, as slow errors of the tracking."""
+        return self.slow is not None and not self.repeats and self.own_law is None
 
     @property
     def doubtful(self) -> bool:
         """Whether the selected effects imitate something else.
 
         Their parameters change from episode to episode, their law is another one, a law of any form explains more of
-        what repeats than they do, or what differs from episode to episode follows a law of the motion.
+        what repeats than they do, or what differs from episode to episode follows a law of the motion and they do not
+        explain nearly all that the model lacks.
         """
         inconsistent = self.agreement is not None and self.agreement.doubtful
         imitated = self.repeats and self.common_share < LIMITS.common_share
-        follows = self.own_law is not None
+        most = bool(self.in_flight) and self.explained_share >= LIMITS.enough_share
+        follows = self.own_law is not None and not most
         return inconsistent or imitated or follows or any(one.better for one in self.others)
 
 
@@ -119,18 +133,17 @@ def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candi
     slow, law = _told_slow_errors(prepared, found.world, candidates)
     if slow is None:
         return replace(found, own_law=law)
-    found = _searched(prepared.with_slow_noise(world, slow.noise_model), prepared, world, candidates, slow)
+    found = _searched(prepared.with_slow_noise(world, slow.noise_model), prepared, world, candidates, slow, law)
     by_group = [p.name.partition(".")[0] for p in effect_parameters(found.world) if p.shared == "group"]
     if not by_group or not set(by_group) - {active.effect.name for active in world.effects}:
-        return replace(found, own_law=law)
+        return found
     # what groups have of their own counted as slow errors of the tracks, and hid which effect it is
     beside, own_law = _told_slow_errors(
         prepared.with_own(found.world), found.world, candidates, not set(by_group) & set(TILTS)
     )
     if beside is None:
-        return replace(found, own_law=law)
-    found = _searched(prepared.with_slow_noise(world, beside.noise_model), prepared, world, candidates, beside)
-    return replace(found, own_law=own_law)
+        return found
+    return _searched(prepared.with_slow_noise(world, beside.noise_model), prepared, world, candidates, beside, own_law)
 
 
 def _told_slow_errors(
@@ -162,7 +175,12 @@ def _slow_errors(prepared: Prepared, world: World, candidates: Sequence[Candidat
 
 
 def _searched(
-    prepared: Prepared, quick: Prepared, world: World, candidates: Sequence[Candidate], slow: SlowErrors | None
+    prepared: Prepared,
+    quick: Prepared,
+    world: World,
+    candidates: Sequence[Candidate],
+    slow: SlowErrors | None,
+    own_law: str | None = None,
 ) -> FlightFindings:
     """Return the findings under the noise of prepared episodes.
 
@@ -173,6 +191,7 @@ def _searched(
         world: The model's world.
         candidates: All candidates.
         slow: The slow errors.
+        own_law: What accelerations that differ from episode to episode follow.
     """
     windows = flight_windows(prepared, world)
     scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
@@ -200,8 +219,9 @@ def _searched(
         names = [name for name in names if name not in better]
         others = [one for one in others if one.effect not in better]
     agreement = None if flight is None else consistency(flight, after_flight, names, prepared.groups, scatter)
-    if flight is not None and slow is not None and agreement is not None and agreement.doubtful:
-        steps, after_flight, flight = _without_contradicted(prepared, steps, after_flight, flight, scatter)
+    followed = own_law is not None
+    if flight is not None and slow is not None and agreement is not None and (agreement.doubtful or followed):
+        steps, after_flight, flight = _without_contradicted(prepared, steps, after_flight, flight, scatter, followed)
         names = [step.best.name for step in steps if step.flagged and step.own_std is None]
         agreement = consistency(flight, after_flight, names, prepared.groups, scatter)
         others = [one for one in others if one.effect in names]
@@ -219,6 +239,7 @@ def _searched(
         others=tuple(others),
         left=left,
         common_share=share,
+        own_law=own_law,
     )
 
 
@@ -263,11 +284,12 @@ def _with_the_needed(
 
 
 def _without_contradicted(
-    prepared: Prepared, steps: list[SelectionStep], world: World, flight: Segments, scatter: float
+    prepared: Prepared, steps: list[SelectionStep], world: World, flight: Segments, scatter: float, followed: bool
 ) -> tuple[list[SelectionStep], World, Segments]:
     """Leave out the effects whose parameters differ from episode to episode, where flights do not ask for them.
 
-    Such an effect imitates something else; where what is left without it does not exceed the noise, the others stand.
+    Such an effect imitates something else; the others stand where what is left without it does not exceed the noise,
+    or is known to be a force that differs from episode to episode (`followed`).
     """
     names = [step.best.name for step in steps if step.flagged and step.own_std is None]
     alone = {name: consistency(flight, world, [name], prepared.groups, scatter) for name in names}
@@ -276,7 +298,7 @@ def _without_contradicted(
     if not wrong or not kept:
         return steps, world, flight
     other, fitted = _without(flight, world, wrong)
-    if is_significant(worst_omnibus(flight_windows(prepared, other), scatter)):
+    if not followed and is_significant(worst_omnibus(flight_windows(prepared, other), scatter)):
         return steps, world, flight
     return kept, other, fitted
 

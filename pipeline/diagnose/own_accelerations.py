@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optimization.uncertainty import f_tail
+from ..optimization.uncertainty import chi2_tail, f_tail
 from ..segments.residual_wrench import ResidualWrenches
 from .thresholds import THRESHOLDS
 
@@ -25,6 +25,10 @@ Array = NDArray[np.float64]
 QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 FEWEST = 4
 """Minimum number of episodes: fewer leave less than two degrees of freedom beside a law."""
+
+
+UPWARD = "upward"
+"""Name of what accelerations follow that differ along gravity as much as across it, as a lift does."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,6 +43,8 @@ class OwnAccelerations:
     """Index of the episode of each piece, shape (n,)."""
     motion: dict[str, Array]
     """Level vectors (n, 2) that a force could follow, by name; the first is the velocity."""
+    upward: tuple[Array, Array] | None = None
+    """Score and information (n,) of the acceleration along gravity, which no tilt changes; None where unknown."""
 
     @staticmethod
     def of(found: ResidualWrenches, level: Sequence[int]) -> OwnAccelerations:
@@ -57,6 +63,7 @@ class OwnAccelerations:
             information=found.information[:, axes][:, :, axes],
             episode=np.array([item.episode for item in found.segments]),
             motion={name: vector[:, axes] for name, vector in vectors.items()},
+            upward=_upward(found, axes),
         )
 
     def held_out_gains(self, std_m_s2: float) -> Array:
@@ -86,11 +93,31 @@ class OwnAccelerations:
         values = self.by_episode()
         if len(values) < FEWEST:
             return None
+        if self._is_upward(values):
+            return UPWARD
         means = {name: self._mean(vector) for name, vector in self.motion.items()}
         found = {name: _followed_p(values, vector) for name, vector in means.items()}
         found["heading"] = _polarised_p(values, means["velocity"])
         name = min(found, key=lambda one: found[one])
         return name if len(found) * found[name] < LIMITS.repeated_p else None
+
+    def _is_upward(self, values: Array) -> bool:
+        """Return whether episodes differ along gravity, too, by no less than across it (E, 2) beyond chance.
+
+        A tilt of gravity by an angle a changes it by g a across and by g a^2 / 2 along.
+        """
+        if self.upward is None:
+            return False
+        units = [self.episode == episode for episode in np.unique(self.episode)]
+        score, information = (np.array([part[own].sum() for own in units]) for part in self.upward)
+        if not (information > 0).all():
+            return False
+        own, count = score / information, len(units)
+        mean = float(score.sum() / information.sum())
+        if chi2_tail(float((information * (own - mean) ** 2).sum()), count - 1) > LIMITS.repeated_p:
+            return False
+        level = float(values.var(0, ddof=1).mean())
+        return f_tail(level / float(own.var(ddof=1)), 2 * (count - 1), count - 1) > LIMITS.repeated_p
 
     def by_episode(self) -> Array:
         """Return the acceleration (E, 2) of each episode [m/s2]."""
@@ -104,6 +131,15 @@ class OwnAccelerations:
     def _mean(self, vectors: Array) -> Array:
         """Return the mean of vectors (n, 2) in each episode (E, 2)."""
         return np.array([vectors[self.episode == episode].mean(0) for episode in np.unique(self.episode)])
+
+
+def _upward(found: ResidualWrenches, level: Sequence[int]) -> tuple[Array, Array] | None:
+    """Return score and information (n,) of accelerations along the one axis that is not level; None without one."""
+    up = [axis for axis in range(3) if axis not in level]
+    if len(up) != 1:
+        return None
+    information = found.information[:, up[0], up[0]]
+    return information * found.wrench[:, up[0]], information
 
 
 def _followed_p(values: Array, vectors: Array) -> float:

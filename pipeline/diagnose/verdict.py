@@ -10,7 +10,6 @@ from ...datasets.io.progress import note
 from ..physics.world import World
 from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import Omnibus
 from ..segments.sliding_fit import StartedSliding
 from .alternative_laws import OtherLaw
 from .contact_search import TESTS, Chosen, ContactFindings, with_contact
@@ -107,12 +106,13 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
     """Return the verdict from the selected effects and the findings in flight.
 
     Without slow errors all that is left in flight is physics, and the effects have to explain nearly all of it. Beside
-    slow errors they have to explain what repeats from episode to episode.
+    slow errors they have to explain what repeats from episode to episode: what does not is an error of the tracking,
+    of which no model is exact, or cannot be told from one.
     """
-    too_little = is_significant(flown.after) and _explained(flown.before, flown.after) < LIMITS.enough_share
+    too_little = is_significant(flown.after) and flown.explained_share < LIMITS.enough_share
     if flown.doubtful or (flown.slow is None and too_little):
         return "unexplained"
-    if not chosen and flown.remains:
+    if not chosen and flown.remains and not flown.differs:
         return "unexplained"
     if any(len(one.equals) > 1 for one in chosen):
         return "not_separable"
@@ -145,13 +145,6 @@ def _errors(contact: ContactFindings, flown: FlightFindings) -> dict[str, tuple[
         if segments is not None and one.evidence.name in present:
             errors[one.evidence.name] = held_out_errors(segments, contact.world, one.evidence.name)
     return errors
-
-
-def _explained(before: Omnibus | None, after: Omnibus | None) -> float:
-    """Return the share of the excess of the omnibus statistic over 1 that the selected effects explain."""
-    if before is None or after is None or before.statistic <= 1:
-        return 0.0
-    return 1 - (after.statistic - 1) / (before.statistic - 1)
 
 
 def _ranking(chosen: Sequence[Chosen], steps: Sequence[SelectionStep], contact: Sequence[Evidence]) -> list[Evidence]:

@@ -6,8 +6,10 @@ from ...schemas import ResidualLaw
 from ..report.page import listed
 from ..segments.prepare import Prepared
 from .law_export import further_terms
+from .own_accelerations import UPWARD
 from .verdict import Findings
 
+_DIFFERS = " Something is left in flight; it differs from episode to episode, as errors of the tracking do."
 _ORGANISED = {
     "constant": "In these flights, one constant force explains more of it than any coordinate does.",
     "time": "It changes most clearly with the time within an episode.",
@@ -35,7 +37,7 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     """
     names = [c.evidence.candidate.spec for c in findings.chosen]
     if findings.verdict == "none_missing":
-        return "Nothing is missing that these data could show."
+        return f"Nothing is missing that these data could show.{_DIFFERS if findings.remaining else ''}"
     if findings.verdict == "unexplained":
         where = f" {organised(law.where)}" if law is not None else ""
         return f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
@@ -54,6 +56,11 @@ def _own(findings: Findings) -> str:
         return ""
     if law == "episode":
         return " Each episode is pushed in another direction; more episodes tell a tilt of each from a force."
+    if law == UPWARD:
+        return (
+            " Each episode is pushed in another direction, upwards or downwards, too, which no tilt does, but the lift "
+            "of a spin: measure the spin."
+        )
     return f" Each episode is pushed in another direction, which follows its {law}."
 
 
@@ -79,11 +86,11 @@ def _rest(findings: Findings, law: ResidualLaw | None) -> str:
     names += [active.effect.name for active in findings.base.effects]
     further = () if law is None else further_terms(law, names)
     if not further:
-        return _left(findings)
+        return f"{_left(findings)}{_own(findings)}"
     terms = listed([f"{term.coefficient:.3g} {term.unit} [{term.term}]" for term in further])
     return (
-        f"{_left(findings, True)} A law describes a part of it: {terms}; `--save-law FILE.py` makes an effect of it "
-        "that is added in the same step."
+        f"{_left(findings, True)}{_own(findings)} A law describes a part of it: {terms}; `--save-law FILE.py` makes "
+        "an effect of it that is added in the same step."
     )
 
 
@@ -99,7 +106,7 @@ def _left(findings: Findings, law: bool = False) -> str:
         share = f"{100 * found.common_share:.0f} % of what repeats from episode to episode is explained"
         what = "a constant force" if found.left.coordinate == "constant" else f"a force by {found.left.coordinate}"
         return f" In addition, something remains unexplained: {share}, and {what} remains."
-    if found.slow is not None and not law:
+    if found.slow is not None and not law and found.own_law is None:
         return (
             " In addition, something remains unexplained; it differs from episode to episode, as errors of the "
             "tracking do."

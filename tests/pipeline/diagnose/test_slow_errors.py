@@ -17,14 +17,14 @@ from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright
 from cgwm.pipeline.diagnose.pictures import effect_picture
 from cgwm.pipeline.diagnose.remaining import remaining_of
 from cgwm.pipeline.diagnose.rest_tilts import rests_confirm  # pyright: ignore[reportMissingImports]
-from cgwm.pipeline.diagnose.verdict import Findings, find
+from cgwm.pipeline.diagnose.verdict import Findings, _verdict, find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import Prepared, prepare, whole_flights
-from cgwm.pipeline.segments.repeated_forces import repeated_force  # pyright: ignore[reportMissingImports]
-from cgwm.pipeline.segments.residual_wrench import ResidualWrenches
+from cgwm.pipeline.segments.repeated_forces import RepeatedForce, repeated_force  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.segments.residual_wrench import Omnibus, ResidualWrenches
 from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.segments.slow_errors import SlowErrors, moving  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel, axis_innovations  # pyright: ignore[reportMissingImports]
@@ -107,6 +107,20 @@ def test_a_drag_is_named_beside_slow_errors_with_the_right_number() -> None:
     assert [one.evidence.name for one in named.chosen] == ["linear_drag"]
     estimate, error = named.chosen[0].evidence.estimates["c"]
     assert abs(estimate - 0.3) < 3 * error and error < 0.03
+    # beside a force that differs from episode to episode, what explains nearly all stands, and nothing else does
+    assert not replace(named.flight, own_law="heading").doubtful
+    assert replace(named.flight, own_law="heading", steps=()).doubtful
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_what_differs_from_episode_to_episode_beside_slow_errors_is_no_missing_physics(repeats: bool) -> None:
+    """No model of slow errors is exact: those of smoothed tracks exceed it in every episode, each in its own way."""
+    silent = found({}).flight
+    law = RepeatedForce(coordinate="x", frame="world", gains=(9.0, 10.0, 11.0) if repeats else (-9.0, 10.0, -11.0))
+    errors = SlowErrors(NoiseModel(), NoiseModel(), evidence=100.0, sway_evidence=0.0)
+    left = replace(silent, slow=errors, left=law, after=Omnibus(3.0, 100.0, 1e-9), common_share=float(not repeats))
+    assert left.remains and _verdict((), left) == ("unexplained" if repeats else "none_missing")
+    assert _verdict((), replace(left, slow=None, left=None)) == "unexplained"
 
 
 def test_rivals_in_the_presence_of_an_effect_that_has_gone_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,7 +202,9 @@ def test_what_repeats_is_told_from_what_each_episode_has_of_its_own(own: bool, r
         assert law.coordinate == "x" and law.frame == "world"
 
 
-@pytest.mark.parametrize(("kind", "law"), [("tilts", None), ("heading", "heading"), ("place", "place")])
+@pytest.mark.parametrize(
+    ("kind", "law"), [("tilts", None), ("heading", "heading"), ("place", "place"), ("lift", "upward")]
+)
 def test_what_is_of_each_episode_s_own_is_told_from_a_law_of_its_motion(kind: str, law: str | None) -> None:
     rng = np.random.default_rng(7)
     count, each = 8, 4
@@ -197,16 +213,20 @@ def test_what_is_of_each_episode_s_own_is_told_from_a_law_of_its_motion(kind: st
     across = np.stack((-np.sin(heading), np.cos(heading)), 1)
     own = {
         "tilts": 0.3 * rng.standard_normal((count, 2)),
+        "lift": 0.3 * rng.standard_normal((count, 2)),
         "heading": np.sin(2 * heading)[:, None] * across,
         "place": 0.5 - 2 * place,
     }[kind]
     measured = np.repeat(own, each, 0) + 0.02 * rng.standard_normal((count * each, 2))
     information = np.tile(np.eye(2) / 0.02**2, (count * each, 1, 1))
+    upward = np.repeat(0.3 * rng.standard_normal(count) * (kind == "lift"), each)
+    upward += 0.02 * rng.standard_normal(count * each)
     found = OwnAccelerations(
         score=measured / 0.02**2,
         information=information,
         episode=np.repeat(np.arange(count), each),
         motion={"velocity": np.repeat(along, each, 0), "place": np.repeat(place, each, 0)},
+        upward=(upward / 0.02**2, np.full(count * each, 1 / 0.02**2)),
     )
     assert found.law() == law
     # each piece is predicted by the others of its episode, but not where the push changes within it
