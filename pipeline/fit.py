@@ -19,6 +19,7 @@ from ..datasets.models.effect_files import effect_file
 from ..datasets.models.finished import finished_model
 from ..datasets.models.fit_inputs import input_hashes, motion_inputs, photo_inputs, versions
 from ..datasets.models.model import Model, read_model, write_model
+from ..datasets.shapes.surfaces import stored
 from ..schemas import (
     Body,
     BodyModel,
@@ -327,10 +328,12 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
             )
         )
     world = capture.manifest.world
+    meshes = capture.surface_meshes()
     file = ModelFile(
         gravity_m_s2=world.gravity_m_s2,
         ground=world.ground,
         bodies=tuple(bodies),
+        surfaces=tuple(stored(one, meshes.get(one.name), f"{one.name}.obj") for one in capture.manifest.surfaces),
         parameters=tuple(
             p
             for body, fitted in zip(capture.manifest.bodies, bodies, strict=True)
@@ -344,6 +347,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
         file=file,
         body_splats={name: body.visual for name, body in scene.bodies.items() if body.visual is not None},
         collision={name: body.collision for name, body in scene.bodies.items()},
+        surface_meshes=meshes,
         scene=scene.scene,
         fit=FitFile(stages={"sg-gs": scene.record}),
         cameras=scene.cameras,

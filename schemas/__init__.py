@@ -5,7 +5,6 @@ from .calibration import CalibrationAttempt, CalibrationReport, ImageVerdict, Pa
 from .cameras import CAMERAS_FORMAT, CameraIntrinsics, CamerasFile, PosedImage, PosedVideo, Scale
 from .capture import (
     CAPTURE_FORMAT,
-    QUATERNION_NORM_TOLERANCE,
     Body,
     BoxShape,
     Calibration,
@@ -20,7 +19,6 @@ from .capture import (
     MaterialPair,
     Measurement,
     PhotoBox,
-    Pose,
     Shape,
     SphereShape,
     Video,
@@ -122,7 +120,9 @@ from .model import (
 )
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
+from .pose import QUATERNION_NORM_TOLERANCE, Pose
 from .results import EpisodeErrors, ErrorSummary, EvalResult, KeptOutput
+from .surfaces import Surface
 from .validation import Failure, ValidationReport
 from .view import ViewReport
 
@@ -252,6 +252,7 @@ __all__ = [
     "SphereShape",
     "SplatCheck",
     "SplatConfig",
+    "Surface",
     "SynthesizeConfig",
     "ThrowGrid",
     "ThrowsFile",

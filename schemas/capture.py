@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from .base import FileModel
 from .materials import pair_of, repeated
+from .pose import Pose
 from .quantities import (
     ContactTime,
     Coordinate,
@@ -23,24 +24,12 @@ from .quantities import (
     Position3,
     Vector3,
 )
+from .surfaces import Surface
 
 CAPTURE_FORMAT = "cgwm-capture/1"
-QUATERNION_NORM_TOLERANCE = 1e-3
-"""A quaternion whose norm is off by no more than this is normalised; by more, it is refused."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=120)]
 Pixel = Annotated[float, Field(ge=-1e6, le=1e6)]
-
-
-def unit_quaternion(quat_wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Return the normalised quaternion; refuse one whose norm is off by more than the tolerance."""
-    norm = math.sqrt(sum(value * value for value in quat_wxyz))
-    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
-        raise ValueError(
-            f"the quaternion has norm {norm:.4f}; it must be 1 within {QUATERNION_NORM_TOLERANCE:g} (order w, x, y, z)"
-        )
-    w, x, y, z = (value / norm for value in quat_wxyz)
-    return w, x, y, z
 
 
 def physical_inertia(value: tuple[float, ...]) -> tuple[float, ...]:
@@ -64,18 +53,6 @@ def _positive_definite(xx: float, yy: float, zz: float, products: Vector3) -> bo
     minor = xx * yy - xy * xy
     determinant = zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz
     return min(xx, yy, zz, minor, determinant) > 0
-
-
-class Pose(FileModel):
-    """A rigid pose: position [m] and unit quaternion (w, x, y, z)."""
-
-    position_m: Position3 = (0.0, 0.0, 0.0)
-    quat_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-
-    @field_validator("quat_wxyz")
-    @classmethod
-    def _unit(cls, value: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-        return unit_quaternion(value)
 
 
 class Ground(FileModel):
@@ -313,6 +290,7 @@ def _require_known_materials(manifest: CaptureManifest) -> None:
         raise ValueError(f"two [[materials]] have the name '{twice}'; names must differ")
     ground = manifest.world.ground
     named = [(f"body '{body.name}'", body.material) for body in manifest.bodies]
+    named += [(f"surface '{surface.name}'", surface.material) for surface in manifest.surfaces]
     named += [("[world].ground", None if ground is None else ground.material)]
     named += [("[[pairs]]", name) for pair in manifest.pairs for name in pair.materials]
     for where, name in named:
@@ -334,6 +312,8 @@ class CaptureManifest(FileModel):
     """Materials that bodies and ground may have."""
     pairs: tuple[MaterialPair, ...] = ()
     """Contact parameters of pairs of materials, as far as they are known."""
+    surfaces: tuple[Surface, ...] = ()
+    """Fixed surfaces besides the ground."""
     measurement: Measurement = Measurement()
     splits: dict[Name, tuple[str, ...]] = {}
     episodes: dict[str, Episode] = {}
@@ -347,6 +327,9 @@ class CaptureManifest(FileModel):
         if twice:
             raise ValueError(f"two bodies have the name '{twice[0]}'; names must differ")
         _require_known_materials(self)
+        again = repeated([*names, *(surface.name for surface in self.surfaces)])
+        if again is not None:
+            raise ValueError(f"two surfaces, or a body and a surface, have the name '{again}'; names must differ")
         for split, episodes in self.splits.items():
             if len(set(episodes)) != len(episodes):
                 raise ValueError(f"split '{split}' names an episode twice")

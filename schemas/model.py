@@ -21,6 +21,7 @@ from .quantities import (
     RadiusFactor,
     Step,
 )
+from .surfaces import Surface
 
 MODEL_FORMAT = "cgwm-model/1"
 
@@ -237,6 +238,8 @@ class ModelFile(FileModel):
     gravity_m_s2: Gravity = (0.0, 0.0, -9.81)
     ground: Ground | None = None
     bodies: tuple[BodyModel, ...]
+    surfaces: tuple[Surface, ...] = ()
+    """Fixed surfaces besides the ground; height fields are stored as meshes."""
     contact: ContactParameters | None = None
     """None until the stage phys-geo has run; the law of all contacts that `pairs` does not have."""
     pairs: tuple[PairContact, ...] = ()
@@ -273,6 +276,7 @@ class ModelFile(FileModel):
     def _once(self) -> ModelFile:
         for what, names in (
             ("bodies have", (body.name for body in self.bodies)),
+            ("bodies or surfaces have", (one.name for one in (*self.bodies, *self.surfaces))),
             ("parameters have", (parameter.name for parameter in self.parameters)),
             # one effect acts once, however its values are shared
             ("effects have", (effect.name.partition("@")[0] for effect in self.effects)),

@@ -98,6 +98,7 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
     attempt(_check_names, capture)
     for body in capture.manifest.bodies:
         attempt(_check_shape, capture, body.name)
+    attempt(capture.surface_meshes)
     _check_files(capture, faults)
     sizes: dict[str, tuple[int, int]] = {}
     photos = listed(capture.photos)

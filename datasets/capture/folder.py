@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
 from ...schemas.documents import shortened
 from ...schemas.regular_files import real_path, require_regular_file
+from ..shapes.meshes import Mesh, read_mesh
+from ..shapes.surfaces import surface_meshes
 from .cameras import Camera, camera_of
 from .files import entries_of, files_under, has_folder, optional_file
 from .geometry_maps import GeometryMaps, read_maps
@@ -62,6 +65,37 @@ class CaptureFolder:
         raise UsageError(
             f"{self.root / 'capture.toml'}: no body '{name}'.", legal + "." + did_you_mean(name, self.body_names)
         )
+
+    def surface_meshes(self) -> Mapping[str, Mesh]:
+        """Return the triangles of the fixed surfaces that are meshes or height fields, by name.
+
+        Raises:
+            InputDataError: As `read_surface`, or if a file lies outside the capture.
+        """
+        manifest = self.root / "capture.toml"
+        for surface in self.manifest.surfaces:
+            shape = surface.mesh or surface.height_field
+            if shape is not None and not real_path(self.root / shape.path).is_relative_to(real_path(self.root)):
+                raise InputDataError(
+                    f"{manifest}: [[surfaces]] '{surface.name}': path '{shape.path}' lies outside the capture.",
+                    "a file of the capture directory.",
+                    "copy the file into it.",
+                )
+        return surface_meshes(self.manifest.surfaces, self.root, self._largest_body_m())
+
+    def _largest_body_m(self) -> float | None:
+        """Return the diameter of the largest body whose shape the manifest or a mesh gives [m]; None without one."""
+        sizes = []
+        for body in self.manifest.bodies:
+            shape = body.shape
+            if shape is not None and shape.box is not None:
+                sizes.append(2 * math.hypot(*shape.box.half_extents_m))
+            elif shape is not None and shape.sphere is not None:
+                sizes.append(2 * shape.sphere.radius_m)
+            elif shape is not None and shape.mesh is not None:
+                corners = read_mesh(self.root / shape.mesh.path).vertices
+                sizes.append(float(np.linalg.norm(np.ptp(corners, axis=0))))
+        return max(sizes, default=None)
 
     def shape_file(self, body: Body) -> Path | None:
         """Return the file of a body's mesh or splats, which must lie inside the capture; None without one."""

@@ -13,11 +13,15 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from ...schemas import BodyModel, ContactParameters, ModelFile
+from ...schemas.surfaces import Surface
 from ..capture.cameras import Camera
+from ..shapes.meshes import Mesh
 from .model import Model
 
 MIN_DAMPING_RATIO = 1e-3
 """Minimum damping ratio that is written, because MuJoCo's solref divides by it."""
+HALF_SHEET_M = 1e-3
+"""Half the thickness of rectangles, and depth of the wedges behind triangles, which MuJoCo needs to be solid [m]."""
 IMPEDANCE = 0.99
 """d of solimp; the penetration at rest in MuJoCo is (1 - d) g tau^2 / number of contacts."""
 
@@ -66,6 +70,8 @@ def write_mjcf(
         normal = np.asarray(file.ground.normal)
         place = {"pos": _text(normal * file.ground.offset_m), "zaxis": _text(normal)}
         ET.SubElement(world, "geom", name="ground", type="plane", size="0 0 1").attrib.update(place)
+    for surface in file.surfaces:
+        _add_surface(root, world, surface, model)
     for body in file.bodies:
         _add_body(world, body, model)
     for name, camera in (cameras or {}).items():
@@ -114,6 +120,41 @@ def _contact(contact: ContactParameters | None) -> dict[str, str]:
         "solref": _text((contact.contact_time_s / zeta, zeta)),
         "solimp": _text((IMPEDANCE, IMPEDANCE, 0.001)),
     }
+
+
+def _add_surface(root: ET.Element, world: ET.Element, surface: Surface, model: Model) -> None:
+    """Add a fixed surface as a geom; each triangle of a mesh is one, as MuJoCo makes meshes convex."""
+    place = {"pos": _text(surface.pose.position_m), "quat": _text(surface.pose.quat_wxyz)}
+    mesh = model.surface_meshes.get(surface.name)
+    if mesh is not None:
+        _add_triangles(root, world, surface.name, place, mesh)
+        return
+    if surface.half_space is not None:
+        shape = {"type": "plane", "size": "0 0 1"}
+    elif surface.cylinder is not None:
+        shape = {"type": "cylinder", "size": _text((surface.cylinder.radius_m, surface.cylinder.half_length_m))}
+    elif surface.box is not None:
+        shape = {"type": "box", "size": _text(surface.box.half_extents_m)}
+    else:
+        half = surface.rectangle.half_extents_m if surface.rectangle is not None else (1.0, 1.0)
+        shape = {"type": "box", "size": _text((*half, HALF_SHEET_M))}
+    ET.SubElement(world, "geom", {"name": surface.name, **shape, **place})
+
+
+def _add_triangles(root: ET.Element, world: ET.Element, name: str, place: dict[str, str], mesh: Mesh) -> None:
+    """Add triangles as thin wedges, with their backs behind the mesh."""
+    asset = root.find("asset")
+    asset = ET.SubElement(root, "asset") if asset is None else asset
+    corners = mesh.corners()
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    backs = corners.mean(1) - 2 * HALF_SHEET_M * normals
+    parent = ET.SubElement(world, "body", {"name": f"{name}_surface", **place})
+    for index, (triangle, back) in enumerate(zip(corners, backs, strict=True)):
+        label = f"{name}_{index}"
+        ET.SubElement(asset, "mesh", name=label, vertex=_text(np.concatenate((triangle.ravel(), back))))
+
+        ET.SubElement(parent, "geom", name=label, type="mesh", mesh=label)
 
 
 def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from ..capture.cameras import require_rigid
 from ..capture.tracks import Track, read_tracks, write_tracks
 from ..io.atomic import new_directory
 from ..io.kinds import refuse_other_kind
+from ..shapes.meshes import Mesh
 from ..shapes.ply import Splats, read_splats, write_splats
+from ..shapes.surfaces import obj_text, stored, surface_meshes
 from .agreement import require_agreement
 from .effect_files import pack_effects, unpack_effects
 
@@ -36,6 +39,8 @@ class Model:
     """Collision spheres by body, body frame, of which only centres and scales are used; the visual spheres if the model
     has no others.
     """
+    surface_meshes: Mapping[str, Mesh] = field(default_factory=dict)
+    """Triangles of the fixed surfaces that are meshes, in the frame of the surface, by name."""
     scene: Splats | None = None
     """Background spheres, world frame, or None."""
     fit: FitFile = field(default_factory=FitFile)
@@ -86,6 +91,9 @@ def read_model(path: Path | str) -> Model:
         if body.collision is not None:
             collision[body.name] = read_splats(_inside(root, body.collision))
     require_agreement(file, collision, root / "model.json")
+    for surface in file.surfaces:
+        if surface.mesh is not None:
+            _inside(root, surface.mesh.path)
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
     fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
     pictures = {name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()}
@@ -99,6 +107,7 @@ def read_model(path: Path | str) -> Model:
         file=file,
         body_splats=body_splats,
         collision=collision,
+        surface_meshes=surface_meshes(file.surfaces, root),
         scene=scene,
         fit=fit,
         cameras=cameras,
@@ -123,10 +132,16 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
         update = {"splats": names[0] if visual else None, "collision": names[1] if colliding else None}
         bodies.append(body.model_copy(update=update))
     scene = None if model.scene is None else "scene.ply"
-    file = model.file.model_copy(update={"bodies": tuple(bodies), "scene": scene})
+    meshes = {name: (_free_name(name, ".obj", taken), mesh) for name, mesh in model.surface_meshes.items()}
+    surfaces = tuple(
+        stored(one, model.surface_meshes.get(one.name), meshes.get(one.name, ("",))[0]) for one in model.file.surfaces
+    )
+    file = model.file.model_copy(update={"bodies": tuple(bodies), "scene": scene, "surfaces": surfaces})
     with new_directory(path, "model", overwrite) as directory:
         for name, splats in files:
             write_splats(directory / name, splats, "body")
+        for name, mesh in meshes.values():
+            (directory / name).write_text(obj_text(mesh), encoding="utf-8")
         if model.scene is not None:
             write_splats(directory / "scene.ply", model.scene, "world")
         if model.cameras is not None:

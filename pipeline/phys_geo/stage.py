@@ -12,6 +12,7 @@ from ...datasets.capture.video import video_info
 from ...datasets.io.progress import note
 from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
+from ...datasets.shapes.surfaces import stored
 from ...schemas import (
     BodyModel,
     FitFile,
@@ -60,7 +61,7 @@ def fit_motion(
     """
     _require_fittable(model, capture, config)
     require_known_pairs(capture, split)
-    ready = replace(model, file=_physics_start(model, capture, config))
+    ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
     started = time.perf_counter()
     found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
     found = replace(found, warnings=(*found.warnings, *found.record.unconverged(), *warnings))
@@ -114,6 +115,15 @@ def _of_materials(bodies: Sequence[BodyModel], capture: Capture) -> tuple[BodyMo
     """Return the bodies with the materials of the capture."""
     materials = {body.name: body.material for body in capture.manifest.bodies}
     return tuple(body.model_copy(update={"material": materials.get(body.name)}) for body in bodies)
+
+
+def _with_surfaces(model: Model, capture: Capture) -> Model:
+    """Return the model with the fixed surfaces of the capture, where it has any; an earlier model may lack them."""
+    if not capture.manifest.surfaces:
+        return model
+    meshes = capture.surface_meshes()
+    surfaces = tuple(stored(one, meshes.get(one.name), f"{one.name}.obj") for one in capture.manifest.surfaces)
+    return replace(model, file=model.file.model_copy(update={"surfaces": surfaces}), surface_meshes=meshes)
 
 
 def _fitted_motion(

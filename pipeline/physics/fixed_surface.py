@@ -8,12 +8,19 @@ which a sphere is pushed out the shortest way. A rectangle and an open mesh are 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from ..geometry.rotation import quat_to_matrix
+from .mesh_topology import Topology
 from .surface_mesh import MESH_CONTACTS, SurfaceMesh
+
+if TYPE_CHECKING:
+    from ...datasets.shapes.meshes import Mesh
+    from ...schemas.surfaces import Surface
 
 KINDS = ("half_space", "box", "cylinder", "mesh")
 """Kinds by number, as the kernels know them; a rectangle is a box without thickness."""
@@ -96,3 +103,24 @@ def _corner_distance(past: Tensor) -> tuple[Tensor, Tensor]:
     depth, nearest = past.max(-1)
     into = torch.nn.functional.one_hot(nearest, past.shape[-1]).to(past)
     return torch.where(apart, size, depth), torch.where(apart[..., None], outside / size[..., None], into)
+
+
+def shape_of(entry: Surface) -> tuple[int, tuple[float, float, float]]:
+    """Return kind and size [m] of a surface of a model, as `FixedSurface` has them."""
+    if entry.rectangle is not None:
+        return BOX, (*entry.rectangle.half_extents_m, 0.0)
+    if entry.box is not None:
+        return BOX, entry.box.half_extents_m
+    if entry.cylinder is not None:
+        return CYLINDER, (entry.cylinder.radius_m, entry.cylinder.radius_m, entry.cylinder.half_length_m)
+    return (HALF_SPACE if entry.half_space is not None else MESH), (0.0, 0.0, 0.0)
+
+
+def surface_mesh(mesh: Mesh, entry: Surface) -> SurfaceMesh:
+    """Return the triangles of a surface of a model with their neighbours; those of one mesh are found once."""
+    return _surface_mesh(mesh, entry.mesh is not None and entry.mesh.inside != "none", entry.name)
+
+
+@lru_cache(16)
+def _surface_mesh(mesh: Mesh, solid: bool, name: str) -> SurfaceMesh:
+    return SurfaceMesh(Topology.of(mesh.vertices, mesh.faces, solid=solid, name=name))

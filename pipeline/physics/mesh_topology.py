@@ -7,13 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import InputDataError
+from ...datasets.shapes.surfaces import require_areas
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-LEAST_HEIGHT = 1e-9
-"""Least height of a triangle in units of its longest side; below, it is degenerate."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +48,7 @@ class Topology:
         """
         vertices, faces = _joined(vertices, faces)
         corners = vertices[faces]
-        _require_areas(corners, name)
+        require_areas(corners, name)
         edges = _Edges.of(vertices, faces)
         start, count, ways = _ways(vertices, faces, edges)
         return Topology(
@@ -62,14 +59,6 @@ class Topology:
             way_start=start,
             way_count=count,
         )
-
-
-def is_closed(faces: Indices) -> bool:
-    """Return whether every edge of triangles (F, 3) is passed once in each direction."""
-    half = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    base = int(faces.max()) + 1
-    forward, backward = half[:, 0] * base + half[:, 1], half[:, 1] * base + half[:, 0]
-    return len(np.unique(forward)) == len(forward) and bool(np.array_equal(np.sort(forward), np.sort(backward)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,20 +90,6 @@ def _joined(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     """Return a mesh whose vertices at one place are joined."""
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     return unique, inverse.reshape(-1)[faces]
-
-
-def _require_areas(corners: Array, name: str) -> None:
-    sides = np.roll(corners, -1, 1) - corners
-    longest = np.linalg.norm(sides, axis=2).max(1)
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    wrong = np.flatnonzero(~(area > LEAST_HEIGHT * longest**2))
-    if len(wrong):
-        place = ", ".join(f"{x:g}" for x in corners[wrong[0], 0])
-        raise InputDataError(
-            f"{name}: {len(wrong)} of {len(corners)} triangles are degenerate, the first at ({place}) m.",
-            "triangles with an area.",
-            "clean the mesh (remove degenerate faces) and export it again.",
-        )
 
 
 def _ways(vertices: Array, faces: Indices, edges: _Edges) -> tuple[Indices, Indices, Array]:

@@ -109,7 +109,8 @@ class SurfaceMesh:
             Distances (Q, MESH_CONTACTS) [m], infinite where there is no contact, and features (Q, MESH_CONTACTS),
             triangle * FEATURES + feature, in both sorted along `ORDER`.
         """
-        reach = radii.clamp_min(self.cell_m) + margin
+        # from inside a solid, the way out may be longer than the radius
+        reach = (radii.clamp_min(self.cell_m) if self.solid else radii) + margin
         distance = centers.new_full((len(centers), MESH_CONTACTS), torch.inf)
         feature = torch.zeros_like(distance, dtype=torch.int64)
         low, high = (torch.as_tensor(x).to(centers) for x in self.bounds)

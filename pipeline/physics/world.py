@@ -17,7 +17,7 @@ from .chain import Chain
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
-from .fixed_surface import FixedSurface
+from .fixed_surface import FixedSurface, shape_of, surface_mesh
 from .paper_law import PaperLaw
 from .smooth_distance import plane_contacts
 
@@ -256,6 +256,7 @@ class World:
 
         ground = file.ground
         world = World(
+            surfaces=_surfaces(model, tensor),
             bodies=tuple(bodies),
             gravity=tensor(file.gravity_m_s2),
             ground_normal=tensor(ground.normal)[0] if ground else None,
@@ -346,6 +347,25 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         on_plane=on_plane,
         material=entry.material,
     )
+
+
+def _surfaces(model: Model, tensor: Callable[[object], Tensor]) -> tuple[FixedSurface, ...]:
+    """Return the fixed surfaces of a model; `tensor` as in :func:`_body`."""
+    found = []
+    for entry in model.file.surfaces:
+        kind, size = shape_of(entry)
+        found.append(
+            FixedSurface(
+                name=entry.name,
+                kind=kind,
+                position=tensor(entry.pose.position_m),
+                quat_wxyz=tensor(entry.pose.quat_wxyz),
+                size=tensor(size),
+                material=entry.material,
+                mesh=None if entry.mesh is None else surface_mesh(model.surface_meshes[entry.name], entry),
+            )
+        )
+    return tuple(found)
 
 
 def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:

@@ -11,7 +11,6 @@ import torch
 from cgwm.pipeline.physics import engine, simulate
 from cgwm.pipeline.physics.contact_detection import Placed
 from cgwm.pipeline.physics.fixed_surface import FixedSurface
-from cgwm.pipeline.physics.mesh_topology import is_closed
 from cgwm.pipeline.physics.surface_detection import all_surface_points
 from cgwm.schemas import InputDataError
 from helpers import fixed_surfaces as fixed
@@ -107,15 +106,6 @@ def test_a_height_field_is_solid_below() -> None:
 def test_degenerate_triangles_are_refused() -> None:
     with pytest.raises(InputDataError, match="mesh: 1 of 1 triangles are degenerate, the first at"):
         fixed.mesh_surface([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
-
-
-def test_closed_meshes_are_known() -> None:
-    _, faces = fixed.box_mesh((1, 1, 1), pieces=1)
-    vertices, _ = fixed.box_mesh((1, 1, 1), pieces=1)
-    faces = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces]
-    assert is_closed(faces)
-    assert not is_closed(faces[1:])
-    assert not is_closed(np.concatenate((faces[:-1], faces[-1:, ::-1])))
 
 
 @pytest.mark.parametrize("kind", ["planes", "mesh"])

@@ -158,7 +158,7 @@ INLINE int cell_of(Number at, Number low, Number cell, int count) {
 
 // Finds the contacts of a sphere with a mesh; see `SurfaceMesh.features`.
 __device__ void find(const TriangleMesh& m, Point p, Number radius, Number margin, Searched& found) {
-    Number reach = greater(radius, m.cell) + margin;
+    Number reach = (m.solid ? greater(radius, m.cell) : radius) + margin;
     found.count = 0;
     found.inside = false;
     Point far_low = m.low - p, far_high = p - m.high;
