@@ -133,10 +133,10 @@ _CONTACTS = (
     _entry("contacts/body_a", "Index into bodies/names.", _PER_CONTACT, dtype="i4", low="0", high="B - 1"),
     _entry(
         "contacts/body_b",
-        "Index into bodies/names; -1 = the ground.",
+        "Index into bodies/names; -1 = the ground, -2 and below = the fixed surfaces of the model, in their order.",
         _PER_CONTACT,
         dtype="i4",
-        low="-1",
+        low="-1024",
         high="B - 1",
     ),
     _entry(

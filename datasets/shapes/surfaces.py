@@ -147,7 +147,7 @@ def _heights(path: Path) -> Array:
         if grid is None:
             raise InputDataError(f"{path}: the picture does not decode.", todo="export the height field again.")
         good = grid.ndim == 2 and min(grid.shape, default=0) >= 2
-        found, white = f"a picture of shape {grid.shape}", float(np.iinfo(grid.dtype).max)
+        found, white = f"a picture of shape {grid.shape}", float(np.iinfo(grid.dtype.name).max)
     else:
         raise InputDataError(f"{path}: a height field with the suffix '{path.suffix}'.", ".png or .npy.")
     if not good:

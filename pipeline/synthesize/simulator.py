@@ -174,6 +174,8 @@ def joined_worlds(worlds: Sequence[World]) -> World:
 def _joined(things: list[T]) -> T:
     first: Any = things[0]
     found: Any = first
+    if all(thing is first for thing in things):
+        return found
     if isinstance(first, Tensor):
         tensors: list[Any] = things
         found = _joined_tensors(tensors)

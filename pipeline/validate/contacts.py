@@ -50,7 +50,12 @@ def _check_distances(rollout: Rollout, model: Model) -> Iterator[Fault]:
     reach = np.array([_reach_m(model, name) for name in rollout.bodies])
     a, b, gap = contacts["body_a"], contacts["body_b"], contacts["distance"]
     off = np.zeros(len(gap))
-    on_ground = b < 0
+    on_ground, on_body = b == -1, b >= 0
+    least = -1 - len(model.file.surfaces)
+    if (b < least).any():
+        row = int(b.argmin())
+        text = f"contacts/body_b: frame {frame[row]}: {b[row]} is no surface of the model, whose last is {least}."
+        yield Fault(check="contacts", text=text, frame=int(frame[row]), body=rollout.bodies[a[row]])
     if model.file.ground is not None:
         given = (model.file.ground.offset_m, "m")
         offset_m = rollout.attributes.parameters.get("ground_offset_m", given)[0]
@@ -58,7 +63,7 @@ def _check_distances(rollout: Rollout, model: Model) -> Iterator[Fault]:
         off[on_ground] = (np.abs(gap - height) - REACH_SLACK * reach[a])[on_ground]
     both = REACH_SLACK * (reach[a] + reach[b])
     apart = np.linalg.norm(places[frame, a] - places[frame, b], axis=-1)
-    off[~on_ground] = (np.maximum(gap - apart, -gap) - both)[~on_ground]
+    off[on_body] = (np.maximum(gap - apart, -gap) - both)[on_body]
     if (off > 0).any():
         row = int(off.argmax())
         name = rollout.bodies[a[row]]

@@ -69,7 +69,7 @@ def has_usable_contacts(rollout: Rollout) -> bool:
     """Return whether each contact belongs to a frame, and to bodies that exist."""
     table, count = rollout.part("contacts"), len(rollout.bodies)
     a, b = table["body_a"], table["body_b"]
-    return _divides(rollout) and not ((a < 0) | (a >= count) | (b < -1) | (b >= count)).any()
+    return _divides(rollout) and not ((a < 0) | (a >= count) | (b >= count)).any()
 
 
 def _divides(rollout: Rollout) -> bool:

@@ -269,7 +269,7 @@ def other_settings(demo: h5py.Group) -> None:
         (far_contact, "m; where the bodies are, spheres of 'cube' miss that by 0."),
         (buried_contact, "m; where the bodies are, spheres of 'cube' miss that by 0."),
         (lost_contacts, "contacts/offsets: they do not divide"),
-        (wild_body, "contacts/body_b: frame 4: 7 is not among what is documented, -1 to B - 1, here at most 0"),
+        (wild_body, "contacts/body_b: frame 4: 7 is not among what is documented, -1024 to B - 1, here at most 0"),
         (crooked_normal, "contacts/normal_world: frame 4: a norm differs from 1 by 0.1"),
         (shifted_camera, "of its mask lies outside the projected body; the pose or the camera is wrong"),
         (opengl_camera, "of its mask lies outside the projected body; the pose or the camera is wrong"),
