@@ -121,10 +121,13 @@ def words_of(command: str) -> list[str]:
 
 
 def test_the_manifest_is_legal(tmp_path: Path) -> None:
-    text, materials = blocks("docs/capture.md", "toml")
+    text, *others = blocks("docs/capture.md", "toml")
+    materials, surfaces = sorted(others, key=lambda block: "[[surfaces]]" in block)
     path = tmp_path / "capture.toml"
     path.write_text('format = "cgwm-capture/1"\n' + materials)
     assert read_toml(path, CaptureManifest).pairs[0].friction == 0.3
+    path.write_text('format = "cgwm-capture/1"\n' + surfaces)
+    assert [surface.name for surface in read_toml(path, CaptureManifest).surfaces] == ["ramp", "post"]
     path.write_text(text)
     manifest = read_toml(path, CaptureManifest)
     assert manifest.bodies[0].mass_kg == 0.37
