@@ -44,6 +44,7 @@ from .physics.world import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
 from .runtime.device import resolve_device
 from .runtime.resources import enough_memory
+from .sg_gs.collision_spheres import fills_hull
 from .sg_gs.stage import SgGsResult, fit_scene
 
 Stage = Literal["all", "sg-gs", "phys-geo"]
@@ -325,6 +326,11 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
                 material=body.material,
                 collision_distance_m=found.collision_distance_m,
                 radius_factor=scene.radius_factor,
+                convex=fills_hull(
+                    np.asarray(found.collision.means, float),
+                    scene.radius_factor * np.asarray(found.collision.scales, float),
+                    found.mass_properties.volume_m3,
+                ),
             )
         )
     world = capture.manifest.world

@@ -147,6 +147,8 @@ class BodyModel(FileModel):
     """Material, by which its contacts with others have the laws of `pairs`; None for that of `contact`."""
     radius_factor: RadiusFactor = 2.0
     """Collision radius of a sphere in units of its Gaussian scale s."""
+    convex: bool = False
+    """Whether the body fills the convex hull of its colliding spheres; other bodies then touch that hull."""
 
     @field_validator("inertia_kg_m2")
     @classmethod

@@ -17,6 +17,7 @@ from torch.autograd import forward_ad
 
 from ..geometry.rotation import cross
 from .fixed_surface import HALF_SPACE
+from .hull import MOST_PLANES, Hull, hull_distance, parallel_face, parting
 from .smooth_distance import blended, log_sum_exp_distance, smooth_min
 from .world import Body, World
 
@@ -59,6 +60,11 @@ class Placed:
     def radii(self, chosen: Tensor | None = None) -> Tensor:
         """Return the radii (1 or n, N or K) [m] of its spheres, or of the chosen ones (n, K)."""
         return pick(self.body.radii, chosen)
+
+    def in_frame(self, position: Tensor) -> Tensor:
+        """Return positions (n, C, 3) [m] of the world in the body frame."""
+        origin = self.body.com if self.body.free else torch.zeros_like(self.body.com)
+        return (position - self.reference[:, None]) @ self.rotation + origin[:, None]
 
     def point_velocity(self, position: Tensor) -> Tensor:
         """Return the velocity (n, C, 3) [m/s] of its material points at `position` (n, C, 3)."""
@@ -159,7 +165,9 @@ def body_points(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | N
         step_s: Step [s], shape (n,).
         sharpness_per_m: beta [1/m] of the published log-sum-exp distance; None for the simplex smooth minimum.
     """
-    on_a, on_b = (_against_union(*order, step_s, sharpness_per_m) for order in ((a, b), (b, a)))
+    flat_a, flat_b = _flat_faces(a, b)
+    on_a = _against_union(a, b, step_s, sharpness_per_m, flat_a)
+    on_b = _against_union(b, a, step_s, sharpness_per_m, flat_b)
     count = b.body.radii.shape[-1]
     parts = []
     if on_a is not None:
@@ -171,7 +179,8 @@ def body_points(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | N
 
 def all_body_points(a: Placed, b: Placed) -> Points:
     """Return the points of all spheres of two bodies against the other body, touching or not, in slot order."""
-    on_a, on_b = _all_against_union(a, b), _all_against_union(b, a)
+    flat_a, flat_b = _flat_faces(a, b)
+    on_a, on_b = _all_against_union(a, b, flat_a), _all_against_union(b, a, flat_b)
     return _joined([replace(on_a, normal=-on_a.normal), replace(on_b, slot=on_b.slot + b.body.radii.shape[-1])])
 
 
@@ -179,15 +188,44 @@ def _joined(parts: Sequence[Points]) -> Points:
     return Points(*(torch.cat([getattr(part, name) for part in parts], 1) for name in Points.__dataclass_fields__))
 
 
-def _against_union(union: Placed, spheres: Placed, step_s: Tensor, sharpness_per_m: float | None) -> Points | None:
+@torch.no_grad()
+def _flat_faces(a: Placed, b: Placed) -> tuple[Tensor | None, Tensor | None]:
+    """Return the faces (n,) of two hulls that lie flat on each other, -1 for none; None where a body has no hull.
+
+    They are those parallel to the plane of one hull that parts it best from the other one.
+    """
+    first, second = a.body.hull, b.body.hull
+    if first is None or second is None or first.planes_against(second) > MOST_PLANES:
+        return None, None
+    a, b = a.plain(), b.plain()
+    height_a, out_of_a = _parting(a, first, b, second)
+    height_b, out_of_b = _parting(b, second, a, first)
+    axis = torch.where((height_b > height_a)[:, None], -out_of_b, out_of_a)[:, None]
+    return parallel_face(first, (axis @ a.rotation)[:, 0]), parallel_face(second, (-axis @ b.rotation)[:, 0])
+
+
+def _parting(near: Placed, hull: Hull, far: Placed, other: Hull) -> tuple[Tensor, Tensor]:
+    """Return how high (n,) [m] another hull lies over the plane that parts them best, and its normal (n, 3)."""
+    points = near.in_frame(far.centers()[:, other.supports])
+    height, normal = parting(hull, points, far.radii()[:, other.supports])
+    return height, (near.rotation @ normal[..., None]).squeeze(-1)
+
+
+def _against_union(
+    union: Placed, spheres: Placed, step_s: Tensor, sharpness_per_m: float | None, face: Tensor | None
+) -> Points | None:
     """Return the points of `spheres` that may touch `union` within a step; normals point out of the union."""
     softness = _softness(union, sharpness_per_m)
+    flat = _is_flat(union, sharpness_per_m)
     with torch.no_grad():
         surface, queries = union.plain(), spheres.plain()
         slot = _within(queries, surface, step_s, softness)
         if not slot.shape[1]:
             return None
-        distance = _sphere_distances(queries, surface, slot)
+        if flat:
+            distance = _to_hull(surface, queries.centers(slot), face)[0][..., None]
+        else:
+            distance = _sphere_distances(queries, surface, slot)
         reached = plain(step_s)[:, None] * _speed_bound(union, spheres)[:, None]
         depth = distance.amin(-1) - queries.radii(slot) - reached
         kept = _lowest(depth, ROUNDING_M + softness)
@@ -195,15 +233,49 @@ def _against_union(union: Placed, spheres: Placed, step_s: Tensor, sharpness_per
             return None
         near = depth.gather(1, kept) < ROUNDING_M + softness
         distance = distance.gather(1, kept[..., None].expand(-1, -1, distance.shape[-1]))
-    return _points_at(union, spheres, slot.gather(1, kept), near, distance, sharpness_per_m)
+    slot = slot.gather(1, kept)
+    if flat:
+        return _points_at_hull(union, spheres, slot, near, face)
+    return _points_at(union, spheres, slot, near, distance, sharpness_per_m)
 
 
-def _all_against_union(union: Placed, spheres: Placed) -> Points:
+def _all_against_union(union: Placed, spheres: Placed, face: Tensor | None) -> Points:
     """Return the points of all `spheres` at the surface of `union`; normals point out of the union."""
+    slot = torch.arange(spheres.body.radii.shape[-1], device=union.reference.device)
+    slot = slot.expand(union.reference.shape[0], -1)
+    near = torch.ones_like(slot, dtype=torch.bool)
+    if _is_flat(union, None):
+        return _points_at_hull(union, spheres, slot, near, face)
     with torch.no_grad():
         distance = _sphere_distances(spheres.plain(), union.plain(), None)
-    slot = torch.arange(spheres.body.radii.shape[-1], device=distance.device).expand(distance.shape[0], -1)
-    return _points_at(union, spheres, slot, torch.ones_like(slot, dtype=torch.bool), distance, None)
+    return _points_at(union, spheres, slot, near, distance, None)
+
+
+def _is_flat(union: Placed, sharpness_per_m: float | None) -> bool:
+    """Return whether a body is touched by its hull; the published distance is one to spheres."""
+    return union.body.hull is not None and sharpness_per_m is None
+
+
+def _to_hull(surface: Placed, points: Tensor, face: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the distances (n, K) [m] of points (n, K, 3) to the hull of a body, and its normals in the body frame."""
+    body = surface.body
+    if body.hull is None:
+        raise ValueError(f"body '{body.name}' has no hull")
+    return hull_distance(surface.in_frame(points), body.hull, body.centers, body.radii, face)
+
+
+def _points_at_hull(surface: Placed, spheres: Placed, slot: Tensor, near: Tensor, face: Tensor | None) -> Points:
+    """Return the points of the spheres in slots (n, K) at the hull of a body."""
+    points, radii = spheres.centers(slot), spheres.radii(slot)
+    distance, normal = _to_hull(surface, points, face)
+    return _facing(slot, near, points, radii, distance, normal @ surface.rotation.transpose(-1, -2))
+
+
+def _facing(slot: Tensor, near: Tensor, points: Tensor, radii: Tensor, distance: Tensor, normal: Tensor) -> Points:
+    """Return the contact points of spheres, given the distances of their centres (n, K) and the outward normals."""
+    gap = distance - radii
+    position = points - (radii + 0.5 * gap)[..., None] * normal
+    return Points(slot=slot, near=near, gap=gap, normal=normal, position=position)
 
 
 def _sphere_distances(queries: Placed, surface: Placed, chosen: Tensor | None) -> Tensor:
@@ -232,10 +304,7 @@ def _points_at(
     else:
         minimum = partial(log_sum_exp_distance, per_m=sharpness_per_m)
     value, normal = blended(offset, member_radii, minimum)
-    gap = value - radii
-    return Points(
-        slot=slot, near=near, gap=gap, normal=normal, position=points - (radii + 0.5 * gap)[..., None] * normal
-    )
+    return _facing(slot, near, points, radii, value, normal)
 
 
 def _softness(union: Placed, sharpness_per_m: float | None) -> float:

@@ -183,7 +183,7 @@ class Contacts:
         rubbing = [chain for chain in self.chains if chain.rows is not None and any(chain.rows.active)]
         iterations = self.world.iterations
         old = [chain.impulses if iterations > 1 else None for chain in rubbing]
-        found, rubbed = solve_with_joints(groups, iterations, warm, rows, old)
+        found, rubbed = solve_with_joints(groups, iterations, warm, rows, old, not self.chains)
         for chain, impulses in zip(rubbing, rubbed, strict=True):
             chain.impulses = impulses
         return found

@@ -109,6 +109,29 @@ class TurningResistance:
     """Largest torque across the normal in units of the normal force [m], shape (n, C)."""
 
 
+@dataclass(frozen=True)
+class Response:
+    """What contacts ask for; n items, C points."""
+
+    gap: Tensor
+    """Gap [m], shape (n, C)."""
+    step_s: Tensor
+    """Step [s], shape (n, 1)."""
+    stiffness: Tensor
+    """Dimensionless stiffness of a step [1], shape (n, 1 or C)."""
+    damping: Tensor
+    """Dimensionless damping of a step [1], shape (n, 1 or C)."""
+
+    def aim(self, speed: Tensor) -> Tensor:
+        """Return the gap speed (n, C) [m/s] that the contacts ask for, given that without them (n, C) [m/s]."""
+        gap, h = self.gap, self.step_s
+        ahead = gap + h * speed
+        # the fraction of the step that the contact is closed makes the damper's onset continuous in the gap
+        closing = (h * speed.abs()).clamp_min(1e-12)
+        closed = torch.where(gap > 0, (-ahead / closing).clamp(0.0, 1.0), torch.ones_like(gap))
+        return speed - self.damping * closed * speed - self.stiffness * ahead.clamp_max(0.0) / h
+
+
 @dataclass(frozen=True, kw_only=True)
 class ContactGroup:
     """Contacts of one pair of bodies in one step, prepared for the solver; n items, C points."""
@@ -119,6 +142,8 @@ class ContactGroup:
     """Free velocity of a against b along the axes [m/s], shape (n, C, 3)."""
     sides: tuple[Rows, ...]
     """Jacobian rows of the bodies that can move."""
+    response: Response
+    """What the contacts ask for."""
     target: Tensor
     """Gap speed that each closed contact asks for [m/s], shape (n, C)."""
     stop_n: Tensor
@@ -148,18 +173,16 @@ class ContactGroup:
         share = _share(normal_rows, mass, ahead, gap)
 
         k, d = coefficients(touch.contact_time_s, touch.damping_ratio, h)
-        # the fraction of the step that the contact is closed makes the damper's onset continuous in the gap
-        closing = (h * speed.abs()).clamp_min(1e-12)
-        closed = torch.where(gap > 0, (-ahead / closing).clamp(0.0, 1.0), torch.ones_like(gap))
-        demand = -d * closed * speed - k * ahead.clamp_max(0.0) / h
+        response = Response(gap, h, k, d)
         touching = (gap < 0) | (ahead < 0)
-        target = torch.where(touching, speed + demand, torch.full_like(gap, -FAR_M_S))
+        target = torch.where(touching, response.aim(speed), torch.full_like(gap, -FAR_M_S))
         # the sum of the two tangential mobilities bounds the larger one
         stop_t = share / (mobility[..., 1] + mobility[..., 2])
         group = ContactGroup(
             axes=axes,
             relative=relative,
             sides=sides,
+            response=response,
             target=target,
             stop_n=share * mass,
             stop_t=stop_t,
@@ -215,8 +238,12 @@ def solve_with_joints(
     warm: Sequence[Tensor | None],
     joints: Sequence[JointRows],
     joint_warm: Sequence[Tensor | None],
+    under_load: bool = True,
 ) -> tuple[list[Impulses], list[Tensor]]:
-    """Solve the impulses of all groups, and those (n, J, 3) of the joints of chains after each iteration over them."""
+    """Solve the impulses of all groups, and those (n, J, 3) of the joints of chains after each iteration over them.
+
+    Contacts carry the load of others where `under_load`; the kernel does not in worlds with chains.
+    """
     groups = _splitting(groups)
     rubbed = [
         torch.zeros_like(rows.target[..., :1].expand(-1, -1, 3)) if old is None else old
@@ -226,8 +253,11 @@ def solve_with_joints(
         Impulses(torch.zeros_like(group.relative) if old is None else old)
         for group, old in zip(groups, warm, strict=True)
     ]
+    loaded = _loaded(groups) if under_load else None
     for _ in range(iterations):
         velocities = _all_velocities(groups, found, joints, rubbed)
+        if loaded is not None:
+            groups = [_under_load(*each, loaded) for each in zip(groups, found, velocities, strict=True)]
         found = [_iterate(group, given, *now) for group, given, now in zip(groups, found, velocities, strict=True)]
         if joints:
             moved = _moved(groups, found, joints, rubbed)
@@ -252,6 +282,30 @@ def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
             turning = replace(turning, stop=share[..., None] * turning.stop)
         split.append(replace(group, stop_n=share * group.stop_n, stop_t=share * group.stop_t, turning=turning))
     return split
+
+
+def _loaded(groups: Sequence[ContactGroup]) -> Tensor | None:
+    """Return in which items (n, 1) several pairs of bodies touch; None where there is one pair."""
+    if len(groups) < 2:
+        return None
+    active = [(group.target > -0.5 * FAR_M_S).any(1, keepdim=True) for group in groups]
+    return torch.stack(active).sum(0) > 1
+
+
+def _under_load(
+    group: ContactGroup, impulses: Impulses, now: tuple[Tensor, Tensor | None], loaded: Tensor
+) -> ContactGroup:
+    """Aim the contacts of a pair at what they ask for under the present impulses of all other pairs.
+
+    A contact so carries the load that others put on its bodies, and not only their weight: under their weight alone,
+    two bodies in free fall ask for no force between them, and a stack would open and close at every step.
+    """
+    speed = now[0][..., 0]
+    for side in group.sides:
+        own = (side.jacobian @ _motion(side, group, impulses)).squeeze(-1)
+        speed = speed - own.unflatten(1, (-1, 3))[..., 0]
+    active = loaded & (group.target > -0.5 * FAR_M_S)
+    return replace(group, target=torch.where(active, group.response.aim(speed), group.target))
 
 
 def _all_velocities(

@@ -18,6 +18,7 @@ from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
 from .fixed_surface import FixedSurface, shape_of, surface_mesh
+from .hull import Hull
 from .paper_law import PaperLaw
 from .smooth_distance import plane_contacts
 
@@ -53,6 +54,8 @@ class Body:
     """Indices of the spheres that the ground can touch, shape (K,); None for all."""
     material: str | None = None
     """Material, by which its pairs with others have their laws; None where it does not matter."""
+    hull: Hull | None = None
+    """Hull of the spheres, by which other bodies touch this one; None where they touch its spheres."""
 
     @property
     def free(self) -> bool:
@@ -280,9 +283,10 @@ class World:
         return self if only is None else replace(self, contact=self.pair_laws[only], pair_laws={})
 
     def with_body(self, index: int, **changes: Tensor) -> World:
-        """Return a copy in which some tensors of one body are replaced."""
+        """Return a copy in which some tensors of one body are replaced; other spheres have no hull."""
         bodies = list(self.bodies)
-        bodies[index] = replace(bodies[index], **changes)
+        other = {"hull": None} if {"centers", "radii"} & set(changes) else {}
+        bodies[index] = replace(bodies[index], **changes, **other)
         return replace(self, bodies=tuple(bodies))
 
 
@@ -333,8 +337,10 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         centers, radii = tensor(spheres.means), tensor(spheres.scales * entry.radius_factor)
         place = tensor((*entry.photo_pose.position_m, *entry.photo_pose.quat_wxyz))
         on_plane = plane_contacts(centers[0], radii[0])
+        hull = Hull.of(centers[0], radii[0], on_plane) if entry.convex else None
     else:
         centers, radii, place, on_plane = geometry.centers, geometry.radii, geometry.place, geometry.on_plane
+        hull = geometry.hull
     return Body(
         name=entry.name,
         motion=entry.motion,
@@ -346,6 +352,7 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         place=place,
         on_plane=on_plane,
         material=entry.material,
+        hull=hull,
     )
 
 

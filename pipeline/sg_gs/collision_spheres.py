@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from ...datasets.shapes.ply import Splats, read_splats
@@ -27,6 +28,10 @@ from ..geometry.surface_distance import union_distance
 
 DIRECTIONS = 1500
 """Number of directions in which the support function is matched."""
+_CONVEX_EXCESS = 0.05
+"""Largest excess of the hull's volume over that of a convex solid: grids measure volumes to 1 %, and the hull of an
+L-block exceeds it by a third.
+"""
 _SUPPORT_TOLERANCE = 1e-3  # of the solid's size
 _MEAN_TOLERANCE, _MOST_TOLERANCE = 2e-3, 7.5e-3
 """Mean and largest gap, in units of the solid's size, below which no more spheres are added."""
@@ -169,6 +174,23 @@ def support_of_spheres(centers: Array, radii: Array, directions: Array | None = 
     """Return max n . c + r over spheres [m], for each direction, shape (D,)."""
     directions = fibonacci_directions(DIRECTIONS) if directions is None else directions
     return (directions @ centers.T + radii).max(1)
+
+
+def fills_hull(centers: Array, radii: Array, volume_m3: float) -> bool:
+    """Return whether a solid of a volume [m3] fills the convex hull of its spheres, so that its faces are flat.
+
+    Args:
+        centers: Centres of the spheres [m], shape (n, 3).
+        radii: Their radii [m], shape (n,).
+        volume_m3: Volume of the solid [m3].
+    """
+    directions = fibonacci_directions(DIRECTIONS)
+    support = (directions @ centers.T + radii).argmax(1)
+    try:
+        hull = ConvexHull(centers[support] + radii[support, None] * directions)
+    except QhullError:
+        return False
+    return bool(hull.volume <= (1 + _CONVEX_EXCESS) * volume_m3)
 
 
 class _Chosen:

@@ -42,7 +42,9 @@ class Packed:
     contact law, shape (1 or B, intervals, 2 + 2 laws).
     """
     geometry: Tensor
-    """Centres in the body frame and radii of the spheres [m], shape (1 or B, spheres, 4)."""
+    """Centres in the body frame and radii of the spheres [m]; then of each hull three rows a face, as `Hull.faces`,
+    one row an edge and one a support: the indices of their spheres within the body; shape (1 or B, rows, 4).
+    """
     surfaces: Tensor
     """Positions [m], orientations and sizes [m] of the fixed surfaces, shape (1 or B, surfaces, 10)."""
     mesh_numbers: Tensor
@@ -131,7 +133,7 @@ def pack(
         ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
-        geometry=_joined(spheres, batch),
+        geometry=_joined([*spheres, *(row for body in world.bodies for row in _hull_rows(body))], batch),
         surfaces=_joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
         mesh_numbers=meshes.numbers.to(times),
         mesh_indices=meshes.indices.to(times.device),
@@ -183,6 +185,7 @@ def _structure(
         spheres=tuple(body.radii.shape[-1] for body in world.bodies),
         pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
         laws=_law_numbers(world),
+        hulls=_hulls(world),
         lowest=lowest,
         surfaces=tuple(surface.kind for surface in world.surfaces),
         mesh_starts=mesh_starts,
@@ -196,6 +199,18 @@ def _law_numbers(world: World) -> tuple[int, ...]:
     """Return the number of each pair's contact law; none where all are the same."""
     numbers = laws_in_use(world).of_pair
     return numbers if any(numbers) else ()
+
+
+def _hulls(world: World) -> tuple[tuple[int, int, int, int], ...]:
+    """Return by body the first row of its hull in the geometry and the numbers of faces, edges and supports."""
+    row, found = sum(body.radii.shape[-1] for body in world.bodies), []
+    for body in world.bodies:
+        counts = (0, 0, 0)
+        if body.hull is not None:
+            counts = (len(body.hull.faces), len(body.hull.edges), len(body.hull.supports))
+        found.append((row, *counts))
+        row += 3 * counts[0] + counts[1] + counts[2]
+    return tuple(found)
 
 
 def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tensor:
@@ -265,6 +280,15 @@ def _surface(surface: FixedSurface, turn: Tensor | None) -> Tensor:
     parts = (_turned(turn, surface.position), _turned_quat(turn, surface.quat_wxyz), surface.size)
     batch = max(part.shape[0] for part in parts)
     return torch.cat([part.expand(batch, -1) for part in parts], -1)[:, None]
+
+
+def _hull_rows(body: Body) -> list[Tensor]:
+    """Return the rows of faces, edges and supports of a body's hull (1, rows, 4); none without a hull."""
+    if body.hull is None:
+        return []
+    edges, supports = body.hull.edges, body.hull.supports[:, None]
+    indices = [torch.nn.functional.pad(x, (0, 4 - x.shape[1])).to(body.hull.faces)[None] for x in (edges, supports)]
+    return [body.hull.faces.reshape(1, -1, 4), *indices]
 
 
 def _listed_spheres(world: World) -> tuple[Tensor, tuple[tuple[int, int], ...]]:

@@ -9,6 +9,7 @@ from ...runtime import kernel_build
 from ..contact_detection import PAIR_SMOOTHING_M
 from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
+from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
 from ..impulse_solver import CONTACT_ONSET_M
 from ..joint_rows import LIMIT_TIME_S
 from ..surface_detection import FAR_M
@@ -74,6 +75,8 @@ class Structure:
     """Pairs of bodies that may touch, -1 for the ground, each with its number of contacts."""
     laws: tuple[int, ...] = ()
     """Number of the contact law of each pair; empty where all have the same one."""
+    hulls: tuple[tuple[int, int, int, int], ...] = ()
+    """First row in the geometry, faces, edges and supports of each body's hull; none where its spheres are touched."""
     lowest: tuple[tuple[int, int], ...] = ()
     """First row and number of each body's spheres whose heights count; empty where heights do not."""
     surfaces: tuple[int, ...] = ()
@@ -149,13 +152,17 @@ class Structure:
             "HALF_SPACE_KIND": HALF_SPACE, "BOX_KIND": BOX, "MESH_KIND": MESH,
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
+            "HULLS": paired and any(faces for _, faces, _, _ in self.hulls),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
             "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
-        lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define ONSET_M {CONTACT_ONSET_M!r}"]
+        lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define SAME_PLANE_M {SAME_PLANE_M!r}"]
+        lines += [f"#define SAME_NORMAL {SAME_NORMAL!r}", f"#define OVERHANG_M {OVERHANG_M!r}"]
+        lines += [f"#define PARALLEL {PARALLEL!r}", f"#define MOST_PLANES {MOST_PLANES}"]
+        lines += [f"#define ONSET_M {CONTACT_ONSET_M!r}"]
         lines += [f"#define NEWTON_STEPS {NEWTON_STEPS}", f"#define FLATTEST {FLATTEST!r}"]
         lines += [f"#define ORDER_{axis} {value!r}" for axis, value in zip("XYZ", ORDER, strict=True)]
         lines += [f"#define FLAT_SINE {FLAT!r}", f"#define FAR_M {FAR_M!r}"]
@@ -173,6 +180,8 @@ class Structure:
             "group_of": tree.groups(self.free),
             "body_link": [tree.bodies.index(b) if b in tree.bodies else -1 for b in range(len(self.free))],
         }  # fmt: skip
+        for index, name in enumerate(("hull_start", "face_count", "edge_count", "support_count")):
+            lists[name] = [hull[index] for hull in self.hulls]
         functions = [_function(name, values) for name, values in lists.items()] + tree.lists()
         return "\n".join((*lines, kernel_file("language"), *functions, *map(kernel_file, _FILES)))
 

@@ -5,10 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets.shapes.meshes import Mesh
+from cgwm.datasets.synthetic.objects import make_object
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume, read_mesh
 from cgwm.pipeline.geometry.primitives import spheres_volume
-from cgwm.pipeline.sg_gs.collision_spheres import distil, shape_to_spheres, support_of_spheres, union_distance
+from cgwm.pipeline.sg_gs.collision_spheres import (
+    distil,
+    fills_hull,
+    shape_to_spheres,
+    support_of_spheres,
+    union_distance,
+)
 from cgwm.schemas import InputDataError, Shape
 
 HALF = np.array([0.05, 0.03, 0.02])
@@ -137,3 +144,12 @@ def test_bad_meshes(tmp_path, ellipsoid):
     (tmp_path / "bad.obj").write_text("v 0 0 0\nf 1 2 9\n")
     with pytest.raises(InputDataError, match="a face names vertex 9 of 1"):
         read_mesh(tmp_path / "bad.obj")
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
+def test_boxes_wedges_and_prisms_fill_their_hull_and_blocks_with_a_notch_do_not(seed):
+    one = make_object(seed)
+    solid = mesh_volume(Mesh(one.vertices, np.asarray(one.faces, np.int64)))
+    spheres = distil(solid, 32)
+    convex = one.family not in ("l_block", "t_block")
+    assert fills_hull(spheres.centers, spheres.radii, solid.mass_properties().volume_m3) == convex

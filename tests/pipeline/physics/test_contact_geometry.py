@@ -5,16 +5,19 @@ from dataclasses import replace
 
 import pytest
 import torch
+from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.checks import overlaps
 from cgwm.pipeline.physics.contact_detection import Placed, all_body_points
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.hull import Hull, hull_distance
 from cgwm.pipeline.physics.impulse_solver import tangent_axes
 from cgwm.pipeline.physics.rollout import require_finite
 from cgwm.pipeline.physics.rollout_cost import rollout_seconds
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.physics.world import Body
 from cgwm.schemas import NotConvergedError
-from helpers.worlds import F64, ball_body, law, state_of, times, world_of
+from helpers.worlds import F64, ball_body, batch, law, state_of, times, world_of
 
 UP = (1.0, 0.0, 0.0, 0.0)
 
@@ -83,3 +86,27 @@ def test_more_bodies_cost_more() -> None:
     one = rollout_seconds(world_of(ball_body(0.04)), 10, 1.0)
     two = rollout_seconds(world_of(ball_body(0.04), ball_body(0.04, name="two")), 10, 1.0)
     assert 0 < one < two and rollout_seconds(world_of(ball_body(0.04)), 20, 1.0) == pytest.approx(2 * one, rel=0.2)
+
+
+def test_the_distance_to_a_hull_is_that_to_its_support_function() -> None:
+    """max over n of n . p - h(n): no direction is above it, and outside its own normal reaches it."""
+    generator = torch.Generator().manual_seed(0)
+    centers = 0.03 * torch.randn(40, 3, generator=generator, dtype=F64)
+    radii = 0.02 * torch.rand(40, generator=generator, dtype=F64) + 0.001
+    hull = Hull.of(centers, radii, plane_contacts(centers, radii))
+    assert hull is not None
+    points = 0.1 * torch.randn(1, 500, 3, generator=generator, dtype=F64)
+    distance, normal = hull_distance(points, hull, centers[None], radii[None])
+    chosen = hull.supports
+
+    def over(n: torch.Tensor) -> torch.Tensor:
+        return (n * points[0]).sum(-1) - (n @ centers[chosen].T + radii[chosen]).amax(-1)
+
+    torch.testing.assert_close(over(normal[0]), distance[0], atol=1e-12, rtol=0)
+    for direction in torch.as_tensor(fibonacci_directions(300)):
+        assert bool((over(direction.expand(500, 3)) <= distance[0] + 1e-12).all())
+
+
+def test_spheres_in_one_plane_have_no_hull() -> None:
+    centers = batch([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [1.0, 1.0, 0]])[0]
+    assert Hull.of(centers, torch.full((4,), 0.1, dtype=F64), torch.arange(4)) is None

@@ -19,6 +19,7 @@ from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume
 from cgwm.pipeline.geometry.rotation import quat_rotate
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, damping_ratio_of, restitution
 from cgwm.pipeline.physics.engine import rollout as roll_out
+from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.sg_gs.collision_spheres import distil, shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
@@ -71,6 +72,12 @@ def cube_of_spheres(spheres: int, half: float = 0.05, on_plane: bool = True, nam
     centers, radii = torch.as_tensor(chosen.means), torch.as_tensor(2 * chosen.scales)
     body = replace(box_body(half=(half,) * 3), name=name, centers=centers[None], radii=radii[None])
     return replace(body, on_plane=plane_contacts(centers, radii)) if on_plane else body
+
+
+def flat(body: Body) -> Body:
+    """Return a body that others touch by the hull of its spheres."""
+    assert body.on_plane is not None
+    return replace(body, hull=Hull.of(body.centers[0], body.radii[0], body.on_plane))
 
 
 def tilted(world: World, slopes: torch.Tensor) -> World:
@@ -351,19 +358,19 @@ def test_bodies_rest_within_a_tenth_of_a_millimetre(duration_s: float) -> None:
     assert bool((rollout.position_m[:2, -1, 0, 2] + torch.tensor(low[:2]) > -2 * G * 0.005**2).all())
 
 
-@pytest.mark.evidence
-def test_three_cubes_of_spheres_stand_on_each_other() -> None:
-    """Spheres make bumpy faces, whose bumps slide into dents at once; then the cubes stay where they are stacked."""
+@pytest.mark.parametrize("duration_s", [3.0, pytest.param(10.0, marks=pytest.mark.evidence)])
+def test_three_cubes_stand_on_each_other(duration_s: float) -> None:
+    """Cubes of 32 spheres each, touched by their hulls: no drift above 0.01 mm, no motion above 0.1 mm/s after 1 s."""
     half, count = 0.03, 3
-    cubes = [cube_of_spheres(32, half, name=f"cube{k}") for k in range(count)]
+    cubes = [flat(cube_of_spheres(32, half, name=f"cube{k}")) for k in range(count)]
     start = state_of(*[((0, 0, half + 2 * half * k), UP, (0, 0, 0), (0, 0, 0)) for k in range(count)])
-    rollout = roll_out(world_of(*cubes), start, times(1.2, 5))
-    place, turn = rollout.position_m[0, -1], 2 * rollout.quat_wxyz[0, -1, :, 1:3].norm(dim=-1).asin()
-    expected = half + 2 * half * torch.arange(count, dtype=F64)
-    torch.testing.assert_close(place[:, 2], expected, atol=1.5e-3, rtol=0)
-    assert float(place[:, :2].norm(dim=-1).max()) < 0.01
-    assert float(turn.max()) < math.radians(3)
-    assert float((rollout.position_m[0, -1] - rollout.position_m[0, 3]).norm(dim=-1).max()) < 2e-3
+    rollout = roll_out(world_of(*cubes), start, times(duration_s, 10))
+    settled = rollout.position_m[0, 10:]
+    assert float((settled - settled[0]).norm(dim=-1).max()) < 1e-5
+    assert float(rollout.velocity_m_s[0, 10:].norm(dim=-1).max()) < 1e-4
+    # each contact is as deep as its load asks for, of up to six times the acceleration of gravity here
+    assert float((settled[-1, :, 2] - start.position_m[0, :, 2]).abs().max()) < 10 * G * 0.004**2
+    assert float(settled[-1, :, :2].abs().max()) < 1e-4
 
 
 # the discretisation

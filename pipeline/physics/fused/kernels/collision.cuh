@@ -146,10 +146,75 @@ struct Facing {
     Number sharp_gap;  // to the nearest sphere, without smoothing
 };
 
+#if HULLS
+INLINE Hull hull_of(const Problem& problem, const Environment& env, int b) {
+    Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(b), sphere_count(b)};
+    Hull hull = {spheres,       env.geometry + 4LL * hull_start(b), face_count(b), edge_count(b),
+                 support_count(b)};
+    return hull;
+}
+
+// Raises `most` to the greatest height that the spheres of another hull have over a plane of this one; sets `axis` to
+// the normal of that plane, in the world frame, times `sign`.
+INLINE void part_by(const Problem& problem, const Environment& env, int b, int other, const Mat* rotations,
+                    Number sign, Number& most, Number* axis) {
+    Hull hull = hull_of(problem, env, b), its = hull_of(problem, env, other);
+    Vec origin = env.bodies[other].position - rotations[other] * env.constants[other].com - env.bodies[b].position;
+    Vec shift = transposed(rotations[b], origin) + env.constants[b].com;
+    Number from[3] = {plain(shift.x), plain(shift.y), plain(shift.z)};
+    for (int i = 0; i < hull.faces; i++) {
+        Vec normal = rotations[b] * problem.geometry.vector(hull.row + 12LL * i);
+        Vec within = transposed(rotations[other], normal);
+        Number x = plain(within.x), y = plain(within.y), z = plain(within.z), least = Number(1e30);
+        for (int k = 0; k < its.supports; k++) {
+            const Number* s = its.support(k);
+            least = lesser(least, x * s[0] + y * s[1] + z * s[2] - s[3]);
+        }
+        least += hull.affine(i, 0, from);
+        if (!(least > most)) continue;
+        most = least;
+        axis[0] = sign * plain(normal.x);
+        axis[1] = sign * plain(normal.y);
+        axis[2] = sign * plain(normal.z);
+    }
+}
+
+// Returns the face of a body whose normal is nearest to `sign` times the axis; -1 where none is parallel to it.
+INLINE int flat_face(const Problem& problem, const Environment& env, int b, const Mat& rotation, Number sign,
+                     const Number* axis) {
+    Hull hull = hull_of(problem, env, b);
+    Vec at = transposed(rotation, vec(Real(sign * axis[0]), Real(sign * axis[1]), Real(sign * axis[2])));
+    Number x = plain(at.x), y = plain(at.y), z = plain(at.z), most = Number(PARALLEL);
+    int face = -1;
+    for (int i = 0; i < hull.faces; i++) {
+        const Number* n = problem.geometry.value + hull.row + 12LL * i;
+        Number along = x * n[0] + y * n[1] + z * n[2];
+        if (along > most) {
+            most = along;
+            face = i;
+        }
+    }
+    return face;
+}
+
+// Finds the faces of two bodies that lie flat on each other: those parallel to the plane that parts their hulls best.
+INLINE void find_flat(const Problem& problem, const Environment& env, int a, int b, const Mat* rotations, int& on_a,
+                      int& on_b) {
+    on_a = on_b = -1;
+    if (face_count(a) == 0 || face_count(b) == 0) return;
+    if (face_count(a) * support_count(b) + face_count(b) * support_count(a) > MOST_PLANES) return;
+    Number most = Number(-1e30), axis[3] = {Number(0), Number(0), Number(1)};
+    part_by(problem, env, a, b, rotations, Number(1), most, axis);
+    part_by(problem, env, b, a, rotations, Number(-1), most, axis);
+    on_a = flat_face(problem, env, a, rotations[a], Number(1), axis);
+    on_b = flat_face(problem, env, b, rotations[b], Number(-1), axis);
+}
+#endif
+
 // Finds gap, normal and point of one slot of a pair of bodies: first come the spheres of b against the union of a, then
-// those of a against the union of b. Returns false if the gap exceeds `limit`.
+// those of a against the union of b. Returns false if the gap exceeds `limit`. The faces are those of `find_flat`.
 __device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
-                     Facing& facing) {
+                     int flat_a, int flat_b, Facing& facing) {
     bool second = k >= sphere_count(pair_b(p));
     int mine = second ? pair_a(p) : pair_b(p), other = second ? pair_b(p) : pair_a(p);
     Vec position = env.bodies[other].position;
@@ -166,8 +231,17 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
     Vec local = transposed(rotations[other], center - position) + env.constants[other].com, outward;
     Real distance;
     Number nearest;
-    up = transposed(rotations[other], up);
-    if (!union_distance(spheres, local, limit + plain(radius), up, distance, nearest, outward)) return false;
+    Number reached = limit + plain(radius);
+#if HULLS
+    if (face_count(other) > 0) {
+        Hull hull = hull_of(problem, env, other);
+        if (!distance_to_hull(hull, local, second ? flat_b : flat_a, reached, distance, nearest, outward)) return false;
+    } else
+#endif
+    {
+        up = transposed(rotations[other], up);
+        if (!union_distance(spheres, local, reached, up, distance, nearest, outward)) return false;
+    }
     outward = rotations[other] * outward;
     facing.gap = distance - radius;
     facing.sharp_gap = nearest - plain(radius);
@@ -193,15 +267,18 @@ __device__ int touch_pair(const Problem& problem, Environment& env, int p, const
     Number left = Number(1) - Number(0.5) * h * spins;
     Number limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
     if (size(com_a - com_b) - ca.reach - cb.reach - Number(SMOOTHING_M) < limit) {
-        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, on_a = -1, on_b = -1;
 #if LINKS
         reveal(env, motions, a);
         reveal(env, motions, b);
 #endif
+#if HULLS
+        find_flat(problem, env, a, b, rotations, on_a, on_b);
+#endif
         for (int k = behind; k < contact_count(p); k += LANES) {
             Facing facing;
             Real weight;
-            if (!face(problem, env, p, k, rotations, limit, facing)) continue;
+            if (!face(problem, env, p, k, rotations, limit, on_a, on_b, facing)) continue;
             Contact& c = list[count];
             c.normal = facing.normal;
             c.arm = facing.point - com_a;
@@ -282,9 +359,6 @@ __device__ int touch_surface(const Problem& problem, Environment& env, int p, co
             Real mobility = mobility_trace(m, c.arm);
 #endif
             if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight)) continue;
-#if MESHES && RECORD
-            c.gap = gap;
-#endif
             if (env.warm) {
                 Vec along = env.before[c.slot], one, two;
                 tangents(env, c.normal, one, two);
@@ -335,6 +409,45 @@ INLINE void split(Contact* list, int count, const int* groups) {
         Number share = most > 1 ? Number(1) / Number(most) : Number(1);
         c.stop_n = share * c.stop_n;
         c.stop_t = share * c.stop_t;
+    }
+}
+#endif
+
+#if PAIRED
+struct Load {  // what the contacts of a pair do to their bodies: change of a's velocity and, with the sign of a, of b's
+    Vec linear_a, linear_b, turn_a, turn_b;
+};
+
+// Sums the impulses of the contacts from `first` to `end`, which belong to one pair, over the lanes.
+INLINE Load load_of(const Environment& env, const Contact* list, int first, int end, int a, int b,
+                    const Motion* motions) {
+    Vec linear = none(), angular_a = none(), angular_b = none();
+    for (int i = first; i < end; i++) {
+        const Contact& c = list[i];
+        linear = linear + c.impulse;
+        angular_a = angular_a + cross(c.arm, c.impulse);
+        if (b >= 0) angular_b = angular_b + cross(c.arm_b, c.impulse);
+    }
+    linear = env.lanes.sum(linear);
+    Load load = {motions[a].inverse_mass * linear, none(), motions[a].inverse_inertia * env.lanes.sum(angular_a),
+                 none()};
+    if (b >= 0) {
+        load.linear_b = motions[b].inverse_mass * linear;
+        load.turn_b = motions[b].inverse_inertia * env.lanes.sum(angular_b);
+    }
+    return load;
+}
+
+// Aims the contacts of a pair at what they ask for under the present impulses of all other pairs: a contact so carries
+// the load that others put on its bodies, and not only their weight. `load` is that of the pair itself.
+INLINE void aim_under_load(const Law& law, Contact* list, int first, int end, const Load& load,
+                           const Motion* motions) {
+    for (int i = first; i < end; i++) {
+        Contact& c = list[i];
+        if (plain(c.target) < Number(-1e29)) continue;
+        Vec own = load.linear_a + cross(load.turn_a, c.arm);
+        if (c.b >= 0) own = own + load.linear_b + cross(load.turn_b, c.arm_b);
+        c.target = aim(law, c.gap, dot(relative_velocity(c, motions) - own, c.normal));
     }
 }
 #endif
@@ -459,7 +572,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
     int count = 0;
 #if PAIRED
-    int groups[BODIES] = {};
+    int groups[BODIES] = {}, ends[PAIRS], loaded = 0;
     for (int p = 0; p < PAIRS; p++) {
         int a = pair_a(p), b = pair_b(p), touching = 0;
         if (b >= 0) {
@@ -483,9 +596,14 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         if (env.lanes.any(touching > 0) && env.lanes.sum(Number(touching)) > Number(0)) {
             groups[group_of(a)]++;
             if (b >= 0 && group_of(b) >= 0) groups[group_of(b)]++;
+#if !LINKS
+            loaded++;  // `Load` has no share of the joints of chains
+#endif
         }
+        ends[p] = count;
     }
     split(list, count, groups);
+    Load loads[PAIRS];
     if (!env.lanes.any(count > 0)) {
         forget(env);
 #if LINKS
@@ -528,10 +646,20 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
     bool reached[LINKS];  // in any environment of the warp
     for (int l = 0; l < LINKS; l++) reached[l] = env.lanes.any(env.chain.known[l]);
 #endif
+#if PAIRED
+    const int first_sweep = sweep;
+    bool active[PAIRS];
+    for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = env.lanes.any(ends[p] > first);
+#endif
     do {
         EACH_BODY
         for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
 #if PAIRED
+        if (loaded > 1 && sweep != first_sweep) {
+            for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
+                if (active[p]) aim_under_load(env.laws[pair_law(p)], list, first, ends[p], loads[p], motions);
+            }
+        }
         for (int i = 0; i < count; i++) {
             Contact& c = list[i];
             if (sweep >= 0) c.impulse = swept(c, env.laws[0], relative_velocity(c, motions));
@@ -581,6 +709,13 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             motions[b].velocity = free_velocities[b] + motions[b].inverse_mass * linear[b];
             motions[b].omega = free_omegas[b] + motions[b].inverse_inertia * angular[b];
         }
+#if PAIRED
+        if (loaded > 1 && sweep + 1 < problem.sweeps) {
+            for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
+                if (active[p]) loads[p] = load_of(env, list, first, ends[p], pair_a(p), pair_b(p), motions);
+            }
+        }
+#endif
     } while (++sweep < problem.sweeps);
     keep(env, list, count, problem.sweeps);
     EACH_BODY

@@ -111,6 +111,12 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
         Searched searched;
         searched.sphere = -1;
 #endif
+#if PAIRED
+        int on_a = -1, on_b = -1;
+#if HULLS
+        if (pair_b(p) >= 0) find_flat(problem, env, a, pair_b(p), rotations, on_a, on_b);
+#endif
+#endif
         EACH_SLOT
         for (int s = 0; s < SLOTS; s++) {
             int k = behind + s * LANES;
@@ -120,7 +126,7 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
 #if PAIRED
             if (pair_b(p) >= 0) {
                 Facing facing;
-                face(problem, env, p, k, rotations, Number(1e30), facing);
+                face(problem, env, p, k, rotations, Number(1e30), on_a, on_b, facing);
                 gap = facing.gap;
                 normal = facing.normal;
                 point = facing.point;

@@ -23,6 +23,7 @@ from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
+from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.physics.pair_laws import laws_in_use
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
@@ -131,6 +132,30 @@ def test_many_spheres_on_the_plane(fused: Fused) -> None:
     """More contacts than a thread has room for in registers, and without a choice of those that touch."""
     world, state = world_of(replace(cube(), on_plane=None)), tossed(2)
     agree(simulate(world, state, times(0.2), None, True), fused(world, state, times(0.2), None, True, lanes=2), 1e-9)
+
+
+def flat_cube(side: int = 3, half: float = 0.05, name: str = "cube") -> Body:
+    """Return a cube that other bodies touch by the hull of its spheres."""
+    body = cube(side, half, name=name)
+    return replace(body, hull=hull_of(body))
+
+
+def hull_of(body: Body) -> Hull | None:
+    return Hull.of(body.centers[0], body.radii[0], plane_contacts(body.centers[0], body.radii[0]))
+
+
+def test_cubes_that_lie_flat_on_each_other(fused: Fused) -> None:
+    """One lands flat on the other, with an overhang; a ball hits the upper one; by hulls, under load."""
+    world = world_of(flat_cube(name="low"), flat_cube(2, 0.04, "top"), ball_body(0.02, name="ball"))
+    state = state_of(
+        ((0, 0, 0.05), UPRIGHT, (0, 0, 0), (0, 0, 0)),
+        ((0.02, 0.005, 0.142), (1, 0.01, -0.02, 0.05), (0.1, 0, -0.4), (0, 0, 1)),
+        ((-0.07, 0.0, 0.14), UPRIGHT, (1.0, 0, 0), (0, 0, 0)),
+        count=2,
+    )
+    expected = simulate(world, state, times(0.1), None, True)
+    assert expected.contacts is not None and float(expected.contacts.impulse_n_s.abs().amax()) > 0
+    agree(expected, fused(world, state, times(0.1), None, True, lanes=None), 1e-7)
 
 
 def crowd() -> tuple[World, State, dict[str, Track | Drive]]:
@@ -364,6 +389,14 @@ def test_derivatives_by_the_laws_of_pairs(fused: Fused) -> None:
     world, _, driven = crowd()
     first = [-0.006, 0, 0.053, 0.01, 0.02, 0.01, -0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
     world = of_materials(world, steel_wood=worlds.law(), steel_steel=worlds.law())
+    agree_with_derivatives(fused, world, first, times(0.05), driven, 0.0)
+
+
+def test_derivatives_of_cubes_that_lie_on_each_other(fused: Fused) -> None:
+    world, _, driven = crowd()
+    low, top, *others = world.bodies
+    world = replace(world, bodies=(replace(flat_cube(2), name=low.name), replace(top, hull=hull_of(top)), *others))
+    first = [0, 0, 0.053, 0.01, 0.02, 0.01, 0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
     agree_with_derivatives(fused, world, first, times(0.05), driven, 0.0)
 
 
