@@ -38,6 +38,7 @@ _PUBLIC = {
     "import_csv": ".datasets.importers.csv_tracks",
     "import_hdf5": ".datasets.importers.hdf5_tracks",
     "import_jugglebot": ".datasets.importers.jugglebot",
+    "import_pushes": ".datasets.importers.pushes",
     "import_pinwm": ".datasets.importers.pinwm",
     "import_rosbag": ".datasets.importers.rosbag",
     "import_tum": ".datasets.importers.tum",
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
     from .datasets.importers.hdf5_tracks import import_hdf5
     from .datasets.importers.jugglebot import import_jugglebot
     from .datasets.importers.pinwm import import_pinwm
+    from .datasets.importers.pushes import import_pushes
     from .datasets.importers.rosbag import import_rosbag
     from .datasets.importers.tum import import_tum
     from .datasets.models import Model, read_model
@@ -134,6 +136,7 @@ __all__ = [
     "import_hdf5",
     "import_jugglebot",
     "import_pinwm",
+    "import_pushes",
     "import_rosbag",
     "import_tum",
     "improve",

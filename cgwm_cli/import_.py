@@ -22,6 +22,7 @@ _OPTIONS = {
     "pinwm": ("train",),
     "jugglebot": ("only", *_SPLITS),
     "balldrops": ("only",),
+    "pushes": ("only", *_SPLITS),
     "csv": ("columns", "length_unit", "time_unit", "spin_frame", *_TRACKS),
     "tum": ("length_unit", "time_unit", *_TRACKS),
     "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
@@ -34,11 +35,12 @@ _OPTIONS = {
 def import_capture(
     emit: Emit,
     format_: Annotated[
-        Literal["contactnets", "pinwm", "jugglebot", "balldrops", "csv", "tum", "hdf5", "rosbag"],
+        Literal["contactnets", "pinwm", "jugglebot", "balldrops", "pushes", "csv", "tum", "hdf5", "rosbag"],
         typer.Argument(
             metavar="FORMAT",
             help="csv, tum, hdf5, rosbag: your own poses; contactnets: tosses of a cube (.pt files or .npz); pinwm: "
-            "pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: falling balls.",
+            "pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: falling balls; pushes: "
+            "a robot's finger that pushes an object, with forces (.txt of MLab_EXP, .json or .h5 of MIT push).",
             show_default=False,
         ),
     ],
@@ -71,7 +73,10 @@ def import_capture(
     only: Annotated[
         str | None,
         typer.Option(
-            "--only", metavar="GROUP", help="jugglebot: one session; balldrops: one ball.", show_default=False
+            "--only",
+            metavar="GROUP",
+            help="jugglebot: one session; balldrops: one ball; pushes: one file.",
+            show_default=False,
         ),
     ] = None,
     columns: Annotated[

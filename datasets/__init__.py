@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .importers.hdf5_tracks import import_hdf5
     from .importers.jugglebot import import_jugglebot
     from .importers.pinwm import import_pinwm
+    from .importers.pushes import import_pushes
     from .importers.recordings import Units
     from .importers.rosbag import import_rosbag
     from .importers.tum import import_tum
@@ -45,6 +46,7 @@ _HOMES = {
     "importers.hdf5_tracks": ("import_hdf5",),
     "capture.images": ("read_label", "read_rgb", "write_image"),
     "importers.jugglebot": ("import_jugglebot",),
+    "importers.pushes": ("import_pushes",),
     "io.kinds": ("kind_of",),
     "rollouts.loader": ("RolloutDataset", "RolloutReader"),
     "capture.manifest": ("manifest_toml", "write_manifest"),
@@ -82,6 +84,7 @@ __all__ = [
     "import_hdf5",
     "import_jugglebot",
     "import_pinwm",
+    "import_pushes",
     "import_rosbag",
     "import_tum",
     "kind_of",
