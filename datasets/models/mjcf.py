@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...schemas import BodyModel, ContactParameters, ModelFile
+from ...schemas import BodyModel, ContactParameters, InputDataError, ModelFile
+from ...schemas.materials import pair_of
 from ...schemas.surfaces import Surface
 from ..capture.cameras import Camera
 from ..shapes.meshes import Mesh
@@ -24,6 +26,10 @@ HALF_SHEET_M = 1e-3
 """Half the thickness of rectangles, and depth of the wedges behind triangles, which MuJoCo needs to be solid [m]."""
 IMPEDANCE = 0.99
 """d of solimp; the penetration at rest in MuJoCo is (1 - d) g tau^2 / number of contacts."""
+
+
+MOST_PAIRS = 50_000
+"""Maximum number of pairs of geoms of two bodies with a contact law of their own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +80,7 @@ def write_mjcf(
         _add_surface(root, world, surface, model)
     for body in file.bodies:
         _add_body(world, body, model)
+    _add_pairs(root, model)
     for name, camera in (cameras or {}).items():
         _add_camera(world, name, camera)
     if keyframe is not None:
@@ -108,7 +115,7 @@ def _timestep(file: ModelFile) -> float:
     if file.contact is None:
         return step
     # MuJoCo clips a time constant below two steps; a twentieth of tau keeps the restitution within 0.003.
-    return min(step, file.contact.contact_time_s / 20)
+    return min(step, *(law.contact_time_s / 20 for law in (file.contact, *file.pairs)))
 
 
 def _contact(contact: ContactParameters | None) -> dict[str, str]:
@@ -157,6 +164,47 @@ def _add_triangles(root: ET.Element, world: ET.Element, name: str, place: dict[s
         ET.SubElement(parent, "geom", name=label, type="mesh", mesh=label)
 
 
+def _add_pairs(root: ET.Element, model: Model) -> None:
+    """Add a `pair` for each two geoms whose materials have a law of their own.
+
+    A pair takes the place of what MuJoCo makes of the parameters of its two geoms; those of geoms are of all others.
+    """
+    file = model.file
+    laws = {pair_of(*entry.materials): entry for entry in file.pairs}
+    ground = None if file.ground is None else file.ground.material
+    contact = ET.Element("contact")
+    for index, body in enumerate(file.bodies):
+        others = [("ground", ground, ["ground"])] if body.motion == "free" and file.ground is not None else []
+        others += [
+            (other.name, other.material, _geoms(other, model))
+            for other in file.bodies[index + 1 :]
+            if "free" in (body.motion, other.motion)
+        ]
+        for other, material, names in others:
+            law = None if body.material is None or material is None else laws.get(pair_of(body.material, material))
+            if law is None:
+                continue
+            mine = _geoms(body, model)
+            if len(mine) * len(names) > MOST_PAIRS:
+                raise InputDataError(
+                    f"body '{body.name}' and '{other}' have {len(mine)} and {len(names)} spheres and a contact law of "
+                    f"their own, which MJCF needs {len(mine) * len(names)} pairs for.",
+                    f"up to {MOST_PAIRS} pairs.",
+                    "fit with fewer collision spheres (--spheres).",
+                )
+            numbers = _contact(law) | {"friction": _text((law.friction, law.friction, 0.0, 0.0, 0.0)), "condim": "3"}
+            for first, second in product(mine, names):
+                ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
+    if len(contact):
+        root.append(contact)
+
+
+def _geoms(body: BodyModel, model: Model) -> list[str]:
+    """Return the names of a body's geoms."""
+    spheres = model.collision.get(body.name)
+    return [f"{body.name}_{k}" for k in range(1 if spheres is None else len(spheres))]
+
+
 def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:
     pose = body.photo_pose
     element = ET.SubElement(world, "body", name=body.name, pos=_text(pose.position_m), quat=_text(pose.quat_wxyz))
@@ -170,12 +218,16 @@ def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:
     spheres = model.collision.get(body.name)
     if spheres is not None:
         radii = np.asarray(spheres.scales, float) * body.radius_factor
-        for center, radius in zip(np.asarray(spheres.means, float), radii, strict=True):
-            ET.SubElement(element, "geom", type="sphere", pos=_text(center), size=_text(radius))
-    elif body.shape is not None and body.shape.box is not None:
-        ET.SubElement(element, "geom", type="box", size=_text(body.shape.box.half_extents_m))
-    elif body.shape is not None and body.shape.sphere is not None:
-        ET.SubElement(element, "geom", type="sphere", size=_text(body.shape.sphere.radius_m))
+        names = _geoms(body, model) if model.file.pairs else []
+        for k, (center, radius) in enumerate(zip(np.asarray(spheres.means, float), radii, strict=True)):
+            geom = ET.SubElement(element, "geom", {"name": names[k]} if names else {})
+            geom.attrib.update(type="sphere", pos=_text(center), size=_text(radius))
+    elif body.shape is not None and (body.shape.box is not None or body.shape.sphere is not None):
+        geom = ET.SubElement(element, "geom", {"name": _geoms(body, model)[0]} if model.file.pairs else {})
+        if body.shape.box is not None:
+            geom.attrib.update(type="box", size=_text(body.shape.box.half_extents_m))
+        elif body.shape.sphere is not None:
+            geom.attrib.update(type="sphere", size=_text(body.shape.sphere.radius_m))
 
 
 def _add_keyframe(root: ET.Element, file: ModelFile, keyframe: Keyframe) -> None:

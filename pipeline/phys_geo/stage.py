@@ -139,7 +139,9 @@ def _fitted_motion(
         with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
             earlier = EarlierEstimates.of(ready.file.parameters, ready.file.correlations)
             medians = start_laws(ready.file, capture.manifest).medians
-            found = fit_with_effects(world, episodes, config, noise, warm_started, capture.groups, earlier, medians)
+            found = fit_with_effects(
+                world, episodes, config, noise, warm_started, capture.groups, earlier, medians, measured.force_std_n
+            )
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
         return replace(found, warnings=(*found.warnings, *warnings))

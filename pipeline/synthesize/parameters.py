@@ -25,6 +25,7 @@ from ...schemas import (
     did_you_mean,
     parse,
 )
+from ...schemas.materials import of_pair
 from ..physics.contact_law import restitution
 from ..physics.effects.registry import effect_of
 from .distributions import draw
@@ -134,6 +135,7 @@ def settable(file: ModelFile) -> list[str]:
     """Return the names of all parameters that a rollout can set, fitted or not."""
     names = [parameter.name for parameter in file.parameters]
     names += [*ContactParameters.model_fields, "ground_offset_m"]
+    names += [of_pair(name, entry.materials) for entry in file.pairs for name in ContactParameters.model_fields]
     names += [f"{body.name}.{key}" for body in file.bodies for key in ("mass_kg", "com_x_m", "com_y_m", "com_z_m")]
     names += [f"{_own_name(effect)}.{key}" for effect in file.effects for key in effect.parameters]
     return [name for name in dict.fromkeys(names) if can_vary(file, name)]
@@ -165,7 +167,8 @@ def _unit(file: ModelFile, name: str) -> str:
         for entry in (*loaded.parameters, *loaded.constants) if loaded.name == owner else ():
             if entry.name == number:
                 return entry.unit
-    return _UNITS.get(number, "m" if number.startswith("com_") else "1")
+    base = name.partition("[")[0]
+    return _UNITS.get(base if base in _UNITS else number, "m" if number.startswith("com_") else "1")
 
 
 def _present(file: ModelFile, name: str) -> float:
@@ -174,6 +177,9 @@ def _present(file: ModelFile, name: str) -> float:
         return file.ground.offset_m
     if file.contact is not None and name in type(file.contact).model_fields:
         return getattr(file.contact, name)
+    found = _of_pair(file, name)
+    if found is not None:
+        return getattr(file.pairs[found[0]], found[1])
     owner, _, number = name.partition(".")
     for effect in file.effects:
         if _own_name(effect) == owner:
@@ -184,13 +190,14 @@ def _present(file: ModelFile, name: str) -> float:
 
 def _derived(file: ModelFile, name: str, estimate: float) -> float:
     """Return a derived parameter from the drawn ones, else its estimate; formulas as in the stage phys-geo."""
-    law = file.contact
+    base = name.partition("[")[0]
+    law = next((entry for entry in file.pairs if name == of_pair(base, entry.materials)), file.contact)
     mass = next((body.mass_kg for body in file.bodies if body.motion == "free"), None)
-    if law is None or mass is None or name not in DERIVED:
+    if law is None or mass is None or base not in DERIVED:
         return estimate
-    if name == "restitution":
+    if base == "restitution":
         return float(restitution(torch.tensor(law.damping_ratio, dtype=torch.float64)))
-    if name == "stiffness_n_m":
+    if base == "stiffness_n_m":
         return mass / law.contact_time_s**2
     return 2 * law.damping_ratio * mass / law.contact_time_s
 
@@ -219,7 +226,7 @@ def can_vary(file: ModelFile, name: str) -> bool:
     """Return whether :func:`with_parameter` can set a parameter."""
     if name == "ground_offset_m":
         return file.ground is not None
-    if file.contact is not None and name in type(file.contact).model_fields:
+    if (file.contact is not None and name in type(file.contact).model_fields) or _of_pair(file, name) is not None:
         return True
     owner, _, number = name.partition(".")
     if any(_own_name(effect) == owner and number in effect.parameters for effect in file.effects):
@@ -227,6 +234,15 @@ def can_vary(file: ModelFile, name: str) -> bool:
     legal = ("mass_kg", *(f"com_{axis}_m" for axis in "xyz"))
     moments = tuple(f"moment_{axis}" for axis in "xyz") if any(p.name == name for p in file.parameters) else ()
     return number in (*legal, *moments) and any(body.name == owner for body in file.bodies)
+
+
+def _of_pair(file: ModelFile, name: str) -> tuple[int, str] | None:
+    """Return the index of the pair of materials that a parameter belongs to, and its name without it; else None."""
+    for index, entry in enumerate(file.pairs):
+        for number in ContactParameters.model_fields:
+            if name == of_pair(number, entry.materials):
+                return index, number
+    return None
 
 
 def _own_name(effect: EffectModel) -> str:
@@ -249,6 +265,11 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
         return file.model_copy(update={"ground": file.ground.model_copy(update={"offset_m": value})})
     if file.contact is not None and name in type(file.contact).model_fields:
         return file.model_copy(update={"contact": file.contact.model_copy(update={name: value})})
+    found = _of_pair(file, name)
+    if found is not None:
+        pairs = list(file.pairs)
+        pairs[found[0]] = pairs[found[0]].model_copy(update={found[1]: value})
+        return file.model_copy(update={"pairs": tuple(pairs)})
     owner, _, number = name.partition(".")
     effects = tuple(
         effect.model_copy(update={"parameters": {**effect.parameters, number: value}})
@@ -285,4 +306,8 @@ def _with_number(body: BodyModel, number: str, value: float) -> BodyModel:
 
 def not_varied(file: ModelFile) -> list[str]:
     """Return the names of fitted parameters that rollouts keep at their estimate, because they cannot be set."""
-    return [p.name for p in file.parameters if p.std_error and p.name not in DERIVED and not can_vary(file, p.name)]
+    return [
+        p.name
+        for p in file.parameters
+        if p.std_error and p.name.partition("[")[0] not in DERIVED and not can_vary(file, p.name)
+    ]

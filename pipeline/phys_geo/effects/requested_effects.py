@@ -102,6 +102,7 @@ def fit_with_effects(
     groups: Mapping[str, str] | None = None,
     earlier: EarlierEstimates | None = None,
     medians: Mapping[str, float] | None = None,
+    force_std_n: float | None = None,
 ) -> PhysicsFit:
     """Fit the world as `fit_physics` does, after checking its effects' needs and cutting throws at their release.
 
@@ -112,7 +113,7 @@ def fit_with_effects(
     _require_needs(world, episodes)
     released_s, warnings = find_releases(world, episodes, noise)
     thrown = after_release(episodes, released_s)
-    found = fit_physics(world, thrown, config, noise, warm_started, groups, earlier, medians)
+    found = fit_physics(world, thrown, config, noise, warm_started, groups, earlier, medians, force_std_n)
     return replace(found, warnings=(*found.warnings, *warnings))
 
 

@@ -12,6 +12,7 @@
 6. With few episodes, multiple shooting from several starts, the search's among them (`contact_shooting.py`): states and
    parameters together, with soft ties between short segments that absorb errors of the contact model. With many
    episodes the search alone: their mean error is smooth, and their scatter gives the intervals.
+7. Where tracks of driven bodies carry forces, what these say in addition (`measured_forces.py`).
 
 If nothing touches anything in any episode, there is no contact to search for: the contact parameters stay at their
 priors, and only effects are fitted.
@@ -65,6 +66,7 @@ from .contact_result import (
 from .contact_shooting import ShootingEpisodes, shoot_contact
 from .earlier_estimates import EarlierEstimates
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
+from .measured_forces import measured_forces, with_forces
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
 from .part_choice import SCALE, asked_parts, choose_parts
 
@@ -92,6 +94,7 @@ def fit_physics(
     groups: Mapping[str, str] | None = None,
     earlier: EarlierEstimates | None = None,
     medians: Mapping[str, float] | None = None,
+    force_std_n: float | None = None,
 ) -> PhysicsFit:
     """Fit contact parameters and ground height to measured tracks, and effects and mass distribution where asked for.
 
@@ -107,6 +110,7 @@ def fit_physics(
         groups: Group of each episode that belongs to one, for effects with group-specific parameters.
         earlier: What an earlier fit found: kept where these episodes do not observe it.
         medians: Medians of the priors of contact parameters that are known better than usual, by name.
+        force_std_n: Noise of a component of the measured forces of driven bodies [N]; estimated where None.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
@@ -133,6 +137,11 @@ def fit_physics(
         estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
         if data.bounces is not None:
             estimate = with_damping(estimate, damping_of(data.bounces))
+        forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
+        if forces:
+            note("phys-geo: measured forces")
+            estimate, told = with_forces(ready.world, estimate, forces, batch.observations)
+            record = replace(record, forces=told)
         found = physics_fit(ready.world, earlier.kept_in(ready.world, estimate), data.noise, record)
     return _completed(found, ready)
 

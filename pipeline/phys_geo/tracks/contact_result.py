@@ -122,6 +122,8 @@ class FitRecord:
     """Effective number of samples of the search; None where nothing was searched."""
     shooting: ShootingRecord | None = None
     """Course of multiple shooting, where it was used."""
+    forces: dict[str, Any] | None = None
+    """Record of the fit to measured forces, where there are any."""
     images: dict[str, Any] = field(default_factory=dict)
     """Entries of a fit to videos."""
 
@@ -130,6 +132,7 @@ class FitRecord:
         parts = {
             "the mass distribution": _converged(self.mass_distribution),
             "the effects": _converged(self.effects),
+            "the measured forces": _converged(self.forces),
             "the contact parameters (multiple shooting)": self.shooting is None
             or self.shooting.converged
             or not self.shooting.kept,
@@ -156,6 +159,7 @@ class FitRecord:
             "bounces": self.bounces,
             "search_open_loop_m": self.search_open_loop_m,
             "search_effective_samples": self.search_effective_samples,
+            "forces": self.forces,
         }
         record |= {name: value for name, value in optional.items() if value is not None}
         return record | ({} if self.shooting is None else self.shooting.to_json()) | self.images

@@ -1,0 +1,119 @@
+"""Friction from the measured force of a slow push: the track alone does not tell it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets import Track
+from cgwm.datasets.capture.tracks import Episode
+from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
+from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, PhysicsFit
+from cgwm.pipeline.phys_geo.tracks.measured_forces import force_noise, measured_forces, with_forces
+from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics.engine import rollout as roll_out
+from cgwm.pipeline.physics.parameters import contact_parameters
+from cgwm.pipeline.trajectories.observations import Observations
+from cgwm.pipeline.trajectories.track_noise import Noise
+from cgwm.schemas import FittedParameter, PhysConfig
+from helpers.worlds import ball_body, batch, box_body, law, state_of, world_of
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+MASS, G, FRICTION, SPEED, FORCE_STD = 0.4, 9.81, 0.22, 0.05, 0.02
+HALF = (0.05, 0.05, 0.01)
+GROUND, FINGER = ("aluminium", "wood"), ("aluminium", "steel")
+RADIUS = 0.01
+FINE, COARSE = Noise(1e-4, 1e-3), Noise(1e-3, 1e-2)
+FAST = PhysConfig(population=8, generations=2, iterations=4, step_s=0.002, mass_distribution=False, length_scale=False)
+
+
+def world() -> World:
+    """A box that a finger pushes; its laws are those at the start of a fit, not the true ones."""
+    box, side = box_body(HALF, MASS), batch([[0.005 - HALF[0], 0.0, 0.0]])
+    centers, radii = torch.cat((box.centers, side), 1), torch.cat((box.radii, batch([0.005])), 1)
+    box = replace(box, material="aluminium", centers=centers, radii=radii)
+    finger = replace(ball_body(RADIUS, name="finger"), motion="driven", material="steel")
+    same = world_of(box, finger, contact=law(0.5, 0.004, 0.4), step_s=0.002)
+    return replace(same, ground_material="wood", pair_laws={GROUND: law(0.5), FINGER: law(0.5)})
+
+
+def push(seed: int, sideways_m: float, noise: Noise = FINE) -> Episode:
+    """A push along x at constant speed, of a finger a little beside the middle, with the force of Coulomb's law.
+
+    The track comes from the engine, the force from the closed form mu m g while the box moves.
+    """
+    rng = np.random.default_rng(seed)
+    times = np.arange(0, 0.61, 1 / 60)
+    path = np.stack((-HALF[0] - RADIUS - 0.001 + SPEED * times, np.full_like(times, sideways_m), 0 * times), -1)
+    path[:, 2] = HALF[2]
+    true = replace(world(), pair_laws={GROUND: law(FRICTION), FINGER: law(0.3)})
+    start = state_of(
+        ((0, 0, HALF[2] - 1e-4), UPRIGHT, (0, 0, 0), (0, 0, 0)), (tuple(path[0]), UPRIGHT, (0,) * 3, (0,) * 3)
+    )
+    finger = Track(times, path, np.tile(UPRIGHT, (len(times), 1)))
+    rollout = roll_out(true, start, torch.as_tensor(times), {"finger": finger})
+    position, quat = rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy()
+    force = np.zeros_like(path)
+    force[:, 0] = np.where(position[:, 0] > 2e-4, FRICTION * MASS * G, 0.0)
+    force += FORCE_STD * rng.standard_normal(force.shape)
+    seen = Track(times, position + noise.position_m * rng.standard_normal(position.shape), quat)
+    return Episode(f"{seed}", {"box": seen, "finger": replace(finger, force_n=force)})
+
+
+@cache
+def fitted(forces: bool) -> PhysicsFit:
+    noise = FINE if forces else COARSE  # with fine tracks, how far the box springs off the finger tells a little
+    episodes = [push(0, 0.0, noise), push(1, 0.0, noise)]
+    if not forces:
+        episodes = [Episode(n, {"box": t["box"], "finger": replace(t["finger"], force_n=None)}) for n, t in episodes]
+    return fit_physics(world(), episodes, FAST, noise)
+
+
+def parameter(found: PhysicsFit, name: str) -> FittedParameter:
+    return next(p for p in found.parameters if p.name == name)
+
+
+def test_the_force_of_a_slow_push_tells_the_friction_of_the_ground() -> None:
+    """From the priors alone, which is what the motion leaves of the frictions."""
+    one = push(0, 0.0)
+    parameters = contact_parameters(world())
+    assert [p.name for p in parameters][::3] == ["friction[aluminium,wood]", "friction[aluminium,steel]"]
+    prior = ContactEstimate(
+        parameters=parameters,
+        values=np.array([p.encode(p.prior[0]) for p in parameters]),
+        covariance=np.diag([p.prior[1] ** 2 for p in parameters]),
+    )
+    seen = Observations.of(world(), [one], [(-1.0, 1.0)])
+    forces = measured_forces(world(), [one], seen, FORCE_STD)
+    assert [force.std_n for force in forces] == [FORCE_STD]
+    found, record = with_forces(world(), prior, forces, seen)
+    error = np.sqrt(found.covariance[0, 0])
+    assert abs(found.values[0] - np.log(FRICTION)) < min(0.01, 1.96 * error)
+    assert error < 0.01 and np.sqrt(found.covariance[3, 3]) > 0.3  # the finger's own friction hardly shows
+    assert record["converged"] and record["misfit"] < 1.5
+
+
+@pytest.mark.evidence
+def test_a_fit_with_forces_finds_the_friction_of_the_ground() -> None:
+    found = fitted(True)
+    friction = parameter(found, "friction[aluminium,wood]")
+    assert friction.state == "fitted" and friction.interval_95 is not None
+    assert abs(friction.estimate / FRICTION - 1) < 0.01
+    assert friction.interval_95[0] < FRICTION < friction.interval_95[1]
+    assert found.pairs[GROUND].friction == friction.estimate
+    assert found.record.forces is not None and found.record.forces["converged"]
+
+
+@pytest.mark.evidence
+def test_without_forces_it_is_not_observable() -> None:
+    found = fitted(False)
+    assert parameter(found, "friction[aluminium,wood]").state == "not_observable"
+    assert any("friction[aluminium,wood]" in text and "not observable" in text for text in found.warnings)
+    assert found.record.forces is None
+
+
+def test_noise_of_forces_is_that_of_their_second_differences() -> None:
+    rng = np.random.default_rng(0)
+    slow = np.linspace(0, 3, 4000)[:, None] * np.array([1.0, 0.5, -2.0])
+    assert abs(force_noise(slow + 0.05 * rng.standard_normal(slow.shape)) / 0.05 - 1) < 0.1
