@@ -255,7 +255,8 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'format = "cgwm-capture/1"\n',
             "",
             "C/capture.toml: the top level lacks the field 'format'.\n"
-            "Allowed: format, world, bodies, materials, pairs, measurement, splits, episodes, video, calibration.\n"
+            "Allowed: format, world, bodies, materials, pairs, surfaces, measurement, "
+            "splits, episodes, video, calibration.\n"
             "Next: correct the field.",
         ),
         (
@@ -269,7 +270,8 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             "[splits]",
             "[split]",
             "C/capture.toml, line 7: the top level has an unknown field 'split'.\n"
-            "Allowed: format, world, bodies, materials, pairs, measurement, splits, episodes, video, calibration. "
+            "Allowed: format, world, bodies, materials, pairs, surfaces, measurement, "
+            "splits, episodes, video, calibration. "
             "Did you mean 'splits'?\nNext: correct the field.",
         ),
         (
