@@ -7,7 +7,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
@@ -18,6 +20,7 @@ from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
 from ..trajectories.track_noise import Noise, estimate_noise
+from .carried_starts import carried_starts
 from .contact_phases import is_round
 from .release_detection import held_starts, release_warnings, without_held
 from .segment_states import fit_states
@@ -202,16 +205,20 @@ class _State:
         episodes: Sequence[Episode],
         given: tuple[float | None, float | None],
     ) -> _State:
-        """Return the whole episodes with a rough estimate of their noise, not yet cut."""
+        """Return the episodes from their releases on with a rough estimate of their noise, not yet cut."""
         free = [world.bodies[k].name for k in world.free]
         rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
-        whole = whole_episodes(world, episodes)
+        noise = Noise(given[0] or rough[0], given[1] or rough[1])
+        every = whole_episodes(world, episodes)
+        held = carried_starts(world, every, noise)
+        whole = without_held(every, held)
         nothing = torch.zeros_like(whole.seen[..., 0], dtype=torch.bool)
         return _State(
             world=world,
             given=given,
-            noise=Noise(given[0] or rough[0], given[1] or rough[1]),
+            noise=noise,
             observations=whole,
+            held=held,
             oriented=bool(whole.has_orientation.any()),
             airborne=nothing,
             supported=nothing,
@@ -301,18 +308,27 @@ def _model_correlated_noise(state: _State) -> None:
         return
     position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))
     state.noise = Noise(position, rotation)
-    state.segment(state.touched | _smeared(state.observations, ~state.airborne))
+    state.segment(state.touched | _smeared(state.observations, ~state.airborne, state.noise_model))
     state.fit_flights()
     state.warnings.append(noise_model_warnings(state.noise_model))
 
 
-def _smeared(whole: Observations, contact: Tensor) -> Tensor:
-    """Return the frames (E, T) into which a filter smears contacts."""
+def _smeared(whole: Observations, contact: Tensor, noise_model: NoiseModel) -> Tensor:
+    """Return the frames (E, T) into which a filter smears contacts: it reaches as far as it correlates errors."""
     seen = whole.seen.amax(-1) > 0
-    near = torch.nn.functional.max_pool1d(
-        (contact & seen).double()[:, None], 2 * LIMITS.smeared_frames + 1, 1, LIMITS.smeared_frames
+    step_s = float(
+        np.median(np.concatenate([_steps(times, known) for times, known in zip(whole.times_s, seen, strict=True)]))
     )
+    memory_s = max(noise.time_s for noise in noise_model if noise.share)
+    reach_s = min(LIMITS.smeared_times * memory_s, LIMITS.smeared_s)
+    reach = max(LIMITS.smeared_frames, math.ceil(reach_s / step_s))
+    near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * reach + 1, 1, reach)
     return near[:, 0] > 0
+
+
+def _steps(times_s: Tensor, known: Tensor) -> NDArray[np.float64]:
+    """Return the times between known frames [s]."""
+    return times_s[known].diff().numpy(force=True).astype(np.float64)
 
 
 def _agreed(

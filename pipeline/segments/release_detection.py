@@ -1,4 +1,7 @@
-"""Detection of episodes that begin before the release: in the first frames the body turns differently from the rest.
+"""Detection of episodes that begin before the release: in the first frames the body moves or turns unlike the rest.
+
+A step of acceleration of the size of gravity shows in the positions (`carried_starts`), of each episode alone; smaller
+torques show in how it turns:
 
 A hand or a machine that still touches a body when a recording begins applies a torque for some frames. In free flight a
 body turns by its inertia alone, whatever forces act on its centre of mass, so the orientation shows the release without
@@ -21,6 +24,7 @@ from ...pipeline.trajectories.track_noise import Noise
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
 from ..trajectories.track_noise import estimate_noise
+from .carried_starts import carried_starts
 from .segment_states import fit_states
 from .segments import Segments
 from .thresholds import SEGMENT_THRESHOLDS
@@ -72,15 +76,14 @@ def find_releases(
     """
     free = [world.bodies[k].name for k in world.free]
     found = [tracks[name] for _, tracks in episodes for name in free if name in tracks]
-    if all(track.quat_wxyz is None for track in found):
-        return {}, []
     rough = estimate_noise(found)
     std = Noise(noise[0] or rough[0], noise[1] or rough[1])
     whole = whole_episodes(world, episodes)
-    items, _, _ = cut_episodes(world, whole, std)
-    if not items:
-        return {}, []
-    held = held_starts(fit_states(Segments.of("flight", world, whole, items, std)), whole)
+    held = carried_starts(world, whole, std)
+    freed = without_held(whole, held)
+    items, _, _ = cut_episodes(world, freed, std)
+    if items and any(track.quat_wxyz is not None for track in found):
+        held |= held_starts(fit_states(Segments.of("flight", world, freed, items, std)), freed)
     released_s = {episodes[k][0]: float(whole.times_s[k, first]) for k, first in held.items()}
     return released_s, release_warnings(released_s, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
 
@@ -109,8 +112,8 @@ def release_warnings(released_s: Mapping[str, float], starts_s: Mapping[str, flo
         starts_s: Time [s] of the first frame, by name.
     """
     return [
-        f"episode '{name}' begins in a hand: for the first {1e3 * (at - starts_s[name]):.0f} ms of flight the body "
-        "turns differently from the rest, as if something still touched it or the tracker had not found it yet. These "
+        f"episode '{name}' begins in a hand: for the first {1e3 * (at - starts_s[name]):.0f} ms the body moves or "
+        "turns unlike the rest, as if something still touched it or the tracker had not found it yet. These "
         "frames are left out; start the recording there ([episodes] start_s in capture.toml: "
         f"{at:.3f} on the track's clock)."
         for name, at in released_s.items()

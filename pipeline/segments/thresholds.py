@@ -66,6 +66,32 @@ class InputThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CarriedThresholds:
+    """An episode begins while the body is carried or pushed."""
+
+    weights: float = threshold(
+        0.5,
+        "weights",
+        "step of acceleration at the release from which something held or pushed the body before",
+        "by argument: what holds a body still carries its weight; effects in flight are smooth",
+        "the first tenth of a second is lost where it is none",
+    )
+    sigmas: float = threshold(5.0, "standard errors", "the same: at least so many", BY_ARGUMENT)
+    longest_s: float = threshold(0.2, "s", "latest release that is looked for", BY_ARGUMENT)
+    free_s: float = threshold(0.06, "s", "shortest motion after the release", BY_ARGUMENT)
+    window_s: float = threshold(0.35, "s", "motion from the first frame on that is a parabola", BY_ARGUMENT)
+    least_frames: int = threshold(8, "frames", "fewest that a beginning has", "parabola, step and its time")
+    widths_s: tuple[float, ...] = threshold(
+        (0.0, 0.008, 0.016, 0.024),
+        "s",
+        "widths of a filter that rounds the step",
+        "by argument: low passes from 10 Hz on",
+    )
+    rounded: float = threshold(2.0, "widths", "after the release the rounded step is over", BY_ARGUMENT)
+    most_alike: float = threshold(0.95, "1", "largest correlation of neighbouring errors that is believed", BY_ARGUMENT)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PreparationThresholds:
     """Noise is believed, a direction or a force counts as measured."""
 
@@ -81,8 +107,15 @@ class PreparationThresholds:
         "frames",
         "frames next to a contact that count as contact where errors are correlated",
         "by argument: a filter of seven frames",
-        "after longer filters impacts are smeared further",
+        "longer filters: `smeared_times`",
     )
+    smeared_times: float = threshold(
+        2.0,
+        "correlation times",
+        "the same, in times over which the errors are correlated",
+        "by argument: a filter smears a contact as far as it correlates errors",
+    )
+    smeared_s: float = threshold(0.04, "s", "longest such time: slower errors come from no filter", BY_ARGUMENT)
     bad_fit: float = threshold(1.3, "1", "chi2 of a contact segment, in usual ones, from which it is fitted again")
     unobservable_share: float = threshold(
         0.8, "widths of the prior", "standard error from which a parameter is called not observable"
@@ -258,6 +291,8 @@ class SegmentThresholds:
 
     input: InputThresholds = InputThresholds()
     """Input checks."""
+    carried: CarriedThresholds = CarriedThresholds()
+    """Beginnings in a hand."""
     preparation: PreparationThresholds = PreparationThresholds()
     """Preparation and linearization."""
     phases: PhaseThresholds = PhaseThresholds()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -72,9 +72,9 @@ def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
 def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Noise) -> tuple[Observations, int, Tensor]:
     """Remove wrong measurements in flight, and find flight frames in which something touched the body.
 
-    A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen. Where the other
-    frames of a window do not lie on a cubic either, something touched the body: a bounce on a ground at another height
-    than stated, or a hand.
+    A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen; so are several
+    in a row where the frames before and after them lie on one cubic. Where they do not, something touched the body: a
+    bounce on a ground at another height than stated, or a hand.
 
     Returns:
         The episodes; the number of wrong measurements; frames (E, T) of flight in which something touched the body.
@@ -82,6 +82,13 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
     seen, turned = whole.seen.clone(), whole.has_orientation.clone()
     kinked = torch.zeros_like(seen[..., 0], dtype=torch.bool)
     wrong: set[tuple[int, int, int, int]] = set()
+    for kind in (0, 1):
+        mask = (seen, turned)[kind]
+        for episode, frames, column in _bursts(whole, flight, noise, kind):
+            mask[episode, frames, column] = 0.0
+            wrong |= {(kind, episode, int(frame), column) for frame in frames}
+    count, whole = len(wrong), replace(whole, seen=seen.clone(), has_orientation=turned.clone())
+    wrong.clear()
     for kind in (0, 1):
         for segment, column, frames, away in _windows(whole, flight, kind, step=1):
             size = np.abs(away).max(1) / noise[kind]
@@ -94,12 +101,50 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
                 wrong.add((kind, segment.episode, int(frames[worst]), column))
             else:
                 kinked[segment.episode, torch.as_tensor(frames)] = True
-    count = 0
     for kind, episode, frame, column in wrong:
         if not bool(kinked[episode, frame]):
             (seen, turned)[kind][episode, frame, column] = 0.0
             count += 1
     return replace(whole, seen=seen, has_orientation=turned), count, kinked
+
+
+def _bursts(
+    whole: Observations, flight: Sequence[Segment], noise: Noise, kind: int
+) -> Iterator[tuple[int, np.ndarray, int]]:
+    """Yield episode, frames and body of bursts: rows of wrong measurements between frames that lie on one cubic."""
+    rough: dict[tuple[int, int, int, int], set[int]] = {}
+    for segment, column, frames, away in _windows(whole, flight, kind, step=1):
+        if np.abs(away).max() > LIMITS.outlier_sigmas * noise[kind]:
+            rough.setdefault((segment.episode, segment.first, segment.last, column), set()).update(frames.tolist())
+    mask = (whole.seen, whole.has_orientation)[kind]
+    for (episode, first, last, column), found in rough.items():
+        frames = np.array(sorted(found))
+        for run in np.split(frames, np.nonzero(np.diff(frames) > 1)[0] + 1):
+            # a window that holds one wrong frame reaches beyond it by its own length
+            inner = run[WINDOW // 2 : len(run) - WINDOW // 2]
+            if not len(inner) or inner[0] - WINDOW < first or inner[-1] + WINDOW > last:
+                continue
+            frames = np.arange(inner[0] - WINDOW, inner[-1] + 1 + WINDOW)
+            frames = frames[mask[episode, torch.as_tensor(frames), column].numpy() > 0]
+            outside = (frames < inner[0]) | (frames > inner[-1])
+            times = whole.times_s[episode].numpy()
+            if times[inner[-1]] - times[inner[0]] > LIMITS.longest_burst_s or outside.sum() < WINDOW or outside.all():
+                continue
+            away = _off_cubic(whole, episode, column, frames, kind, outside) / noise[kind]
+            wrong = frames[~outside & (away > LIMITS.keep_sigmas)]
+            if away[outside].max() <= LIMITS.outlier_sigmas and len(wrong) >= LIMITS.least_burst:
+                yield episode, wrong, column
+
+
+def _off_cubic(
+    whole: Observations, episode: int, column: int, frames: np.ndarray, kind: int, fitted: np.ndarray
+) -> np.ndarray:
+    """Return how far each of the frames (n) is from the cubic through the fitted ones [m or rad], in any coordinate."""
+    chosen = torch.as_tensor(frames)
+    t, values = _values(whole, episode, column, chosen, kind)
+    powers = np.vander((t - t.mean()) / (t[-1] - t[0]), DEGREE + 1)
+    coefficients = np.linalg.lstsq(powers[fitted], values[fitted], rcond=None)[0]
+    return np.abs(values - powers @ coefficients).max(1)
 
 
 def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: float) -> float:
@@ -190,12 +235,7 @@ def _positions(whole: Observations, episode: int, column: int, frames: Tensor) -
 
 def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> np.ndarray:
     """Return the residuals of a cubic (n, 1 to 3) [m or rad], scaled to equal variance."""
-    t = whole.times_s[episode, frames].numpy()
-    if kind == 0:
-        values = _positions(whole, episode, column, frames)
-    else:
-        quat = whole.quat_wxyz[episode, frames, column]
-        values = continuous_turns(whole.times_s[episode, frames], quat, reference=torch.tensor(len(quat) // 2)).numpy()
+    t, values = _values(whole, episode, column, frames, kind)
     scaled = (t - t.mean()) / (t[-1] - t[0])
     q, _ = np.linalg.qr(np.vander(scaled, DEGREE + 1))
     left = 1 - (q * q).sum(1)
@@ -209,3 +249,12 @@ def _spread(residuals: np.ndarray, floor: float) -> float | None:
     first = MAD_TO_STD * float(np.median(np.abs(residuals)))
     kept = residuals[np.abs(residuals) < LIMITS.keep_sigmas * max(first, floor)]
     return max(float(np.sqrt(np.mean(kept**2))), floor)
+
+
+def _values(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (n) [s] and what is measured then (n, 1 to 3): positions [m], or rotation vectors [rad]."""
+    times = whole.times_s[episode, frames]
+    if kind == 0:
+        return times.numpy(), _positions(whole, episode, column, frames)
+    quat = whole.quat_wxyz[episode, frames, column]
+    return times.numpy(), continuous_turns(times, quat, reference=torch.tensor(len(quat) // 2)).numpy()

@@ -59,7 +59,8 @@ def cut_episodes(
     Returns:
         The flight segments, the contact segments, and the airborne frames (E, T).
     """
-    clear = clear_frames(world, whole, noise)
+    # a wrong measurement in the middle of a flight does not end it
+    clear = clear_frames(world, replace(whole, seen=_between(whole.seen)), noise)
     if touched is not None:
         clear &= ~touched
     flight: list[Segment] = []
@@ -73,6 +74,11 @@ def cut_episodes(
             flight += flies
             contact += touches
     return flight, without_rest(whole, contact, noise), clear
+
+
+def _between(seen: Tensor) -> Tensor:
+    """Return 1 for all frames from the first to the last seen one of a body (E, T, nf), 0 elsewhere."""
+    return torch.minimum(seen.cummax(1).values, seen.flip(1).cummax(1).values.flip(1))
 
 
 def _cut_stretch(

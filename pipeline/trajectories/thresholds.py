@@ -66,6 +66,15 @@ class TrackNoiseThresholds:
         "a frame this far from the cubic through its neighbours is a wrong measurement",
         "by argument: 2e-9 of normal errors",
     )
+    longest_burst_s: float = threshold(
+        0.1,
+        "s",
+        "longest row of wrong measurements in flight; a cubic follows the motion over no longer one",
+        BY_ARGUMENT,
+    )
+    least_burst: int = threshold(
+        2, "frames", "fewest wrong frames in such a row; a single one is told by itself", BY_ARGUMENT
+    )
     keep_sigmas: float = threshold(
         4.0,
         "sigmas",

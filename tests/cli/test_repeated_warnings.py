@@ -8,7 +8,7 @@ def test_episodes_that_begin_in_a_hand_are_one_warning_with_the_range_of_their_n
     starts = {f"{k:03d}": 0.0 for k in range(8)}
     (text,) = warnings(release_warnings({name: 0.02 + 0.01 * k for k, name in enumerate(starts)}, starts))
     assert text.startswith("warning: 8 episodes (000, 001, 002, 003, 004, 005 and 2 more) begin in a hand: ")
-    assert "for the first 20 to 90 ms of flight" in text
+    assert "for the first 20 to 90 ms the body moves or turns unlike the rest" in text
     assert "0.020 to 0.090 on the track's clock" in text
 
 

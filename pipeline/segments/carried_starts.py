@@ -1,0 +1,160 @@
+"""Detection of episodes that begin while something carries or pushes the body: its acceleration steps at the release.
+
+Until the release at t_r a body has an acceleration that its free motion has not: x(t) = p(t) + A (t_r - t)^2 / 2 for
+t < t_r, with a polynomial p of second degree and continuous velocity. What holds a body still carries its weight, and a
+hand that throws it does more, so A is of the size of gravity and points up; effects of air, wind or tilt have no step
+of that size, and the rounded beginning of an impact is one down. On the ground, no contact makes a body gain speed
+faster than by friction: there A has to be along the motion. A filter rounds the step; its width, a property of the
+capture, is fitted with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from ..physics.world import World
+from ..trajectories.observations import Observations
+from ..trajectories.segmentation import clear_frames
+from ..trajectories.track_noise import Noise
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.carried
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Beginning:
+    """The first frames of a body in an episode: all in flight, or all on the ground."""
+
+    episode: int
+    """Index of the episode."""
+    frames: NDArray[np.intp]
+    """Their indices (n)."""
+    times_s: Array
+    """Times since the first one (n) [s]."""
+    places_m: Array
+    """Positions (n, d) [m]: all three coordinates in flight, those along the ground on it."""
+    airborne: bool
+    """Whether it begins in flight."""
+    up: Array
+    """Unit vector (3,) against gravity."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step:
+    """The step of acceleration that explains a beginning best."""
+
+    release_s: float
+    """Time since the first frame [s]."""
+    size_m_s2: float
+    """Size of the step [m/s2]; 0 where none is admissible."""
+    known_m_s2: float
+    """Its standard error for independent errors of 1 m [m/s2]."""
+    residual_m: Array
+    """What is left (n, d) [m]."""
+
+
+def carried_starts(world: World, whole: Observations, noise: Noise) -> dict[int, int]:
+    """Return the first free frame of each episode that begins while the body is carried or pushed, by index.
+
+    Worlds with several bodies, of which one may push another, have none.
+
+    Args:
+        world: With the shape, the ground and gravity.
+        whole: The episodes.
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
+    """
+    begun = list(_beginnings(world, whole, noise)) if len(world.bodies) == 1 else []
+    if not begun:
+        return {}
+    least = LIMITS.weights * float(world.gravity.norm())
+    tried = {width: [_step(one, width) for one in begun] for width in LIMITS.widths_s}
+    width, steps = min(tried.items(), key=lambda item: _left(item[1]))
+    spread = _spread(steps)
+    found = {}
+    for one, step in zip(begun, steps, strict=True):
+        if step.size_m_s2 >= max(least, LIMITS.sigmas * spread * step.known_m_s2):
+            # the error of the release's time is about one frame
+            free = int(np.searchsorted(one.times_s, step.release_s + LIMITS.rounded * width)) + 1
+            if free < len(one.frames):
+                found[one.episode] = int(one.frames[free])
+    return found
+
+
+def _beginnings(world: World, whole: Observations, noise: Noise) -> Iterator[Beginning]:
+    """Yield the first frames of the episodes that have enough of them."""
+    clear, normal = clear_frames(world, whole, noise).numpy(force=True), world.ground_normal
+    up = -(world.gravity / world.gravity.norm()).flatten().numpy(force=True).astype(np.float64)
+    for episode, times in enumerate(whole.times_s.numpy(force=True)):
+        seen = np.nonzero(whole.seen[episode, :, 0].numpy(force=True) > 0)[0]
+        if not len(seen):
+            continue
+        airborne = bool(clear[episode, seen[0]])
+        other = np.nonzero(clear[episode, seen] != airborne)[0]
+        frames = seen[: other[0]] if len(other) else seen
+        frames = frames[times[frames] - times[frames[0]] <= LIMITS.window_s]
+        if len(frames) < LIMITS.least_frames:
+            continue
+        places = whole.position_m[episode, frames, 0].numpy(force=True).astype(np.float64)
+        if not airborne and normal is not None:
+            across = normal.numpy(force=True).astype(np.float64)
+            places = places - (places @ across)[:, None] * across
+        since = (times[frames] - times[frames[0]]).astype(np.float64)
+        yield Beginning(episode=episode, frames=frames, times_s=since, places_m=places, airborne=airborne, up=up)
+
+
+def _step(one: Beginning, width_s: float) -> Step:
+    """Return the step of acceleration that explains a beginning best, rounded by a filter of a width [s]."""
+    scale = one.times_s[-1]
+    powers = np.vander(one.times_s / scale, 3, increasing=True)
+    basis = np.linalg.qr(powers)[0]
+    plain = one.places_m - basis @ (basis.T @ one.places_m)
+    latest = min(LIMITS.longest_s, scale - LIMITS.free_s)
+    releases = one.times_s[one.times_s <= latest]
+    best = Step(release_s=0.0, size_m_s2=0.0, known_m_s2=0.0, residual_m=plain)
+    if not len(releases):
+        return best
+    shapes = _shape(releases[:, None] - one.times_s, width_s)
+    shapes = shapes - (shapes @ basis) @ basis.T
+    square = (shapes**2).sum(1)
+    sizes = np.divide(shapes @ plain, square[:, None], out=np.zeros((len(square), 3)), where=square[:, None] > 0)
+    gains = square * (sizes**2).sum(1)
+    gains[sizes @ (one.up if one.airborne else one.places_m[-1] - one.places_m[0]) <= 0] = 0.0
+    place = int(gains.argmax())
+    if gains[place] <= 0:
+        return best
+    return Step(
+        release_s=float(releases[place]),
+        size_m_s2=float(np.linalg.norm(sizes[place])),
+        known_m_s2=float(1 / np.sqrt(square[place])),
+        residual_m=plain - shapes[place][:, None] * sizes[place],
+    )
+
+
+def _shape(before_s: Array, width_s: float) -> Array:
+    """Return (t_r - t)^2 / 2 until the release and 0 after it, convolved with a normal density of a width [s]."""
+    if width_s <= 0:
+        return 0.5 * before_s.clip(0.0) ** 2
+    x = before_s / width_s
+    density = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    return 0.5 * width_s**2 * ((x**2 + 1) * ndtr(x) + x * density)
+
+
+def _left(steps: Sequence[Step]) -> float:
+    return sum(float((step.residual_m**2).sum()) for step in steps)
+
+
+def _spread(steps: Sequence[Step]) -> float:
+    """Return the standard deviation of the residuals [m] that independent errors as uncertain as these would have.
+
+    Errors with correlation r between neighbouring frames carry (1 - r) / (1 + r) as much information.
+    """
+    usual = float(np.median([(step.residual_m**2).sum() / max(step.residual_m.size - 9, 1) for step in steps]))
+    products = sum(float((step.residual_m[1:] * step.residual_m[:-1]).sum()) for step in steps)
+    alike = float(np.clip(products / max(_left(steps), 1e-30), 0.0, LIMITS.most_alike))
+    return float(np.sqrt(usual * (1 + alike) / (1 - alike)))

@@ -1,0 +1,56 @@
+"""What is carried or pushed when a recording begins is seen by its acceleration, in each episode alone."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.segments.carried_starts import carried_starts
+from cgwm.pipeline.segments.release_detection import find_releases
+from cgwm.pipeline.trajectories.segmentation import whole_episodes
+from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers.diagnosis_data import tosses, world_with
+
+NOISE = Noise(3e-4, 1e-3)
+RATE_HZ = 148.0
+HELD_FRAMES = 9
+UP = np.array([0.0, 0.0, 1.0])
+Episodes = list[tuple[str, dict[str, Track]]]
+
+
+def thrown(effects: Mapping[str, Mapping[str, float]] | None = None) -> Episodes:
+    return tosses(world_with("ball", effects or {}), 3, 6, 0.3, RATE_HZ, NOISE, (0.6, 0.9))
+
+
+def carried(episodes: Episodes, acceleration_m_s2: np.ndarray) -> Episodes:
+    """All tosses with a hand that carries the body with an additional acceleration until the release."""
+    found = []
+    for name, tracks in episodes:
+        ((body, track),) = tracks.items()
+        before = np.clip(track.time_s[HELD_FRAMES] - track.time_s, 0, None)
+        moved = track.position_m + 0.5 * before[:, None] ** 2 * acceleration_m_s2
+        found.append((name, {body: replace(track, position_m=moved)}))
+    return found
+
+
+@pytest.mark.parametrize("acceleration", [9.81 * UP, np.array([12.0, -8.0, 15.0])], ids=["held still", "thrown"])
+def test_releases_are_found_though_every_episode_begins_in_a_hand(acceleration: np.ndarray) -> None:
+    world = world_with("ball")
+    released, warnings = find_releases(world, carried(thrown(), acceleration), (None, None))
+    assert len(released) == len(warnings) == 6
+    for at in released.values():
+        assert HELD_FRAMES / RATE_HZ <= at + 1e-9 <= (HELD_FRAMES + 4) / RATE_HZ
+
+
+@pytest.mark.parametrize(
+    "effects", [{}, {"quadratic_drag": {"k": 0.3}}, {"magnus_lift": {"s": 0.02}}, {"gravity_scale": {"s": 0.2}}]
+)
+def test_what_acts_all_along_the_flight_carries_nothing(effects: Mapping[str, Mapping[str, float]]) -> None:
+    world = world_with("ball")
+    assert carried_starts(world, whole_episodes(world, thrown(effects)), NOISE) == {}
+
+
+def test_a_step_down_is_the_rounded_beginning_of_an_impact() -> None:
+    world = world_with("ball")
+    assert carried_starts(world, whole_episodes(world, carried(thrown(), -20.0 * UP)), NOISE) == {}
