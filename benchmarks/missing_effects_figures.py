@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from real_like.score import RIGHT, judge, ratio_of, wilson
 from render_results import record
 
 LARGE_RATIO = 300**0.5
 """From this multiple of the slow error on an effect counts as large: the middle of 3 to 100 on a log scale."""
 MOST_FALSE_NULLS, MOST_WRONG_UNKNOWN, LEAST_LARGE, LEAST_SMALL, LEAST_PAIRS = 0.02, 0.05, 0.9, 0.8, 0.8
+MOST_RATIO = 0.5
 Row = dict[str, Any]
 
 
 def record_figures(rows: Sequence[Row], command: str) -> None:
-    """Record the figures of a whole report, all contenders, in benchmarks/results/diagnose.jsonl."""
+    """Record the figures of a report, all contenders, in benchmarks/results/diagnose.jsonl."""
     for who in dict.fromkeys(row["contender"] for row in rows):
         own = [row for row in rows if row["contender"] == who]
         for figure in figures(who, own):
@@ -42,6 +44,31 @@ def figures(who: str, rows: Sequence[Row]) -> Iterator[Row]:
         yield _most(who, f"real-like, nothing hidden, motions of {engine}: a wrong name", alarms, MOST_FALSE_NULLS)
     wrong = [bool(mark["false"]) for _, mark in judged]
     yield _most(who, "real-like, all captures: a wrong name", wrong, None)
+    yield from _added(who, [row for row, (_, mark) in zip(rows, judged, strict=True) if mark["mark"] in RIGHT])
+
+
+def _added(who: str, named: Sequence[Row]) -> Iterator[Row]:
+    """Yield what adding the effects did where they were named rightly: errors of the test split, and intervals."""
+    from diagnose import covered
+
+    errors = [row["errors"] for row in named if "errors" in row]
+    pairs = [(one["before"]["open_loop_m"], one["after"]["open_loop_m"]) for one in errors]
+    ratios = [after / before for before, after in pairs if before and after]
+    if ratios:
+        middle, spread = float(np.median(ratios)), np.percentile(ratios, (25, 75))
+        yield {
+            "figure": "real-like, open-loop error on test episodes, with the named effect / without it",
+            "value": round(middle, 2),
+            "target": f"at most {MOST_RATIO}",
+            "met": middle <= MOST_RATIO,
+            "note": f"median of {len(ratios)}, half lie within {spread[0]:.2f} to {spread[1]:.2f}",
+        }
+    held = [yes for row in named for yes in covered({**row, "truth": row["truth"]["effects"]})]
+    if held:
+        yield {
+            **_figure(who, "real-like, 95 % intervals of added parameters that contain the true value", held,
+                      wilson(sum(held), len(held)), "90 to 99 %", 0.9 <= sum(held) / len(held) <= 0.99, ""),
+        }  # fmt: skip
 
 
 def _right(judged: Sequence[tuple[Row, Row]], row: str) -> list[bool]:
