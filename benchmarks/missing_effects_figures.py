@@ -51,7 +51,8 @@ def _added(who: str, named: Sequence[Row]) -> Iterator[Row]:
     """Yield what adding the effects did where they were named rightly: errors of the test split, and intervals."""
     from diagnose import covered
 
-    errors = [row["errors"] for row in named if "errors" in row]
+    added = [row for row in named if "errors" in row]
+    errors = [row["errors"] for row in added]
     pairs = [(one["before"]["open_loop_m"], one["after"]["open_loop_m"]) for one in errors]
     ratios = [after / before for before, after in pairs if before and after]
     if ratios:
@@ -63,7 +64,7 @@ def _added(who: str, named: Sequence[Row]) -> Iterator[Row]:
             "met": middle <= MOST_RATIO,
             "note": f"median of {len(ratios)}, half lie within {spread[0]:.2f} to {spread[1]:.2f}",
         }
-    held = [yes for row in named for yes in covered({**row, "truth": row["truth"]["effects"]})]
+    held = [yes for row in added for yes in covered({**row, "truth": row["truth"]["effects"]})]
     if held:
         yield {
             **_figure(who, "real-like, 95 % intervals of added parameters that contain the true value", held,
