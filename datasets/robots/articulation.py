@@ -107,7 +107,10 @@ class Articulation:
         for joint in joints:
             for end in (joint.parent, joint.link):
                 if end not in links:
-                    raise InputDataError(f"{path}: joint '{joint.name}' names the link '{end}', which is not there.")
+                    raise InputDataError(
+                        f"{path}: joint '{joint.name}' names the link '{end}', which is not there.",
+                        ", ".join(links) + ".",
+                    )
             if joint.link in carried:
                 raise InputDataError(
                     f"{path}: link '{joint.link}' is carried by the joints '{carried[joint.link].name}' and "

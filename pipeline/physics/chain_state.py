@@ -55,7 +55,10 @@ def _require_tree(world: World, chain: Chain, bodies: Mapping[str, Body], owner:
     seen: list[str] = []
     for link, parent in zip(chain.links, ("", *(joint.parent for joint in chain.joints)), strict=True):
         if link not in bodies or bodies[link].motion != "link":
-            raise InputDataError(f"{place}: '{link}' is not a body with motion \"link\" of this world.")
+            links = [name for name, body in bodies.items() if body.motion == "link"]
+            raise InputDataError(
+                f"{place}: '{link}' is not a body with motion \"link\" of this world.", ", ".join(links) + "."
+            )
         if link in owner:
             raise InputDataError(f"{place}: '{link}' is carried by two joints: a loop.", "a tree of links.")
         if parent and parent not in seen:

@@ -572,7 +572,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
     int count = 0;
 #if PAIRED
-    int groups[BODIES] = {}, ends[PAIRS], loaded = 0;
+    int groups[BODIES] = {}, ends[PAIR_ROOM], loaded = 0;
     for (int p = 0; p < PAIRS; p++) {
         int a = pair_a(p), b = pair_b(p), touching = 0;
         if (b >= 0) {
@@ -603,7 +603,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         ends[p] = count;
     }
     split(list, count, groups);
-    Load loads[PAIRS];
+    Load loads[PAIR_ROOM];
     if (!env.lanes.any(count > 0)) {
         forget(env);
 #if LINKS
@@ -648,7 +648,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
 #if PAIRED
     const int first_sweep = sweep;
-    bool active[PAIRS];
+    bool active[PAIR_ROOM];
     for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = env.lanes.any(ends[p] > first);
 #endif
     do {
