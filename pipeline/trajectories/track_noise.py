@@ -57,9 +57,11 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
         t = track.time_s[rows] - track.time_s[rows].mean(1, keepdims=True)
         positions.append(_residuals(t, track.position_m[:, moves(track.position_m)][rows], degree).ravel())
         if track.quat_wxyz is not None:
-            turn = Rotation.from_quat(track.quat_wxyz, scalar_first=True)
-            middle = turn[np.repeat(rows[:, WINDOW // 2], window)]
-            turned = (middle.inv() * turn[rows.ravel()]).as_rotvec().reshape(*rows.shape, 3)
+            middle, turn = (
+                Rotation.from_quat(track.quat_wxyz[frames], scalar_first=True)
+                for frames in (np.repeat(rows[:, WINDOW // 2], window), rows.ravel())
+            )
+            turned = (middle.inv() * turn).as_rotvec().reshape(*rows.shape, 3)
             rotations.append(_residuals(t, turned, degree).ravel())
     return Noise(max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD))
 
