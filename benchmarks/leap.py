@@ -1,4 +1,4 @@
-"""Cost of a sub-step of a robot hand that turns a cube: cgwm on the CPU or CUDA, MuJoCo and MuJoCo Warp beside it.
+"""Cost of a sub-step of a robot hand that turns a cube: cgwm on the CPU or CUDA, MuJoCo on the CPU beside it.
 
     python benchmarks/leap.py leap_hand/robots/hands/leap_hand/leap_hand_right.urdf --environments 64
     python benchmarks/leap.py ... --device cuda --single --environments 4096
