@@ -1,6 +1,7 @@
 """The fused kernel's source built with g++ and run on the CPU: every line of it is tested without a GPU.
 
-The lanes of an environment are fibres that take turns: each runs to its next exchange with the others.
+The threads of a warp are fibres that take turns: each runs to its next exchange with the others. As on a GPU, several
+environments share a warp, and all of its threads must take part in each exchange, at the same place of the program.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ SHIM = r"""
 #define __device__
 #define __restrict__ __restrict
 
-struct Fibres {  // the lanes of one environment
+struct Fibres {  // the threads of a warp
     ucontext_t home, contexts[32];
     double slots[2][32];
+    const void* places[2][32];
     long exchanges[32];
     bool done[32];
     int count, current;
@@ -45,24 +47,31 @@ static void next_fibre() {
     swapcontext(&fibres.contexts[from], &fibres.contexts[fibres.current]);
 }
 
-static const double* exchange(double mine) {
-    int lane = fibres.current;
-    double* slots = fibres.slots[fibres.exchanges[lane]++ % 2];
-    slots[lane] = mine;
+static const double* exchange(double mine, const void* place) {
+    int lane = fibres.current, turn = fibres.exchanges[lane]++ % 2;
+    fibres.slots[turn][lane] = mine;
+    fibres.places[turn][lane] = place;
     next_fibre();
-    for (int other = 0; other < fibres.count; other++) {  // all lanes must take part in each exchange
+    for (int other = 0; other < fibres.count; other++) {
         long ahead = fibres.exchanges[other] - fibres.exchanges[lane];
-        if (ahead < 0 || ahead > 1) { fprintf(stderr, "lanes part ways\n"); abort(); }
+        if (ahead < 0 || ahead > 1 || fibres.places[turn][other] != place) {
+            fprintf(stderr, "lanes part ways\n");
+            abort();
+        }
     }
-    return slots;
+    return fibres.slots[turn];
 }
-template <class T> T __shfl_xor_sync(unsigned, T mine, int apart, int) {
+#define PLACE __builtin_return_address(0)
+template <class T> __attribute__((noinline)) T __shfl_xor_sync(unsigned, T mine, int apart, int) {
     int lane = fibres.current;
-    return T(exchange(mine)[lane ^ apart]);
+    return T(exchange(mine, PLACE)[lane ^ apart]);
 }
-template <class T> T __shfl_sync(unsigned, T mine, int source, int) { return T(exchange(mine)[source]); }
-static bool __any_sync(unsigned, bool mine) {
-    const double* all = exchange(mine);
+template <class T> __attribute__((noinline)) T __shfl_sync(unsigned, T mine, int source, int width) {
+    int first = fibres.current / width * width;
+    return T(exchange(mine, PLACE)[first + source]);
+}
+__attribute__((noinline)) static bool __any_sync(unsigned, bool mine) {
+    const double* all = exchange(mine, PLACE);
     for (int lane = 0; lane < fibres.count; lane++) if (all[lane] != 0) return true;
     return false;
 }
@@ -70,29 +79,31 @@ static bool __any_sync(unsigned, bool mine) {
 
 ENTRY = r"""
 static const Problem* shared_problem;
-static int shared_index;
+static int first_environment;
 
 static void lane_main() {
-    Lanes lanes = {fibres.current, false};
-    roll(*shared_problem, shared_index, lanes);
+    Lanes lanes = {fibres.current % LANES, false};
+    roll(*shared_problem, first_environment + fibres.current / LANES, lanes);
     fibres.done[fibres.current] = true;
-    if (fibres.current + 1 < LANES) next_fibre();  // the others end one after the other
+    if (fibres.current + 1 < fibres.count) next_fibre();  // the others end one after the other
     setcontext(&fibres.home);
 }
 
 extern "C" void run(PARAMETERS) {
     Problem problem = PROBLEM;
-    for (int index = 0; index < environments; index++) {
 #if LANES == 1
+    for (int index = 0; index < environments; index++) {
         Lanes lanes = {0, false};
         roll(problem, index, lanes);
+    }
 #else
-        static char stacks[LANES][1 << 20];
+    for (int first = 0; first < environments; first += 32 / LANES) {
+        static char stacks[32][1 << 20];
         shared_problem = &problem;
-        shared_index = index;
-        fibres.count = LANES;
+        first_environment = first;
+        fibres.count = environments - first < 32 / LANES ? (environments - first) * LANES : 32;
         fibres.current = 0;
-        for (int lane = 0; lane < LANES; lane++) {
+        for (int lane = 0; lane < fibres.count; lane++) {
             fibres.exchanges[lane] = 0;
             fibres.done[lane] = false;
             getcontext(&fibres.contexts[lane]);
@@ -102,11 +113,11 @@ extern "C" void run(PARAMETERS) {
             makecontext(&fibres.contexts[lane], lane_main, 0);
         }
         swapcontext(&fibres.home, &fibres.contexts[0]);
-        for (int lane = 0; lane < LANES; lane++) {
+        for (int lane = 0; lane < fibres.count; lane++) {
             if (!fibres.done[lane]) { fprintf(stderr, "lane %d waits for others that ended\n", lane); abort(); }
         }
-#endif
     }
+#endif
 }
 """
 

@@ -648,6 +648,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
 #if PAIRED
     const int first_sweep = sweep;
+    const bool loads_count = env.lanes.any(loaded > 1);  // the whole warp takes part in the sums of `load_of`
     bool active[PAIR_ROOM];
     for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = env.lanes.any(ends[p] > first);
 #endif
@@ -710,7 +711,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             motions[b].omega = free_omegas[b] + motions[b].inverse_inertia * angular[b];
         }
 #if PAIRED
-        if (loaded > 1 && sweep + 1 < problem.sweeps) {
+        if (loads_count && sweep + 1 < problem.sweeps) {
             for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
                 if (active[p]) loads[p] = load_of(env, list, first, ends[p], pair_a(p), pair_b(p), motions);
             }
