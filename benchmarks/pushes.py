@@ -6,8 +6,8 @@ far the supports, or the pressure of the patch, lie from the centre. Errors are 
 
     python benchmarks/pushes.py FOLDER [--json]
 
-FOLDER holds one folder for each file, named by the three supports as x1_x2_x3_y1_y2_y3 [mm] or `patch`, those on plywood
-with `wood_` before it.
+FOLDER holds one folder for each file, named by the three supports as x1_x2_x3_y1_y2_y3 [mm] or `patch`, those on
+plywood with `wood_` before it.
 """
 
 from __future__ import annotations
@@ -177,9 +177,9 @@ def _ends_of(world: World, pushes: Pushes, count: int) -> Array:
 def ellipsoid_ends(pushes: Pushes, settings: Array) -> Array:
     """Return the end poses (C, n, 3) of a quasi-static limit surface for settings (C, 3), as `cgwm_ends`.
 
-    The twist is proportional to (f, tau / c^2), c the mean distance of the supports from the centre times the scale; the
-    finger sticks where its force lies in the friction cone, and slides at the edge of the cone elsewhere (Lynch et al.,
-    "Manipulation and active sensing by pushing using tactile feedback", 1992).
+    The twist is proportional to (f, tau / c^2), c the mean distance of the supports from the centre times the scale;
+    the finger sticks where its force lies in the friction cone, and slides at the edge of the cone elsewhere (Lynch et
+    al., "Manipulation and active sensing by pushing using tactile feedback", 1992).
     """
     count, n = len(settings), len(pushes.start)
     each = np.repeat(settings, n, 0)

@@ -324,6 +324,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
                 photo_pose=found.photo_pose or Pose(),
                 shape=body.shape,
                 material=body.material,
+                face_points=body.face_points,
                 collision_distance_m=found.collision_distance_m,
                 radius_factor=scene.radius_factor,
                 convex=fills_hull(

@@ -15,6 +15,7 @@ from .quantities import (
     Coordinate,
     DampingRatio,
     Deviation,
+    FacePoints,
     FrameRate,
     Friction,
     Gravity,
@@ -154,6 +155,9 @@ class Body(FileModel):
     """T_world_body while the photos were taken; default identity (see `Capture`)."""
     material: Name | None = None
     """Its material, one of [[materials]], where it matters what touches it."""
+    face_points: FacePoints = 0
+    """Least number of points on each flat face of a convex body, by which the ground carries it as a plate; 0: by its
+    corners alone, as it suffices where it tumbles."""
     photo_box: PhotoBox | None = None
     """Where the body is in photos without masks; left out: found on the ground (stage SG-GS)."""
 

@@ -14,6 +14,7 @@ from .quantities import (
     ContactTime,
     DampingRatio,
     Deviation,
+    FacePoints,
     Friction,
     Gravity,
     Mass,
@@ -149,6 +150,8 @@ class BodyModel(FileModel):
     """Collision radius of a sphere in units of its Gaussian scale s."""
     convex: bool = False
     """Whether the body fills the convex hull of its colliding spheres; other bodies then touch that hull."""
+    face_points: FacePoints = 0
+    """Least number of points on each flat face by which the ground carries it as a plate; 0: by its corners alone."""
 
     @field_validator("inertia_kg_m2")
     @classmethod

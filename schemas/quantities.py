@@ -34,6 +34,8 @@ Speed = Annotated[float, Field(ge=-1e5, le=1e5)]
 """[m/s]."""
 Deviation = Annotated[float, Field(ge=1e-12, le=1e6)]
 """Standard deviation of a measurement, in its unit."""
+FacePoints = Annotated[int, Field(ge=0, le=1000)]
+"""Number of points on a face."""
 Friction = Annotated[float, Field(ge=0, le=100)]
 """Coulomb coefficient [1]."""
 ContactTime = Annotated[float, Field(ge=1e-7, le=10)]

@@ -61,6 +61,12 @@ class Placed:
         """Return the radii (1 or n, N or K) [m] of its spheres, or of the chosen ones (n, K)."""
         return pick(self.body.radii, chosen)
 
+    def plane_spheres(self, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return centres (n, K, 3) and radii (1 or n, K) [m] in slots (n, K) of what the ground can touch."""
+        centers, radii = self.body.plane_spheres
+        arms = pick(centers - self.origin[:, None], chosen) @ self.rotation.transpose(-1, -2)
+        return self.reference[:, None] + arms, pick(radii, chosen)
+
     def in_frame(self, position: Tensor) -> Tensor:
         """Return positions (n, C, 3) [m] of the world in the body frame."""
         origin = self.body.com if self.body.free else torch.zeros_like(self.body.com)
@@ -108,6 +114,8 @@ def slot_count(world: World, pair: tuple[int, int]) -> int:
     """Return the number of contacts that a pair can have: one per sphere that can touch, several with a mesh."""
     first, surface = world.bodies[pair[0]], world.surface(pair[1])
     plane = pair[1] == GROUND if surface is None else surface.kind == HALF_SPACE
+    if pair[1] == GROUND:
+        return first.plane_spheres[1].shape[-1]
     if plane and first.on_plane is not None:
         return len(first.on_plane)
     if surface is not None:
@@ -126,9 +134,7 @@ def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
     (normal, offset), body = world.ground, placed.body
     with torch.no_grad():
         still = placed.plain()
-        centers, radii = plain(body.centers), plain(body.radii)
-        if body.on_plane is not None:
-            centers, radii = centers[:, body.on_plane], radii[:, body.on_plane]
+        centers, radii = (plain(x) for x in body.plane_spheres)
         axes = torch.stack((normal.expand_as(still.omega), cross(normal.expand_as(still.omega), still.omega)), -1)
         height, rate = _along(centers - still.origin[:, None], still.rotation.transpose(-1, -2) @ axes).unbind(-1)
         gap = height + (still.reference @ normal - plain(offset))[:, None] - radii
@@ -145,9 +151,8 @@ def near_body(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | Non
 
 def ground_points(world: World, placed: Placed, slot: Tensor, near: Tensor | None = None) -> Points:
     """Return the contact points with the ground of the spheres in the given slots (n, C); `near` as in `Points`."""
-    (normal, offset), body = world.ground, placed.body
-    chosen = slot if body.on_plane is None else body.on_plane[slot]
-    centers, radii = placed.centers(chosen), placed.radii(chosen)
+    normal, offset = world.ground
+    centers, radii = placed.plane_spheres(slot)
     gap = centers @ normal - offset[:, None] - radii
     position = centers - radii[..., None] * normal
     near = torch.ones_like(gap, dtype=torch.bool) if near is None else near

@@ -69,6 +69,8 @@ class Touch:
     """Largest torque against rolling in units of the normal force [m]; None for none."""
     torsion_m: Tensor | None = None
     """Largest torque against spinning about the normal in units of the normal force [m]; None for none."""
+    area: Tensor | None = None
+    """Area by which each point takes its share of the load, in any unit, shape (n, C); None where all count alike."""
     anisotropy: Tensor | None = None
     """Coefficients a and b of anisotropic friction along `tangent_axes` of the normal [1], see `friction_ellipse.py`;
     shape (n, 1 or C, 2); None for isotropic friction.

@@ -31,7 +31,7 @@ from .impulse_solver import ContactGroup, Impulses, Rows, solve_with_joints, tan
 from .paper_law import PaperLaw, paper_impulses
 from .rigid_body import Inertia, Motion
 from .surface_detection import Nearby, near_surface, surface_points
-from .world import World
+from .world import Body, World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,6 +242,7 @@ class Contacts:
             friction=friction,
             contact_time_s=time,
             damping_ratio=ratio,
+            area=_areas(a.body, points) if ground else None,
         )
         for active in self.effects:
             changed = active.effect.contact(active.at(items), touch)
@@ -308,6 +309,12 @@ class Contacts:
             else:
                 warm.append(None)
         return warm
+
+
+def _areas(body: Body, points: Points) -> Tensor | None:
+    """Return the areas (n, C) of points on the ground; None where all count alike."""
+    areas = body.plane_areas
+    return None if areas is None else areas[points.slot]
 
 
 def _only_friction(before: Touch, after: Touch) -> bool:

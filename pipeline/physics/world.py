@@ -20,11 +20,12 @@ from .effects.registry import effect_of
 from .fixed_surface import FixedSurface, shape_of, surface_mesh
 from .hull import Hull
 from .paper_law import PaperLaw
+from .patch import Patch
 from .smooth_distance import plane_contacts
 
 if TYPE_CHECKING:
     from ...datasets.models.model import Model
-    from ...schemas import ContactParameters, EffectModel
+    from ...schemas import BodyModel, ContactParameters, EffectModel
 
 MOST_STEPS = 2_000_000_000
 """Maximum number of steps of a rollout: some hours; the kernels count them in 32 bits."""
@@ -56,6 +57,26 @@ class Body:
     """Material, by which its pairs with others have their laws; None where it does not matter."""
     hull: Hull | None = None
     """Hull of the spheres, by which other bodies touch this one; None where they touch its spheres."""
+    patch: Patch | None = None
+    """Points of the hull's flat faces, by which the ground carries them as plates; None where its supports carry."""
+
+    @property
+    def plane_spheres(self) -> tuple[Tensor, Tensor]:
+        """Centres (B, K, 3) and radii (B, K) [m] of what the ground can touch: spheres, then points of the patches."""
+        centers, radii = self.centers, self.radii
+        if self.on_plane is not None:
+            centers, radii = centers[:, self.on_plane], radii[:, self.on_plane]
+        if self.patch is None:
+            return centers, radii
+        points, sizes = self.patch.centers(self.centers), self.patch.radii(self.radii)
+        return torch.cat((centers, points), 1), torch.cat((radii, sizes), 1)
+
+    @property
+    def plane_areas(self) -> Tensor | None:
+        """Areas (K,) of what the ground can touch, in the order of `plane_spheres`; None where all count alike."""
+        if self.patch is None:
+            return None
+        return self.patch.weights(self.radii.shape[-1] if self.on_plane is None else len(self.on_plane))
 
     @property
     def free(self) -> bool:
@@ -338,9 +359,10 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         place = tensor((*entry.photo_pose.position_m, *entry.photo_pose.quat_wxyz))
         on_plane = plane_contacts(centers[0], radii[0])
         hull = Hull.of(centers[0], radii[0], on_plane) if entry.convex else None
+        patch = _patch(entry, hull, centers[0], radii[0])
     else:
         centers, radii, place, on_plane = geometry.centers, geometry.radii, geometry.place, geometry.on_plane
-        hull = geometry.hull
+        hull, patch = geometry.hull, geometry.patch
     return Body(
         name=entry.name,
         motion=entry.motion,
@@ -353,7 +375,27 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         on_plane=on_plane,
         material=entry.material,
         hull=hull,
+        patch=patch,
     )
+
+
+def _patch(entry: BodyModel, hull: Hull | None, centers: Tensor, radii: Tensor) -> Patch | None:
+    """Return the points of the flat faces of a body of a model, where it asks for them.
+
+    Raises:
+        InputDataError: If it asks for points and has no flat face.
+    """
+    if entry.face_points == 0:
+        return None
+    found = None if hull is None else Patch.of(hull, centers, radii, entry.face_points)
+    if found is None:
+        reason = "no flat face" if entry.convex else "a shape that does not fill its convex hull"
+        raise InputDataError(
+            f"body '{entry.name}' has face_points = {entry.face_points} and {reason}.",
+            "face_points of convex bodies with flat faces.",
+            "leave face_points out, or give the body a shape with flat faces.",
+        )
+    return found
 
 
 def _surfaces(model: Model, tensor: Callable[[object], Tensor]) -> tuple[FixedSurface, ...]:

@@ -1,7 +1,12 @@
-"""Worlds for the tests of physics: a box of eight corner spheres, a ball."""
+"""Worlds for the tests of physics: a box of eight corner spheres, the same with patches, a ball."""
+
+from dataclasses import replace
 
 import torch
 from cgwm.pipeline.physics import Body, ContactLaw, State, World
+from cgwm.pipeline.physics.hull import Hull
+from cgwm.pipeline.physics.patch import Patch
+from cgwm.pipeline.physics.smooth_distance import plane_contacts
 
 F64 = torch.float64
 
@@ -28,6 +33,16 @@ def box_body(half: tuple[float, float, float] = (0.05, 0.04, 0.03), mass: float 
         centers=(signs * (extent - radius))[None],
         radii=torch.full((1, 8), radius, dtype=F64),
     )
+
+
+def plate_body(half: tuple[float, float, float], mass: float = 0.4, points: int = 12, radius: float = 5e-4) -> Body:
+    """Return a box with points spread over its faces, at least `points` each."""
+    body = box_body(half, mass, radius)
+    centers, radii = body.centers[0], body.radii[0]
+    supports = plane_contacts(centers, radii)
+    hull = Hull.of(centers, radii, supports)
+    assert hull is not None
+    return replace(body, on_plane=supports, hull=hull, patch=Patch.of(hull, centers, radii, points))
 
 
 def ball_body(radius: float = 0.04, mass: float = 0.2, name: str = "ball", copies: int = 1) -> Body:

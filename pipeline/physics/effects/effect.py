@@ -107,9 +107,7 @@ class BodyMotion:
         The arms begin in the centre of mass, world axes; the heights are infinite where there is no ground.
         """
         body = self.body
-        centers, radii = body.centers, body.radii
-        if body.on_plane is not None:
-            centers, radii = centers[:, body.on_plane], radii[:, body.on_plane]
+        centers, radii = body.plane_spheres
         normal = self.normal[:, None]
         arms = (centers - body.com[:, None]) @ self.rotation.transpose(-1, -2) - radii[..., None] * normal
         over = ((self.com[:, None] + arms) * normal).sum(-1)

@@ -133,7 +133,9 @@ def pack(
         ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
-        geometry=_joined([*spheres, *(row for body in world.bodies for row in _hull_rows(body))], batch),
+        geometry=_joined(
+            [*spheres, *(row for body in world.bodies for row in _hull_rows(body)), *_patch_rows(world)], batch
+        ),
         surfaces=_joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
         mesh_numbers=meshes.numbers.to(times),
         mesh_indices=meshes.indices.to(times.device),
@@ -186,6 +188,7 @@ def _structure(
         pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
         laws=_law_numbers(world),
         hulls=_hulls(world),
+        areas=_area_starts(world),
         lowest=lowest,
         surfaces=tuple(surface.kind for surface in world.surfaces),
         mesh_starts=mesh_starts,
@@ -291,6 +294,39 @@ def _hull_rows(body: Body) -> list[Tensor]:
     return [body.hull.faces.reshape(1, -1, 4), *indices]
 
 
+def _patch_rows(world: World) -> list[Tensor]:
+    """Return the rows of the patches (1 or B, rows, 4), as in `_patch_starts`: of each body its points, then areas."""
+    found = []
+    for body in world.bodies:
+        areas = body.plane_areas
+        if body.patch is None or areas is None:
+            continue
+        points, sizes = body.patch.centers(body.centers), body.patch.radii(body.radii)
+        batch = max(points.shape[0], sizes.shape[0])
+        found.append(torch.cat((points.expand(batch, -1, -1), sizes.expand(batch, -1)[..., None]), -1))
+        found.append(torch.nn.functional.pad(areas, (0, -len(areas) % 4)).reshape(1, -1, 4).to(points))
+    return found
+
+
+def _patch_starts(world: World) -> list[tuple[int, int]]:
+    """Return by body the rows of the geometry in which the points of its patches and their areas begin."""
+    row, found = sum(body.radii.shape[-1] for body in world.bodies), []
+    row += sum(3 * faces + edges + supports for _, faces, edges, supports in _hulls(world))
+    for body in world.bodies:
+        points = 0 if body.patch is None else len(body.patch.areas)
+        areas = body.plane_areas
+        found.append((row, row + points))
+        row += points + (0 if areas is None else -(-len(areas) // 4))
+    return found
+
+
+def _area_starts(world: World) -> tuple[int, ...]:
+    """Return by pair the row in which the areas of its contacts begin, -1 where all count alike; empty for no areas."""
+    starts = _patch_starts(world)
+    found = [starts[a][1] if b == GROUND and world.bodies[a].patch is not None else -1 for a, b in pairs_of(world)]
+    return tuple(found) if any(start >= 0 for start in found) else ()
+
+
 def _listed_spheres(world: World) -> tuple[Tensor, tuple[tuple[int, int], ...]]:
     """Return the row of the sphere of each contact (C,), and the place in it of the candidates for each lowest sphere.
 
@@ -305,12 +341,25 @@ def _contact_spheres(world: World, starts: list[int]) -> Tensor:
     """Return the row of the sphere of each contact, shape (C,)."""
     parts = [torch.zeros(0, dtype=torch.int64, device=world.gravity.device)]
     for a, b in pairs_of(world):
+        if b == GROUND:
+            parts.append(_plane_rows(world, a, starts[a]))
+            continue
         surface = world.surface(b)
-        plane = b == GROUND or (surface is not None and surface.kind == HALF_SPACE)
+        plane = surface is not None and surface.kind == HALF_SPACE
         for index in (a,) if b < 0 else (b, a):
             rows = _rows(world.bodies[index], world.bodies[a].on_plane if plane else None, starts[index])
             parts.append(rows if surface is None else rows.repeat_interleave(surface.contacts_per_sphere))
     return torch.cat(parts).to(torch.int32)
+
+
+def _plane_rows(world: World, index: int, start: int) -> Tensor:
+    """Return the rows of what the ground can touch of a body, in the order of `Body.plane_spheres`."""
+    body = world.bodies[index]
+    rows = _rows(body, body.on_plane, start)
+    if body.patch is None:
+        return rows
+    points = torch.arange(len(body.patch.areas), device=rows.device) + _patch_starts(world)[index][0]
+    return torch.cat((rows, points))
 
 
 def _rows(body: Body, chosen: Tensor | None, start: int) -> Tensor:
@@ -334,7 +383,7 @@ def _with_lowest(world: World, starts: list[int], listed: Tensor) -> tuple[Tenso
         if index in within or not body.free or world.ground_normal is None:
             lowest.append(within.get(index, (0, 0)))
             continue
-        rows = _rows(body, body.on_plane, starts[index]).to(torch.int32)
+        rows = _plane_rows(world, index, starts[index]).to(torch.int32)
         lowest.append((len(listed), len(rows)))
         listed = torch.cat((listed, rows))
     return listed, tuple(lowest)

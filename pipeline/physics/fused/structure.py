@@ -10,7 +10,7 @@ from ..contact_detection import PAIR_SMOOTHING_M
 from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
-from ..impulse_solver import CONTACT_ONSET_M
+from ..impulse_solver import CONTACT_ONSET_M, LEAST_MOBILITY
 from ..joint_rows import LIMIT_TIME_S
 from ..surface_detection import FAR_M
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
@@ -77,6 +77,8 @@ class Structure:
     """Number of the contact law of each pair; empty where all have the same one."""
     hulls: tuple[tuple[int, int, int, int], ...] = ()
     """First row in the geometry, faces, edges and supports of each body's hull; none where its spheres are touched."""
+    areas: tuple[int, ...] = ()
+    """First row in the geometry of the areas of each pair's contacts, -1 where all count alike; empty for no areas."""
     lowest: tuple[tuple[int, int], ...] = ()
     """First row and number of each body's spheres whose heights count; empty where heights do not."""
     surfaces: tuple[int, ...] = ()
@@ -153,6 +155,7 @@ class Structure:
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
             "HULLS": paired and any(faces for _, faces, _, _ in self.hulls),
+            "PATCHES": bool(self.areas),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
             "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy,
@@ -162,7 +165,7 @@ class Structure:
         lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define SAME_PLANE_M {SAME_PLANE_M!r}"]
         lines += [f"#define SAME_NORMAL {SAME_NORMAL!r}", f"#define OVERHANG_M {OVERHANG_M!r}"]
         lines += [f"#define PARALLEL {PARALLEL!r}", f"#define MOST_PLANES {MOST_PLANES}"]
-        lines += [f"#define ONSET_M {CONTACT_ONSET_M!r}"]
+        lines += [f"#define ONSET_M {CONTACT_ONSET_M!r}", f"#define LEAST_MOBILITY {LEAST_MOBILITY!r}"]
         lines += [f"#define NEWTON_STEPS {NEWTON_STEPS}", f"#define FLATTEST {FLATTEST!r}"]
         lines += [f"#define ORDER_{axis} {value!r}" for axis, value in zip("XYZ", ORDER, strict=True)]
         lines += [f"#define FLAT_SINE {FLAT!r}", f"#define FAR_M {FAR_M!r}"]
@@ -173,7 +176,7 @@ class Structure:
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
             "contact_start": _starts([count for _, _, count in self.pairs]),
-            "pair_law": self.laws,
+            "pair_law": self.laws, "area_start": self.areas,
             "surface_kind": self.surfaces, "mesh_number_start": [start for start, _ in self.mesh_starts],
             "mesh_index_start": [start for _, start in self.mesh_starts],
             "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],

@@ -489,6 +489,22 @@ INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
     env.warm = count > 0;
 }
 
+#if PATCHES
+// Distributes the effective mass among the contacts of a patch in proportion to their areas: `_share_by_area` of
+// impulse_solver.
+INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Motion& motion, Contact* list,
+                          const Real* weights, int first, int count) {
+    Real spread = Real(0), mobility = Real(0);
+    EACH_CONTACT(list, first, count) {
+        Real each = weights[i] * reciprocal(list[i].stop_n);
+        mobility += each;
+        spread += each * crowd(moments, motion, list[i]);
+    }
+    Real bound = lanes.sum(spread) * reciprocal(lanes.sum(mobility) + Real(Number(LEAST_MOBILITY)));
+    EACH_CONTACT(list, first, count) share_out(list[i], list[i].stop_n * bound, weights[i]);
+}
+#endif
+
 // Finds the contacts of a body with the ground. They are appended to the list (LISTED), or each is stored in its own
 // slot.
 INLINE void touch_plane(const Problem& problem, const Environment& env, int p, const Mat& rotation,
@@ -531,7 +547,13 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
 #endif
         bool touches = touch_ground(list[i], env.laws[pair_law(p)], motion, rotation * held, height, radius, weights[i]);
         if (touches) {
-            add_row(moments, list[i], weights[i]);
+#if PATCHES
+            if (area_start(p) >= 0) {
+                weights[i] = problem.geometry.value[env.geometry + 4LL * area_start(p) + contact - contact_start(p)] * weights[i];
+                add_row(moments, list[i], weights[i]);
+            } else
+#endif
+            add_row(moments, list[i], weights[i] * list[i].stop_n);
             count++;
 #if PAIRED
             list[i].normal = vec(Real(0), Real(0), Real(1));
@@ -551,6 +573,11 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
     }
     if (!env.lanes.any(count > first)) return;
     moments = sum_rows(env.lanes, moments);
+#if PATCHES
+    if (area_start(p) >= 0) {
+        share_by_area(env.lanes, moments, motion, list, weights, first, count);
+    } else
+#endif
     EACH_CONTACT(list, first, count) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
 #if SURFACE
     Real total = Real(0);

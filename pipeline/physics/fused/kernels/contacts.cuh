@@ -169,8 +169,8 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
 struct Moments {
     Real w, x, y, xx, xy, yy;
 };
-INLINE void add_row(Moments& m, const Contact& c, Real weight) {
-    Real w = weight * c.stop_n, x = c.arm.y, y = -c.arm.x, wx = w * x, wy = w * y;
+INLINE void add_row(Moments& m, const Contact& c, Real w) {
+    Real x = c.arm.y, y = -c.arm.x, wx = w * x, wy = w * y;
     m.w += w;
     m.x += wx;
     m.y += wy;

@@ -158,6 +158,20 @@ def test_cubes_that_lie_flat_on_each_other(fused: Fused) -> None:
     agree(expected, fused(world, state, times(0.1), None, True, lanes=None), 1e-7)
 
 
+@pytest.mark.parametrize("lanes", [1, pytest.param(8, marks=pytest.mark.evidence)])
+def test_a_box_whose_faces_are_plates(fused: Fused, lanes: int) -> None:
+    """Alone, it tumbles; then it lies, under a ball, and slides."""
+    plate = worlds.plate_body((0.05, 0.04, 0.03))
+    state = tossed(2)
+    expected = simulate(world_of(plate), state, times(0.3), None, True)
+    agree(expected, fused(world_of(plate), state, times(0.3), None, True, lanes=lanes), 1e-8)
+    world = world_of(plate, ball_body(0.02, name="ball"))
+    state = state_of(
+        ((0, 0, 0.03), UPRIGHT, (0.3, 0, 0), (0, 0, 2)), ((0.02, 0.01, 0.082), UPRIGHT, (0, 0, 0), (0, 0, 0)), count=2
+    )
+    agree(simulate(world, state, times(0.1), None, True), fused(world, state, times(0.1), None, True, lanes=None), 1e-8)
+
+
 def crowd() -> tuple[World, State, dict[str, Track | Drive]]:
     """Return two free bodies, a pusher that turns, and a fixed ball, all of which touch others within 0.16 s."""
     pusher = replace(ball_body(0.02, name="pusher", copies=3), motion="driven")
@@ -346,6 +360,12 @@ def agree_with_derivatives(
 def test_derivatives_of_a_toss(fused: Fused) -> None:
     first = [0, 0, 0.065, 0.1, 0.2, 0.1, 0.5, 0.2, -0.3, 3, 5, -2]
     agree_with_derivatives(fused, world_of(box_body()), first, times(0.1), None, 0.02)
+
+
+def test_derivatives_of_a_box_whose_faces_are_plates(fused: Fused) -> None:
+    first = [0, 0, 0.0295, 0.001, 0.002, 0.1, 0.5, 0.2, -0.1, 0.3, 0.2, 2]
+    plate = world_of(worlds.plate_body((0.05, 0.04, 0.03)))
+    agree_with_derivatives(fused, plate, first, times(0.04), None, 0.02)
 
 
 def test_derivatives_of_bodies_that_touch(fused: Fused) -> None:
