@@ -35,6 +35,7 @@ _PUBLIC = {
     "fit": ".pipeline.fit",
     "import_balldrops": ".datasets.importers.balldrops",
     "import_contactnets": ".datasets.importers.contactnets",
+    "import_elbow": ".datasets.importers.elbow",
     "import_csv": ".datasets.importers.csv_tracks",
     "import_hdf5": ".datasets.importers.hdf5_tracks",
     "import_jugglebot": ".datasets.importers.jugglebot",
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from .datasets.importers.balldrops import import_balldrops
     from .datasets.importers.contactnets import import_contactnets
     from .datasets.importers.csv_tracks import import_csv
+    from .datasets.importers.elbow import import_elbow
     from .datasets.importers.hdf5_tracks import import_hdf5
     from .datasets.importers.jugglebot import import_jugglebot
     from .datasets.importers.pinwm import import_pinwm
@@ -133,6 +135,7 @@ __all__ = [
     "import_balldrops",
     "import_contactnets",
     "import_csv",
+    "import_elbow",
     "import_hdf5",
     "import_jugglebot",
     "import_pinwm",

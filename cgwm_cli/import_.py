@@ -23,6 +23,7 @@ _OPTIONS = {
     "jugglebot": ("only", *_SPLITS),
     "balldrops": ("only",),
     "pushes": ("only", *_SPLITS),
+    "elbow": _SPLITS,
     "csv": ("columns", "length_unit", "time_unit", "spin_frame", *_TRACKS),
     "tum": ("length_unit", "time_unit", *_TRACKS),
     "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
@@ -35,12 +36,13 @@ _OPTIONS = {
 def import_capture(
     emit: Emit,
     format_: Annotated[
-        Literal["contactnets", "pinwm", "jugglebot", "balldrops", "pushes", "csv", "tum", "hdf5", "rosbag"],
+        Literal["contactnets", "pinwm", "jugglebot", "balldrops", "pushes", "elbow", "csv", "tum", "hdf5", "rosbag"],
         typer.Argument(
             metavar="FORMAT",
             help="csv, tum, hdf5, rosbag: your own poses; contactnets: tosses of a cube (.pt files or .npz); pinwm: "
             "pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: falling balls; pushes: "
-            "a robot's finger that pushes an object, with forces (.txt of MLab_EXP, .json or .h5 of MIT push).",
+            "a robot's finger that pushes an object, with forces (.txt of MLab_EXP, .json or .h5 of MIT push); elbow: "
+            "tosses of two links with a hinge (folder or .tar.xz of .pt files and a URDF).",
             show_default=False,
         ),
     ],

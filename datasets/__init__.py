@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .importers.balldrops import import_balldrops
     from .importers.contactnets import import_contactnets
     from .importers.csv_tracks import import_csv
+    from .importers.elbow import import_elbow
     from .importers.hdf5_tracks import import_hdf5
     from .importers.jugglebot import import_jugglebot
     from .importers.pinwm import import_pinwm
@@ -42,6 +43,7 @@ _HOMES = {
     "capture.check": ("CaptureFacts", "check_capture"),
     "importers.contactnets": ("import_contactnets",),
     "importers.csv_tracks": ("import_csv",),
+    "importers.elbow": ("import_elbow",),
     "rollouts.dataset": ("read_manifest",),
     "importers.hdf5_tracks": ("import_hdf5",),
     "capture.images": ("read_label", "read_rgb", "write_image"),
@@ -81,6 +83,7 @@ __all__ = [
     "import_balldrops",
     "import_contactnets",
     "import_csv",
+    "import_elbow",
     "import_hdf5",
     "import_jugglebot",
     "import_pinwm",

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ..datasets.capture.capture import Capture
+from ..datasets.capture.links import articulation_models, articulations_of
 from ..datasets.io.neighbours import clean_stale
 from ..datasets.io.outputs import reads, refuse_output
 from ..datasets.models.effect_files import effect_file
@@ -297,7 +298,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
         fresh = _from_scene(capture, fit_scene(capture, config, checkpoint))
         return replace(fresh, file=with_fitted_physics(fresh.file, model.file))
     if stage == "phys-geo":
-        lacking = [body.name for body in capture.manifest.bodies if body.shape is None]
+        lacking = [body.name for body in capture.manifest.bodies if body.shape is None and body.motion != "link"]
         if lacking:
             raise InputDataError(
                 f"{capture.root / 'capture.toml'}: body '{lacking[0]}' has no shape, and physics needs one.",
@@ -340,6 +341,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
         gravity_m_s2=world.gravity_m_s2,
         ground=world.ground,
         bodies=tuple(bodies),
+        articulations=articulation_models(capture.manifest, articulations_of(capture.root, capture.manifest)),
         surfaces=tuple(stored(one, meshes.get(one.name), f"{one.name}.obj") for one in capture.manifest.surfaces),
         parameters=tuple(
             p

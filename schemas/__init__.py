@@ -1,5 +1,6 @@
 """Pydantic models of everything that touches the disk, and the errors that users meet. No torch here."""
 
+from .articulations import Articulation, ArticulationModel, JointModel
 from .base import FileModel, parse, read_json, read_toml
 from .calibration import CalibrationAttempt, CalibrationReport, ImageVerdict, PairFigures, SelfCheckFigures
 from .cameras import CAMERAS_FORMAT, CameraIntrinsics, CamerasFile, PosedImage, PosedVideo, Scale
@@ -136,6 +137,8 @@ __all__ = [
     "QUATERNION_NORM_TOLERANCE",
     "ROLLOUTS_FORMAT",
     "SEALED_FORMAT",
+    "Articulation",
+    "ArticulationModel",
     "Body",
     "BodyCheck",
     "BodyModel",
@@ -200,6 +203,7 @@ __all__ = [
     "IndexEntry",
     "InputDataError",
     "InterruptedWork",
+    "JointModel",
     "KeptOutput",
     "KnownCameraDistance",
     "KnownDistance",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from .articulations import Articulation
 from .base import FileModel
 from .materials import pair_of, repeated
 from .pose import Pose
@@ -141,8 +142,9 @@ class Body(FileModel):
     """A rigid body."""
 
     name: Name
-    motion: Literal["free", "driven", "fixed"] = "free"
-    """free: moves by physics; driven: its track is the command; fixed: does not move."""
+    motion: Literal["free", "driven", "fixed", "link"] = "free"
+    """free: moves by physics; driven: its track is the command; fixed: does not move; link: of [[articulations]], not
+    to be written by hand."""
     mass_kg: Mass | None = None
     """Mass [kg]; left out: free, and fitted only where a force makes it observable."""
     inertia_kg_m2: tuple[float, ...] | None = None
@@ -295,6 +297,7 @@ def _require_known_materials(manifest: CaptureManifest) -> None:
     ground = manifest.world.ground
     named = [(f"body '{body.name}'", body.material) for body in manifest.bodies]
     named += [(f"surface '{surface.name}'", surface.material) for surface in manifest.surfaces]
+    named += [(f"articulation '{one.name}'", one.material) for one in manifest.articulations]
     named += [("[world].ground", None if ground is None else ground.material)]
     named += [("[[pairs]]", name) for pair in manifest.pairs for name in pair.materials]
     for where, name in named:
@@ -312,6 +315,8 @@ class CaptureManifest(FileModel):
     format: Literal["cgwm-capture/1"]
     world: World = World()
     bodies: tuple[Body, ...] = ()
+    articulations: tuple[Articulation, ...] = ()
+    """Jointed bodies."""
     materials: tuple[Material, ...] = ()
     """Materials that bodies and ground may have."""
     pairs: tuple[MaterialPair, ...] = ()
@@ -330,6 +335,12 @@ class CaptureManifest(FileModel):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"two bodies have the name '{twice[0]}'; names must differ")
+        linked = next((body.name for body in self.bodies if body.motion == "link"), None)
+        if linked is not None:
+            raise ValueError(f"body '{linked}': links are not listed, but come from the file of [[articulations]]")
+        again = repeated([one.name for one in self.articulations])
+        if again is not None:
+            raise ValueError(f"two [[articulations]] have the name '{again}'; names must differ")
         _require_known_materials(self)
         again = repeated([*names, *(surface.name for surface in self.surfaces)])
         if again is not None:

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from .articulations import ArticulationModel, require_links
 from .base import FileModel
 from .capture import Ground, Name, Pose, Shape, physical_inertia
 from .described import NotDescribed
@@ -128,7 +129,8 @@ class BodyModel(FileModel):
     """A body of the model. Files are names in the model's directory."""
 
     name: Name
-    motion: Literal["free", "driven", "fixed"]
+    motion: Literal["free", "driven", "fixed", "link"]
+    """link: of one of `articulations`."""
     mass_kg: Mass
     inertia_kg_m2: tuple[float, float, float, float, float, float]
     """xx yy zz xy xz yz about the centre of mass, body axes [kg m2]."""
@@ -243,6 +245,8 @@ class ModelFile(FileModel):
     gravity_m_s2: Gravity = (0.0, 0.0, -9.81)
     ground: Ground | None = None
     bodies: tuple[BodyModel, ...]
+    articulations: tuple[ArticulationModel, ...] = ()
+    """Jointed bodies, whose links are bodies."""
     surfaces: tuple[Surface, ...] = ()
     """Fixed surfaces besides the ground; height fields are stored as meshes."""
     contact: ContactParameters | None = None
@@ -269,6 +273,18 @@ class ModelFile(FileModel):
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 
+    @property
+    def tracked(self) -> list[str]:
+        """Names of the bodies that physics moves: free ones, and links that joints or a free root move."""
+        moved = {link for one in self.articulations for link in one.moving_links}
+        return [body.name for body in self.bodies if body.motion == "free" or body.name in moved]
+
+    @property
+    def commanded(self) -> list[str]:
+        """Names of the bodies whose tracks are commands: driven ones, and roots of driven articulations."""
+        roots = {one.root for one in self.articulations if one.base == "driven"}
+        return [body.name for body in self.bodies if body.motion == "driven" or body.name in roots]
+
     @field_validator("measurement_std")
     @classmethod
     def _known_measurements(cls, value: dict[str, float]) -> dict[str, float]:
@@ -282,6 +298,8 @@ class ModelFile(FileModel):
         for what, names in (
             ("bodies have", (body.name for body in self.bodies)),
             ("bodies or surfaces have", (one.name for one in (*self.bodies, *self.surfaces))),
+            ("articulations have", (one.name for one in self.articulations)),
+            ("joints have", (joint.name for one in self.articulations for joint in one.joints)),
             ("parameters have", (parameter.name for parameter in self.parameters)),
             # one effect acts once, however its values are shared
             ("effects have", (effect.name.partition("@")[0] for effect in self.effects)),
@@ -293,6 +311,7 @@ class ModelFile(FileModel):
         again = repeated(" and ".join(f"'{name}'" for name in pair_of(*pair.materials)) for pair in self.pairs)
         if again is not None:
             raise ValueError(f"two pairs are of {again}; each pair of materials stands once, in either order")
+        require_links(self.articulations, {body.name: body.motion for body in self.bodies})
         if self.pairs and self.contact is None:
             raise ValueError("pairs without contact: the law of all other contacts is missing")
         return self

@@ -32,8 +32,9 @@ PIPELINE: tuple[tuple[str, tuple[str, ...]], ...] = (
 DATASETS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("files", ("io",)),
     ("files", ("shapes",)),
+    ("files", ("robots",)),
     ("files", ("capture",)),
-    ("formats", ("importers", "models", "robots", "rollouts", "synthetic")),
+    ("formats", ("importers", "models", "rollouts", "synthetic")),
     ("formats", ("exports",)),
 )
 """Floors of `datasets/`, the lowest first."""

@@ -11,6 +11,7 @@ from ..io.kinds import refuse_other_kind
 from .cameras import read_cameras
 from .check import check_capture
 from .folder import CaptureFolder
+from .links import with_links
 
 
 class Capture(CaptureFolder):
@@ -33,7 +34,7 @@ class Capture(CaptureFolder):
         """
         root = Path(path)
         refuse_other_kind(root, "capture")
-        manifest = read_toml(root / "capture.toml", CaptureManifest)
+        manifest = with_links(root, read_toml(root / "capture.toml", CaptureManifest))
         cameras = read_cameras(root, manifest.calibration.supplied_in_metres)
         capture = cls(root, manifest, cameras, None if splits is None else tuple(splits))
         if check:

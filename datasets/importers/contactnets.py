@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ...schemas import Body, BoxShape, CaptureManifest, Ground, InputDataError, Shape, World
 from ...schemas.imports import ImportResult
-from ...schemas.regular_files import require_regular_file
 from ..capture.files import entries_of
 from ..capture.manifest import write_manifest
 from ..capture.tracks import Track, tracks_csv
@@ -18,6 +17,7 @@ from ..io.arrays import read_npz
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from ..io.progress import note, progress
+from .tensors import read_tensor
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,6 @@ INERTIA_KG_M2 = 0.00081
 BODY = "cube"
 
 _COLUMNS = 19
-_MOST_NUMBERS = 10_000_000
 _POSITION, _QUATERNION, _VELOCITY, _OMEGA = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 _NPZ_FIELDS = ("offsets", "pos", "quat_wxyz", "vel", "omega_body", "toss_index", "rate_hz", "half_width_m")
 
@@ -129,30 +128,11 @@ def _read(source: Path) -> _Tosses:
 
 
 def _read_pt(files: list[Path]) -> _Tosses:
-    import torch
-
     tracks: dict[int, Track] = {}
     for file in progress(files, "reading", unit="toss"):
         if not file.stem.isdecimal():
             raise InputDataError(f"{file}: the name is no toss number.", "<number>.pt.")
-        try:
-            # weights_only: tensors are read, nothing that the file may carry is executed.
-            tensor = torch.load(require_regular_file(file), weights_only=True, map_location="cpu")
-        except InputDataError:
-            raise
-        except Exception:  # torch raises whatever its readers raise, and advises to read without the precaution
-            raise InputDataError(
-                f"{file}: not a tensor that can be read safely: it is damaged, or holds more than numbers.",
-                "a tensor alone, as torch.save writes it; objects of Python are refused: reading them could run code.",
-                "take the original, or save the tensor alone.",
-            ) from None
-        if not isinstance(tensor, torch.Tensor) or tensor.shape[-1:] != (_COLUMNS,) or tensor.dim() not in (2, 3):
-            shape = tuple(tensor.shape) if isinstance(tensor, torch.Tensor) else type(tensor).__name__
-            raise InputDataError(f"{file}: {shape} where a toss was expected.", f"a tensor (1, T, {_COLUMNS}).")
-        if tensor.numel() > _MOST_NUMBERS or tensor.is_complex():  # a tensor may repeat few numbers without end
-            found = f"{file}: {tensor.numel()} numbers, {tensor.dtype}."
-            raise InputDataError(found, f"at most {_MOST_NUMBERS} real numbers.")
-        rows = tensor.reshape(-1, _COLUMNS).numpy().astype(np.float64)
+        rows = read_tensor(file, _COLUMNS, batched=True)
         rows[:, _POSITION] *= HALF_WIDTH_M
         rows[:, _VELOCITY] *= HALF_WIDTH_M
         tracks[int(file.stem)] = _track(str(file), rows, RATE_HZ)

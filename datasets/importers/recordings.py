@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from ...schemas import QUATERNION_NORM_TOLERANCE, Body, CaptureManifest, InputDataError, World
+from ...schemas import QUATERNION_NORM_TOLERANCE, Articulation, Body, CaptureManifest, InputDataError, World
 from ...schemas.capture import Episode, Name
 from ...schemas.imports import ImportResult
 from ...schemas.regular_files import read_text_file, require_regular_file
@@ -293,12 +293,14 @@ def write_recordings(
     bodies: Iterable[Body],
     recordings: Sequence[Recording],
     splits: dict[str, tuple[str, ...]],
+    articulations: Iterable[Articulation] = (),
 ) -> ImportResult:
     """Write the manifest and the tracks into an empty directory that becomes `out`."""
     manifest = CaptureManifest(
         format="cgwm-capture/1",
         world=world,
         bodies=tuple(bodies),
+        articulations=tuple(articulations),
         splits=splits,
         episodes={recording.name: recording.entry for recording in recordings if recording.entry != Episode()},
     )

@@ -78,4 +78,5 @@ def versions() -> dict[str, str]:
 def _shapes(capture: Capture) -> dict[str, str]:
     """Return the hashes of the files of the bodies' shapes."""
     files = [file for body in capture.manifest.bodies if (file := capture.shape_file(body)) is not None]
+    files += [capture.root / entry.path for entry in capture.manifest.articulations]
     return {file.relative_to(capture.root).as_posix(): sha256(file) for file in files if file.is_file()}

@@ -12,6 +12,7 @@ from ...datasets.capture.tracks import Episode
 from ...datasets.io.atomic import new_file, sha256
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note, progress
+from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
 from ...schemas.regular_files import real_path
@@ -84,6 +85,8 @@ def compare(
         refuse_output(out, "page", overwrite)
     _refuse_twice(models)
     loaded = [(str(path), read_model(path)) for path in models]
+    for name, model in loaded:
+        refuse_joints(model.file.articulations, name, "compare")
     accepted = accept_units or any(model.accepts_units for _, model in loaded)
     source = Capture.open(capture, splits=(split,), accept_units=accepted)
     with _checked_work(loaded, source, split):

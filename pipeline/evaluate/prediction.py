@@ -254,7 +254,7 @@ def _ballistic(world: World, grid: Array, rollout: Rollout, item: int, model: Mo
     """
     position, quat = model.position_m.copy(), model.quat_wxyz.copy()
     time = torch.as_tensor(grid - grid[last]).to(rollout.position_m)[:, None]
-    for body in world.free:
+    for body in world.tracked:
         start = rollout.quat_wxyz[item, last, body]
         omega, velocity = rollout.omega_body_rad_s[item, last, body], rollout.velocity_m_s[item, last, body]
         com = world.bodies[body].com[0]

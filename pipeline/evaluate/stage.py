@@ -229,8 +229,8 @@ def _listed(names: Sequence[str]) -> str:
 
 def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
     """Return the episodes in which every moving body has a track, and messages on the others."""
-    moving = [body.name for body in model.file.bodies if body.motion != "fixed"]
-    if not any(body.motion == "free" for body in model.file.bodies):
+    moving = [*model.file.tracked, *model.file.commanded]
+    if not model.file.tracked:
         raise InputDataError(
             f"{model.place}: none of its bodies is free, so there is no motion to predict.",
             'a body with the motion "free".',
@@ -253,7 +253,7 @@ def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> Noise
     rotation = known.get("rotation_rad") or given.rotation_std_rad
     if position and rotation:
         return Noise(position, rotation)
-    free = [body.name for body in model.file.bodies if body.motion == "free"]
+    free = model.file.tracked
     estimated = estimate_noise([tracks[name] for _, tracks in episodes for name in free])
     return Noise(position or estimated.position_m, rotation or estimated.rotation_rad)
 

@@ -25,7 +25,7 @@ def evaluation_parts(world: World, episodes: Sequence[Episode], state_fits: int)
         state_fits: Maximum number of episodes whose state is fitted to all frames.
     """
     spans, frames = durations(episodes), frame_count(episodes)
-    free = max(len(world.free), 1)
+    free = max(len(world.tracked), 1)
     each = STATE_FIT_ITERATIONS * (_STATE_SIZE * free + len(DAMPINGS))
     parts = [rollout_part("predictions", world, spans, 2 + SAMPLES[1], MAX_ITEMS, frames)]
     if state_fits:

@@ -23,6 +23,7 @@ from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
 from ...datasets.io.outputs import DirectoryKind, FileKind, may_repeat, reads, refuse_output
 from ...datasets.io.progress import note
+from ...datasets.models.joints import refuse_joints
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
@@ -245,6 +246,7 @@ def object_model(model: Model, name: str) -> ObjectModel:
 
 def _simulated(thing: Path) -> Model:
     model = read_model(thing)
+    refuse_joints(model.file.articulations, str(thing), "export --to mjcf")
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking or model.file.contact is None:
         what = f"the body '{lacking[0]}' has no collision spheres" if lacking else "its physics are not fitted"

@@ -19,6 +19,10 @@ from ..physics.parameters import CONTACT_PARAMETERS
 Pair = tuple[str, str]
 
 
+MOVED = ("free", "link")
+"""Motions of bodies that physics moves."""
+
+
 @dataclass(frozen=True)
 class TouchingBodies:
     """Two bodies that can touch, or one and the ground."""
@@ -36,10 +40,10 @@ def touching_bodies(manifest: CaptureManifest) -> Iterator[TouchingBodies]:
     """Yield the bodies that can touch: each free one with the ground, and with every other body."""
     bodies, ground = manifest.bodies, manifest.world.ground
     for index, body in enumerate(bodies):
-        if body.motion == "free" and ground is not None:
+        if body.motion in MOVED and ground is not None:
             yield TouchingBodies((body.name,), _pair(body.material, ground.material))
         for other in bodies[index + 1 :]:
-            if "free" in (body.motion, other.motion):
+            if body.motion in MOVED or other.motion in MOVED:
                 yield TouchingBodies((body.name, other.name), _pair(body.material, other.material))
 
 

@@ -6,10 +6,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import torch
+
 from ...datasets.capture.cameras import require_metric
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.video import video_info
 from ...datasets.io.progress import note
+from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
 from ...datasets.shapes.surfaces import stored
@@ -25,6 +28,7 @@ from ...schemas import (
     UsageError,
 )
 from ...schemas.materials import pair_of
+from ..physics.chain_values import FACTORS, with_chain_values
 from ..physics.effects.registry import effect_of
 from ..physics.rollout_cost import durations
 from ..physics.world import World, inertia_elements
@@ -68,10 +72,10 @@ def fit_motion(
     seconds = round(time.perf_counter() - started, 2)
     record = found.record.to_json() | {"seconds": seconds, "supervise": config.supervise}
     record |= {"warnings": list(found.warnings)}
-    fitted = _merge(ready.file, found)
+    fitted = _merge(ready.file, World.from_model(ready), found)
     fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
     ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
-    if config.supervise == "tracks":
+    if config.supervise == "tracks" and not ready.file.articulations:
         described = not_described(World.from_model(ready), track_episodes(capture, split), found.noise)
         ready = replace(ready, file=ready.file.model_copy(update={"not_described": described}))
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
@@ -81,10 +85,14 @@ def fit_motion(
 
 def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> None:
     """Refuse a model or a capture from whose motion no physics can be fitted."""
+    asked = [name for name in ("mass_distribution", "length_scale") if getattr(config, name) is True]
+    asked += ["effects"] if config.effects else []
+    if asked:
+        refuse_joints(model.file.articulations, str(capture.root), f"fit with phys-geo.{asked[0]}")
     uses_photos = any(name in model.body_splats for name in capture.body_names)
     if capture.cameras is not None and (uses_photos or config.supervise != "tracks"):
         require_metric(capture.cameras)
-    if not any(body.motion == "free" for body in model.file.bodies):
+    if not model.file.tracked:
         raise InputDataError(
             f"{capture.root / 'capture.toml'}: no body is free, so no motion contains information about contact.",
             'motion = "free" for the body whose physics is wanted.',
@@ -137,7 +145,8 @@ def _fitted_motion(
         episodes = track_episodes(capture, split)
         spans = durations(episodes)
         with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
-            earlier = EarlierEstimates.of(ready.file.parameters, ready.file.correlations)
+            kept = [p for p in ready.file.parameters if not p.name.endswith(FACTORS)]
+            earlier = EarlierEstimates.of(kept, ready.file.correlations)
             medians = start_laws(ready.file, capture.manifest).medians
             found = fit_with_effects(
                 world, episodes, config, noise, warm_started, capture.groups, earlier, medians, measured.force_std_n
@@ -145,6 +154,7 @@ def _fitted_motion(
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
         return replace(found, warnings=(*found.warnings, *warnings))
+    refuse_joints(ready.file.articulations, ready.place, f"fit with --supervise {config.supervise}")
     for name in ("mass_distribution", "length_scale"):
         if getattr(config, name) is True:
             raise UsageError(
@@ -192,7 +202,7 @@ def _has_video(capture: Capture, split: str) -> bool:
     return any(capture.videos(name) for name in capture.episodes(split))
 
 
-def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
+def _merge(file: ModelFile, world: World, found: PhysicsFit) -> ModelFile:
     """Return the model file with the results of the fit in place of earlier ones."""
     fresh = {parameter.name for parameter in found.parameters}
     kept = [parameter for parameter in file.parameters if parameter.name not in fresh]
@@ -200,6 +210,7 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
     added = (SCALE,) if any(p.name.startswith(f"{SCALE}.") for p in found.parameters) else ()
     effects = with_effects(file.effects, added)
     own_values, spread = ({}, {}) if found.effects is None else (found.effects.own_values, found.effects.spread)
+    file = _with_joints(file, world, found)
     return file.model_copy(
         update={
             "bodies": file.bodies if found.mass is None else _with_mass(file.bodies, found.mass.world),
@@ -221,6 +232,39 @@ def _merge(file: ModelFile, found: PhysicsFit) -> ModelFile:
             "warnings": tuple(dict.fromkeys((*file.warnings, *found.warnings))),
         }
     )
+
+
+def _with_joints(file: ModelFile, world: World, found: PhysicsFit) -> ModelFile:
+    """Return the model file with the fitted numbers of joints and links in its articulations and bodies."""
+    if not file.articulations:
+        return file
+    values = {p.name: torch.tensor([p.estimate], dtype=torch.float64) for p in found.parameters}
+    joints = {entry.name: entry for entry in file.articulations}
+    for entry in file.articulations:
+        moved = [
+            joint.model_copy(
+                update={
+                    name: float(values[f"{joint.name}.{name}"])
+                    for name in ("damping", "friction")
+                    if f"{joint.name}.{name}" in values
+                }
+            )
+            for joint in entry.joints
+        ]
+        joints[entry.name] = entry.model_copy(update={"joints": tuple(moved)})
+    links = {body.name: body for body in with_chain_values(world, values).bodies if body.motion == "link"}
+    bodies = [
+        body.model_copy(
+            update={
+                "mass_kg": float(links[body.name].mass[0]),
+                "inertia_kg_m2": inertia_elements(links[body.name].inertia[0].numpy()),
+            }
+        )
+        if body.name in links
+        else body
+        for body in file.bodies
+    ]
+    return file.model_copy(update={"articulations": tuple(joints.values()), "bodies": tuple(bodies)})
 
 
 def _with_offset(ground: Ground | None, kept: Sequence[FittedParameter], found: PhysicsFit) -> Ground | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...schemas import PhysConfig
+from ..physics.chain_parameters import chain_parameters
+from ..physics.parameters import contact_parameters
 from ..physics.rollout_cost import rollout_part
 from ..physics.world import World
 from ..runtime.work_budget import Part
@@ -29,8 +31,9 @@ def fit_parts(world: World, spans_s: Sequence[float], config: PhysConfig) -> lis
         spans_s: Duration of each episode [s].
         config: The stage's settings.
     """
+    parameters = len(contact_parameters(world)) + len(chain_parameters(world)) + 1
     used = [min(span, MAX_SPAN_S) for span in spans_s][:MAX_EPISODES]
-    rollouts = float(config.generations) * (config.population or default_population(max(len(used), 1)))
+    rollouts = float(config.generations) * (config.population or default_population(max(len(used), 1), parameters))
     parts = [rollout_part("the search", world, used, rollouts, MAX_ROLLOUTS)]
     if len(used) < ENOUGH_EPISODES:
         starts = _SHOOTING_STARTS[len(used) >= SEVERAL_EPISODES]

@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ...schemas import InputDataError
+from ...schemas import ArticulationModel, InputDataError
 from ..geometry.rotation import cross, quat_exp, quat_multiply, quat_rotate
 
 KINDS = ("hinge", "slide", "fixed")
@@ -199,6 +199,29 @@ class Chain:
             positions.append(positions[parent] + quat_rotate(quats[parent], offset))
             quats.append(quat_multiply(quats[parent], turn).expand(batch, 4))
         return torch.stack(positions, 1), torch.stack(quats, 1)
+
+
+def chain_of_model(entry: ArticulationModel, like: Tensor) -> Chain:
+    """Return a jointed body of a model as a chain of tensors with the type and device of `like`."""
+    joints = tuple(
+        Joint.of(
+            joint.name,
+            joint.kind,
+            joint.link,
+            joint.parent,
+            position_m=joint.position_m,
+            quat_wxyz=joint.quat_wxyz,
+            axis=joint.axis,
+            lower=-math.inf if joint.lower is None else joint.lower,
+            upper=math.inf if joint.upper is None else joint.upper,
+            damping=joint.damping,
+            friction=joint.friction,
+            armature=joint.armature,
+            like=like,
+        )
+        for joint in entry.joints
+    )
+    return Chain(name=entry.name, root=entry.root, base=entry.base, joints=joints)
 
 
 def link_velocities(

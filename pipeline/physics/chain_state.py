@@ -88,11 +88,35 @@ def _require_inertia(place: str, chain: Chain, bodies: Mapping[str, Body]) -> No
         raise InputDataError(f"{place}: its free root '{chain.root}' has no mass.", "a mass above 0 kg.")
 
 
-def joints_of(world: World, state: State, chain: Chain) -> tuple[Tensor, Tensor]:
+def on_joints(world: World, state: State) -> State:
+    """Return a state in which links are on their joints: values and speeds are read from poses that may be off.
+
+    A fit moves links as if they were free; what a joint does not admit is left out.
+    """
+    for chain in world.chains:
+        values, speeds = joints_of(world, state, chain, exact=False)
+        names = chain.joint_names
+        state = _posed(
+            world,
+            state,
+            chain,
+            dict(zip(names, values.unbind(-1), strict=True)),
+            dict(zip(names, speeds.unbind(-1), strict=True)),
+        )
+    return state
+
+
+def joints_of(world: World, state: State, chain: Chain, exact: bool = True) -> tuple[Tensor, Tensor]:
     """Return values [rad or m] and speeds (B, joints) of the moving joints of a chain, from the poses of its links.
 
     A hinge's value is the one in the middle of its limits, where it has two, plus or minus half a turn; else between
     minus and plus half a turn.
+
+    Args:
+        world: The world.
+        state: Poses and velocities of all bodies.
+        chain: The chain.
+        exact: Whether links that are off their joints are refused; else the nearest values are returned.
 
     Raises:
         InputDataError: If a link is not where its joint admits it, with the environment.
@@ -106,7 +130,8 @@ def joints_of(world: World, state: State, chain: Chain) -> tuple[Tensor, Tensor]
         offset = quat_rotate(quat_conjugate(turn), position - above) - joint.position
         turned = quat_multiply(quat_conjugate(joint.quat_wxyz), quat_multiply(quat_conjugate(turn), quat))
         value = _value(joint, offset, turned)
-        _require_joint(joint, offset, turned, value)
+        if exact:
+            _require_joint(joint, offset, turned, value)
         if joint.kind == "fixed":
             continue
         omega = quat_rotate(turn, state.omega_body_rad_s[:, parent])

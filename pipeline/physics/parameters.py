@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...schemas.materials import of_pair
+from .chain_values import with_chain_values
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .pair_laws import laws_in_use
@@ -236,6 +237,8 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
     world = replace(world, effects=tuple(_with_values(active, column) for active in world.effects))
     if "ground_shift_m" in column and world.ground_offset is not None:
         world = replace(world, ground_offset=world.ground_offset + column["ground_shift_m"])
+    if world.chains:
+        world = with_chain_values(world, column)
     for index, body in enumerate(world.bodies):
         changes = _mass_distribution_of(body, column)
         world = world.with_body(index, **changes) if changes else world

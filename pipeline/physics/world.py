@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...schemas import InputDataError, UsageError
 from ...schemas.materials import pair_of
-from .chain import Chain
+from .chain import Chain, chain_of_model
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
@@ -136,6 +136,17 @@ class World:
     def free(self) -> list[int]:
         """Indices of the free bodies."""
         return [index for index, body in enumerate(self.bodies) if body.free]
+
+    @property
+    def tracked(self) -> list[int]:
+        """Indices of the bodies that physics moves: free ones, and links that joints or a free root move."""
+        return [index for index in range(len(self.bodies)) if self.moves(index)]
+
+    @property
+    def driven(self) -> list[str]:
+        """Names of the bodies whose tracks are commands: driven ones, and roots of driven chains."""
+        roots = {chain.root for chain in self.chains if chain.base == "driven"}
+        return [body.name for body in self.bodies if body.motion == "driven" or body.name in roots]
 
     def chain_of(self, index: int) -> int:
         """Return the number of the chain of which a body is a link, -1 for none."""
@@ -281,6 +292,7 @@ class World:
         ground = file.ground
         world = World(
             surfaces=_surfaces(model, tensor),
+            chains=tuple(chain_of_model(entry, tensor(0.0)) for entry in file.articulations),
             bodies=tuple(bodies),
             gravity=tensor(file.gravity_m_s2),
             ground_normal=tensor(ground.normal)[0] if ground else None,

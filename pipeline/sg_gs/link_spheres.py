@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ...datasets.robots import Articulation, GeometryOfLink
+from ...datasets.robots import Articulation, GeometryOfLink, LinkOfRobot
 from ...datasets.shapes.meshes import Mesh
 from ...schemas import InputDataError, Shape
 from ..geometry.directions import fibonacci_directions
@@ -70,6 +70,11 @@ def _spheres_of(path: Path, name: str, parts: Sequence[GeometryOfLink], mesh: Me
     except InputDataError as error:
         raise InputDataError(f"{path}: link '{name}': {error.found}", error.allowed, error.todo) from error
     return spheres.centers, spheres.radii
+
+
+def link_mesh(link: LinkOfRobot) -> Mesh:
+    """Return the surface of all that collides of a link, in its frame."""
+    return _joined([_mesh_of(part) for part in link.geometry])
 
 
 def _area(mesh: Mesh) -> float:

@@ -20,6 +20,7 @@ from .bodies import BodyResult, fit_body
 from .body_separation import separate
 from .context import Stage
 from .held_out import HeldOut, look
+from .link_bodies import link_results
 from .turntable import turntable, upward
 from .views import as_bytes, load_views
 
@@ -79,7 +80,11 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     pictures = _separated(stage)
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
+    links = link_results(capture, config)
     for index, body in enumerate(capture.manifest.bodies):
+        if body.name in links:
+            results[body.name] = links[body.name]
+            continue
         results[body.name], world = fit_body(stage, index, body)
         if world is not None:
             placed.append(world)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...datasets.capture.cameras import Camera
 from ...datasets.io.atomic import sha256
+from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.shards import shard_range
 from ...schemas import DatasetManifest, InputDataError, ModelFile, SamplingPlan, SynthesizeConfig, UsageError
@@ -76,6 +77,7 @@ def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
 
 def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
     model = read_model(path)
+    refuse_joints(model.file.articulations, str(path), "synthesize")
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking:
         raise InputDataError(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..optimization.levenberg_marquardt import Solution, minimise
+from ..physics.chain_state import on_joints
 from ..physics.smooth_distance import union_distance
 from ..physics.world import Body, World
 from .observations import START_FRAMES, Observations, straight_line
@@ -112,7 +113,8 @@ def estimate_states(
         iterations=iterations,
         prior_information=_information(world, warm, noise),
     )
-    return replace(observations, state=retract(observations.state, solution.states, observations.free)), solution
+    moved = on_joints(world, retract(observations.state, solution.states, observations.free))
+    return replace(observations, state=moved), solution
 
 
 def _information(world: World, warm: Observations, noise: Noise) -> Tensor:

@@ -14,6 +14,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode, Track
 from ...schemas import InputDataError
 from ..geometry.rotation import continuous_turns, matrix_to_quat
+from ..physics.chain_state import on_joints
 from ..physics.kinematic import Drive
 from ..physics.parameters import with_own
 from ..physics.world import State, World
@@ -102,9 +103,9 @@ class Observations:
         drives = {
             body.name: Drive.of([tracks[body.name] for _, tracks in episodes], like)
             for body in world.bodies
-            if body.motion == "driven"
+            if body.name in world.driven
         }
-        free = tuple(world.free)
+        free = tuple(world.tracked)
         partial = Observations(
             names=tuple(row.name for row in rows),
             times_s=times,
@@ -119,7 +120,7 @@ class Observations:
             own_values=_own(world, [row.name for row in rows]),
             spin_rad_s=_measured_spins(padded, like),
         )
-        return replace(partial, state=first_state(world, partial))
+        return replace(partial, state=on_joints(world, first_state(world, partial)))
 
     def select(self, items: Sequence[int]) -> Observations:
         """Return some items of the batch."""
@@ -173,7 +174,7 @@ class _Row:
     @staticmethod
     def of(world: World, name: str, tracks: dict[str, Track], window: tuple[float, float]) -> _Row:
         """Cut a window [s] from the tracks of an episode, on the union of their frame times."""
-        bodies = [world.bodies[index].name for index in world.free]
+        bodies = [world.bodies[index].name for index in world.tracked]
         cut = {body: tracks[body].window(*window) for body in bodies if body in tracks}
         times = np.unique(np.concatenate([track.time_s for track in cut.values()]))
         shape = (len(times), len(bodies))
@@ -267,8 +268,9 @@ def _resting(world: World, batch: int) -> State:
     like = world.gravity
     zero = torch.zeros(batch, len(world.bodies), 3).to(like)
     position, quat = zero.clone(), matrix_to_quat(torch.eye(3).to(like)).expand(batch, len(world.bodies), 4).clone()
+    rooted = {chain.root for chain in world.chains if chain.base == "fixed"}
     for index, body in enumerate(world.bodies):
-        if body.motion == "fixed" and body.place is not None:
+        if (body.motion == "fixed" or body.name in rooted) and body.place is not None:
             position[:, index], quat[:, index] = body.place[:, :3], body.place[:, 3:]
     return State(position, quat, zero, zero)
 
@@ -279,7 +281,7 @@ def track_episodes(capture: Capture, split: str) -> list[Episode]:
     Raises:
         InputDataError: If none has.
     """
-    free = {body.name for body in capture.manifest.bodies if body.motion == "free"}
+    free = {body.name for body in capture.manifest.bodies if body.motion in ("free", "link")}
     episodes = [Episode(name, capture.tracks(name)) for name in capture.episodes(split)]
     usable = [episode for episode in episodes if free & set(episode.tracks)]
     if not usable:

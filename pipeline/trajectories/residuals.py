@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..optimization.forward_mode import batched_jacobian
+from ..physics.chain_state import on_joints
 from ..physics.engine import length_groups, ragged_rollout
 from ..physics.observation_model import measure
 from ..physics.parameters import Parameter, apply_parameters
@@ -128,7 +129,7 @@ class TrajectoryResiduals:
         world = seen.world(self.world, repeats)
         if count:
             world = apply_parameters(world, self.parameters, torch.stack(values, -1))
-        state = retract(seen.state.repeat(repeats), inputs[:, count:], seen.free)
+        state = on_joints(world, retract(seen.state.repeat(repeats), inputs[:, count:], seen.free))
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
         return measure(world, state, seen.times_s[:, :frames].repeat(repeats, 1), drives)
 

@@ -40,6 +40,8 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
     file = _still(model.file)
     if file.contact is None or not any(body.motion == "free" for body in file.bodies):
         return [], {}
+    if file.articulations:
+        return [], {"simulated": "no: it has jointed bodies"}
     facts = {}
     if len(file.effects) < len(model.file.effects):
         left_out = [packed_name(effect.name) for effect in model.file.effects if effect not in file.effects]

@@ -122,12 +122,15 @@ def words_of(command: str) -> list[str]:
 
 def test_the_manifest_is_legal(tmp_path: Path) -> None:
     text, *others = blocks("docs/capture.md", "toml")
-    materials, surfaces = sorted(others, key=lambda block: "[[surfaces]]" in block)
+    order = ("[[materials]]", "[[surfaces]]", "[[articulations]]")
+    materials, surfaces, joints = (next(block for block in others if word in block) for word in order)
     path = tmp_path / "capture.toml"
     path.write_text('format = "cgwm-capture/1"\n' + materials)
     assert read_toml(path, CaptureManifest).pairs[0].friction == 0.3
     path.write_text('format = "cgwm-capture/1"\n' + surfaces)
     assert [surface.name for surface in read_toml(path, CaptureManifest).surfaces] == ["ramp", "post"]
+    path.write_text('format = "cgwm-capture/1"\n' + joints)
+    assert [one.path for one in read_toml(path, CaptureManifest).articulations] == ["elbow.urdf"]
     path.write_text(text)
     manifest = read_toml(path, CaptureManifest)
     assert manifest.bodies[0].mass_kg == 0.37

@@ -111,7 +111,8 @@ def fit_with_effects(
         NotConvergedError: If every rollout diverges.
     """
     _require_needs(world, episodes)
-    released_s, warnings = find_releases(world, episodes, noise)
+    # the detection of hands takes the flight of a single body
+    released_s, warnings = ({}, []) if world.chains else find_releases(world, episodes, noise)
     thrown = after_release(episodes, released_s)
     found = fit_physics(world, thrown, config, noise, warm_started, groups, earlier, medians, force_std_n)
     return replace(found, warnings=(*found.warnings, *warnings))

@@ -31,6 +31,7 @@ from ....datasets.io.progress import note
 from ....schemas import FitChoice, InputDataError, PhysConfig
 from ....schemas.materials import of_pair
 from ...optimization.importance_sampling import episode_covariance
+from ...physics.chain_parameters import chain_parameters
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.pair_laws import laws_in_use
 from ...physics.parameters import (
@@ -180,7 +181,10 @@ class _FitData:
     def of(world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]) -> _FitData:
         """Choose the episodes of the search, and estimate the noise where it is not given."""
         free_tracks = [
-            tracks[world.bodies[i].name] for _, tracks in episodes for i in world.free if world.bodies[i].name in tracks
+            tracks[world.bodies[i].name]
+            for _, tracks in episodes
+            for i in world.tracked
+            if world.bodies[i].name in tracks
         ]
         chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
         searched = [episodes[i] for i in chosen]
@@ -197,7 +201,7 @@ class _FitData:
             noise_estimated=estimated,
             noise=Noise(noise[0] or estimated[0], noise[1] or estimated[1]),
             bounces=None
-            if airborne or len(laws_in_use(world).laws) > 1
+            if airborne or world.chains or len(laws_in_use(world).laws) > 1
             else restitution_of(world, whole_episodes(world, episodes)),
             airborne=airborne,
         )
@@ -242,7 +246,7 @@ def _fitted_before(
     # with few episodes the search cannot separate the ground's height from the bouncing; shooting can
     height = world.ground_normal is not None and len(data.episodes) >= ENOUGH_EPISODES
     contact = _of_seen_pairs(world, contact_parameters(world, medians), data.episodes)
-    names = [*contact, *([GROUND_SHIFT] if height else [])]
+    names = [*contact, *chain_parameters(world), *([GROUND_SHIFT] if height else [])]
     start = [(p, _start(world, p) if warm_started else p.prior[0]) for p in names]
     world, start = with_bounces(world, start, data.bounces)
     world, mass, choice = _with_chosen_parts(world, data, config, start)
@@ -290,7 +294,7 @@ def _with_chosen_parts(
         config: The stage's settings.
         start: Contact parameters, and their start.
     """
-    choice = None if data.airborne else choose_parts(world, data.episodes, data.noise, config)
+    choice = None if data.airborne or world.chains else choose_parts(world, data.episodes, data.noise, config)
     parts = {*asked_parts(config), *(() if choice is None else choice.chosen)}
     mass: EffectEstimate | None = None
     wanted = [part for part in MASS_PARTS if part in parts]
@@ -376,7 +380,7 @@ def _start(world: World, parameter: Parameter) -> float:
     if parameter is GROUND_SHIFT:
         return 0.0
     low, high = parameter.bounds
-    return min(max(contact_values(world)[parameter.name], low), high)
+    return min(max(contact_values(world).get(parameter.name, parameter.prior[0]), low), high)
 
 
 def _of_seen_pairs(world: World, parameters: Sequence[Parameter], episodes: Sequence[Episode]) -> list[Parameter]:

@@ -336,7 +336,7 @@ def _derived_of(
 ) -> list[FittedParameter]:
     """Return the derived quantities of the law whose contact time and damping ratio are at the given places."""
     tau, zeta = places
-    mass = float(world.bodies[world.free[0]].mass[0])
+    mass = float(world.bodies[world.tracked[0]].mass[0])
     formulas = {
         "restitution": ("1", lambda z: restitution(z[zeta].exp())),
         "stiffness_n_m": ("N/m", lambda z: mass / z[tau].exp().square()),

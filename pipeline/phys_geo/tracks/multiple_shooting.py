@@ -21,6 +21,7 @@ from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...optimization.least_squares import Descent, Policy, descend
 from ...optimization.levenberg_marquardt import robust_loss
 from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
+from ...physics.chain_state import on_joints
 from ...physics.engine import ragged_rollout, rollouts_at_once
 from ...physics.engine import rollout as rolled_out
 from ...physics.observation_model import as_measured, true_times
@@ -249,15 +250,16 @@ class Shooting:
     def _motion(self, shared: Tensor, states: State, changes: Tensor, repeats: int) -> Rollout:
         """Return the true motion of the segments by parameters (K B, P) from changed states (K B, S)."""
         seen = self.segments
-        every = retract(states.repeat(repeats), changes, list(seen.free))
+        world = self._world(shared)
+        every = on_joints(world, retract(states.repeat(repeats), changes, list(seen.free)))
         times = seen.times_s.repeat(repeats, 1)
         number = torch.arange(len(times)).view(repeats, -1)
 
         def roll(items: list[int], frames: int) -> Rollout:
             rows = number[:, items].flatten()
-            world, some = self._world(shared[rows]), seen.select(items)
+            some_world, some = self._world(shared[rows]), seen.select(items)
             drives = {name: drive.repeat(repeats) for name, drive in some.drives.items()}
-            return rolled_out(world, every.at(rows), true_times(world, times[rows, :frames]), drives)
+            return rolled_out(some_world, every.at(rows), true_times(some_world, times[rows, :frames]), drives)
 
         return ragged_rollout(times, (self.end + 1).tolist(), repeats, roll)
 

@@ -28,6 +28,8 @@ MAX_ROLLOUTS = 1200
 POPULATION = (24, 96)
 """Minimum and maximum number of samples in a generation, chosen for about `MAX_ROLLOUTS` rollouts if the settings give
 none."""
+USUAL_PARAMETERS = 5
+"""Number of parameters up to which `POPULATION` is enough."""
 LEAST_GENERATIONS = 2
 """Minimum number of generations of a search that starts at an earlier fit."""
 SEVERAL_EPISODES = 3
@@ -86,7 +88,7 @@ def search_contact(
         open_loop_errors(world, batch.observations, batch.warm, names),
         prior,
         seed=config.seed,
-        population=config.population or default_population(episodes),
+        population=config.population or default_population(episodes, len(names)),
         generations=generations,
         first=np.array([p.encode(value) for p, value in start]),
         errors=ERRORS_PER_EPISODE * episodes,
@@ -101,12 +103,13 @@ def search_contact(
     return result
 
 
-def default_population(episodes: int) -> int:
-    """Return the number of samples in a generation."""
+def default_population(episodes: int, parameters: int = USUAL_PARAMETERS) -> int:
+    """Return the number of samples in a generation, more for more parameters than a rigid body on a ground has."""
     rollouts = MAX_ROLLOUTS
     if SEVERAL_EPISODES <= episodes < ENOUGH_EPISODES:  # shooting follows, and the cost has a single basin
         rollouts //= 5
-    return min(max(rollouts // episodes, POPULATION[0]), POPULATION[1])
+    usual = min(max(rollouts // episodes, POPULATION[0]), POPULATION[1])
+    return usual * max(parameters, USUAL_PARAMETERS) // USUAL_PARAMETERS
 
 
 def _noise_floor(world: World, observations: Observations, noise: Noise) -> float:

@@ -255,7 +255,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'format = "cgwm-capture/1"\n',
             "",
             "C/capture.toml: the top level lacks the field 'format'.\n"
-            "Allowed: format, world, bodies, materials, pairs, surfaces, measurement, "
+            "Allowed: format, world, bodies, articulations, materials, pairs, surfaces, measurement, "
             "splits, episodes, video, calibration.\n"
             "Next: correct the field.",
         ),
@@ -270,7 +270,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             "[splits]",
             "[split]",
             "C/capture.toml, line 7: the top level has an unknown field 'split'.\n"
-            "Allowed: format, world, bodies, materials, pairs, surfaces, measurement, "
+            "Allowed: format, world, bodies, articulations, materials, pairs, surfaces, measurement, "
             "splits, episodes, video, calibration. "
             "Did you mean 'splits'?\nNext: correct the field.",
         ),

@@ -13,7 +13,9 @@ from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, State, World, simulate
 from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Place
-from cgwm.pipeline.physics.chain_state import joints_of, require_chains, with_joints
+from cgwm.pipeline.physics.chain_parameters import chain_parameters
+from cgwm.pipeline.physics.chain_state import joints_of, on_joints, require_chains, with_joints
+from cgwm.pipeline.physics.chain_values import with_chain_values
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.schemas import InputDataError, UsageError
@@ -335,3 +337,45 @@ def test_what_cannot_be_a_chain_is_refused() -> None:
     servoed = replace(chain, joints=(replace(chain.joints[0], stiffness=batch(1.0)), chain.joints[1]))
     with pytest.raises(InputDataError, match="have servos and no command"):
         simulate(replace(world, chains=(servoed,)), with_joints(world, still(3), {}), times(0.01))
+
+
+def test_links_off_their_joints_are_put_on_them_and_others_stay() -> None:
+    chain, bodies = double_pendulum("free")
+    world = chained(chain, *bodies)
+    free = State(*(x.clone() for x in still(3).tensors))
+    free.velocity_m_s[:, 0] = torch.tensor([0.1, -0.2, 0.3])
+    free.omega_body_rad_s[:, 0] = torch.tensor([1.0, 2.0, -0.5])
+    given = with_joints(world, free, {"first": 0.4, "second": -1.2}, {"first": 2.0, "second": -0.7})
+    for kept, found in zip(given.tensors, on_joints(world, given).tensors, strict=True):
+        np.testing.assert_allclose(found, kept, atol=1e-14)
+    moved = State(*(x.clone() for x in given.tensors))
+    moved.position_m[:, 2] += 0.01
+    moved.velocity_m_s[:, 1] -= 0.2
+    for kept, found in zip(given.tensors, on_joints(world, moved).tensors, strict=True):
+        np.testing.assert_allclose(found, kept, atol=1e-14)  # hinges admit neither
+    turned = State(*(x.clone() for x in given.tensors))
+    turned.omega_body_rad_s[:, 2] += torch.tensor([0.0, 0.3, 0.0])  # about its axis
+    values, speeds = joints_of(world, on_joints(world, turned), chain)
+    np.testing.assert_allclose(values[0], [0.4, -1.2], atol=1e-12)
+    np.testing.assert_allclose(speeds[0], [2.0, -0.4], atol=1e-12)
+
+
+def test_parameters_of_a_chain_keep_its_mass_and_scale_what_they_name() -> None:
+    chain, bodies = double_pendulum("free", damping=0.02)
+    world = chained(chain, *bodies)
+    parameters = {p.name: p for p in chain_parameters(world)}
+    assert list(parameters) == [
+        "first.damping", "first.friction", "second.damping", "second.friction", "upper.mass_factor",
+        "lower.mass_factor", "arm.inertia_factor",
+    ]  # fmt: skip
+    assert parameters["first.damping"].prior[0] == 0.02  # what is given is the median
+    values = {"lower.mass_factor": batch([2.0, 1.0])[0], "arm.inertia_factor": batch([1.0, 3.0])[0]}
+    values |= {"second.friction": batch([0.1, 0.2])[0]}
+    found = with_chain_values(world, values)
+    before, after = (torch.stack([b.mass.expand(2) for b in w.bodies]) for w in (world, found))
+    np.testing.assert_allclose(after.sum(0), before.sum(0), rtol=1e-14)
+    np.testing.assert_allclose((after / before)[2] / (after / before)[0], [2.0, 1.0], rtol=1e-14)
+    radius = [b.inertia.diagonal(dim1=-2, dim2=-1).sum(-1) / b.mass for b in (world.bodies[2], found.bodies[2])]
+    np.testing.assert_allclose(radius[1] / radius[0], [1.0, 3.0], rtol=1e-14)
+    np.testing.assert_allclose(found.chains[0].joints[1].friction, [0.1, 0.2])
+    assert found.chains[0].joints[0].friction is world.chains[0].joints[0].friction
