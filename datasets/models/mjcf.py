@@ -171,10 +171,12 @@ def _add_pairs(root: ET.Element, model: Model) -> None:
     """
     file = model.file
     laws = {pair_of(*entry.materials): entry for entry in file.pairs}
-    ground = None if file.ground is None else file.ground.material
+    fixed = [(one.name, one.material, _surface_geoms(one, model)) for one in file.surfaces]
+    if file.ground is not None:
+        fixed.append(("ground", file.ground.material, ["ground"]))
     contact = ET.Element("contact")
     for index, body in enumerate(file.bodies):
-        others = [("ground", ground, ["ground"])] if body.motion == "free" and file.ground is not None else []
+        others = list(fixed) if body.motion == "free" else []
         others += [
             (other.name, other.material, _geoms(other, model))
             for other in file.bodies[index + 1 :]
@@ -187,16 +189,22 @@ def _add_pairs(root: ET.Element, model: Model) -> None:
             mine = _geoms(body, model)
             if len(mine) * len(names) > MOST_PAIRS:
                 raise InputDataError(
-                    f"body '{body.name}' and '{other}' have {len(mine)} and {len(names)} spheres and a contact law of "
+                    f"body '{body.name}' and '{other}' have {len(mine)} and {len(names)} geoms and a contact law of "
                     f"their own, which MJCF needs {len(mine) * len(names)} pairs for.",
                     f"up to {MOST_PAIRS} pairs.",
-                    "fit with fewer collision spheres (--spheres).",
+                    "fit with fewer collision spheres (--spheres), or give the surface fewer triangles.",
                 )
             numbers = _contact(law) | {"friction": _text((law.friction, law.friction, 0.0, 0.0, 0.0)), "condim": "3"}
             for first, second in product(mine, names):
                 ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
     if len(contact):
         root.append(contact)
+
+
+def _surface_geoms(surface: Surface, model: Model) -> list[str]:
+    """Return the names of a surface's geoms."""
+    mesh = model.surface_meshes.get(surface.name)
+    return [surface.name] if mesh is None else [f"{surface.name}_{index}" for index in range(len(mesh.faces))]
 
 
 def _geoms(body: BodyModel, model: Model) -> list[str]:

@@ -25,23 +25,28 @@ MOVED = ("free", "link")
 
 @dataclass(frozen=True)
 class TouchingBodies:
-    """Two bodies that can touch, or one and the ground."""
+    """Two bodies that can touch, or one and what does not move."""
 
     bodies: tuple[str, ...]
-    """Their names; one for a body and the ground."""
+    """Their names; one for a body and the ground, or a surface."""
     pair: Pair | None
     """Their materials; None where one of them has none."""
+    surface: str | None = None
+    """Name of the surface that the body can touch; None for the ground or another body."""
 
     def __str__(self) -> str:
-        return " and ".join(f"'{name}'" for name in self.bodies) + (" and the ground" if len(self.bodies) == 1 else "")
+        other = "the ground" if self.surface is None else f"surface '{self.surface}'"
+        return " and ".join([f"'{name}'" for name in self.bodies] + [other] * (len(self.bodies) == 1))
 
 
 def touching_bodies(manifest: CaptureManifest) -> Iterator[TouchingBodies]:
-    """Yield the bodies that can touch: each free one with the ground, and with every other body."""
+    """Yield the bodies that can touch: each free one with the ground, every surface, and every other body."""
     bodies, ground = manifest.bodies, manifest.world.ground
     for index, body in enumerate(bodies):
         if body.motion in MOVED and ground is not None:
             yield TouchingBodies((body.name,), _pair(body.material, ground.material))
+        for surface in manifest.surfaces if body.motion == "free" else ():
+            yield TouchingBodies((body.name,), _pair(body.material, surface.material), surface.name)
         for other in bodies[index + 1 :]:
             if body.motion in MOVED or other.motion in MOVED:
                 yield TouchingBodies((body.name, other.name), _pair(body.material, other.material))

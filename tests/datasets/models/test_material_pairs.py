@@ -1,5 +1,6 @@
 """Laws of pairs of materials in a model: in its parameters, its rollouts' parameters, its world and its MJCF."""
 
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -8,7 +9,8 @@ import pytest
 from cgwm.datasets.models.agreement import require_agreement, require_contact
 from cgwm.datasets.models.mjcf import write_mjcf
 from cgwm.datasets.models.model import Model
-from cgwm.pipeline.phys_geo.material_pairs import given_numbers, start_laws
+from cgwm.datasets.shapes.meshes import Mesh
+from cgwm.pipeline.phys_geo.material_pairs import given_numbers, start_laws, touching_bodies
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.synthesize.parameters import draw_parameters, settable, with_parameter
 from cgwm.schemas import (
@@ -22,8 +24,10 @@ from cgwm.schemas import (
     MaterialPair,
     ModelFile,
     PairContact,
+    Surface,
 )
 from cgwm.schemas import World as Surroundings
+from helpers.fixed_surfaces import groove
 from helpers.small_model import small_model
 from pydantic import ValidationError
 
@@ -67,6 +71,32 @@ def test_a_pair_is_a_pair_of_geoms_in_mjcf() -> None:
     assert all(pair.get("geom1") in geoms and pair.get("geom2") == "ground" for pair in pairs)
     assert {pair.get("friction") for pair in pairs} == {"0.2 0.2 0 0 0"}
     assert ET.fromstring(write_mjcf(model(pairs=(), parameters=()))).find("contact") is None
+
+
+def test_pairs_of_bodies_and_surfaces() -> None:
+    surfaces = (
+        Surface.model_validate({"name": "sheet", "material": "ice", "rectangle": {"half_extents_m": (1, 1)}}),
+        Surface.model_validate({"name": "track", "material": "ice", "mesh": {"path": "track.obj", "inside": "none"}}),
+        Surface.model_validate({"name": "post", "cylinder": {"radius_m": 0.1, "half_length_m": 1}}),
+    )
+    law = PAIR.model_copy(update={"materials": ("ice", "steel"), "friction": 0.03})
+    both = model(surfaces=surfaces, pairs=(PAIR, law))
+    both = replace(both, surface_meshes={"track": Mesh(*groove(0.3, 3))})
+    pairs = ET.fromstring(write_mjcf(both)).findall("contact/pair")
+    frictions: dict[str, set[str]] = {}
+    for pair in pairs:
+        frictions.setdefault(str(pair.get("geom2")), set()).add(str(pair.get("friction")))
+    ice = {"0.03 0.03 0 0 0"}
+    assert frictions == {"ground": {"0.2 0.2 0 0 0"}, "sheet": ice, **{f"track_{k}": ice for k in range(8)}}
+    steel = Body(name="cube", mass_kg=1.0, material="steel")
+    materials = (Material(name="steel"), Material(name="ice", friction=0.1))
+    manifest = CaptureManifest(
+        format="cgwm-capture/1", bodies=(steel,), materials=materials, surfaces=surfaces[:1],
+        pairs=(MaterialPair(materials=("steel", "ice"), friction=0.03),),
+    )  # fmt: skip
+    laws = start_laws(model(pairs=(), contact=None, parameters=()).file, manifest)
+    assert laws.contact.friction == 0.03 and laws.medians == {"friction": 0.03}  # the only pair in use
+    assert [str(one) for one in touching_bodies(manifest)] == ["'cube' and surface 'sheet'"]
 
 
 def test_what_contradicts_itself_is_refused() -> None:

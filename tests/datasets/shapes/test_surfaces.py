@@ -14,6 +14,7 @@ from cgwm.datasets.models.mjcf import write_mjcf
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.datasets.shapes.surfaces import obj_text, read_surface, stored
+from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.fixed_surface import BOX, CYLINDER, HALF_SPACE, MESH
 from cgwm.schemas import InputDataError, Surface
@@ -81,6 +82,37 @@ def test_a_model_keeps_its_surfaces(tmp_path: Path) -> None:
     mujoco = pytest.importorskip("mujoco")
     scene = mujoco.MjModel.from_xml_string(write_mjcf(again))
     assert scene.ngeom == 27 + 1 + 4 + len(faces)
+
+
+def test_surfaces_are_where_mujoco_puts_them() -> None:
+    mujoco = pytest.importorskip("mujoco")
+    pose = {"position_m": (0.3, -0.2, 0.1), "quat_wxyz": (0.5, 0.5, -0.1, 0.7)}
+    shapes = [
+        Surface.model_validate({"name": "track", "pose": pose, "mesh": {"path": "track.obj", "inside": "none"}}),
+        Surface.model_validate({"name": "post", "pose": pose, "cylinder": {"radius_m": 0.1, "half_length_m": 0.2}}),
+        Surface.model_validate({"name": "block", "pose": pose, "box": {"half_extents_m": (0.1, 0.2, 0.3)}}),
+        Surface.model_validate({"name": "sheet", "pose": pose, "rectangle": {"half_extents_m": (0.1, 0.2)}}),
+        Surface.model_validate({"name": "floor", "pose": pose, "half_space": {}}),
+    ]
+    model, track = small_model(), Mesh(*groove(0.3, 4))
+    file = model.file.model_copy(update={"surfaces": tuple(shapes)})
+    model = replace(model, file=file, surface_meshes={"track": track})
+    scene = mujoco.MjModel.from_xml_string(write_mjcf(model))
+    data = mujoco.MjData(scene)
+    mujoco.mj_forward(scene, data)
+    world = World.from_model(model)
+    rotation = quat_to_matrix(world.surfaces[0].quat_wxyz)[0].numpy()
+    for one in shapes[1:]:
+        geom = scene.geom(one.name).id
+        np.testing.assert_allclose(data.geom_xpos[geom], pose["position_m"], atol=1e-12)
+        np.testing.assert_allclose(data.geom_xmat[geom].reshape(3, 3), rotation, atol=1e-9)
+    expected = track.corners() @ rotation.T + pose["position_m"]
+    for index, triangle in enumerate(expected):
+        geom = scene.geom(f"track_{index}").id
+        first = scene.mesh_vertadr[scene.geom_dataid[geom]]
+        corners = scene.mesh_vert[first : first + 4] @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        apart = np.linalg.norm(triangle[:, None] - corners, axis=2).min(1)
+        assert apart.max() < 1e-6  # MuJoCo keeps corners in single precision
 
 
 def _refused(edit: Callable[[Path], Surface], tmp_path: Path, body_m: float | None = None) -> str:
