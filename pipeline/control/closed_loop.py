@@ -22,6 +22,7 @@ from ..physics.checks import require_apart
 from ..physics.fused.stepping import FusedStepper
 from ..physics.kinematic import Drive
 from ..physics.stepping import Stepper, TorchStepper
+from ..physics.thin_walls import require_thick_walls
 from ..physics.world import State, World
 from .frame_renderer import FrameRenderer
 
@@ -115,6 +116,7 @@ class ClosedLoop:
         poses = {self.body_names[k]: (pose[0][:, k], quat_normalize(pose[1][:, k])) for k in driven}
         at_rest = self._typed(self._commanded(poses, {name: Velocity((0.0, 0.0, 0.0)) for name in poses}))
         require_apart(world, start)
+        require_thick_walls(world, start)
         self._stepper.reset(start, at_rest)
         self._poses, self._steps = poses, 0
         frame, pairs = self._picture.of(start)

@@ -28,6 +28,7 @@ from ..physics.fused import unsupported
 from ..physics.fused.host import lacking
 from ..physics.kinematic import Drive
 from ..physics.rollout import Rollout, require_finite
+from ..physics.thin_walls import require_thick_walls
 from ..physics.world import State, World
 from ..runtime.kernel_build import compiler_version
 from .draw import Draw
@@ -114,6 +115,7 @@ class Simulator:
         worlds = [World.from_model(draw.model, geometry=self._world) for draw in draws]
         for world, draw, name in zip(worlds, draws, names, strict=True):
             require_apart(world, _state([draw.start]), name)
+            require_thick_walls(world, _state([draw.start]), name)
         world = joined_worlds([*worlds, *[worlds[-1]] * (size - len(draws))])
         state = _state([draw.start for draw in filled])
         driven = self._driven(filled)

@@ -17,6 +17,7 @@ from ..physics.effects.registry import BUILT_IN
 from ..physics.engine import rollout
 from ..physics.fused.host import lacking
 from ..physics.rollout import Rollout, simulate
+from ..physics.thin_walls import thin_wall_warnings
 from ..physics.world import State, World
 
 LENGTH_S = 1.0
@@ -50,6 +51,7 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
         with torch.no_grad():
             world = World.from_model(replace(model, file=file))
             state = _start(world)
+            thin = thin_wall_warnings(world)
             _require_own_values(model, file, world)
             result = _simulated(world, state)
     except CgwmError as error:
@@ -57,6 +59,8 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
         return [f"model.json: it cannot be simulated: {found}"], facts
     if result.times_s[-1] < LENGTH_S:
         facts["simulated_s"] = f"{float(result.times_s[-1]):.3g}"
+    if thin:
+        facts["thin_walls"] = " ".join(thin)
     fault = _fault(world, state, result)
     return ([] if fault is None else [f"model.json: {fault}"]), facts
 
